@@ -14,10 +14,9 @@ from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.findings import Case, document_of
 from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
 from pipeline.errors import ConvergenceError, NotObservableError
-from pipeline.estimation.candidates import MOUNTING, configured_effects
+from pipeline.estimation.candidates import MOUNTING, OTHER, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.rest_means import is_multi_position
-from pipeline.estimation.something_else import OTHER
 from pipeline.model.effects import catalogue, effect
 from pipeline.validation.heldout import last_error
 

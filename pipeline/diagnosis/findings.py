@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.words import next_experiment, to_distinguish
+from pipeline.estimation.candidates import OTHER
 from pipeline.estimation.posterior import CERTAIN
 from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
-from pipeline.estimation.something_else import OTHER
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:

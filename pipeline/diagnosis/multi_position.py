@@ -32,9 +32,8 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import Term
 from pipeline.estimation.multi_position.fit import fit
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
-from pipeline.estimation.multi_position.posterior import posterior
 from pipeline.estimation.multi_position.result import calibration_of, model_of
-from pipeline.estimation.multi_position.selection import FAR, select
+from pipeline.estimation.multi_position.selection import FAR, posterior, select
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue, effect, effect_from
 

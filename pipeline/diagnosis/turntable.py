@@ -20,13 +20,12 @@ from pipeline.diagnosis.residual_plots import plots
 from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
 from pipeline.errors import ConvergenceError
-from pipeline.estimation.candidates import turns_of
+from pipeline.estimation.candidates import free_curves, turns_of
 from pipeline.estimation.design import Start
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.posterior_turns import posterior
 from pipeline.estimation.selection import FAR_ABOVE, select
-from pipeline.estimation.something_else import free_curves
 from pipeline.model.effects import catalogue
 from pipeline.records import Noise
 from pipeline.validation.error_breakdown import with_known_effects

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.something_else import OTHER
+from pipeline.estimation.candidates import OTHER
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, unit_of
 

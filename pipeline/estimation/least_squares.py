@@ -17,7 +17,7 @@ it is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, sec
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Values
 
-    Function = Callable[[Values], Values]
-
+State = TypeVar("State")
+HALVINGS = 30  # of a step: what is left then is rounding
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
 PART_OF_NULL_SPACE = 1e-3  # of a unit vector of it, from which on a parameter is named as not determined
 COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, with a factor for sums over many residuals
@@ -45,9 +45,10 @@ class ScaledColumns:
     singular: Values
     Vt: Values
     scale: Values
+    tolerance: float  # of the largest singular value, below which a combination counts as not determined
 
     @classmethod
-    def of(cls, A: Values) -> ScaledColumns:
+    def of(cls, A: Values, tolerance: float = RANK_TOLERANCE) -> ScaledColumns:
         """Factorise (n, p) columns; n may be smaller than p."""
         n, p = A.shape
         scale = np.linalg.norm(A, axis=0)
@@ -57,12 +58,12 @@ class ScaledColumns:
         singular, basis = np.zeros(p), np.zeros((n, p))
         singular[: len(s)] = s
         basis[:, : len(s)] = Q @ U
-        return cls(basis, singular, Vt, scale)
+        return cls(basis, singular, Vt, scale, tolerance)
 
     @property
     def rank(self) -> int:
         """Number of parameters, or combinations of them, that are determined."""
-        return int(np.sum(self.singular > RANK_TOLERANCE * self.singular[0]))
+        return int(np.sum(self.singular > self.tolerance * self.singular[0]))
 
     @property
     def condition(self) -> float:
@@ -80,8 +81,9 @@ class ScaledColumns:
         return (self.Vt.T / self.singular / self.scale[:, None]) @ self.basis.T
 
     def covariance(self) -> Values:
-        """Return ``(A^T A)^-1``, for full rank: (p, p) array."""
-        half: Values = self.Vt.T / self.singular / self.scale[:, None]
+        """Return ``(A^T A)^-1``, of what is determined: (p, p) array."""
+        keep = slice(self.rank)
+        half: Values = self.Vt[keep].T / self.singular[keep] / self.scale[:, None]
         return half @ half.T
 
     def require_full_rank(self, names: Sequence[str] | None = None) -> None:
@@ -113,6 +115,17 @@ class LeastSquaresResult:
     cosine: float  # largest |cosine| between the residual and a column of the Jacobian
     converged: bool  # whether the residual is orthogonal to the columns, or the next step is below the rounding of x
 
+    @classmethod
+    def of(cls, x: Values, r: Values, J: Values, factors: ScaledColumns, sigma: float | None) -> LeastSquaresResult:
+        """Return the outcome at x with the residuals r and their columns J; ``sigma`` as in ``solve_linear``."""
+        norm, dof = float(np.linalg.norm(r)), len(r) - len(x)
+        cosine = float(np.max(np.abs(J.T @ r) / factors.scale) / norm) if norm > 0 else 0.0
+        small = bool(np.all(np.abs(factors.solve(r)) <= STEP_AT_MINIMUM * np.abs(x)))
+        if sigma is None:
+            sigma = norm / np.sqrt(dof) if dof > 0 else 0.0
+        converged = small or cosine <= COSINE_AT_MINIMUM
+        return cls(x, sigma**2 * factors.covariance(), r, dof, factors.rank, factors.condition, cosine, converged)
+
     @property
     def standard_uncertainty(self) -> Values:
         """Standard uncertainty of each parameter: (p,) array."""
@@ -132,63 +145,47 @@ def solve_linear(
     factors.require_full_rank(names)
     x = factors.solve(y)
     x += factors.solve(y - A @ x)  # one refinement recovers the digits that ill-conditioned columns cost
-    return _result(x, y - A @ x, A, factors, sigma)
+    return LeastSquaresResult.of(x, y - A @ x, A, factors, sigma)
 
 
-def solve_nonlinear(
-    residuals: Function,
-    start: Values,
-    jacobian: Function,
-    *,
-    sigma: float | None = None,
-    names: Sequence[str] | None = None,
-    iterations: int = 50,
-) -> LeastSquaresResult:
-    """Minimise ``|residuals(x)|`` by Gauss-Newton steps from a start nearby.
+def gauss_newton(  # noqa: PLR0917  (what an iteration is)
+    at: Callable[[State], tuple[Values, Values]],
+    start: State,
+    moved: Callable[[State, Values], tuple[State, Values]],
+    small: Callable[[Values, ScaledColumns], bool] | None,
+    iterations: int,
+    tolerance: float = RANK_TOLERANCE,
+) -> tuple[State, tuple[Values, Values], int]:
+    """Minimise ``|r|`` by Gauss-Newton steps, each halved while it does not lower ``|r|``.
 
-    ``residuals``: (p,) to (n,). ``start``: (p,). ``jacobian``: (p,) to (n, p). ``sigma``, ``names``: as in
-    ``solve_linear``. ``iterations``: limit on the number of steps. Where the certificate fails, ``converged`` is False;
-    that is an outcome, no exception. Raises ``NotObservableError`` if the data do not determine all parameters.
+    ``at``: state to its residuals (n,) and their derivative (n, p). ``moved``: state and step (p,) to the state there,
+    and what was taken of the step. ``small``: whether a step, with the factors of the derivative, is the last; by
+    default one that changes nothing but rounding. ``tolerance``: as of ``ScaledColumns``. Returns the state, residuals
+    and derivative there, and the number of steps. Raises ``NotObservableError`` where the start is not finite.
     """
-    with np.errstate(all="ignore"):  # steps that overflow do not lower the sum of squares
-        x = np.array(start, float)
-        r, J = residuals(x), jacobian(x)
-        if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
-            raise NotObservableError(
-                "residuals or their derivatives are not finite at the start: give a start nearer the solution, or "
-                "check the readings for values that are not finite"
-            )
-        factors, size = ScaledColumns.of(J), np.inf
-        for _ in range(iterations):
-            x_new, r_new = _halved(residuals, x, r, -factors.solve(r))
-            if x_new is None or r_new is None:
+    state, (r, J), size = start, at(start), np.inf
+    if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
+        raise NotObservableError(
+            "residuals or their derivatives are not finite at the start: give a start nearer the solution, or "
+            "check the readings for values that are not finite"
+        )
+    for count in range(iterations):
+        factors = ScaledColumns.of(J, tolerance)
+        step, before = -factors.solve(r), r @ r
+        for halving in range(HALVINGS):
+            new, taken = moved(state, step * 0.5**halving)
+            r_new, J_new = at(new)
+            # Near the minimum the sum of squares is flat to rounding while the step still has digits.
+            if r_new @ r_new < before * (1.0 + (ROUNDING if halving == 0 else 0.0)) and np.all(np.isfinite(J_new)):
                 break
-            J_new = jacobian(x_new)
-            if not np.all(np.isfinite(J_new)):
-                break
-            small = bool(np.all(np.abs(x_new - x) <= STEP_AT_MINIMUM * np.abs(x_new)))
-            size, before = float(np.linalg.norm((x_new - x) * factors.scale)), size
-            stalled = size >= before and r_new @ r_new >= (1.0 - ROUNDING) * (r @ r)
-            x, r, J = x_new, r_new, J_new
-            factors = ScaledColumns.of(J)
-            if small or stalled:
-                break
-    factors.require_full_rank(names)
-    return _result(x, r, J, factors, sigma)
-
-
-def _halved(residuals: Function, x: Values, r: Values, step: Values) -> tuple[Values | None, Values | None]:
-    """Return x and r after the first of step, step/2, ... that lowers ``|r|``, or None where none does.
-
-    Near the minimum the sum of squares is flat to rounding while the step still has digits: there it may stay the same.
-    """
-    before = r @ r
-    for tried in range(30):
-        x_new = x + step * 0.5**tried
-        r_new = residuals(x_new)
-        if r_new @ r_new < before * (1.0 + (ROUNDING if tried == 0 else 0.0)):
-            return x_new, r_new
-    return None, None
+        else:
+            return state, (r, J), count
+        size, last = float(np.linalg.norm(taken * factors.scale)), size
+        stalled = size >= last and r_new @ r_new >= (1.0 - ROUNDING) * before
+        state, r, J = new, r_new, J_new
+        if small(taken, factors) if small else stalled or size <= STEP_AT_MINIMUM * np.linalg.norm(r):
+            return state, (r, J), count + 1
+    return state, (r, J), iterations
 
 
 def certificate(A: Values, residual: Values, condition: float, rank: int) -> dict[str, Any]:
@@ -212,27 +209,3 @@ def certified(cosine: float, condition: float, rank: int, parameters: int) -> di
         "rank": rank,
         "parameters": parameters,
     }
-
-
-def _cosine(r: Values, J: Values, factors: ScaledColumns) -> float:
-    """Return the largest |cosine| between the residual and a column of the Jacobian."""
-    norm = float(np.linalg.norm(r))
-    return float(np.max(np.abs(J.T @ r) / factors.scale) / norm) if norm > 0 else 0.0
-
-
-def _result(x: Values, r: Values, J: Values, factors: ScaledColumns, sigma: float | None) -> LeastSquaresResult:
-    dof = len(r) - len(x)
-    cosine = _cosine(r, J, factors)
-    settled = bool(np.all(np.abs(factors.solve(r)) <= STEP_AT_MINIMUM * np.abs(x)))
-    if sigma is None:
-        sigma = float(np.linalg.norm(r)) / np.sqrt(dof) if dof > 0 else 0.0
-    return LeastSquaresResult(
-        x=x,
-        covariance=sigma**2 * factors.covariance(),
-        residual=r,
-        degrees_of_freedom=dof,
-        rank=factors.rank,
-        condition=factors.condition,
-        cosine=cosine,
-        converged=settled or cosine <= COSINE_AT_MINIMUM,
-    )

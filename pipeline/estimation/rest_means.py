@@ -2,7 +2,8 @@
 
 A rest is one orientation: its mean reading is one equation, ``|matrix @ (mean - bias)| = G``. Where a unit has no
 recording for validation, every ``holdout_every``-th rest is kept out of the fit, and the fit is judged by it. The
-gyroscope is fitted to the rests of the accelerometer's method.
+gyroscope is fitted to the rests of the accelerometer's method. ``Orientations`` are the rows of a fit by gravity's
+length alone, also of a table: dwells of stop-and-go turns, single samples of continuous ones.
 """
 
 from __future__ import annotations
@@ -12,15 +13,17 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.turns import stop_and_go
+from pipeline.model.kinematics import table_motion
 from pipeline.signal.filters import filter_autocovariance, smooth_temperature, variance_of_mean
 from pipeline.signal.quiet_motion import believed_rates, creep_in
-from pipeline.signal.rests import find_rests, rests_from_table, usable
+from pipeline.signal.rests import Rest, find_rests, rests_from_table, usable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Index, Integers, Mask, Recording, SensorCalibration, Values
-    from pipeline.signal.rests import Rest
 
 ROLE, HELD_OUT = "rests", "validation"
 
@@ -164,7 +167,7 @@ class Rests:
     creep_about: Values  # (m,), deg/s; standard deviation of the rate about gravity
     clock_shared: bool  # whether the time between the recordings is known
 
-    def select(self, index: Mask) -> Self:
+    def select(self, index: Mask | slice) -> Self:
         """Return some of the rests."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "clock_shared"}
         return replace(self, **{name: values[index] for name, values in arrays.items()})
@@ -207,23 +210,98 @@ def rests_of(
     """
     every = holdout_interval(recordings, settings) if role == ROLE else 0
     refused = _left_out(accelerometer)
-    chosen = [(i, r) for i, r in enumerate(recordings) if r.role == role and r.reading(sensor) is not None]
+    chosen: dict[int, list[Rest]] = {}
+    held: set[tuple[int, int]] = set()
+    for index, recording in enumerate(recordings):
+        if recording.role == role and recording.reading(sensor) is not None:
+            split = split_rests(recording, every)
+            rests = sorted([*split.used, *split.held_out], key=lambda rest: rest.start)
+            chosen[index] = [r for r in rests if (recording.name, float(recording.time[r.start])) not in refused]
+            held |= {(index, rest.start) for rest in (rests if role == HELD_OUT else split.held_out)}
+    if not chosen:
+        return None
+    found = gathered(sensor, recordings, chosen)
+    keys = zip(found.recording.tolist(), found.span[:, 0].tolist(), strict=True)
+    return replace(found, held_out=np.array([key in held for key in keys], bool)) if len(found.time) else None
+
+
+def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, Sequence[Rest]]) -> Rests:
+    """Return given rests of some recordings, by their index; none is held out."""
     columns: dict[str, list[Any]] = {}
-    for index, recording in chosen:
-        split = split_rests(recording, every)
-        rests = sorted([*split.used, *split.held_out], key=lambda rest: rest.start)
-        rests = [r for r in rests if (recording.name, float(recording.time[r.start])) not in refused]
-        found = _of_recording(sensor, recording, rests)
-        out = [rest.start for rest in split.held_out]
-        found["held_out"] = np.isin(found["span"][:, 0], out) | (role == HELD_OUT)
-        found["recording"] = np.full(len(found["count"]), index)
+    for index, rests in chosen.items():
+        found = _of_recording(sensor, recordings[index], rests)
+        count = len(found["count"])
+        found |= {"held_out": np.zeros(count, bool), "recording": np.full(count, index)}
         for name, values in found.items():
             columns.setdefault(name, []).append(values)
-    if not columns or sum(len(c) for c in columns["count"]) == 0:
-        return None
     alone = len(np.unique(np.concatenate(columns["recording"]))) == 1
-    shared = alone or all(recording.clock_shared for _, recording in chosen)
+    shared = alone or all(recordings[index].clock_shared for index in chosen)
     return Rests(**{name: np.concatenate(values) for name, values in columns.items()}, clock_shared=shared)
+
+
+@dataclass(frozen=True)
+class Orientations:
+    """Mean readings in different orientations."""
+
+    recordings: Sequence[Recording]
+    rests: Rests  # the rows of the fit
+    held_out: tuple[tuple[Recording, Rest], ...]
+    left_out: tuple[tuple[Recording, Rest], ...]
+    by_hand: bool  # whether no row is of a table
+
+    @property
+    def used(self) -> list[tuple[Recording, Rest]]:
+        """The samples of each row."""
+        spans = zip(self.rests.recording.tolist(), self.rests.span.tolist(), strict=True)
+        return [(self.recordings[i], Rest(start, stop)) for i, (start, stop) in spans]
+
+    @property
+    def white(self) -> Values:
+        """Standard deviation of a raw sample about the mean of its row: (3,) array, g; 0 where no row has two."""
+        filters = [self.recordings[i].filter for i in self.rests.recording[:1]]
+        gain = float(filters[0].get("noise_gain", 1.0)) if filters else 1.0
+        return self.rests.white / (gain or 1.0)
+
+
+def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Orientations:
+    """Collect the rows of all recordings made for the accelerometer.
+
+    ``recordings``: those of role ``rests`` and ``accelerometer`` are used. ``settings``: sections ``table`` and
+    ``procedure``. Raises ``CannotCalibrateError`` if no such recording holds readings of the accelerometer.
+    """
+    every = holdout_interval(recordings, settings)
+    used: dict[int, Sequence[Rest]] = {}
+    held_out: list[tuple[Recording, Rest]] = []
+    left_out: list[tuple[Recording, Rest]] = []
+    by_hand = True
+    for i, recording in enumerate(recordings):
+        if recording.role not in {"rests", "accelerometer"} or recording.accelerometer is None:
+            continue
+        on_table = _rests_on_table(recording, settings["table"])
+        if on_table is None:
+            split = split_rests(recording, every if recording.role == "rests" else 0)
+            used[i] = split.used
+            held_out += [(recording, rest) for rest in split.held_out]
+            left_out += [(recording, rest) for rest in split.left_out]
+        else:
+            by_hand, used[i] = False, on_table
+    if not used:
+        raise CannotCalibrateError(
+            "nonlinear least squares needs the accelerometer at rest in many orientations, and no recording of role "
+            "rests or accelerometer holds its readings: record some 24 rests, each in another orientation"
+        )
+    rests = gathered("accelerometer", recordings, used)
+    return Orientations(recordings, rests, tuple(held_out), tuple(left_out), by_hand)
+
+
+def _rests_on_table(recording: Recording, table: Mapping[str, Any]) -> list[Rest] | None:
+    """Return the dwells of a recording on a table, single samples of a continuous one, or None without a table."""
+    motion = table_motion(recording, table) if recording.role == "accelerometer" else None
+    if motion is None:
+        return None
+    if stop_and_go(motion):
+        return rests_from_table(recording)
+    return [Rest(i, i + 1) for i in np.flatnonzero(sound_samples(recording, "accelerometer")).tolist()]
 
 
 def _left_out(accelerometer: SensorCalibration | None) -> set[tuple[str, float]]:
@@ -244,9 +322,10 @@ def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> d
     assert reading is not None  # noqa: S101
     inside = [slice(a, b) for a, b in span]
     scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
-    creeps = [creep_in(recording, a, b) for a, b in span.tolist()] if recording.accelerometer is not None else []
+    by_hand = recording.accelerometer is not None and recording.table_angle is None
+    creeps = [creep_in(recording, a, b) for a, b in span.tolist()] if by_hand else []
     rate, error, about = believed_rates(creeps) if creeps else (np.zeros((len(span), 3)), np.zeros(len(span)), 0.0)
-    if sensor == "accelerometer":  # less the tilt of a unit that creeps
+    if sensor == "accelerometer" and by_hand:  # less the tilt of a unit that creeps
         scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
     warmth = np.full(recording.samples, np.nan)
     if recording.temperature is not None:

@@ -4,6 +4,10 @@ A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recor
 stage needs only such a module and its name in a method's list. The stages of the staged method are functions of one
 module for each sensor, and some stages are the same for both sensors.
 
+The stage ``given`` (``method=given``) is no fit, but bias, matrix and effects of an existing calibration, which the
+recordings judge by validation and diagnosis. Its uncertainty is what its file states. Where that states none, the
+covariance is zero, the budget says so, and what noise cannot explain on held-out motion is a departure of it.
+
 The correction by the stages so far is ``{"steps": [...]}``; each step acts on the output of the step before, on row
 vectors v:
 
@@ -22,19 +26,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
-from pipeline.records import StageResult
+from pipeline.records import NORMAL, Contribution, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
-    from pipeline.records import Recording, SensorCalibration, Values
+    from pipeline.records import Recording, Values
 
 STAGED = {
     "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),
     "gyroscope": ("bias", "orthogonality_and_misalignment", "scale_factor"),
 }
-OF_BOTH_SENSORS = ("reference_least_squares", "effects", "given")
+OF_BOTH_SENSORS = ("reference_least_squares", "effects")
+GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # the stage of a sensor whose method is null
 KINDS = "subtract, matrix, two_sided"
 
@@ -43,7 +48,7 @@ def stage_module(sensor: str, stage: str) -> str:
     """Return the module that holds a stage."""
     if stage in STAGED[sensor]:
         return f"pipeline.estimation.{sensor}.staged"
-    if stage == NOT_WANTED:
+    if stage in (NOT_WANTED, GIVEN):
         return __name__
     return f"pipeline.estimation.{stage}" if stage in OF_BOTH_SENSORS else f"pipeline.estimation.{sensor}.{stage}"
 
@@ -61,10 +66,51 @@ def fit_stage(
     """
     if stage == NOT_WANTED:
         raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")
+    if stage == GIVEN:
+        return given_calibration(sensor, settings)
     fit = import_module(stage_module(sensor, stage)).fit
     named = (stage,) if stage in STAGED[sensor] else (sensor,) if stage in OF_BOTH_SENSORS else ()
     found: SensorCalibration = fit(*named, recordings, previous, settings)
     return found
+
+
+def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibration:
+    """Return the given calibration of a sensor, as its configuration holds it (``method.given``).
+
+    Effects of mounting, place, table and timing belong to the bench of the file's own recordings: they are left out,
+    and the stage names them. Raises ``CannotCalibrateError`` where the file holds nothing of the sensor.
+    """
+    from pipeline.estimation.uncertainty_budget import base_parameters, combined  # noqa: PLC0415  (0.1 s of Snakemake)
+
+    given = settings["method"]["given"]
+    part, source = given[sensor], given["source"]
+    if part is None:
+        raise CannotCalibrateError(f"the given calibration {source} holds nothing of the {sensor}")
+    found = SensorCalibration.from_json(sensor, part)
+    bench = part["of_the_bench"]
+    kept = [i for i, name in enumerate(found.parameter_names()) if name.partition(".")[0] not in bench]
+    assert found.covariance is not None  # noqa: S101  (JSON holds zeros where none is known)
+    covariance = found.covariance[np.ix_(kept, kept)]
+    calibration = SensorCalibration(
+        sensor,
+        found.bias,
+        found.matrix,
+        effects=tuple(e for e in found.effects if e.name not in bench),
+        stages=(
+            StageResult(
+                GIVEN,
+                base_parameters(sensor, found.bias, found.matrix, covariance[:12, :12]),
+                details={"source": source, "sha256": given["sha256"], "notes": given["notes"], "left_out": bench},
+            ),
+        ),
+    )
+    if not part["uncertain"]:
+        return combined(
+            calibration, [], {GIVEN_SOURCE: f"{source} states no uncertainty: none is known, and zeros stand for it"}
+        )
+    freedom = np.full(len(kept), np.inf) if found.freedom is None else found.freedom[kept]
+    line = Contribution(GIVEN_SOURCE, "B", NORMAL, covariance, freedom, remark=f"as {source} states it")
+    return combined(calibration, [line], {})
 
 
 def staged_result(  # noqa: PLR0917  (what a stage of the staged method tells)

@@ -6,7 +6,7 @@ The next rest is that by which the calibration of the accelerometer gains most:
 
 where
 
-    J_i : (9,) derivative of the length of gravity at rest i (``estimation.accelerometer.ellipsoid_fit``)
+    J_i : (9,) derivative of the length of gravity at rest i (``derivative_of``)
     s_i : g; standard deviation of that length: white noise of the mean, and the scatter between rests
     P   : precision by the data sheet's limits, taken for two standard deviations; F is regular by it from the start
     g_p : variance of the fit over ``(F^-1)_pp``: bias wander, and a scatter that a few rests show only roughly; 1
@@ -43,10 +43,9 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.accelerometer.ellipsoid_fit import COLUMNS, IDEAL, ROWS, derivative_of, triangle
-from pipeline.estimation.accelerometer.orientations import orientations_of
+from pipeline.estimation.accelerometer.nonlinear_least_squares import COLUMNS, IDEAL, PLACE, ROWS, triangle
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
-from pipeline.estimation.rest_means import ROLE, holdout_interval, rest_means
+from pipeline.estimation.rest_means import ROLE, holdout_interval, orientations_of, rest_means
 from pipeline.records import AXES, coverage_factor
 from pipeline.signal.rests import WINDOW_S, find_rests
 from pipeline.signal.segments import multiples
@@ -55,7 +54,7 @@ from pipeline.simulation.trajectory import rotation_by
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.accelerometer.orientations import Orientations
+    from pipeline.estimation.rest_means import Orientations
     from pipeline.records import Recording, SensorCalibration, Values
     from pipeline.signal.rests import Rest
 
@@ -63,7 +62,6 @@ SHARPNESS = 8  # of the norm that stands for the largest U: within 32 % of it fo
 SWEEPS = 10  # of the exchange; it ends by itself after two or three
 MOST = 60  # rests that are planned ahead: some 7 min
 FEWEST = 9  # rests of the fit, one a parameter
-PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine among bias and full matrix
 SAME = 0.08  # of two components of the vertical: 5 deg from the edge between their sides, so that its name stays
 LEVEL_DEG = 3.0  # a tilt that is not worth a word: units are set down by hand to about 1 deg
 BETWEEN_SIDES = np.tan(np.radians(22.5))  # ratio of two components above which a corner is raised, not a side
@@ -155,18 +153,19 @@ def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dw
         reason = _open(fitted)
         scatter = 0.0 if reason else float(fitted.stages[-1].details["scatter_between_rests"])
     sheet, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
-    white = _white_of_rest(orientations, sheet, dwell)
+    rests, white = orientations.rests, _white_of_rest(orientations, sheet, dwell)
     error = float(np.hypot(white, scatter))
     F = _precision(sheet, gravity)
-    J = derivative_of(orientations.mean, values) if len(orientations.mean) else np.zeros((0, 9))
-    F = F + (J / (orientations.variance + scatter**2)[:, None]).T @ J
+    if len(rests.time):
+        J = derivative_of(rests.reading, values)
+        F = F + (J / (np.mean(orientations.white**2) * rests.share + scatter**2)[:, None]).T @ J
     inflation, freedom, expanded = np.ones(9), np.full(9, np.inf), np.inf
     if fitted is not None and not reason:
         assert fitted.covariance is not None  # noqa: S101
         own = np.diag(fitted.covariance)[PLACE]
         freedom, inflation = fitted.effective_freedom()[PLACE], own / np.diag(np.linalg.inv(F))
         expanded = float(np.max(coverage_factor(freedom) * np.sqrt(own)))
-    of_both = [(pair, False) for pair in orientations.rests] + [(pair, True) for pair in orientations.held_out]
+    of_both = [(pair, False) for pair in orientations.used] + [(pair, True) for pair in orientations.held_out]
     of_both.sort(key=lambda entry: (recordings.index(entry[0][0]), entry[0][1].start))
     pairs = [pair for pair, _ in of_both]
     last = sum(pair[0] is pairs[-1][0] for pair in pairs) if pairs else 0
@@ -187,6 +186,17 @@ def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dw
     )
 
 
+def derivative_of(y: Values, values: Values) -> Values:
+    """Return the derivative of |L (y - b)| with respect to the nine values: (m, 9) array.
+
+    ``d/db = -L^T n`` and ``d/dL_ij = n_i (y - b)_j``, with ``n = u / |u|``.
+    """
+    L, centred = triangle(values), y - values[:3]
+    u = centred @ L.T
+    n = u / np.linalg.norm(u, axis=1, keepdims=True)
+    return np.concatenate([-n @ L, n[:, ROWS] * centred[:, COLUMNS]], axis=1)
+
+
 def _open(fitted: SensorCalibration) -> str:
     """Return what the rests do not determine yet; empty where they determine everything."""
     fixed = fitted.stages[-1].details["fixed"]
@@ -198,9 +208,10 @@ def _open(fitted: SensorCalibration) -> str:
 
 def _white_of_rest(orientations: Orientations, sheet: Mapping[str, Any], dwell: float) -> float:
     """Return the standard deviation by white noise of the mean of a rest to come, an axis, g."""
-    if orientations.white > 0.0:
-        (recording, _), *_ = orientations.rests
-        return orientations.white / float(np.sqrt(max((dwell - WINDOW_S) / recording.interval, 1.0)))
+    white = float(np.sqrt(np.mean(orientations.white**2)))
+    if white > 0.0:
+        (recording, _), *_ = orientations.used
+        return white / float(np.sqrt(max((dwell - WINDOW_S) / recording.interval, 1.0)))
     return float(sheet["noise_density"]) / float(np.sqrt(2.0 * dwell))
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.least_squares import ScaledColumns, solve_linear, solve_nonlinear
-from tests.estimation.complex_step import jacobian_of
+from pipeline.estimation.least_squares import ScaledColumns, solve_linear
+from tests.estimation.complex_step import jacobian_of, solve_nonlinear
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -96,7 +96,7 @@ def test_a_search_cut_short_is_not_called_converged() -> None:
     def valley(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array([x[0] - 5.0, 1e3 * (x[1] - x[0] ** 2), 1.0])
 
-    fit = solve_nonlinear(valley, np.array([1.0, 0.0]), jacobian_of(valley), iterations=1)
+    fit = solve_nonlinear(valley, np.array([1.0, 0.0]), jacobian_of(valley), steps=1)
     assert not fit.converged
     assert fit.cosine > 1e-3
 

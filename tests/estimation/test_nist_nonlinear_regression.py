@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from pipeline.estimation.least_squares import solve_nonlinear
-from tests.estimation.complex_step import jacobian_of
+from tests.estimation.complex_step import jacobian_of, solve_nonlinear
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -10,11 +10,10 @@ import pytest
 from scipy.linalg import null_space
 from scipy.special import logsumexp
 
-from pipeline.estimation.candidates import excited
+from pipeline.estimation.candidates import excited, free_curves
 from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Problem, Version
 from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantiles
 from pipeline.estimation.ranking import without
-from pipeline.estimation.something_else import free_curves
 from pipeline.records import Motion
 
 if TYPE_CHECKING:

@@ -1,71 +1,112 @@
 """Nine parameters of the accelerometer from the length of gravity (paper eqs 1 and 4; Sudsanguan 2019, 5.5-5.6).
 
-    u = T S (y - b),   minimise  sum_i w_i (|u_i| - G)^2
+    u = L (y - b),   L = T S,   |u| = G
 
 with the bias b, the scale factors S and the unit lower triangular misalignment T: x of the sensor is x of the body, and
 its y lies in the plane of x and y, since the length of gravity says nothing of how the sensor is mounted. The
-orientations need not be known. See ``pipeline.estimation.accelerometer.ellipsoid_fit`` for the equations.
+orientations need not be known. Equations and fit are those of ``pipeline.estimation.multi_position``; the rows are
+hand-held rests, the dwells of a table's stop-and-go turns, or the single samples of its continuous turns.
 
 A misalignment that the orientations do not determine, as in six positions, is left at zero, and the result says so. On
 a table the errors of the rows are correlated by the bias wander, whose covariance is that of
-``pipeline.estimation.engine``; by hand that of ``pipeline.estimation.accelerometer.orientations``.
+``pipeline.estimation.engine``.
+
+The start is the ellipsoid ``p . (x^2, y^2, z^2, 2xy, 2xz, 2yz, 2x, 2y, 2z) = 1``, that is ``y^T Q y + 2 h^T y = 1``. It
+is linear in p; its centre is ``b = -Q^-1 h``, and ``L^T L = Q G^2 / (1 + b^T Q b)``.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.accelerometer.ellipsoid_fit import (
-    COLUMNS,
-    MISALIGNMENT,
-    NAMES,
-    ROWS,
-    derivative_of,
-    fit_ellipsoid,
-)
-from pipeline.estimation.accelerometer.orientations import (
-    RestErrors,
-    orientations_of,
-    rest_candidates,
-    rest_scatter,
-    without,
-)
-from pipeline.estimation.engine import LinearMap, Posterior, assess_noise
-from pipeline.estimation.least_squares import ScaledColumns, certified
+from pipeline.estimation.engine import LinearMap, assess_noise
+from pipeline.estimation.gauss_markov import Prior
+from pipeline.estimation.least_squares import ScaledColumns, solve_linear
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through, trials_of, without_trials
+from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
+from pipeline.estimation.multi_position.fit import Fit
+from pipeline.estimation.multi_position.fit import fit as fit_model
+from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, prior_hypotheses
+from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.result import after_stage, curvature, fit_faces, require_faces, with_stage
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.rest_means import describe_rests
+from pipeline.estimation.rest_means import describe_rests, orientations_of, sound_samples
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples
-from pipeline.estimation.uncertainty_budget import (
-    combined,
-    gravity_contribution,
-    noise_contribution,
-    scatter_contribution,
-)
+from pipeline.estimation.uncertainty_budget import combined, gravity_contribution, noise_contribution
 from pipeline.model.kinematics import table_motion
-from pipeline.records import SensorCalibration, StageResult, coverage_factor
+from pipeline.records import Noise, SensorCalibration, coverage_factor
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.accelerometer.ellipsoid_fit import Ellipsoid
-    from pipeline.estimation.accelerometer.orientations import Orientations
     from pipeline.estimation.engine import ResidualNoise
-    from pipeline.estimation.gauss_markov import Prior
-    from pipeline.records import Contribution, Motion, Recording, Values
+    from pipeline.estimation.rest_means import Orientations
+    from pipeline.records import Mask, Recording, Values
 
 NAME = "nonlinear_least_squares"
-MISALIGNMENT_UNKNOWN = 0.05  # rad, standard uncertainty above which the rests do not determine a misalignment
-UNKNOWN = 0.05  # g of a bias, relative of a scale factor: beyond it nothing of them is known
+ROWS, COLUMNS = np.tril_indices(3)
+PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine values among bias and full matrix
+NAMES = np.array(
+    [f"bias_{axis}" for axis in "xyz"]
+    + [
+        f"scale_factor_{'xyz'[i]}" if i == j else f"misalignment_{'xyz'[i]}{'xyz'[j]}"
+        for i, j in zip(ROWS, COLUMNS, strict=True)
+    ]
+)
+MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
+IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
+UNKNOWN = 0.05  # standard uncertainty, g, relative or rad, beyond which nothing of a parameter is known
 FALSE_ALARM = 1e-3  # probability of calling one of the rests of a sound recording an outlier
 SMALLEST_OUTLIER_G = 1e-6  # rests of a noise-free recording are no outliers
 FEWEST_TO_JUDGE = 18  # rests, two a parameter
 OUTLIER_SHARE = 0.2  # of the rests: where more are off, none can be called wrong
 MOST_ROWS = 600  # of which a covariance is drawn
+NOT_INCLUDED = {
+    "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
+    "quantisation": "contained in the noise of the readings, as the rests scatter",
+    "temperature": "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is "
+    "stated",
+    "time base": "no time enters the length of gravity",
+}
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A fit of some of the nine values; ``columns`` and ``residual`` are over the standard deviation of each row."""
+
+    model: AccelerometerModel
+    fit: Fit
+    free: Mask  # (9,)
+    columns: Values  # (m, p)
+    residual: Values  # (m,)
+    deviation: Values  # (m,), g
+
+    @property
+    def error(self) -> Values:
+        """|u| less its target: (m,) array, g."""
+        return -self.residual * self.deviation
+
+    @property
+    def values(self) -> Values:
+        """The nine values."""
+        return np.asarray(np.concatenate([self.fit.state.bias, self.fit.state.matrix.ravel()])[PLACE], np.float64)
+
+    @property
+    def between(self) -> float:
+        """What the rows scatter beyond white noise v, g: ``sum error^2 / (v + s^2) = m - p`` (Mandel & Paule 1970)."""
+        spare, squares, variance = _spare(self), self.error**2, self.fit.error**2
+        if spare < 1 or np.sum(squares / variance) <= spare:
+            return 0.0
+        low, high = 0.0, float(np.sum(squares)) / spare
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if np.sum(squares / (variance + middle)) > spare else (low, middle)
+        return float(np.sqrt(high))
 
 
 def fit(
@@ -82,279 +123,272 @@ def fit(
     """
     if not settings["procedure"].get("faces"):
         return _fit_triangular(recordings, previous, settings)
-    from pipeline.estimation.multi_position.result import fit_faces, require_faces  # noqa: PLC0415  (needs this module)
-
     require_faces(recordings, settings)
     return fit_faces(_fit_triangular(recordings, previous, settings), recordings, settings)
+
+
+def triangle(values: Values) -> Values:
+    """Return L of the nine values: (3, 3) array."""
+    L = np.zeros((3, 3))
+    L[ROWS, COLUMNS] = values[3:]
+    return L
 
 
 def _fit_triangular(
     recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    gravity_g = float(settings["table"].get("gravity_g", 1.0))
-    orientations = orientations_of(recordings, settings)
-    found = _fit_determined(orientations, gravity_g)
-    while refused := _outlier(orientations, found):
-        orientations = without(orientations, refused)
-        found = _fit_determined(orientations, gravity_g)
-    prior = prior_of("accelerometer", recordings, settings)
-    scatter = _scatter(orientations, found, prior, settings["table"])
-    result = StageResult(
-        name=NAME,
-        parameters=_parameters(found, scatter.covariance),
-        residual_rms=float(np.sqrt(np.mean(found.error**2))),
-        correction={"steps": [{"subtract": found.bias.tolist()}, {"matrix": found.matrix.tolist()}]},
-        details=_details(orientations, found, float(scatter.degrees_of_freedom.min())),
+    table, prior = settings["table"], prior_of("accelerometer", recordings, settings)
+    gravity_g = float(table.get("gravity_g", 1.0))
+    rows = orientations_of(recordings, settings)
+    solved = _fit_determined(rows, gravity_g, prior)
+    while refused := _outlier(rows, solved):
+        rows = _without(rows, refused)
+        solved = _fit_determined(rows, gravity_g, prior)
+    found, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
+    correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
+    if not rows.by_hand and _spare(solved) > 1:
+        return _on_table(rows, solved, before, correction, prior, settings)
+    place = np.eye(12)[:, PLACE[solved.free]]
+    covariance = place @ found.covariance @ place.T
+    freedom = float(found.degrees_of_freedom.min())
+    details, parameters = _details(rows, solved, freedom), _parameters(solved, covariance)
+    gain = ScaledColumns.of(solved.columns).weights() * (found.error / solved.deviation)
+    total = np.diag(covariance)
+    white = np.minimum(place @ np.sum(gain**2, axis=1), total)
+    parts = {"white noise": np.sqrt(white), "bias wander and scatter of the rests": np.sqrt(total - white)}
+    return after_stage(
+        before,
+        NAME,
+        details,
+        solved.model,
+        found,
+        settings,
+        correction,
+        parameters=parameters,
+        parts=parts,
+        not_included=NOT_INCLUDED,
     )
-    place = np.zeros((12, 9))
-    place[[0, 1, 2, *(3 + 3 * ROWS + COLUMNS).tolist()], np.arange(9)] = 1.0
-    calibration = SensorCalibration(
-        sensor="accelerometer",
-        bias=found.bias,
-        matrix=found.matrix,
-        stages=(*(previous.stages if previous else ()), result),
-        converged=found.fit.converged,
-        convergence=certified(found.fit.cosine, found.fit.condition, found.fit.rank, int(found.free.sum())),
-    )
-    gravity = gravity_contribution("accelerometer", found.matrix, settings["table"], 12)
-    lines = [scatter.placed(place), *([gravity] if gravity else [])]
-    complete = combined(calibration, lines, _not_included(gravity))
-    trials = trials_of(settings)
-    if not trials:
-        return complete
-    errors = _row_errors(orientations, found, prior, settings["table"])
-    steps = _second_order(orientations, found)
-
-    def results(drawn: Values) -> Values:
-        values = np.tile(np.concatenate([found.bias, found.matrix.ravel()]), (len(drawn), 1))
-        return np.asarray(values + steps(drawn) @ place[:, found.free].T)
-
-    if isinstance(errors, str):
-        return without_trials(complete, errors)
-    return beside_trials(complete, through(errors, [], results), trials, lines[1:])
 
 
-def _row_errors(
-    orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]
-) -> Posterior | str:
-    """Return the distribution of the rows' errors, or why there is none."""
-    rows, every = len(orientations.mean), np.eye(len(orientations.mean))
-    spare = found.fit.degrees_of_freedom
-    if rows > MOST_ROWS:
-        return f"{rows} readings of a continuous turn are too many equations to draw; it is made for rests"
-    if spare <= 1:
-        variance = orientations.variance + prior.wander**2
-        return Posterior(np.ones(1), np.diag(variance)[None], float(3 * np.sum(orientations.count - 1)))
-    if orientations.by_hand and orientations.rests:
-        J = derivative_of(orientations.mean, found.values)[:, found.free]
-        weight, candidates = rest_candidates(_errors(orientations, found, J), every, prior)
-        return Posterior(weight, candidates, np.inf)
-    noise, along = _table_noise(orientations, found, prior, table)
-    per_sample = np.where(np.arange(rows)[:, None] == orientations.row, 1.0 / orientations.count[orientations.row], 0.0)
-    x, y, z = (per_sample * along[orientations.row, c] for c in range(3))
-    return noise.posterior(LinearMap((x, y, z), (every, every, every)))
+def _spare(solved: _Solved) -> int:
+    return len(solved.residual) - int(solved.free.sum())
 
 
-def _second_order(orientations: Orientations, found: Ellipsoid) -> Callable[[Values], Values]:
-    """Return how errors of the rows move the fitted values."""
-    y, values, step = orientations.mean, found.values, 1e-5
-    moved = step * np.eye(9)[found.free]
-    slopes = [derivative_of(y, values + d)[:, found.free] - derivative_of(y, values - d)[:, found.free] for d in moved]
-    H = np.stack(slopes, axis=2) / (2.0 * step)
-    return quadratic_results(derivative_of(y, values)[:, found.free], H, np.diag(found.weight**2))
+def _without(rows: Orientations, refused: Mapping[int, str]) -> Orientations:
+    """Return the rows without some of them, which count as left out, each with its reason."""
+    used = rows.used
+    gone = [(used[i][0], replace(used[i][1], accepted=False, reason=reason)) for i, reason in refused.items()]
+    left_out = sorted([*rows.left_out, *gone], key=lambda pair: (pair[0].name, pair[1].start))
+    kept = np.isin(np.arange(len(used)), list(refused), invert=True)
+    return replace(rows, rests=rows.rests.select(kept), left_out=tuple(left_out))
 
 
-def _not_included(gravity: Contribution | None) -> dict[str, str]:
-    reasons = {
-        "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
-        "quantisation": "contained in the noise of the readings, as the rests scatter",
-        "temperature": "the parameters hold at the temperature of these recordings; "
-        "no accuracy of the thermometer is stated",
-        "time base": "no time enters the length of gravity",
-    }
-    return reasons if gravity else {"local gravity": "table.gravity_accuracy_g is not stated", **reasons}
-
-
-def _fit_determined(orientations: Orientations, gravity_g: float) -> Ellipsoid:
+def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior) -> _Solved:
     """Fit bias, scale factors and those misalignments that the orientations determine."""
-    rows = len(orientations.mean)
-    if rows < 6:
+    count = len(rows.rests.time)
+    if count < 6:
         raise NotObservableError(
-            f"{rows} orientations determine neither bias nor scale factors: {_left(orientations)}. Record rests in at "
+            f"{count} orientations determine neither bias nor scale factors: {_left(rows)}. Record rests in at "
             "least 6 orientations, each axis up and down, or better in 24 that are spread evenly"
         )
-    free = np.full(9, fill_value=True) if rows >= 9 else ~MISALIGNMENT
+    free = np.full(9, fill_value=True) if count >= 9 else ~MISALIGNMENT
     while True:
         try:
-            found = fit_ellipsoid(orientations, gravity_g, free)
+            solved = _fitted(rows, gravity_g, prior, free)
         except NotObservableError as lack:
             if not np.any(free & MISALIGNMENT):
                 raise NotObservableError(
-                    f"the {rows} orientations are too much alike: {lack.message} ({_left(orientations)}). Record rests "
+                    f"the {count} orientations are too much alike: {lack.message} ({_left(rows)}). Record rests "
                     "with each axis up, down and level, spread evenly"
                 ) from lack
             free = ~MISALIGNMENT
             continue
-        uncertainty = np.where(MISALIGNMENT, found.standard_uncertainty, 0.0)
-        if np.max(uncertainty) <= MISALIGNMENT_UNKNOWN:
-            return _require_determined(found, orientations)
-        free = free & (np.arange(9) != np.argmax(uncertainty))
+        u, scale = np.zeros(9), max(1.0, float(np.sum(solved.residual**2)) / max(_spare(solved), 1))
+        u[free] = np.sqrt(scale * np.diag(np.linalg.pinv(solved.columns.T @ solved.columns, hermitian=True)))
+        if np.max(u[MISALIGNMENT]) > UNKNOWN:
+            free = free & (np.arange(9) != np.argmax(np.where(MISALIGNMENT, u, 0.0)))
+            continue
+        weak = NAMES[(u > UNKNOWN) & ~MISALIGNMENT]
+        if len(weak):
+            raise NotObservableError(
+                f"the {count} orientations are nearly degenerate: they leave {', '.join(weak)} open to "
+                f"{float(u.max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled columns). "
+                "Record rests with each axis up, down and level, spread evenly, not all in one plane or direction"
+            )
+        return solved
 
 
-def _require_determined(found: Ellipsoid, orientations: Orientations) -> Ellipsoid:
-    """Refuse a bias or scale factor that the orientations leave as open as no sensor is."""
-    u = np.where(MISALIGNMENT, 0.0, found.standard_uncertainty)
-    weak = [name for name, one in zip(NAMES, u, strict=True) if one > UNKNOWN]
-    if weak:
-        raise NotObservableError(
-            f"the {len(orientations.mean)} orientations are nearly degenerate: they leave {', '.join(weak)} open to "
-            f"{float(u.max()):.2g} (standard uncertainty; condition {found.fit.condition:.1e} in scaled columns). "
-            "Record rests with each axis up, down and level, spread evenly, not all in one plane or direction"
-        )
-    return found
-
-
-def _left(orientations: Orientations) -> str:
-    left_out, held_out = len(orientations.left_out), len(orientations.held_out)
+def _left(rows: Orientations) -> str:
+    left_out, held_out = len(rows.left_out), len(rows.held_out)
     return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation"
 
 
-def _outlier(orientations: Orientations, found: Ellipsoid) -> dict[int, str]:
+def _fitted(rows: Orientations, gravity_g: float, prior: Prior, free: Mask) -> _Solved:
+    """Fit some of the nine values; raise ``NotObservableError`` if the orientations do not determine them."""
+    noise = Noise(rows.white, np.zeros(3), prior.time, "rests")
+    directions = np.eye(12)[:, PLACE[free]]
+    model = AccelerometerModel(rows.rests, directions, gravity_g, noise, wander=rows.by_hand)
+    values = _start(rows.rests.reading, gravity_g, free)
+    state = State(values[:3], triangle(values))
+    equations = model.equations(state)
+    ScaledColumns.of(equations.base).require_full_rank(NAMES[free].tolist())
+    spare = len(rows.rests.time) - int(free.sum())
+    known = Prior(0.0, prior.time) if not rows.by_hand else prior
+    noises = prior_hypotheses(known, float(np.mean(model.white)), model.kinds)
+    if known.wander == 0.0:  # on a table the wander follows from all readings
+        noises = [noise for noise in noises if noise.ratio == 0.0]
+    if spare <= 1:  # too few rows to show a scatter of their own: what is believed of the bias wander stands in
+        noises = [NoiseHypothesis(0.0, prior.time, (prior.wander / float(np.median(equations.error)),), 0.0)]
+    noises = [replace(noise, known=True) for noise in noises]  # by the scatter within the rests
+    found = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
+    equations = model.equations(found.state)
+    deviation = np.sqrt(np.diag(equations.covariance(found.noise)) if rows.by_hand else equations.variance(found.noise))
+    scaled = equations.base / deviation[:, None], equations.residual / deviation
+    return _Solved(model, found, free, *scaled, deviation * equations.error)
+
+
+def _start(y: Values, gravity_g: float, free: Mask) -> Values:
+    """Return the values of the ellipsoid through the readings, or those of an ideal sensor where they draw none."""
+    tilted = bool(free[MISALIGNMENT].all())
+    products = 2.0 * y[:, [0, 0, 1]] * y[:, [1, 2, 2]]
+    columns = [y**2, products, 2.0 * y] if tilted else [y**2, 2.0 * y]
+    try:
+        p = solve_linear(np.concatenate(columns, axis=1), np.ones(len(y)), sigma=1.0).x
+    except NotObservableError:
+        return IDEAL
+    xy, xz, yz = p[3:6] if tilted else np.zeros(3)
+    Q = np.array([[p[0], xy, xz], [xy, p[1], yz], [xz, yz, p[2]]])
+    if np.min(np.linalg.eigvalsh(Q)) <= 0:
+        return IDEAL
+    b = -np.linalg.solve(Q, p[-3:])
+    scaled = Q * gravity_g**2 / (1.0 + b @ Q @ b)
+    reverse = np.linalg.cholesky(scaled[::-1, ::-1])[::-1, ::-1]  # upper triangular U with U U^T = L^T L
+    found = np.concatenate([b, reverse.T[ROWS, COLUMNS]])
+    return np.where(free, found, IDEAL)
+
+
+def _outlier(rows: Orientations, solved: _Solved) -> dict[int, str]:
     """Return the hand-held rest that contradicts the others most, if it does, with the reason.
 
     A rest is compared with what the others alone say: with its leverage h, its weighted error r and p parameters,
     ``t = r / (s sqrt(1 - h))`` follows Student's t with m - p - 1 degrees of freedom, where s is the scatter of the
     others, ``s^2 = (sum r^2 - r^2 / (1 - h)) / (m - p - 1)`` (Belsley, Kuh & Welsch 1980, section 2.1).
     """
-    m, left_out = len(found.error), len(orientations.left_out)
-    if not orientations.by_hand or m < FEWEST_TO_JUDGE or left_out >= OUTLIER_SHARE * (m + left_out):
+    r, left_out = solved.residual, len(rows.left_out)
+    if not rows.by_hand or len(r) < FEWEST_TO_JUDGE or left_out >= OUTLIER_SHARE * (len(r) + left_out):
         return {}
-    J = derivative_of(orientations.mean, found.values)[:, found.free]
-    rest = 1.0 - np.sum(ScaledColumns.of(found.weight[:, None] * J).basis ** 2, axis=1)
-    r, spare = found.weight * found.error, m - int(found.free.sum()) - 1
+    rest = 1.0 - np.sum(ScaledColumns.of(solved.columns).basis ** 2, axis=1)
+    spare = _spare(solved) - 1
     others = np.maximum(np.sum(r**2) - r**2 / np.maximum(rest, 1e-9), 1e-12 * np.sum(r**2)) / spare
     t = np.abs(r) / np.sqrt(others * np.maximum(rest, 1e-9))
     worst = int(np.argmax(t))
-    off = float(found.error[worst] / rest[worst])
-    if t[worst] <= coverage_factor(spare, 1.0 - FALSE_ALARM / m) or abs(off) < SMALLEST_OUTLIER_G:
+    off = float(solved.error[worst] / rest[worst])
+    if t[worst] <= coverage_factor(spare, 1.0 - FALSE_ALARM / len(r)) or abs(off) < SMALLEST_OUTLIER_G:
         return {}
     return {
         worst: f"length of the specific force is {1e3 * off:.2f} mg off what the other rests say, t = {t[worst]:.0f}"
     }
 
 
-def _scatter(orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]) -> Contribution:
-    """Return what the readings' scatter contributes to b and L."""
-    spare = found.fit.degrees_of_freedom
-    if not orientations.by_hand and spare > 1:
-        return _serial_scatter(orientations, found, prior, table)
-    place = np.eye(9)[:, found.free]
-    J = derivative_of(orientations.mean, found.values)[:, found.free]
-    gain = _gain(J, found.weight)
-    if spare > 1 and orientations.rests:
-        return rest_scatter(_errors(orientations, found, J), gain, prior).placed(place)
-    # Too few rests to show a scatter of their own: what is believed of the bias wander stands in.
-    white = gain * orientations.variance @ gain.T
-    covariance = gain * (orientations.variance + prior.wander**2) @ gain.T
-    parts = {"white noise": np.sqrt(np.diag(white)), "bias wander": np.sqrt(np.diag(covariance - white))}
-    freedom = float(3 * np.sum(orientations.count - 1))
-    return scatter_contribution(covariance, freedom, parts).placed(place)
-
-
-def _gain(J: Values, weight: Values) -> Values:
-    """Return the weights of the readings in the estimate, ``(J^T W J)^-1 J^T W`` with W = diag(weight^2)."""
-    factors = ScaledColumns.of(weight[:, None] * J)
-    factors.require_full_rank()
-    return factors.weights() * weight
-
-
-def _errors(orientations: Orientations, found: Ellipsoid, J: Values) -> RestErrors:
-    """Return the errors of hand-held rests, with their times."""
-    truth = (orientations.mean - found.bias) @ found.matrix.T
-    edges = [(r.time[rest.start], r.time[rest.stop - 1] + r.interval) for r, rest in orientations.rests]
-    start, stop = np.array(edges).T
-    own = np.array([id(recording) for recording, _ in orientations.rests])
-    shared = all(recording.clock_shared for recording, _ in orientations.rests)
-    return RestErrors(
-        error=found.error,
-        derivative=J,
-        along=truth / np.linalg.norm(truth, axis=1, keepdims=True) @ found.matrix,
-        variance=orientations.variance,
-        between=found.between,
-        start=start,
-        length=stop - start,
-        joined=np.full((len(own), len(own)), shared) | (own[:, None] == own),
-    )
-
-
-def _serial_scatter(
-    orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]
-) -> Contribution:
-    """Return the scatter under white noise and bias wander, as the residuals of ``y = b + K u`` on the table tell it.
+def _on_table(  # noqa: PLR0917  (what a fit on a table is)
+    rows: Orientations,
+    solved: _Solved,
+    before: SensorCalibration,
+    correction: dict[str, Any],
+    prior: Prior,
+    settings: Mapping[str, Any],
+) -> SensorCalibration:
+    """Return the calibration under white noise and bias wander, as the residuals of ``y = b + K u`` tell them.
 
     The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
     in the readings of each channel c with the weights ``J^+ (n^T L)_c``.
     """
-    row = orientations.row
-    J = derivative_of(orientations.mean, found.values)[:, found.free]
-    noise, along = _table_noise(orientations, found, prior, table)
-    per_sample = (_gain(J, found.weight) / orientations.count)[:, row]
-    weights_x, weights_y, weights_z = (per_sample * along[row, c] for c in range(3))
-    place = np.eye(9)[:, found.free]
-    return noise_contribution(noise, LinearMap((weights_x, weights_y, weights_z), (place, place, place)), prior)
+    used, count, place = rows.used, rows.rests.count, np.eye(12)[:, PLACE[solved.free]]
+    parts = []
+    for i in dict.fromkeys(rows.rests.recording.tolist()):
+        keep = np.zeros(rows.recordings[i].samples, bool)
+        for _, rest in (pair for pair in used if pair[0] is rows.recordings[i]):
+            keep[rest.start : rest.stop] = True
+        parts.append((rows.recordings[i], keep & sound_samples(rows.recordings[i], "accelerometer")))
+    truth = (rows.rests.reading - solved.fit.state.bias) @ solved.fit.state.matrix.T
+    along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ solved.fit.state.matrix
+    noise, row = _table_noise(parts, prior, settings["table"]), np.repeat(np.arange(len(count)), count)
+
+    def map_of(weights: Values, derivative: Values) -> LinearMap:
+        x, y, z = ((weights / count)[:, row] * along[row, c] for c in range(3))
+        return LinearMap((x, y, z), (derivative, derivative, derivative))
+
+    gain = ScaledColumns.of(solved.columns).weights() / solved.deviation
+    scatter = noise_contribution(noise, map_of(gain, place), prior)
+    details = _details(rows, solved, float(scatter.degrees_of_freedom.min()))
+    parameters = _parameters(solved, scatter.covariance)
+    calibration = with_stage(before, NAME, details, solved.model, solved.fit, correction, parameters)
+    gravity = gravity_contribution("accelerometer", calibration.matrix, settings["table"], 12)
+    missing = NOT_INCLUDED if gravity else {"local gravity": "table.gravity_accuracy_g is not stated", **NOT_INCLUDED}
+    lines = [gravity] if gravity else []
+    complete, trials = combined(calibration, [scatter, *lines], missing), trials_of(settings)
+    if not trials:
+        return complete
+    if len(count) > MOST_ROWS:
+        reason = f"{len(count)} readings of a continuous turn are too many equations to draw; it is made for rests"
+        return without_trials(complete, reason)
+    steps = quadratic_results(
+        solved.columns * (solved.deviation / solved.fit.error)[:, None],
+        curvature(solved.model, solved.fit, place.shape[1]),
+        np.diag((solved.fit.error / solved.deviation) ** 2),
+    )
+    estimate, every = np.concatenate([calibration.bias, calibration.matrix.ravel()]), np.eye(len(count))
+
+    def results(drawn: Values) -> Values:
+        return np.asarray(estimate + steps(drawn / solved.fit.error) @ place.T)
+
+    return beside_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines)
 
 
-def _table_noise(
-    orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]
-) -> tuple[ResidualNoise, Values]:
-    """Return the noise on the table, and ``n^T L`` of each row: (m, 3) array."""
-    L = found.matrix
-    truth = (orientations.mean - found.bias) @ L.T
-    along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ L
-    motions = [_motion(recording, table).select(keep) for recording, keep in orientations.parts]
+def _table_noise(parts: Sequence[tuple[Recording, Mask]], prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
+    motions = []
+    for recording, keep in parts:
+        motion = table_motion(recording, table)
+        assert motion is not None  # noqa: S101
+        motions.append(motion.select(keep))
     u = np.concatenate([motion.specific_force for motion in motions])
-    X, reading = np.column_stack([np.ones(len(u)), u]), orientations.reading()
-    factors, blocks = ScaledColumns.of(X), blocks_of_samples(orientations.parts)
+    X = np.column_stack([np.ones(len(u)), u])
+    reading = np.concatenate([np.asarray(recording.accelerometer)[keep] for recording, keep in parts])
+    factors, blocks = ScaledColumns.of(X), blocks_of_samples(parts)
     beta, A, every = factors.solve(reading), factors.weights(), np.eye(4)
     residuals = reading - X @ beta
     reference = Reference("accelerometer", motions, LinearMap((A, A, A), (every, every, every)), beta[1:].T, table)
-    return assess_noise(residuals, X, blocks, prior, disturbance(reference, residuals, blocks)), along
+    return assess_noise(residuals, X, blocks, prior, disturbance(reference, residuals, blocks))
 
 
-def _motion(recording: Recording, table: Mapping[str, Any]) -> Motion:
-    motion = table_motion(recording, table)
-    assert motion is not None  # noqa: S101
-    return motion
-
-
-def _parameters(found: Ellipsoid, covariance: Values) -> dict[str, dict[str, Any]]:
+def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]]:
     """Return b, S and T with their uncertainties; ``L_ij = T_ij S_j``."""
-    S = np.diag(found.matrix)[COLUMNS]
+    values = solved.values
+    S, J = np.diag(solved.fit.state.matrix)[COLUMNS], np.eye(9)
     diagonal = {int(i): 3 + k for k, (i, j) in enumerate(zip(ROWS, COLUMNS, strict=True)) if i == j}
-    J, values = np.eye(9), found.values.copy()
     for k in np.flatnonzero(ROWS != COLUMNS):
         values[3 + k] /= S[k]
         J[3 + k, 3 + k], J[3 + k, diagonal[int(COLUMNS[k])]] = 1.0 / S[k], -values[3 + k] / S[k]
-    own = np.sqrt(np.clip(np.diag(J @ covariance @ J.T), 0.0, None))
+    own = np.sqrt(np.clip(np.diag(J @ covariance[np.ix_(PLACE, PLACE)] @ J.T), 0.0, None))
     units = ["g"] * 3 + ["1" if i == j else "rad" for i, j in zip(ROWS, COLUMNS, strict=True)]
     return {
-        name: {"value": float(value), "unit": unit, "standard_uncertainty": float(u) if is_free else None}
-        for name, value, unit, u, is_free in zip(NAMES, values, units, own, found.free, strict=True)
+        str(name): {"value": float(value), "unit": unit, "standard_uncertainty": float(u) if is_free else None}
+        for name, value, unit, u, is_free in zip(NAMES, values, units, own, solved.free, strict=True)
     }
 
 
-def _details(orientations: Orientations, found: Ellipsoid, freedom: float) -> dict[str, Any]:
+def _details(rows: Orientations, solved: _Solved, freedom: float) -> dict[str, Any]:
     return {
-        "orientations_used": len(orientations.mean),
-        "samples_used": int(orientations.count.sum()),
-        "rests_used": describe_rests(orientations.rests),
-        "rests_left_out": describe_rests(orientations.left_out),
-        "rests_held_out": describe_rests(orientations.held_out),
-        "fixed": [name for name, is_free in zip(NAMES, found.free, strict=True) if not is_free],
-        "white_noise": orientations.white,
-        "scatter_between_rests": found.between,
-        "largest_error": float(np.max(np.abs(found.error))),
-        "condition": found.fit.condition,
-        "cosine": found.fit.cosine,
+        "orientations_used": len(solved.residual),
+        "samples_used": int(rows.rests.count.sum()),
+        "rests_used": describe_rests(rows.used) if rows.by_hand else [],
+        "rests_left_out": describe_rests(rows.left_out),
+        "rests_held_out": describe_rests(rows.held_out),
+        "fixed": NAMES[~solved.free].tolist(),
+        "white_noise": float(np.sqrt(np.mean(rows.white**2))),
+        "scatter_between_rests": solved.between,
+        "largest_error": float(np.max(np.abs(solved.error))),
+        "condition": solved.fit.condition,
+        "cosine": solved.fit.cosine,
         "degrees_of_freedom": freedom,
     }

@@ -39,8 +39,9 @@ SMALLEST_NOISE = 1e-9  # g
 class AccelerometerModel:
     """Equations of the accelerometer's rests.
 
-    ``rests``: those of the fit. ``calibration``: of the method before: its matrix gives the rotation, and a part of L
-    that it could not determine stays. ``held``: those that no fit sees. ``faces``: of ``rests``, where they are stated.
+    ``rests``: those of the fit. ``directions``: (12, b), change of bias and matrix by each base parameter. ``held``:
+    rests that no fit sees. ``faces``: of ``rests``, where they are stated: bias and matrix are free then. ``wander``:
+    whether the equations hold the errors by a Gauss-Markov bias.
     """
 
     sensor = "accelerometer"
@@ -49,18 +50,20 @@ class AccelerometerModel:
     def __init__(
         self,
         rests: Rests,
-        calibration: SensorCalibration,
+        directions: Values,
         gravity_g: float,
         noise: Noise | None,
         *,
         held: Rests | None = None,
         faces: Faces | None = None,
+        wander: bool = True,
     ) -> None:
         self.rests, self.gravity, self.held, self.faces = rests, gravity_g, held, faces
-        self.calibration, self.noise = calibration, noise
+        self.noise = noise
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
-        self.directions = _directions(calibration) if faces is None else np.eye(12)
+        self.directions = directions if faces is None else np.eye(12)
         self.rests_equations = len(rests.time)
+        self.stretches = len(rests.time) if wander else 0
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
         """Return the linear form at some parameters."""
@@ -78,8 +81,9 @@ class AccelerometerModel:
             Z = term.effect.columns(self.sensor, motion, K, term.values)
             return np.asarray(np.einsum("nc,ncp->np", -along, Z) / error[:, None])
 
-        hold = np.zeros((3, len(error), len(error)))
-        hold[:, np.arange(len(error)), np.arange(len(error))] = (along * self.white / error[:, None]).T
+        own = slice(self.stretches)
+        hold = np.zeros((3, len(error), self.stretches))
+        hold[:, range(self.stretches), range(self.stretches)] = (along * self.white / error[:, None]).T[:, own]
         equations = Equations(
             residual=(target - length) / error,
             base=full @ self.directions / error[:, None],
@@ -87,9 +91,9 @@ class AccelerometerModel:
             candidates=[columns(term) for term in candidates],
             scatter=np.square(np.median(error) / error)[None],
             bias=hold,
-            start=rests.start,
-            length=rests.length,
-            joined=rests.joined,
+            start=rests.start[own],
+            length=rests.length[own],
+            joined=rests.select(own).joined,
             error=error,
         )
         if self.faces is None:
@@ -142,7 +146,7 @@ class AccelerometerModel:
         """Return the model with some of its rests held out."""
         kept, judged = self.rests.select(~held), self.rests.select(held)
         faces = self.faces and self.faces.select(~held)
-        return AccelerometerModel(kept, self.calibration, self.gravity, self.noise, held=judged, faces=faces)
+        return AccelerometerModel(kept, self.directions, self.gravity, self.noise, held=judged, faces=faces)
 
     def _motion(self, force: Values, rests: Rests) -> Motion:
         return motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
@@ -186,4 +190,4 @@ def model_of(
     held = rests_of("accelerometer", recordings, settings, role=HELD_OUT) or rests.select(rests.held_out)
     used = rests.select(~rests.held_out)
     faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings)
-    return AccelerometerModel(used, calibration, gravity, noise, held=held, faces=faces)
+    return AccelerometerModel(used, _directions(calibration), gravity, noise, held=held, faces=faces)

@@ -7,6 +7,9 @@ restricted likelihood (``pipeline.estimation.engine``),
 
     -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
+where k = 1 if the scatter within the rests tells the white noise and a scatter of the hypotheses reaches the residuals
+(``NoiseHypothesis.known``).
+
 A few rests leave some combinations of parameters open: two of the nine cross-axis terms of an accelerometer at rest, or
 the amplitude of a warm-up far from its end. So the last fit of plausible effects has the data sheet's limits of their
 parameters p, taken for two standard deviations, as prior with the precision P; it is zero for bias, matrix and time
@@ -24,6 +27,7 @@ variance. Source: Lange, Little & Taylor, JASA 84 (1989), 881-896.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -32,12 +36,14 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.engine import Posterior
+from pipeline.estimation.least_squares import gauss_newton
 from pipeline.estimation.multi_position.likelihood import NEW, project_out
 from pipeline.estimation.multi_position.model import stepped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from pipeline.estimation.least_squares import ScaledColumns
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.multi_position.model import Equations, Model, State
@@ -45,10 +51,11 @@ if TYPE_CHECKING:
 
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
-ROUNDS, HALVINGS = 60, 12  # of Gauss-Newton; of a step that raises the sum of squares
+ROUNDS = 60  # of Gauss-Newton
 SMALL_STEP = 3e-3  # of a standard uncertainty: the last step taken
 STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
-ROUNDING = 1e-9  # relative, of a sum of squares
+SAME_SCALE = 1e-4  # relative change of the noise's scale that leaves the weight of the prior as it is
+OPEN = 1e-7  # of the largest singular value, below which a combination of parameters takes no step
 NONE = 1e-8  # share of its columns below which a combination of parameters is not determined
 FAR = 12.0  # of log L below the best: a weight of 6e-6
 STEPS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
@@ -94,23 +101,48 @@ class Solution:
     cosine: float
 
 
-def fit(model: Model, start: State, hypotheses: Sequence[NoiseHypothesis], limits: Limits) -> Fit:
-    """Fit bias, matrix and effects from given values."""
-    state, converged, rounds = start, False, 0
-    equations = model.equations(state)
-    best = project_out(equations, hypotheses).of_model()[1]
-    while rounds < ROUNDS:
-        rounds += 1
-        solved = solve(equations, hypotheses[best], *_prior(model, state, limits))
-        state, equations, taken = _lowered(model, state, equations, hypotheses[best], solved, limits)
-        uncertainty = np.sqrt(np.diag(solved.covariance))
-        if np.all(np.abs(taken) <= np.maximum(SMALL_STEP * uncertainty, 1e-13)):
-            now = project_out(equations, hypotheses).of_model()[1]
-            if now == best or rounds > ROUNDS // 2:
-                converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
-                break
-            best = now
-    return _assessed(state, equations, hypotheses, _prior(model, state, limits), (rounds, converged))
+def fit(
+    model: Model,
+    start: State,
+    hypotheses: Sequence[NoiseHypothesis],
+    limits: Limits,
+    freedom: float | None = None,
+) -> Fit:
+    """Fit bias, matrix and effects from given values.
+
+    ``freedom``: degrees of freedom of the noise's scale, where other readings tell it; by default of the residuals.
+    """
+    state, rounds, best, scale = start, 0, -1, 0.0
+    seen: list[tuple[State, Equations]] = []
+
+    def at(there: State) -> tuple[Values, Values]:
+        seen.append((there, model.equations(there)))
+        X, residual = seen[-1][1].columns, seen[-1][1].residual
+        white = seen[-1][1].whitened(hypotheses[best], np.concatenate([X, residual[:, None]], axis=1))[0]
+        precision, values = _prior(model, there, limits)
+        root = np.sqrt(scale * precision)
+        believed = np.diag(root)[precision > 0.0]
+        return np.append(white[:, -1], -believed @ values), -np.concatenate([white[:, :-1], believed])
+
+    def small(step: Values, factors: ScaledColumns) -> bool:
+        uncertainty = np.sqrt(scale * np.diag(factors.covariance()))
+        return bool(np.all(np.abs(step) <= np.maximum(SMALL_STEP * uncertainty, 1e-13)))
+
+    while True:
+        equations = next((e for s, e in seen if s is state), None) or model.equations(state)
+        prior = _prior(model, state, limits)
+        likeliest = project_out(equations, hypotheses).of_model()[1]
+        solved = solve(equations, hypotheses[likeliest], *prior)
+        same = not np.any(prior[0]) or abs(solved.scale - scale) <= SAME_SCALE * scale
+        if (likeliest == best and same) or rounds > ROUNDS // 2:
+            break
+        best, scale = likeliest, solved.scale
+        seen.clear()
+        state, _, more = gauss_newton(at, state, partial(stepped, model), small, ROUNDS - rounds, OPEN)
+        rounds += more
+    uncertainty = np.sqrt(np.diag(solved.covariance))
+    converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
+    return _assessed(state, equations, hypotheses, prior, (rounds, converged), freedom)
 
 
 def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
@@ -125,31 +157,13 @@ def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
     return np.concatenate(precision), np.concatenate(values)
 
 
-def _lowered(  # noqa: PLR0917  (they are the problem)
-    model: Model, state: State, equations: Equations, noise: NoiseHypothesis, solved: Solution, limits: Limits
-) -> tuple[State, Equations, Values]:
-    """Take a step, halved while it raises the sum of squares; zeros where no step lowers it."""
-
-    def squares(at: State, there: Equations) -> float:
-        white = there.whitened(noise, there.residual[:, None])[0]
-        precision, values = _prior(model, at, limits)
-        return float(np.sum(white**2)) / solved.scale + float(precision @ values**2)
-
-    before = squares(state, equations)
-    for halving in range(HALVINGS):
-        moved, taken = stepped(model, state, solved.step * 0.5**halving)
-        there = model.equations(moved)
-        if squares(moved, there) <= before * (1.0 + ROUNDING):
-            return moved, there, taken
-    return state, equations, np.zeros(len(solved.step))
-
-
-def _assessed(
+def _assessed(  # noqa: PLR0917  (they are the problem)
     state: State,
     equations: Equations,
     hypotheses: Sequence[NoiseHypothesis],
     prior: tuple[Values, Values],
     how: tuple[int, bool],
+    freedom: float | None,
 ) -> Fit:
     hypotheses, likelihood = refined(equations, hypotheses, prior)
     every = [solve(equations, noise, *prior) for noise in hypotheses]
@@ -157,14 +171,14 @@ def _assessed(
     restricted = np.array([s.restricted for s in every])
     weight = np.exp(restricted - restricted.max())
     weight /= weight.sum()
-    spare = max(len(equations.residual) - every[best].rank, 1)
-    covariance, freedom = Posterior(weight, np.array([s.covariance for s in every]), spare).averaged()
+    spare = max(len(equations.residual) - every[best].rank, 1) if freedom is None else freedom
+    covariance, degrees = Posterior(weight, np.array([s.covariance for s in every]), spare).averaged()
     return Fit(
         state,
         covariance,
         likelihood,
         hypotheses[best],
-        freedom,
+        degrees,
         equations.residual,
         equations.error,
         every[best].rank,
@@ -187,6 +201,8 @@ def refined(
     ``exp(0, +-s, +-2 s)`` times the maximum; otherwise they are those of the grid that have weight.
     """
     scores = project_out(equations, hypotheses).scores()
+    if len(hypotheses) == 1:
+        return list(hypotheses), float(scores.max())
     near = [noise for noise, score in zip(hypotheses, scores, strict=True) if score > scores.max() - FAR]
 
     def restricted(noise: NoiseHypothesis) -> float:
@@ -229,7 +245,7 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
     shown = (V[:, kept] / np.sqrt(w[kept])).T @ along
     rank, rss = int(kept.sum()), max(float(r @ r - shown @ shown), 0.0)
     spare = max(n - rank, 1)
-    k, k_free = max(1.0, rss / n), max(1.0, rss / spare)
+    k, k_free = (max(1.0, rss / n), max(1.0, rss / spare)) if noise.free_scale else (1.0, 1.0)
     believed = k_free * precision
     w, V = np.linalg.eigh(gram + np.diag(believed / size**2))
     kept = w > 1e-14 * w[-1]

@@ -48,6 +48,7 @@ class NoiseHypothesis:
     belief: float  # prior log weight of the bias
     direction: float = 0.0  # c
     none: float = 0.0  # prior log weight of each kind without scatter
+    known: bool = False  # whether the white noise is known, so that a scatter beyond it is one of the levels
 
     @property
     def prior(self) -> float:
@@ -58,6 +59,11 @@ class NoiseHypothesis:
     def levels(self) -> tuple[float, ...]:
         """Scatter of each kind, and c."""
         return *self.scatter, self.direction
+
+    @property
+    def free_scale(self) -> bool:
+        """Whether C is scaled up to the residuals."""
+        return not self.known or max(self.scatter) >= SCATTER[-1]
 
     def at(self, levels: Sequence[float]) -> NoiseHypothesis:
         """Return the hypothesis at other levels."""

@@ -129,6 +129,28 @@ def calibration_of(
     return after_stage(before, "effects", details, model, found, settings)
 
 
+def with_stage(  # noqa: PLR0917  (what a fit by hand is)
+    before: SensorCalibration,
+    name: str,
+    details: dict[str, Any],
+    model: Model,
+    found: Fit,
+    correction: dict[str, Any] | None,
+    parameters: dict[str, dict[str, Any]],
+) -> SensorCalibration:
+    """Return a calibration after one more stage, without its uncertainty."""
+    at_rest = slice(0, model.rests_equations)
+    rms = float(np.sqrt(np.mean((found.residual[at_rest] * found.error[at_rest]) ** 2)))
+    return replace(
+        before,
+        bias=found.state.bias,
+        matrix=found.state.matrix,
+        stages=(*before.stages, StageResult(name, parameters, rms, correction, details)),
+        converged=found.converged,
+        convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
+    )
+
+
 def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     before: SensorCalibration,
     name: str,
@@ -137,31 +159,28 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     found: Fit,
     settings: Mapping[str, Any],
     correction: dict[str, Any] | None = None,
+    *,
+    parameters: dict[str, dict[str, Any]] | None = None,
+    parts: Mapping[str, Values] | None = None,
+    not_included: Mapping[str, str] | None = None,
 ) -> SensorCalibration:
     """Return a fit as a calibration after one more stage, with its uncertainty budget by the residuals.
 
     ``settings``: sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``), ``uncertainty``.
+    ``parameters``: of the stage, where they are not bias and matrix. ``parts``: of the scatter's line of the budget.
     """
     place = parameter_places(model, len(found.covariance))
     covariance = place @ found.covariance @ place.T
     freedom = np.min(np.where(place != 0.0, found.degrees_of_freedom, np.inf), axis=1)
-    effects, parameters = effect_parameters(model.sensor, found.state.terms, covariance)
+    effects, of_effects = effect_parameters(model.sensor, found.state.terms, covariance)
+    parameters = parameters or of_effects
     parameters = parameters or base_parameters(model.sensor, found.state.bias, found.state.matrix, covariance)
-    at_rest = slice(0, model.rests_equations)
-    rms = float(np.sqrt(np.mean((found.residual[at_rest] * found.error[at_rest]) ** 2)))
-    calibration = replace(
-        before,
-        bias=found.state.bias,
-        matrix=found.state.matrix,
-        stages=(*before.stages, StageResult(name, parameters, rms, correction, details)),
-        effects=effects,
-        converged=found.converged,
-        convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
-    )
+    calibration = with_stage(before, name, details, model, found, correction, parameters)
+    calibration = replace(calibration, effects=effects)
     sensor, size, table = calibration.sensor, len(calibration.parameter_names()), settings["table"]
-    scatter = scatter_contribution(covariance, np.inf, remark=REMARK[sensor])
+    scatter = scatter_contribution(covariance, np.inf, parts, REMARK[sensor])
     lines = [scatter.with_freedom(freedom)]
-    missing = dict(NOT_INCLUDED)
+    missing = dict(not_included or NOT_INCLUDED)
     if sensor == "accelerometer":
         gravity = gravity_contribution(sensor, calibration.matrix, table, size)
         lines += [gravity] if gravity else []
@@ -189,7 +208,7 @@ def _with_monte_carlo(
     rows = np.zeros((len(believed), p))
     rows[np.arange(len(believed)), believed] = np.sqrt(found.precision[believed])
     X, H = np.concatenate([X, rows]), np.zeros((n + len(believed), p, p))
-    H[:n] = _curvature(model, found, p)
+    H[:n] = curvature(model, found, p)
     candidates = [np.eye(len(X)) for _ in found.hypotheses]
     for covariance, (noise, _, scale) in zip(candidates, found.hypotheses, strict=True):
         covariance[:n, :n] = scale * equations.covariance(noise)
@@ -209,7 +228,7 @@ def _with_monte_carlo(
     return beside_trials(calibration, draw, trials, direct)
 
 
-def _curvature(model: Model, found: Fit, parameters: int) -> Values:
+def curvature(model: Model, found: Fit, parameters: int) -> Values:
     """Return the derivative of the columns with respect to the parameters: (n, p, p) array, symmetric."""
     slopes = []
     for j, u in enumerate(np.sqrt(np.diag(found.covariance))):

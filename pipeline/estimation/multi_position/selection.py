@@ -6,27 +6,34 @@ with the gain, delta BIC and p of ``likelihood`` and m the number of candidates.
 are fitted anew and every column is rebuilt. An effect that would need ten times its data-sheet limit is no explanation
 of a few rests. Selected effects whose own delta BIC has become negative are dropped; one that a rival replaces with
 delta BIC > 10 is exchanged.
+
+The posterior over effects is that of the linear problem of ``pipeline.estimation.evidence``: columns are taken at the
+fit of what was selected, with its values put back into the residual, ``y = r + Z p``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import starts_of
+from pipeline.estimation.candidates import over_limits, starts_of, time_constants
 from pipeline.estimation.design import Term
+from pipeline.estimation.evidence import Problem, Version
+from pipeline.estimation.gauss_markov import WALK_RATIO, WALK_SHARE, WALK_TIME
 from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.likelihood import NEW, project_out, selection_hypotheses
 from pipeline.estimation.multi_position.model import State, candidates_for
-from pipeline.estimation.ranking import Score
+from pipeline.estimation.posterior import Answers, Search, answers, excluded
+from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
 from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import parameter_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from typing import Any
 
     from numpy.typing import NDArray
@@ -55,23 +62,6 @@ class Scored:
     signal: dict[str, Values]  # its fitted, whitened signal there
 
 
-@dataclass
-class Selection:
-    """What was selected, and how every candidate did."""
-
-    names: list[str]
-    steps: dict[str, Score]  # of each selected effect when it was accepted
-    fits: list[Fit]  # base and configured effects, then with each further selected one; the last is the whole model
-    # given base and configured effects, and given all that was selected
-    first: Scored
-    last: Scored
-    own: dict[str, Scored]  # given all selected effects but one
-    model: Model
-    hypotheses: list[NoiseHypothesis]
-    candidates: list[Effect]
-    limits: dict[str, Values]
-
-
 def select(
     model: Model, start: SensorCalibration, configured: Sequence[str], noise: Noise | None, sheet: Mapping[str, Any]
 ) -> Selection:
@@ -80,7 +70,9 @@ def select(
     ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sheet``: the sensor's
     section of the configuration.
     """
-    return _Search(model, start, configured, noise, sheet).run()
+    found = Selection(model, start, configured, noise, sheet)
+    found.run()
+    return found
 
 
 def fit_configured(
@@ -104,8 +96,17 @@ def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, Values]:
     return {name: parameter_limits(e, sensor, given) for name, e in catalogue().items() if sensor in e.sensors}
 
 
-class _Search:
-    """The state of a selection."""
+class Selection:
+    """What was selected, and how every candidate did: ``first`` and ``last`` before and after the search.
+
+    ``names``: in order. ``steps``: score of each when it was accepted. ``fits``: of base and configured effects, then
+    with each further selected one. ``own``: scores given all selected effects but one.
+    """
+
+    first: Scored
+    last: Scored
+    own: dict[str, Scored]
+    fits: list[Fit]
 
     def __init__(
         self,
@@ -118,7 +119,7 @@ class _Search:
         self.model = model
         self.hypotheses = selection_hypotheses(noise, model.kinds)
         self.limits = limits_of(model.sensor, sheet)
-        self.effects = candidates_for(model.sensor, model.rests, configured)
+        self.candidates = candidates_for(model.sensor, model.rests, configured)
         self.kept_near = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}
         self.base = fit_configured(model, start, configured, self.hypotheses, self.kept_near)
         self.held = len(self.base.state.terms)
@@ -127,28 +128,18 @@ class _Search:
         self.fit = self.base
         self.known: dict[tuple[tuple[str, ...], tuple[str, ...]], Scored] = {}
 
-    def run(self) -> Selection:
-        first = scored = self._scored([])
+    def run(self) -> None:
+        """Search."""
+        self.first = self.last = self._scored([])
         for _ in range(ROUNDS):
-            best = self._best(scored) if len(self.names) < MOST else None
+            best = self._best(self.last) if len(self.names) < MOST else None
             if best is not None:
                 self._add(best)
                 self._drop()
             elif not self._exchange():
                 break
-            scored = self._scored(self.names)
-        return Selection(
-            self.names,
-            self.steps,
-            self._ladder(),
-            first,
-            scored,
-            {name: self._own(name) for name in self.names},
-            self.model,
-            self.hypotheses,
-            self.effects,
-            self.limits,
-        )
+            self.last = self._scored(self.names)
+        self.fits, self.own = self._ladder(), {name: self._own(name) for name in self.names}
 
     def _scored(self, names: Sequence[str]) -> Scored:
         """Score every effect given base, configured and some of the selected effects."""
@@ -185,7 +176,7 @@ class _Search:
         kept = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
         fitted = {term.effect.name: term.values for term in self.fit.state.terms}
         terms = []
-        for this in self.effects:
+        for this in self.candidates:
             if this.name in fitted and this.name not in names:
                 terms.append(Term(this, _silent(this, self.model.sensor, fitted[this.name])))
             elif this.name not in names:
@@ -252,7 +243,7 @@ class _Search:
         held = [term.effect.name for term in self.fit.state.terms]
         if any(score.name in effect(name).contains or name in effect(score.name).contains for name in held):
             return False
-        significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
+        significant = score.delta_bic > GATE_BIC and score.p_value * len(self.candidates) < GATE_P
         return score.admissible and significant and self._possible(score)
 
     def _possible(self, score: Score) -> bool:
@@ -307,3 +298,72 @@ def _silent(this: Effect, sensor: str, values: Values) -> Values:
     """Return parameters at which an effect adds nothing, its nonlinear ones as they are."""
     nonlinear = [p.name in this.nonlinear for p in this.parameters(sensor)]
     return np.where(nonlinear, values, 0.0)
+
+
+def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect] = ()) -> Answers:
+    """Return probabilities, answer set and upper limits.
+
+    ``hidden``: effects that the recordings cannot show. ``others``: further candidates.
+    """
+    shown = {this.name: this for this in (*selection.candidates, *others)}
+    effects = {name: this for name, this in shown.items() if name not in hidden or name in selection.names}
+    return answers([Search(_problem(selection, effects), seeds=[selection.names])], lambda _: 0, effects)
+
+
+def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
+    """Return the linear problem at the fit of what was selected."""
+    model, state = selection.model, selection.fits[-1].state
+    held = len(selection.fits[0].state.terms)
+    fitted = {term.effect.name: term for term in state.terms[held:]}
+    listed: list[tuple[str, Term, float]] = []
+    for name, this in effects.items():
+        width = None  # of a fitted time constant: as wide as the steps of the grid
+        terms = time_constants(this, model.sensor, fitted.get(name), width)
+        listed += [(name, term, weight) for term, weight in terms]
+    equations = model.equations(state, [term for _, term, _ in listed])
+    base = np.concatenate([equations.base, *equations.effects[:held]], axis=1)
+    columns = []
+    for (_, term, _), Z in zip(listed, equations.candidates, strict=True):
+        linear = [p.name not in term.effect.nonlinear for p in term.effect.parameters(model.sensor)]
+        columns.append(Z[:, linear])
+    readings = equations.residual + sum(
+        Z @ fitted[name].values[: Z.shape[1]]
+        for (name, term, _), Z in zip(listed, columns, strict=True)
+        if name in fitted and term is fitted[name]
+    )
+    hypotheses = [*selection.hypotheses, *_random_walks(selection.hypotheses)]
+    together = np.concatenate([base, *columns, readings[:, None]], axis=1)
+    whitened = [equations.whitened(noise, together) for noise in hypotheses]
+    known = base.shape[1]
+    stacked = np.array([white.T @ white for white, _ in whitened])
+    size = np.sqrt(np.maximum(np.einsum("tii->ti", stacked), 1e-300))
+    scaled = stacked / (size[:, :, None] * size[:, None, :])
+    own = np.linalg.eigvalsh(scaled[:, :known, :known])
+    kept = int(np.sum(own[0] > NEW**2))
+    logarithm = np.sum(np.log(np.maximum(own[:, -kept:], 1e-300)), axis=1) + 2.0 * np.sum(
+        np.log(size[:, :known]), axis=1
+    )
+    prior = np.array([h.prior for h in hypotheses]) - 0.5 * (np.array([log for _, log in whitened]) + logarithm)
+    products = without(stacked, np.arange(known))[:, known:, known:]
+    ends = np.cumsum([0, *(Z.shape[1] for Z in columns)]).tolist()
+    places = [(name, slice(*span)) for (name, _, _), span in zip(listed, pairwise(ends), strict=True)]
+    samples = len(readings)
+    products, limits = over_limits(places, products, size[0, known:], selection.limits, samples=samples, least=NEW)
+    versions: dict[str, list[Version]] = {}
+    for (name, at), (_, _, weight) in zip(places, listed, strict=True):
+        versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
+    free = float(max(samples - kept, 1))
+    return Problem(products, prior, 0.0, free, versions, limits, excluded([*effects.values()]))
+
+
+def _random_walks(hypotheses: Sequence[NoiseHypothesis]) -> list[NoiseHypothesis]:
+    """Return the hypotheses with a bias that never settles; see ``pipeline.estimation.gauss_markov.random_walks``."""
+    shortest: dict[float, float] = {}
+    for h in hypotheses:
+        shortest[h.ratio] = min(h.time, shortest.get(h.ratio, h.time))
+    share = float(np.log(WALK_SHARE))
+    return [
+        replace(h, ratio=h.ratio * WALK_RATIO, time=h.time * WALK_TIME, belief=h.belief + share)
+        for h in hypotheses
+        if h.ratio > 0.0 and h.time == shortest[h.ratio]
+    ]

@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation.accelerometer.ellipsoid_fit import derivative_of, error_of, fit_ellipsoid
-from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
-from pipeline.estimation.accelerometer.orientations import Orientations
-from pipeline.estimation.rest_means import held_out_rests, rest_means
+from pipeline.estimation.accelerometer.nonlinear_least_squares import fit, triangle
+from pipeline.estimation.gauss_markov import Prior
+from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
+from pipeline.estimation.multi_position.fit import fit as fit_model
+from pipeline.estimation.multi_position.likelihood import prior_hypotheses
+from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.rest_means import gathered, held_out_rests, rest_means
 from pipeline.estimation.stages import apply_correction
+from pipeline.planning.guide import derivative_of
 from pipeline.records import Recording, SensorCalibration, StageResult, coverage_factor
+from pipeline.signal.rests import Rest
 
 DATA = Path(__file__).parents[3] / "../shared/data"
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="reference data not beside the repository")
@@ -119,8 +124,9 @@ def test_the_derivative_equals_central_differences() -> None:
     values = np.concatenate([BIAS, MATRIX[np.tril_indices(3)]])
     numeric = np.empty((7, 9))
     for k in range(9):
-        step = 1e-6 * np.eye(9)[k]
-        numeric[:, k] = (error_of(y, np.ones(7), values + step) - error_of(y, np.ones(7), values - step)) / 2e-6
+        ends = (values + 1e-6 * np.eye(9)[k], values - 1e-6 * np.eye(9)[k])
+        up, down = (np.linalg.norm((y - v[:3]) @ triangle(v).T, axis=1) for v in ends)
+        numeric[:, k] = (up - down) / 2e-6
     assert derivative_of(y, values) == pytest.approx(numeric, abs=1e-8)
 
 
@@ -212,11 +218,16 @@ def test_earlier_stages_are_kept_and_the_result_survives_its_file() -> None:
 
 def test_noise_within_a_rest_does_not_lengthen_gravity() -> None:
     """The mean of 4 samples with noise of 0.1 g has the variance 0.0025 along each of both directions across it."""
-    mean, four = np.sqrt(0.998**2 + 2.0 * 0.0025) * _spread(24), np.full(24, 4)
-    rests = Orientations(mean, four, 0.1, (), np.zeros(0, np.intp), by_hand=True, rests=(), held_out=(), left_out=())
-    found = fit_ellipsoid(rests, 0.998, np.ones(9, np.bool_))
-    assert found.matrix == pytest.approx(np.eye(3), abs=1e-9)
-    assert found.bias == pytest.approx(np.zeros(3), abs=1e-9)
+    mean = np.sqrt(0.998**2 + 2.0 * 0.0025) * _spread(24)
+    corners = np.sqrt(0.0075) * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    reading = (mean[:, None] + corners).reshape(-1, 3)
+    recording = Recording("recording", "rests", None, np.arange(96) * 20_000_000, accelerometer=reading)
+    rests = gathered("accelerometer", [recording], {0: [Rest(4 * k, 4 * k + 4) for k in range(24)]})
+    model = AccelerometerModel(rests, np.eye(12)[:, FITTED], 0.998, None)
+    assert model.white == pytest.approx([0.1] * 3)
+    found = fit_model(model, State(BIAS, MATRIX), prior_hypotheses(Prior(1e-4, 100.0), 0.1, 1), {})
+    assert found.state.matrix == pytest.approx(np.eye(3), abs=1e-9)
+    assert found.state.bias == pytest.approx(np.zeros(3), abs=1e-9)
 
 
 def test_a_rest_that_contradicts_the_others_is_left_out_with_its_reason() -> None:
