@@ -100,7 +100,8 @@ def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
         for k, turn in enumerate(turns):
             for row, ideal in enumerate(turn.ideal):
                 d = R[k].T @ ideal
-                design[k, row, :, :9] = np.kron(np.eye(3), d)
+                for i in range(3):
+                    design[k, row, i, 3 * i : 3 * i + 3] = d
                 design[k, row, :, 9 + 3 * k : 12 + 3 * k] = np.radians(K @ skew(d))
                 left[k, row] = turn.gravity[1 + row] - K @ d
         rows, off = design.reshape(6 * n, -1), np.append(left, -GAUGE * seats)
@@ -147,7 +148,8 @@ def _fit(turns: Sequence[_Conventional], K: Vector, columns: Vector, limits: Seq
     """
     design = np.zeros((*columns.shape[:3], 12 + columns.shape[3]))
     for k, turn in enumerate(turns):
-        design[k, 1:, :, :9] = [np.kron(np.eye(3), ideal) for ideal in turn.ideal]
+        for i in range(3):
+            design[k, 1:, i, 3 * i : 3 * i + 3] = turn.ideal
     design[:, 0, :, 9:12] = np.eye(3)
     design[..., 12:] = K @ columns
     weight = 1.0 / np.array([[NOISE_C_G], [NOISE_PQ_G], [NOISE_PQ_G]])
