@@ -137,7 +137,7 @@ def outliers(
 def drawing(curves: dict[float, list[list[float]]]) -> str:
     """Return the errors over the number of positions as SVG: a panel for each spread, dashed without the prior."""
     wide, high, left, top, gap = 150.0, 180.0, 62.0, 46.0, 14.0
-    x_of = {n: wide * k / (len(STEPS_DEG) - 1) for k, n in enumerate(STEPS_DEG)}
+    x_of = {n: 14.0 + (wide - 28.0) * k / (len(STEPS_DEG) - 1) for k, n in enumerate(STEPS_DEG)}
     largest = max(value for points in curves.values() for _, *values in points for value in values)
     top_value = np.ceil(10.0 * largest) / 10.0
     out = []
@@ -150,6 +150,8 @@ def drawing(curves: dict[float, list[list[float]]]) -> str:
             out.append(f'<path d="M{x0} {y:.1f}h{wide}" stroke="#e5e7eb"/>')
             if k == 0:
                 out.append(f'<text x="{x0 - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:.1f}</text>')
+        full = top + high * (1.0 - points[0][1] / top_value)
+        out.append(f'<path d="M{x0} {full:.1f}h{wide}" stroke="#1d4ed8" stroke-dasharray="1 3"/>')
         for column, style in ((1, 'stroke="#6b7280" stroke-dasharray="5 4"'), (2, 'stroke="#b45309" stroke-width="2"')):
             places = [(x0 + x_of[int(p[0])], top + high * (1.0 - p[column] / top_value)) for p in points]
             line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
@@ -160,6 +162,7 @@ def drawing(curves: dict[float, list[list[float]]]) -> str:
         f'<text x="{width / 2}" y="{top + high + 36}" text-anchor="middle">positions (72: the full procedure)</text>'
     )
     words = "rms error of bias and matrix over U of the full procedure; dashed: without the prior, solid: with it"
+    words += "; dots: the full procedure without it"
     out.append(f'<text x="{left}" y="16">{words}</text>')
     size = f'width="{width:g}" height="{top + high + 46:g}" viewBox="0 0 {width:g} {top + high + 46:g}"'
     body = "\n".join(out)

@@ -3,7 +3,7 @@
     x_i = theta_i + b + e_i,    cov(e_i) = A_i,    theta_i ~ N(mu, diag(tau^2)) within a lot
     theta_i = x_i - G (x_i - m),    G = A_i (A_i + V)^-1,    cov = (1 - G) A_i (1 - G)^T + G V G^T + cov(b)
 
-x_i is the published estimate of unit i, A_i its covariance by its own readings. b is the error of the table, which the
+x_i is the published estimate of unit i, A_i its covariance by its own noise. b is the error of the table, which the
 units of a lot share: m contains it as x_i does, so that no G reduces it, and cov(b) is added as it is. Where b is not
 shared, the spread of the estimates contains it, and the result is wider than necessary (docs/uncertainty.md).
 m and V (diagonal) are mean and variance of the prediction of a further unit from its siblings, the unit itself left

@@ -149,16 +149,18 @@ def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[C
     return budget_of(changed, lines, {})
 
 
-def covariances(calibration: SensorCalibration, part: JSON) -> tuple[Values, Values]:
+def covariances(calibration: SensorCalibration, part: JSON, shared: str = "") -> tuple[Values, Values]:
     """Return the covariance of a calibration by its own readings, and that by the bench; together the published one.
 
-    ``part``: the sensor's part of the document, whose budget tells the two apart.
+    ``part``: the sensor's part of the document, whose budget tells the two apart; ``shared``: a part of the readings'
+    contribution that counts as of the bench, too.
     """
     C = calibration.covariance
     assert C is not None  # noqa: S101  (from_json)
     total = np.maximum(np.diag(C), 1e-300)
     lines = (part.get("uncertainty_budget") or {}).get("contributions", [])
     stated = np.sum([np.square(c["contribution"]) for c in lines if c["type"] == "B"] or [0.0 * total], axis=0)
+    stated += np.sum([np.square(c["parts"][shared]) for c in lines if shared in c["parts"]] or [0.0 * total], axis=0)
     share = np.clip(stated / total, 0.0, 1.0)
     return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
 

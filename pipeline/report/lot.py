@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 LINE = "prior of the lot"
+LACK_OF_FIT = "lack of fit"  # a table's errors are part of it: no estimate shows whether siblings share it
+SHARED = f"{BENCH}, and {LACK_OF_FIT}"
 NONE = np.empty(0)
 DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: the uncertainty does not hold the error
 
@@ -50,7 +52,7 @@ class Estimate(NamedTuple):
     values: Values
     own: Values
     freedom: Values
-    bench: Values
+    shared: Values
     kind: NDArray[np.intp]
     names: list[str]
     known: Mask  # the sensor's own parameters, of a stated uncertainty
@@ -67,7 +69,7 @@ class Prior(NamedTuple):
     worst: str = ""  # what an outlier differs in most
     predicted: Prediction = Prediction(NONE, NONE, NONE)
     known: Mask = NONE.astype(bool)
-    bench: Values = NONE  # mean standard uncertainty of the siblings by the bench
+    shared: Values = NONE  # mean standard uncertainty of the siblings by what they may share
 
 
 def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> list[Estimate]:
@@ -79,8 +81,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
     for sensor in [s for s in SENSORS if calibration[s]]:
         part = calibration[sensor]
         fit = SensorCalibration.from_json(sensor, part)
-        own, bench = covariances(fit, part)
-        share = np.diag(own) / np.maximum(np.diag(own + bench), 1e-300)
+        own, shared, (freedom, _) = _divided(fit, part)
         mine = [True] * 12 + [owner_of(e) == Owner.SENSOR for e in fit.effects for _ in e.parameters]
         same = [calibration[key] for key in ("table", "procedure")] + [calibration["methods"][sensor]]
         verdict = (diagnosis.get(sensor) or {}).get("verdict")
@@ -97,14 +98,28 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
                 refused=refused,
                 values=x,
                 own=own,
-                freedom=fit.effective_freedom() * share**2,  # Welch and Satterthwaite: that of the readings alone
-                bench=np.sqrt(np.diag(bench)),
+                freedom=freedom,
+                shared=np.sqrt(np.diag(shared)),
                 kind=kinds_of(fit),
                 names=fit.parameter_names(),
                 known=np.array(mine) & (np.diag(own) > 0.0),
             )
         )
     return found
+
+
+def _divided(fit: SensorCalibration, part: JSON) -> tuple[Values, Values, tuple[Values, Values]]:
+    """Return the covariance by the unit's own noise, that by what siblings may share, and degrees of freedom of both.
+
+    By Welch and Satterthwaite, those of the readings follow from the effective ones: the bench has infinitely many.
+    """
+    readings, _ = covariances(fit, part)
+    own, shared = covariances(fit, part, LACK_OF_FIT)
+    total = np.maximum(np.diag(own + shared), 1e-300)
+    of_readings, of_own = np.diag(readings) / total, np.diag(own) / total
+    freedom, lack = fit.effective_freedom() * of_readings**2, of_readings - of_own
+    of_shared = np.divide(freedom * (1.0 - of_own) ** 2, lack**2, out=np.full(len(lack), np.inf), where=lack > 1e-6)
+    return own, shared, (freedom, of_shared)
 
 
 def priors_of(found: Iterable[Estimate]) -> tuple[dict[tuple[str, str], Prior], list[JSON]]:
@@ -140,11 +155,11 @@ def _priors(kind: list[Estimate], kinds: int) -> list[Prior]:
         return [Prior(lot, refused=e.refused or few) for e in kind]
     x, own = np.stack([e.values[known] for e in kind]), np.stack([e.own[np.ix_(known, known)] for e in kind])
     lots = lot_priors(x, own, np.stack([e.freedom[known] for e in kind]), able, (device, kind[0].kind[known]))
-    bench = np.mean([e.bench for e, a in zip(kind, able, strict=True) if a], axis=0)
-    return [_prior(e, lots, i, known, bench) for i, e in enumerate(kind)]
+    shared = np.mean([e.shared for e, a in zip(kind, able, strict=True) if a], axis=0)
+    return [_prior(e, lots, i, known, shared) for i, e in enumerate(kind)]
 
 
-def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, bench: Values) -> Prior:
+def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, shared: Values) -> Prior:
     siblings, p, refused, worst = int(lots.siblings[i]), float(lots.probability[i]), estimate.refused, ""
     outlier = not refused and bool(lots.outlier[i])
     if outlier:
@@ -156,7 +171,7 @@ def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, bench: Value
     elif not refused and siblings < FEWEST:
         refused = f"without outliers {siblings} siblings are left, {FEWEST} or more are needed"
     predicted = Prediction(*(values[i] for values in lots.predicted))
-    return Prior(estimate.lot, siblings, refused, outlier, p, worst, predicted, known, bench)
+    return Prior(estimate.lot, siblings, refused, outlier, p, worst, predicted, known, shared)
 
 
 def calibration_with_prior(calibration: JSON, priors: Mapping[str, Prior]) -> JSON | None:
@@ -177,16 +192,15 @@ def calibration_with_prior(calibration: JSON, priors: Mapping[str, Prior]) -> JS
 
 def _sensor(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSON]:
     fit = SensorCalibration.from_json(sensor, part)
-    own, common = covariances(fit, part)
-    known, u = prior.known, np.sqrt(np.diag(common))
+    own, shared, (freedom, of_shared) = _divided(fit, part)
+    known, u = prior.known, np.sqrt(np.diag(shared))
     found = with_prior(values_of(fit), own, prior.predicted, known)
-    grown = np.divide(np.maximum(u, prior.bench), u, out=np.ones(len(u)), where=u > 0.0)
-    share = np.diag(own) / np.maximum(np.diag(own + common), 1e-300)
+    grown = np.divide(np.maximum(u, prior.shared), u, out=np.ones(len(u)), where=u > 0.0)
     remark = f"of {prior.lot}: mean and spread of {prior.siblings} siblings"
     lines = [
-        Contribution(NOISE, "A", "Student's t", found.own, fit.effective_freedom() * share**2),
+        Contribution(NOISE, "A", "Student's t", found.own, freedom),
         Contribution(LINE, "A", "Student's t", found.lot, found.lot_freedom, remark=remark),
-        Contribution(BENCH, "B", NORMAL, common * np.outer(grown, grown), np.full(len(u), np.inf)),
+        Contribution(SHARED, "B", NORMAL, shared * np.outer(grown, grown), of_shared),
     ]
     stage = StageResult("lot_prior", {}, None, None, {"lot": prior.lot, "siblings": prior.siblings})
     after = with_values(replace(fit, stages=(*fit.stages, stage)), found.values, lines)

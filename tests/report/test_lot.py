@@ -19,12 +19,24 @@ EFFECTS = (
 )
 
 
-def document(unit: str, values: np.ndarray, effects: tuple[FittedEffect, ...] = (), **changes: Any) -> dict[str, Any]:
-    """Return a calibration as it is published, whose bench contributes three times what its readings do."""
+def document(
+    unit: str, values: np.ndarray, effects: tuple[FittedEffect, ...] = (), lack: float = 0.0
+) -> dict[str, Any]:
+    """Return a calibration as it is published, whose bench contributes three times what its readings do.
+
+    ``lack``: how much of the readings' standard uncertainty is lack of fit.
+    """
     size = len(values)
     own, bench = OWN_U**2 * np.eye(size), BENCH_U**2 * np.eye(size)
-    lines = [
-        Contribution("noise of the readings", "A", "Student's t", own, np.full(size, 50.0)),
+    lines = [  # fmt: skip
+        Contribution(
+            "noise of the readings",
+            "A",
+            "Student's t",
+            own,
+            np.full(size, 50.0),
+            parts={"lack of fit": np.full(size, lack * OWN_U)},
+        ),
         Contribution("local gravity", "B", "normal", bench, np.full(size, np.inf)),
     ]
     given = zip(effects, values[12:], strict=True)
@@ -37,7 +49,7 @@ def document(unit: str, values: np.ndarray, effects: tuple[FittedEffect, ...] = 
         budget={"contributions": [line.to_json() for line in lines], "not_included": []},
     )  # fmt: skip
     same = {"sensor": "mpu6050", "table": "t", "procedure": "p", "methods": {SENSOR: "m"}}
-    return {"unit": unit, **same, SENSOR: found.to_json(), "gyroscope": None} | changes
+    return {"unit": unit, **same, SENSOR: found.to_json(), "gyroscope": None}
 
 
 def lot(rng: np.random.Generator, units: int, size: int = 12, error: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +98,11 @@ def test_the_budget_states_what_the_lot_contributes() -> None:
     calibrated, prior = found[0]
     part = calibrated[SENSOR]
     lines = {c["source"]: np.array(c["contribution"]) for c in part["uncertainty_budget"]["contributions"]}
-    assert list(lines) == ["noise of the readings", "prior of the lot", "stated accuracies of the bench"]
+    assert list(lines) == [
+        "noise of the readings",
+        "prior of the lot",
+        "stated accuracies of the bench, and lack of fit",
+    ]
     u = np.concatenate([part["standard_uncertainty"]["bias"], np.ravel(part["standard_uncertainty"]["matrix"])])
     assert np.sqrt(np.sum([line**2 for line in lines.values()], axis=0)) == pytest.approx(u)
     assert calibrated["lot_prior"][SENSOR]["siblings"] == prior.siblings == 19
@@ -94,6 +110,16 @@ def test_the_budget_states_what_the_lot_contributes() -> None:
         "lot": "mpu6050, lot 7", "sensor": SENSOR, "units": [f"U{i}" for i in range(20)], "with_prior": 20,
         "outliers": [], "without": {},
     }  # fmt: skip
+
+
+def test_the_lack_of_fit_is_not_reduced_as_siblings_may_share_it() -> None:
+    _, x = lot(np.random.default_rng(8), 20)
+    found, _ = with_priors([document(f"U{i}", v, lack=0.8) for i, v in enumerate(x)])
+    lines = {
+        c["source"]: np.array(c["contribution"]) for c in found[0][0][SENSOR]["uncertainty_budget"]["contributions"]
+    }
+    assert lines["stated accuracies of the bench, and lack of fit"] == pytest.approx(np.hypot(BENCH_U, 0.8 * OWN_U))
+    assert np.all(lines["noise of the readings"] < 0.6 * OWN_U)  # sqrt(1 - 0.8^2) without the prior
 
 
 def test_effects_of_the_table_have_no_prior() -> None:
