@@ -28,7 +28,7 @@ def document(
     """
     size = len(values)
     own, bench = OWN_U**2 * np.eye(size), BENCH_U**2 * np.eye(size)
-    lines = [  # fmt: skip
+    lines = [
         Contribution(
             "noise of the readings",
             "A",
