@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and other elements of the matrix
 BENCH = "stated accuracies of the bench"
+BY_CHANCE = 0.1  # of a variance, up to which a part of it may be chance: 0.00 to 0.05 without errors (docs/fleet.md)
 SAME = ("sensor", "method", "table")  # what the calibrations of one estimate have in common
 
 
@@ -160,7 +161,9 @@ def covariances(calibration: SensorCalibration, part: JSON, shared: str = "") ->
     total = np.maximum(np.diag(C), 1e-300)
     lines = (part.get("uncertainty_budget") or {}).get("contributions", [])
     stated = np.sum([np.square(c["contribution"]) for c in lines if c["type"] == "B"] or [0.0 * total], axis=0)
-    stated += np.sum([np.square(c["parts"][shared]) for c in lines if shared in c["parts"]] or [0.0 * total], axis=0)
+    for line in lines:
+        part_of, whole = np.square(line["parts"].get(shared, 0.0)), np.square(line["contribution"])
+        stated = stated + np.where(part_of > BY_CHANCE * whole, part_of, 0.0)
     share = np.clip(stated / total, 0.0, 1.0)
     return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
 
