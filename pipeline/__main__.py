@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import sys
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -27,9 +28,14 @@ PROGRAM = "imu-calibration" if Path(sys.argv[0]).name == "imu-calibration" else 
 
 def _summary(module: str, function: str) -> str:
     """Return the first line of the docstring of a function, of ``main`` that of its module, without importing it."""
-    tree = ast.parse(HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
+    tree = _parsed(module)
     functions = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith(function))
     return (ast.get_docstring(tree if function == "main" else next(functions)) or "").splitlines()[0]
+
+
+@cache
+def _parsed(module: str) -> ast.Module:
+    return ast.parse(HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
 
 
 def _help() -> str:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.files import write_atomically
-from pipeline.run_progress import Countdown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,6 +29,7 @@ seeds   simulates the campaign's recordings with every seed and writes FILE (dat
 
 def study(argv: Sequence[str]) -> int:
     """Run the blind study of the diagnosis: hide effects at random, diagnose them, count what is found."""
+    from pipeline.run_progress import Countdown  # noqa: PLC0415
     from pipeline.study.cases import FAMILIES  # noqa: PLC0415  (what a comparison with the thesis does not need)
     from pipeline.study.page import DIAGRAM, page  # noqa: PLC0415
     from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study  # noqa: PLC0415

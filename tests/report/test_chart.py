@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from base64 import b64decode
 
 import numpy as np
 import pytest
@@ -128,3 +129,12 @@ def test_an_interval_and_a_band_are_drawn_at_their_ends() -> None:
     svg = chart(FIGURE, "d", [Panel(layers, "y", height=100, limits=(-1.0, 1.0))], "x").svg
     assert drawn(svg, "band") == ["M640 830l3420 0 0 -500 -3420 0z"]
     assert drawn(svg, "strokes") == ["M640 880V780M4060 380V280"]
+
+
+def test_the_values_that_a_zoom_draws_end_at_the_limits_of_the_panel() -> None:
+    x = np.linspace(0.0, 1.0, 2000)
+    y = np.where(x < 0.5, 7.0, -0.5)  # beyond the limits, and a quarter above the lower one
+    panel = Panel([Samples(x, np.column_stack([y, y, y]))], "y", 100, limits=(-1.0, 1.0))
+    drawn = str(chart(FIGURE, "n", [panel], "x").svg)
+    curves = [np.frombuffer(b64decode(found), "<i2") for found in re.findall(r' data-full="([^"]+)"', drawn)]
+    assert any(set(curve.tolist()) == {32767, -16384} for curve in curves)
