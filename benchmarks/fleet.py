@@ -45,7 +45,7 @@ def _tell():
     words = sys.argv
     name = words[1] if words[0].endswith("pipeline/__main__.py") else "snakemake"
     with open(os.environ["FLEET_TOLD"], "a") as stream:
-        print(name, used.ru_utime + used.ru_stime, used.ru_maxrss, file=stream)
+        print(os.getpid(), name, used.ru_utime + used.ru_stime, used.ru_maxrss, file=stream)
     os._exit = leave
 def _leave(code):
     _tell()
@@ -112,7 +112,8 @@ def _run(folder: str, cores: int) -> tuple[float, list[float], list[float]]:
     spent: dict[str, float] = defaultdict(float)
     jobs: dict[str, int] = defaultdict(int)
     largest = 0.0
-    for line in told.read_text(encoding="utf-8").splitlines():
+    lines = told.read_text(encoding="utf-8").splitlines()
+    for line in dict(line.split(maxsplit=1) for line in lines).values():  # some tell twice
         name, used_s, kilobytes = line.split()
         spent[name] += float(used_s)
         jobs[name] += 1
