@@ -59,7 +59,7 @@ const narrow = matchMedia("(max-width: 700px)"), names_ = document.createElement
 const fit = new ResizeObserver((entries) => requestAnimationFrame(() => {
   for (const { target } of entries) {
     const table = target.firstElementChild;
-    if (target.clientWidth === target.fitted) continue;
+    if (target.clientWidth === target.fitted || table.hidden) continue;
     target.fitted = target.clientWidth;
     table.classList.remove("folded");
     const column = [...table.rows].some((row) => row.offsetHeight > 200); // of a word a line
