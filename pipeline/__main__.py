@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import sys
-from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -28,14 +26,9 @@ PROGRAM = "imu-calibration" if Path(sys.argv[0]).name == "imu-calibration" else 
 
 def _summary(module: str, function: str) -> str:
     """Return the first line of the docstring of a function, of ``main`` that of its module, without importing it."""
-    tree = _parsed(module)
-    functions = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith(function))
-    return (ast.get_docstring(tree if function == "main" else next(functions)) or "").splitlines()[0]
-
-
-@cache
-def _parsed(module: str) -> ast.Module:
-    return ast.parse(HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
+    text = HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
+    start = 0 if function == "main" else text.index(f"\ndef {function}")
+    return text[start:].split('"""', 2)[1].splitlines()[0]
 
 
 def _help() -> str:
