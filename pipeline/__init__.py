@@ -67,8 +67,8 @@ def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()
 def load_campaign(folder: str | Path) -> CampaignResults:
     """Load ``results/<campaign>`` as pandas DataFrames; ``InputError`` where the folder holds no such results.
 
-    The tables are ``.summary``, ``.parameters``, ``.errors``, ``.diagnosis`` and ``.effects``; ``.unit(name)`` is one
-    unit.
+    The tables are ``.summary``, ``.parameters``, ``.errors``, ``.diagnosis``, ``.effects``, ``.noise`` and ``.chips``;
+    ``.unit(name)`` is one unit.
     """
     from pipeline.campaign_results import CampaignResults  # noqa: PLC0415  (pandas, only where it is needed)
 

@@ -41,6 +41,7 @@ EFFECTS = (
     "effect", "delta_bic", "p_value", "explained_share", "held_out_error_before", "held_out_error_after", "plausible",
     "selected", "look_alikes",
 )  # fmt: skip
+CHIPS = ["board", "reference", "unit", "parameter", "value", "value_unit", "expanded_uncertainty", "observable"]
 NOISE = (
     "axis", "term", "value", "value_unit", "low", "high", "upper_limit", "correlation_time_s", "frequency_hz", "reason",
 )  # fmt: skip
@@ -184,6 +185,24 @@ class CampaignResults:
             for part in (parts if isinstance(parts, list) else [parts])
         )
         return pd.DataFrame(rows, columns=["unit", "sensor", *NOISE])
+
+    @cached_property
+    def chips(self) -> pd.DataFrame:
+        """How the chips of boards sit to the reference chip, one row for each chip and parameter (docs/boards.md).
+
+        Columns: ``board, reference, unit, parameter`` ("rotation_x", "lever_arm_y", "time_offset_gyroscope" ...),
+        ``value, value_unit, expanded_uncertainty`` (95 %), ``observable`` (bool).
+        """
+        rows = (
+            {"board": board["name"], "reference": board["reference"], "unit": chip, "parameter": name}
+            | found
+            | {"value_unit": found["unit"], "unit": chip}
+            for unit in map(self.unit, self.units)
+            for board in [unit.calibration.get("board") or {"chips": {}}]
+            for chip, part in board["chips"].items()
+            for name, found in part.get("parameters", {}).items()
+        )
+        return pd.DataFrame(rows, columns=CHIPS)
 
     def unit(self, name: str) -> UnitResults:
         """Return the documents of one unit; ``InputError`` where the campaign has no such unit."""

@@ -45,7 +45,10 @@ BEFORE = {  # what a reader would have at that command
     "your_bench.md": "sed '1s/time_s/Time (s)/; 1s/accel_\\(.\\)_g/A\\1 (g)/g; 1s/gyro_\\(.\\)_dps/G\\1 (deg\\/s)/g' "
     "log.csv > my_log.csv; rm -rf my_bench; python -m pipeline new my_bench --sensor mpu6050; " + U1.format("my_bench"),
 }
-FILES = {"effects_of_your_own.md": {"yaml": "data/bench/effects/gear_mesh.yaml", "python": "path/to/loose_part.py"}}
+FILES = {
+    "boards.md": {"yaml": "two_chips/simulation.yaml"},
+    "effects_of_your_own.md": {"yaml": "data/bench/effects/gear_mesh.yaml", "python": "path/to/loose_part.py"},
+}
 MAY_END_WITH = {"python -m pipeline check my_log.csv": 2}  # a log that needs a profile
 NOT_RUN = {  # by the start of the command, and why
     "pip ": "no package is installed by a test",

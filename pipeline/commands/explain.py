@@ -14,8 +14,8 @@ from pipeline.config.options import LARGEST_CONFIG
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.exports import formats
+from pipeline.exports.conversion import board_lines, explain_calibration
 from pipeline.exports.conversion import convert as write_converted
-from pipeline.exports.conversion import explain_calibration
 from pipeline.exports.reading import CALIBRATION, FoundCalibration, counts_of, format_of, read_any
 from pipeline.files import CONFIGS, read_json
 from pipeline.history import read_history
@@ -86,6 +86,7 @@ def main(argv: Sequence[str]) -> int:
         validation, calibration = (read_json(file) if file.is_file() else {} for file in files)
         texts.append(explain(unit, document, validation, found))
         texts[-1] += "".join(f"  {line}\n" for s in SENSORS for line in sentences(s, calibration.get(s)))
+        texts[-1] += "".join(f"{line}\n" for line in board_lines(calibration)[1:])
     texts += [_failed(unit, failure) for unit, failure in found.failures.items()]
     if len(texts) > 1:
         texts.insert(0, "\n".join(_summary(found)) + "\n")

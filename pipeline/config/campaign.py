@@ -85,6 +85,11 @@ class Campaign:
     combine: str | None = None
     publish_limit: int = 0
 
+    @cached_property
+    def boards(self) -> dict[str, list[str]]:
+        """The chips of each board, in the order of the sheet: units with the same ``board``, the reference first."""
+        return boards_of(self.units)
+
     @property
     def recorded(self) -> Path:
         """Where the recordings are: in the campaign's directory, or among the results of the run that makes them."""
@@ -144,6 +149,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     if problems:
         raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
     batches, chains = cut_batches(units, _count("batch_size", layers.of_run, 1, "auto or "))
+    _check_boards(boards_of(units), batches, str(directory / "units.csv"))
     results = Path(str(settings.get("results", "results"))) / directory.name
     compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
     page, simulation = layers.campaign.page, layers.simulation
@@ -219,6 +225,10 @@ def cut_batches(
         start = 0
         for number in count(1):
             stop = start + (size or min(max(SMALLEST_BATCH, start), LARGEST_BATCH))
+            while 0 < stop < len(names) and (board := units[names[stop]].row.get("board")):
+                if board != units[names[stop - 1]].row.get("board"):
+                    break
+                stop += 1  # the chips of a board stay together
             batch = f"{chain}-{number:04d}"
             batches[batch] = names[start:stop]
             configs = [units[n].config for n in batches[batch]]
@@ -231,6 +241,28 @@ def cut_batches(
             if start >= len(names):
                 break
     return batches, chains
+
+
+def boards_of(units: Mapping[str, UnitRow]) -> dict[str, list[str]]:
+    """Return the units of each board that has several."""
+    found: dict[str, list[str]] = {}
+    for name, unit in units.items():
+        if unit.row.get("board"):
+            found.setdefault(unit.row["board"], []).append(name)
+    return {board: chips for board, chips in found.items() if len(chips) > 1}
+
+
+def _check_boards(boards: Mapping[str, Sequence[str]], batches: Mapping[str, Sequence[str]], sheet: str) -> None:
+    """Refuse boards whose chips are not in one batch; raises ``ConfigurationError``."""
+    batch_of = {unit: batch for batch, units in batches.items() for unit in units}
+    split = [b for b, chips in boards.items() if len({batch_of[chip] for chip in chips}) > 1] if boards else []
+    if split:
+        more = f" and {len(split) - 5} more" * (len(split) > 5)
+        raise ConfigurationError(
+            f"column board: the chips of {', '.join(split[:5])}{more} are estimated together; expected consecutive "
+            "rows with the same method",
+            sheet,
+        )
 
 
 def _one_message(problems: Mapping[str, list[str]]) -> str:

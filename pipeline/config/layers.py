@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")  # all but tab and line ends
-MEANT = ("unit", "overrides", *GROUPS, "serial", "lot", "date")
+MEANT = ("unit", "overrides", *GROUPS, "serial", "lot", "date", "board")
 ALIKE = 0.85  # similarity of a name that is taken for a slip: overide 0.88, procedur 0.94; material for serial 0.71
 LARGEST_BYTES = 100_000_000  # a million units of 100 characters each
 

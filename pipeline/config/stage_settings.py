@@ -165,6 +165,11 @@ def _content(campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: st
         for row in rows:
             own = {c: row.row[c] for c in ("serial", "lot", "date") if row.row.get(c)}
             settings[row.name] |= {"row": own, "run": campaign.run_settings(row.name)}
+    if stage == "calibration" and campaign.boards:
+        for row in rows:
+            board = row.row.get("board", "")
+            if board in campaign.boards:
+                settings[row.name] |= {"board": {"name": board, "chips": campaign.boards[board]}}
     content: dict[str, Any] = dict(zip(("common", "units"), in_common(settings), strict=True))
     content |= effects_for(stage, sensor, [r.config for r in rows])
     if stage in ("ingest", "report"):

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.table_errors import Reference
     from pipeline.records import Recording, SensorCalibration, Values
 
+BY_CHANCE = 0.1  # of a variance, up to which a part of it may be chance: 0.00 to 0.05 without errors (docs/fleet.md)
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not tell it: calibrate the unit again after switching it off"
@@ -264,6 +265,22 @@ def _temperature(
         kind = NORMAL if fitted is not None else RECTANGULAR
         lines.append(type_b(f"temperature ({name.replace('_', ' ')})", kind, u, "degC", effect * slope, how))
     return lines
+
+
+def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Values, Values]:
+    """Return the covariance of a calibration by its own readings, and that by the bench; together the published one.
+
+    ``shared``: a part of the readings' contribution that counts as of the bench, too.
+    """
+    size = len(calibration.parameter_names())
+    C = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance
+    lines = (calibration.budget or {}).get("contributions", [])
+    stated = np.sum([np.square(c["contribution"]) for c in lines if c["type"] == "B"] or [np.zeros(size)], axis=0)
+    for line in lines:
+        part_of, whole = np.square(line["parts"].get(shared, 0.0)), np.square(line["contribution"])
+        stated = stated + np.where(part_of > BY_CHANCE * whole, part_of, 0.0)
+    share = np.clip(stated / np.maximum(np.diag(C), 1e-300), 0.0, 1.0)
+    return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
 
 
 def stage_parameters(values: Mapping[str, tuple[float, str]], covariance: Values) -> dict[str, dict[str, Any]]:

@@ -42,7 +42,8 @@ class Format:
     units : dict
         Sensor to the unit of readings: g or m/s^2, deg/s or rad/s. A sensor without a unit is not in the format.
     needs, needs_counts : list of str
-        Sensors that must be calibrated, and whose counts per unit must be known; without them no file is written.
+        Sensors that must be calibrated (``board``: the unit must be the reference chip of a board), and whose counts
+        per unit must be known; without them no file is written.
     matrix : dict
         Sensor to what the format holds of its matrix; ``full`` by default.
     holds : list of str
@@ -151,7 +152,8 @@ def _rendered(declared: Format, template: Template, subject: Subject) -> str | N
     """Return the text of a file, None where a sensor or its counts are missing."""
     sensors = subject.sensors(declared)
     without_counts = [s for s in declared.needs_counts if s in sensors and not sensors[s].counts]
-    if without_counts or not set(declared.needs) <= set(sensors):
+    known = {*sensors, "board"} if (subject.document.get("board") or {}).get("chips") else set(sensors)
+    if without_counts or not set(declared.needs) <= known:
         return None
     return template.render(
         **{s: sensors.get(s) for s in SENSORS},

@@ -160,7 +160,31 @@ def explain_calibration(found: FoundCalibration) -> str:
         calibration = found.sensors.get(sensor)
         lines += ["", f"  {sensor}"]
         lines += [f"    {line}" for line in _sensor(calibration, found)] if calibration else ["    not calibrated"]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines + board_lines(found.document or {})) + "\n"
+
+
+def board_lines(document: dict[str, Any]) -> list[str]:
+    """Return how the chips of a unit's board sit, in words and numbers; nothing where the unit is on no board."""
+    board = document.get("board")
+    if not board:
+        return []
+    lines = ["", f"  board {board['name']}: reference chip {board['reference']}"]
+    for name, chip in board["chips"].items():
+        if "refused" in chip:
+            lines.append(f"    {name}: not estimated: {chip['refused']}")
+            continue
+        lines += [
+            f"    {name}: f = R (f_ref + [omega x (omega x r) + alpha x r] / 9.80665), w = R w_ref; all calibrated",
+            *(f"      {'R =' if i == 0 else '   '} {_row(np.array(row))}" for i, row in enumerate(chip["rotation"])),
+        ]
+        for parameter, p in chip["parameters"].items():
+            seen = "" if p["observable"] else "   not observable"
+            lines.append(f"      {parameter:26s} {p['value']:.6g} ± {p['expanded_uncertainty']:.2g} {p['unit']}{seen}")
+        for lost in chip["not_observable"]:
+            along = f" along {lost['direction']}" if lost["direction"] else ""
+            lines.append(f"      not observable: {lost['parameter']}{along}: {lost['reason']}")
+        lines += [f"      in doubt: {doubt}" for doubt in chip["doubts"]]
+    return lines
 
 
 def _sensor(calibration: SensorCalibration, found: FoundCalibration) -> list[str]:

@@ -26,7 +26,7 @@ from pipeline.io.channel_table import STRAIGHT, maps_of_log
 from pipeline.model.calibration_file import FAST_S, sentences
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
-from pipeline.records import SENSORS
+from pipeline.records import AXES, SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -346,6 +346,26 @@ def accelerometer_frame(accelerometer: ExportedSensor | None, gyroscope: Exporte
     return {"M_a": M_a, "T_i_b": pose, "M_g": M_g, "C": C, "A": A}
 
 
+def pose(rotation: Values, place: Values) -> Values:
+    """Return T with ``p_i = T p_b``: (4, 4) array, R the rotation from b to i and r the place of i in the axes of b."""
+    R = np.asarray(rotation)
+    return np.block([[R, (0.0 - R @ np.asarray(place))[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def lever_arm_of(chip: dict[str, Any]) -> list[float]:
+    """Return the place of a chip of a board, m; zeros where no lever arm could be estimated."""
+    known = (chip["parameters"].get(f"lever_arm_{axis}") for axis in AXES)
+    return [p["value"] if p else 0.0 for p in known]
+
+
+def static_transform(rotation: Values, place: Values) -> str:
+    """Return the pose of a chip in the axes of the reference chip as options of ``static_transform_publisher``."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s, needed by boards only)
+
+    values = [*place, *Rotation.from_matrix(np.asarray(rotation).T).as_quat().tolist()]
+    return " ".join(f"--{n} {v:.9g}" for n, v in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True))
+
+
 def sampling_rate(document: dict[str, Any]) -> float:
     """Return the sampling rate of the unit's recordings, Hz; 0 where none is known."""
     rates = [i["rate_hz"] for i in document.get("inputs", []) if i.get("rate_hz")]
@@ -364,11 +384,14 @@ def plain(content: Any) -> Any:  # noqa: ANN401
 FUNCTIONS: dict[str, Any] = {
     "accelerometer_frame": accelerometer_frame,
     "identity": np.eye(3),
+    "lever_arm_of": lever_arm_of,
     "matmul": np.matmul,
     "lower_half": np.triu_indices(3)[::-1],  # column by column
     "noise": noise,
     "scaled": lambda value, factor: None if value is None else float(value * factor),
     "sqrt": np.sqrt,
+    "pose": pose,
+    "static_transform": static_transform,
     "rint": lambda values: np.rint(values).astype(int).tolist(),
     "rotation_times_lower": rotation_times_lower,
     "row_lengths": row_lengths,

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.engine import scaled_inverse
-from pipeline.estimation.uncertainty_budget import NOISE
+from pipeline.estimation.uncertainty_budget import NOISE, own_and_bench
 from pipeline.estimation.uncertainty_budget import combined as budget_of
 from pipeline.io.files import wrong_name
 from pipeline.records import NORMAL, SENSORS, Contribution, SensorCalibration, StageResult
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and other elements of the matrix
 BENCH = "stated accuracies of the bench"
-BY_CHANCE = 0.1  # of a variance, up to which a part of it may be chance: 0.00 to 0.05 without errors (docs/fleet.md)
 SAME = ("sensor", "method", "table")  # what the calibrations of one estimate have in common
 
 
@@ -107,7 +106,7 @@ def _ranges(ranges: Sequence[JSON]) -> JSON:
 def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
     each = [SensorCalibration.from_json(sensor, part) for part in parts]
     x = np.stack([values_of(c) for c in each])
-    found = [covariances(c, part) for c, part in zip(each, parts, strict=True)]
+    found = [own_and_bench(c) for c in each]
     own, common = [A for A, _ in found], np.mean([B for _, B in found], axis=0)
     kind = kinds_of(each[0])
     r2 = repeatability(x, np.stack([np.diag(A) for A in own]), kind) ** 2
@@ -148,24 +147,6 @@ def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[C
         at += len(described)
     changed = replace(calibration, bias=theta[:3], matrix=theta[3:12].reshape(3, 3), effects=tuple(effects))
     return budget_of(changed, lines, {})
-
-
-def covariances(calibration: SensorCalibration, part: JSON, shared: str = "") -> tuple[Values, Values]:
-    """Return the covariance of a calibration by its own readings, and that by the bench; together the published one.
-
-    ``part``: the sensor's part of the document, whose budget tells the two apart; ``shared``: a part of the readings'
-    contribution that counts as of the bench, too.
-    """
-    C = calibration.covariance
-    assert C is not None  # noqa: S101  (from_json)
-    total = np.maximum(np.diag(C), 1e-300)
-    lines = (part.get("uncertainty_budget") or {}).get("contributions", [])
-    stated = np.sum([np.square(c["contribution"]) for c in lines if c["type"] == "B"] or [0.0 * total], axis=0)
-    for line in lines:
-        part_of, whole = np.square(line["parts"].get(shared, 0.0)), np.square(line["contribution"])
-        stated = stated + np.where(part_of > BY_CHANCE * whole, part_of, 0.0)
-    share = np.clip(stated / total, 0.0, 1.0)
-    return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
 
 
 def repeatability(x: Values, variance: Values, kind: NDArray[np.intp]) -> Values:

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.estimation.lot_prior import FEWEST, LotPrior, Prediction, lot_priors, with_prior
-from pipeline.estimation.uncertainty_budget import NOISE
+from pipeline.estimation.uncertainty_budget import NOISE, own_and_bench
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import Owner
 from pipeline.records import NORMAL, SENSORS, Contribution, SensorCalibration, StageResult
-from pipeline.report.combined import BENCH, covariances, kinds_of, values_of, with_values
+from pipeline.report.combined import BENCH, kinds_of, values_of, with_values
 from pipeline.report.numbers import number, plain
 from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters
@@ -81,7 +81,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
     for sensor in [s for s in SENSORS if calibration[s]]:
         part = calibration[sensor]
         fit = SensorCalibration.from_json(sensor, part)
-        own, shared, (freedom, _) = _divided(fit, part)
+        own, shared, (freedom, _) = _divided(fit)
         mine = [True] * 12 + [owner_of(e) == Owner.SENSOR for e in fit.effects for _ in e.parameters]
         same = [calibration[key] for key in ("table", "procedure")] + [calibration["methods"][sensor]]
         verdict = (diagnosis.get(sensor) or {}).get("verdict")
@@ -108,13 +108,13 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
     return found
 
 
-def _divided(fit: SensorCalibration, part: JSON) -> tuple[Values, Values, tuple[Values, Values]]:
+def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Values]]:
     """Return the covariance by the unit's own noise, that by what siblings may share, and degrees of freedom of both.
 
     By Welch and Satterthwaite, those of the readings follow from the effective ones: the bench has infinitely many.
     """
-    readings, _ = covariances(fit, part)
-    own, shared = covariances(fit, part, LACK_OF_FIT)
+    readings, _ = own_and_bench(fit)
+    own, shared = own_and_bench(fit, LACK_OF_FIT)
     total = np.maximum(np.diag(own + shared), 1e-300)
     of_readings, of_own = np.diag(readings) / total, np.diag(own) / total
     freedom, lack = fit.effective_freedom() * of_readings**2, of_readings - of_own
@@ -192,7 +192,7 @@ def calibration_with_prior(calibration: JSON, priors: Mapping[str, Prior]) -> JS
 
 def _sensor(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSON]:
     fit = SensorCalibration.from_json(sensor, part)
-    own, shared, (freedom, of_shared) = _divided(fit, part)
+    own, shared, (freedom, of_shared) = _divided(fit)
     known, u = prior.known, np.sqrt(np.diag(shared))
     found = with_prior(values_of(fit), own, prior.predicted, known)
     grown = np.divide(np.maximum(u, prior.shared), u, out=np.ones(len(u)), where=u > 0.0)

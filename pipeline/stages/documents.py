@@ -16,13 +16,16 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.diagnosis.words import in_words
-from pipeline.errors import CannotCalibrateError
+from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
+from pipeline.estimation.chip_document import chip_document
+from pipeline.estimation.chip_rows import Chip
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.rest_means import rests_by_use
 from pipeline.exports import exports
 from pipeline.io.channel_table import axis_maps
 from pipeline.model.calibration_file import implausible
-from pipeline.records import SENSORS
+from pipeline.pack import FAILED
+from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report.certificate import certificate, certificate_page
 from pipeline.report.dcc import digital_certificate
 from pipeline.report.pages import failure_page
@@ -46,12 +49,7 @@ def calibration_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
 
     Raises ``CannotCalibrateError`` if no sensor is calibrated.
     """
-    fits = {sensor: job.inputs[sensor].json(f"{unit}.json") for sensor in SENSORS}
-    validation = job.inputs["validate"].json(f"{unit}.json")
-    reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
-    if not settings["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
-        fitted = {s: validation[s] for s in SENSORS if s not in reasons}
-        reasons |= {s: v["worse_than_raw"] for s, v in fitted.items() if v and v["worse_than_raw"]}
+    fits, reasons = _fits(job, unit, settings)
     if len(reasons) == len(SENSORS):
         told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
         raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
@@ -68,7 +66,41 @@ def calibration_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     }
     for sensor, fit in fits.items():
         document[sensor] = None if sensor in reasons else judged(sensor, fit, settings["sensor"][sensor])
+    if board := settings.get("board"):
+        document["board"] = _on_board(job, unit, board)
     return {f"{unit}.json": document}
+
+
+def _fits(job: Job, unit: str, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the fit of each sensor of a unit, and why some are not its calibration."""
+    fits = {sensor: job.inputs[sensor].json(f"{unit}.json") for sensor in SENSORS}
+    reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
+    if not settings["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
+        validation = job.inputs["validate"].json(f"{unit}.json")
+        fitted = {s: validation[s] for s in SENSORS if s not in reasons}
+        reasons |= {s: v["worse_than_raw"] for s, v in fitted.items() if v and v["worse_than_raw"]}
+    return fits, reasons
+
+
+def _on_board(job: Job, unit: str, board: dict[str, Any]) -> dict[str, Any]:
+    """Return the board of a unit; of its reference chip with how all other chips sit to it."""
+    reference, *others = board["chips"]
+    chips: dict[str, Any] = {}
+    for other in others if unit == reference else ():
+        try:
+            if f"{other}{FAILED}" in job.inputs["validate"]:
+                raise NotObservableError(f"{other} could not be calibrated")
+            chips[other] = chip_document(_chip(job, reference), _chip(job, other))
+        except PipelineError as error:
+            chips[other] = {"refused": error.message}
+    return {"name": board["name"], "reference": reference, "chips": chips}
+
+
+def _chip(job: Job, unit: str) -> Chip:
+    """Return a chip of a board with the recordings and calibrations of its unit."""
+    fits, reasons = _fits(job, unit, job.units[unit])
+    found = {s: None if s in reasons else SensorCalibration.from_json(s, fit) for s, fit in fits.items()}
+    return Chip(unit, recordings_of({"ingest": job.inputs["ingest"]}, unit), found, job.units[unit]["sensor"])
 
 
 def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,10 @@ import yaml
 from pipeline.config.campaign import load_campaign
 from pipeline.config.compose import Composer
 from pipeline.config.options import Problem
+from pipeline.config.stage_settings import settings_of_jobs
+from pipeline.errors import ConfigurationError
 from pipeline.io.read import read_recordings
+from pipeline.stages.batch import merge_common
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,3 +77,25 @@ def test_an_instance_that_nothing_refers_to_and_a_missing_one_are_refused(tmp_pa
         Composer(tmp_path).unit("U1", ["ingest.instance=1"])
     with pytest.raises(Problem, match="instance is null; set it"):
         Composer(tmp_path).unit("U1", ["ingest=ardupilot", "ingest.instance=null"])
+
+
+def test_the_chips_of_a_board_stay_in_one_batch(tmp_path: Path) -> None:
+    readings = {s: np.tile([0, 0, 1, 0, 0, 0.0], (50, 1)) for s in ("left", "middle", "right", "other")}
+    write_campaign(tmp_path, readings)
+    rows = [f"{s}-unit,ingest.instance={s},{'' if s == 'other' else 'B1'}" for s in readings]
+    (tmp_path / "units.csv").write_text("\n".join(["unit,overrides,board", *rows]) + "\n")
+    campaign = load_campaign({"campaign": str(tmp_path), "overrides": ["batch_size=2"]})
+    assert campaign.boards == {"B1": ["left-unit", "middle-unit", "right-unit"]}
+    assert list(campaign.batches.values()) == [["left-unit", "middle-unit", "right-unit"], ["other-unit"]]
+    content = [json.loads(f["calibration"].content) for f in settings_of_jobs(campaign).values() if "calibration" in f]
+    boards = [merge_common(c)["units"] for c in content]
+    assert boards[0]["right-unit"]["board"] == {"name": "B1", "chips": campaign.boards["B1"]}
+    assert "board" not in boards[1]["other-unit"]
+
+
+def test_chips_of_a_board_with_different_methods_are_refused(tmp_path: Path) -> None:
+    write_campaign(tmp_path, {s: np.tile([0, 0, 1, 0, 0, 0.0], (50, 1)) for s in ("left", "right")})
+    rows = ["left-unit,ingest.instance=left,B1,", "right-unit,ingest.instance=right,B1,rests_and_moves"]
+    (tmp_path / "units.csv").write_text("\n".join(["unit,overrides,board,method", *rows]) + "\n")
+    with pytest.raises(ConfigurationError, match="the chips of B1 are estimated together; expected consecutive rows"):
+        load_campaign({"campaign": str(tmp_path)})
