@@ -27,18 +27,18 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
     Mask = NDArray[np.bool_]
 
-FEWEST = 8  # siblings
+FEWEST = 8  # siblings; docs/fleet.md has the errors and intervals in lots of 12 units
 LEVEL = 0.05  # the largest share of a lot that loses the prior by chance, which is no harm (measured: docs/fleet.md)
-FAR_LEVEL = 0.001  # below it a unit is no sibling of others; 0.05 would leave out 4 % and make the spread 10 % smaller
+FAR_LEVEL = 0.001  # below it a unit is no sibling of others; 0.05 would leave out 4 % of a lot and narrow its spread
 GRID = np.geomspace(0.01, 10.0, 64)  # of tau, over the spread of the estimates; steps of 12 %
-OMEGA = 0.5  # of log tau within a kind: axes differ by a factor of 1.6 (assumption; docs/fleet.md has other factors)
+OMEGA = 0.5  # standard deviation of log tau within a kind: axes differ by a factor of 1.6 (assumption)
 ALIKE = np.exp(-0.5 * (np.log(GRID[:, None] / GRID) / OMEGA) ** 2)
 ALIKE /= ALIKE.sum(axis=1, keepdims=True)  # (common tau of the kind, tau of a parameter)
 ROBUST = 1.4826  # median absolute deviation to standard deviation, of normal values
 FAR_AT_FIRST = (
     5.0  # robust standard deviations beyond which a unit is at first no sibling; all are tested again after that
 )
-ROUNDS = 20  # at most, until the siblings stay the same; 2 to 4 in the study (benchmarks/lot_prior.py)
+ROUNDS = 20  # at most, until the siblings stay the same: a set that goes to and fro ends here
 
 
 class Prediction(NamedTuple):
