@@ -39,8 +39,8 @@ VERDICTS = {
 }
 
 PLUS_MINUS = (
-    "+- is two standard uncertainties by the noise of these recordings. A calibration adds the accuracies of the "
-    "bench, and states each parameter with its coverage factor for 95 %."
+    "+- is two standard uncertainties by the noise of these recordings, as the selection estimates it. A calibration "
+    "with the effect estimates the noise anew, adds the accuracies of the bench, and states coverage factors for 95 %."
 )
 GIVEN_DIFFERS = "The model explains the {sensor}; the given calibration is not that of these recordings."
 
