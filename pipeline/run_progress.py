@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
 COST = {"ingest": 2.0, "diagnose": 4.0, "report": 2.0}  # relative to the other stages, by benchmarks/fleet.py
-PER_BATCH = ("ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report")
+PER_BATCH = ("collect", "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report")
 AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
 LAST_STAGE = "report"  # its units are counted as done
 NAMED_JOBS = 2

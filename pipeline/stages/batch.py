@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 FITS = ("accelerometer", "gyroscope")
 INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
+    "collect": (),
     "ingest": (),
     "filter": ("ingest",),
     "fit": ("ingest", "filter"),
@@ -37,7 +38,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "report": ("ingest", "filter", "calibration", "validate", "diagnose", "export"),
     "gather": (),
 }
-OPTIONS = {"fit": ("sensor", "stage", "previous", "last")}
+OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last")}
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
         register_user_effects(content["user_effects"])
     units, output = content.pop("units"), arguments.pop("output")
     inputs = {name: Pack(arguments.pop(name)) for name in INPUTS[stage]}
+    if arguments.get("recordings"):
+        inputs["recordings"] = Pack(Path(arguments["recordings"]))
     return Job(stage, units, content | arguments, inputs, output, results)
 
 

@@ -1,4 +1,4 @@
-"""Stages ingest and filter: a unit's files become one Parquet file with its recordings, and their noise.
+"""Stages collect, ingest and filter: a unit's files become one Parquet file with its recordings, and their noise.
 
 The noise is estimated once, of the filtered readings, for all stages after it (``<unit>.noise.json``). Without a filter
 the readings are those of ingest (``unit_files.recordings_of``).
@@ -6,20 +6,75 @@ the readings are those of ingest (``unit_files.recordings_of``).
 
 from __future__ import annotations
 
+import os
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.errors import IngestError, PipelineError
+from pipeline.io.files import candidate_files, recording_files, unchanged
 from pipeline.io.parquet import to_parquet
 from pipeline.io.read import read_recordings
+from pipeline.pack import FAILED, as_bytes, new_pack
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.filters import apply_filter
 from pipeline.signal.segments import cut, held_out_windows
+from pipeline.stages.batch import failure_of
 from pipeline.stages.unit_files import noise_file, recordings_of
 
 if TYPE_CHECKING:
-    from pipeline.pack import Files
+    from collections.abc import Mapping
+
+    from pipeline.pack import Files, Pack
+    from pipeline.records import Recording
     from pipeline.stages.batch import Job
+
+
+def collect_batch(job: Job) -> None:
+    """Write the raw recordings of all units into one file, for a machine without this disk.
+
+    A member is named by the absolute path of its file without the first slash. A recording of several units is stored
+    once. A unit of which one cannot be read has failed, as in ``ingest``.
+    """
+    files: dict[str, bytes] = {}
+    folders = {unit: Path(job.run["directory"], s["procedure"]["folder"]) for unit, s in job.units.items()}
+    done: set[str] = set()
+    with new_pack(job.output) as add:
+        for unit, settings in job.units.items():
+            found = recording_files(settings["procedure"], settings["ingest"], folders[unit])
+            try:
+                for path in sorted({path for paths in found.values() for path in paths}):
+                    if _member(path) not in done:
+                        with unchanged(path):
+                            add({_member(path): path.read_bytes()})
+                        done.add(_member(path))
+            except IngestError as error:
+                add({unit + FAILED: as_bytes(failure_of(error, unit, "ingest"))})
+            # Ingest reports whether a folder exists, and files that it did not read.
+            files |= {f"{_member(folders[unit])}/": b""} if folders[unit].is_dir() else {}
+            files |= {_member(path): b"" for path in _candidates(settings, folders[unit]) if path.exists()}
+        add({name: content for name, content in files.items() if name not in done})
+
+
+def _extract(recordings: Pack, settings: Mapping[str, Any], folder: Path, root: str) -> None:
+    """Write the recordings of a unit below ``root``, which stands for the root of the file system."""
+    if f"{_member(folder)}/" in recordings:
+        Path(f"{root}{folder}").mkdir(parents=True)
+    for path in _candidates(settings, folder):
+        if _member(path) in recordings:
+            copy = Path(root, _member(path))
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(recordings.read(_member(path)))
+
+
+def _candidates(settings: Mapping[str, Any], folder: Path) -> list[Path]:
+    files = candidate_files(settings["procedure"], settings["ingest"]).values()
+    return [folder / file for candidates in files for candidate in candidates for file in candidate]
+
+
+def _member(path: Path) -> str:
+    return os.path.normpath(path).lstrip("/")
 
 
 def ingest_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
@@ -27,9 +82,23 @@ def ingest_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
 
     Files are named by their path below the campaign's directory.
     """
-    directory, procedure = Path(job.run["directory"]), settings["procedure"]
-    recordings = []
-    folder = directory / procedure["folder"]
+    directory = Path(job.run["directory"])
+    folder = directory / settings["procedure"]["folder"]
+    if "recordings" not in job.inputs:
+        return {f"{unit}.parquet": to_parquet(_ingested(directory, folder, settings))}
+    with tempfile.TemporaryDirectory() as root:
+        try:
+            _extract(job.inputs["recordings"], settings, folder, root)
+            ingested = _ingested(Path(f"{root}{directory}"), Path(f"{root}{folder}"), settings)
+        except PipelineError as error:
+            error.message, error.file = error.message.replace(root, ""), error.file and error.file.replace(root, "")
+            raise
+        named = [replace(r, source=r.source | {"file": r.source["file"].removeprefix(root)}) for r in ingested]
+        return {f"{unit}.parquet": to_parquet(named)}
+
+
+def _ingested(directory: Path, folder: Path, settings: dict[str, Any]) -> list[Recording]:
+    procedure, recordings = settings["procedure"], []
     whole = read_recordings(procedure, settings["ingest"], settings["sensor"], folder)
     held_out = any(read.role == "validation" for read in whole)
     for read in whole:
@@ -44,7 +113,7 @@ def ingest_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
         path = Path(recording.source["file"])
         file = str(path.relative_to(directory)) if path.is_relative_to(directory) else str(path)
         named.append(replace(recording, source=recording.source | {"file": file}))
-    return {f"{unit}.parquet": to_parquet(named)}
+    return named
 
 
 def filter_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:

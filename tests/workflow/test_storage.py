@@ -47,12 +47,22 @@ def published(results: Path) -> dict[str, str]:
     return {str(f.relative_to(results)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 
+def damage(demo: Path) -> None:
+    """Add a unit without recordings, and one with a recording without numbers."""
+    damaged = demo / "raw" / "damaged"
+    shutil.copytree(demo / "raw" / "mpu6050-1", damaged)
+    (damaged / "accel_x.csv").write_text("time_s,accel_x_g\n0,none\n")
+    with (demo / "units.csv").open("a") as sheet:
+        sheet.writelines(f"{unit},,,,mpu6050,acutronic,three_axis_turns,,,\n" for unit in ("absent", "damaged"))
+
+
 def test_the_demo_without_a_shared_disk_has_the_bytes_of_a_local_run(tmp_path: Path) -> None:
     clone, nodes, storage = (tmp_path / name for name in ("clone", "nodes", "storage"))
     for name in (*SENT, "profiles", "data/demo"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copyfile
         (clone / name).parent.mkdir(parents=True, exist_ok=True)
         copy(ROOT / name, clone / name)
+    damage(clone / "data" / "demo")
     nodes.mkdir()
     storage.mkdir()
     subprocess.run(["git", "init", "-q"], cwd=clone, check=True)
@@ -70,8 +80,9 @@ def test_the_demo_without_a_shared_disk_has_the_bytes_of_a_local_run(tmp_path: P
         done = subprocess.run(
             command, cwd=clone, env=environment, capture_output=True, text=True, check=False, timeout=1800
         )
-        assert done.returncode == 0, done.stdout + done.stderr
-    assert len(list(nodes.iterdir())) == 21  # every job but ingest, gather and verdict
+        assert done.returncode == 1, done.stdout + done.stderr
+        assert "2 units failed" in done.stderr
+    assert len(list(nodes.iterdir())) == 23  # every job but collect, gather and verdict
     local, apart = (published(clone / name / "demo") for name in ("local", "apart"))
     assert len(local) > 250
     assert apart == local

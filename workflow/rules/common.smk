@@ -76,6 +76,7 @@ else:
         "simulation": CAMPAIGN.simulation and without_braces(CAMPAIGN.simulation),
         "page": CAMPAIGN.page,
         "chains": CAMPAIGN.chains,
+        "apart": bool(workflow.storage_settings.default_storage_provider),
         "settings": {
             batch: {output: file.name for output, file in files.items()}
             for batch, files in SETTINGS.items()

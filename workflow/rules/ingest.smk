@@ -1,10 +1,37 @@
 # A unit's files -> one Parquet file. Names, sizes and times of the recordings are part of the settings; those that do not
-# exist are no input: their unit fails, the others go on. Snakemake runs a rule with a local input where it was started, not
-# on another machine that does not share a disk with this one: there the packs of ingest replace the recordings.
+# exist are no input: their unit fails, the others go on.
+SIMULATED_INPUT = local(SIMULATED) if PLAN["simulation"] else []
+
+if PLAN["apart"]:
+
+    # Machines that do not share a disk with this one get the recordings of a batch in one file, as Snakemake takes 0.1 ms
+    # for each input at each start.
+    localrules:
+        collect,
+
+    rule collect:
+        input:
+            settings=lambda wildcards: local(settings_file(wildcards.batch, "ingest")),
+            simulated=SIMULATED_INPUT,
+        output:
+            temp(f"{BATCH}/recordings.zip"),
+        log:
+            f"{LOG}/collect.log",
+        threads: 1
+        resources:
+            mem_mb=1000,
+            runtime=10,
+        params:
+            code=code_digest("pipeline.stages.ingest"),
+        shell:
+            "{RUN} collect --config {input.settings:q} --output {output:q} > {log:q} 2>&1"
+
+
 rule ingest:
     input:
-        settings=lambda wildcards: local(settings_file(wildcards.batch, "ingest")),
-        simulated=local(SIMULATED) if PLAN["simulation"] else [],
+        settings=settings_of("ingest"),
+        simulated=[] if PLAN["apart"] else SIMULATED_INPUT,
+        recordings=f"{BATCH}/recordings.zip" if PLAN["apart"] else [],
     output:
         f"{BATCH}/ingest.zip",
     log:
@@ -16,4 +43,4 @@ rule ingest:
     params:
         code=code_digest("pipeline.stages.ingest"),
     shell:
-        "{RUN} ingest --config {input.settings:q} --output {output:q} > {log:q} 2>&1"
+        "{RUN} ingest --config {input.settings:q} --recordings={input.recordings:q} --output {output:q} > {log:q} 2>&1"

@@ -6,7 +6,7 @@ rule verdict:
     output:
         f"{RESULTS}/complete.json",
     log:
-        f"{RESULTS}/logs/verdict.log",
+        local(f"{RESULTS}/logs/verdict.log"),
     threads: 1
     resources:
         mem_mb=1000,
