@@ -19,7 +19,7 @@ import pandas as pd
 
 from pipeline.errors import InputError, MissingInputError
 from pipeline.files import read_json
-from pipeline.pack import batches_of
+from pipeline.pack import DOCUMENTS, read_published
 from pipeline.records import SENSORS
 from pipeline.report.parameters import fitted_parameters, reading_errors
 from pipeline.report.summary import COLUMNS
@@ -27,10 +27,7 @@ from pipeline.report.summary import COLUMNS
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from pipeline.pack import Batch
-
 JSON = dict[str, Any]
-DOCUMENTS = ("calibrations", "validations", "diagnoses")
 PARAMETERS = ("parameter", "value", "value_unit", "expanded_uncertainty", "coverage_factor")
 ERRORS = (
     "step", "rms_error", "mean_abs_error", "max_error", "min_error", "sum_abs_error", "change_percent",
@@ -218,14 +215,8 @@ class CampaignResults:
         return self._documents[name]
 
     def _document(self, folder: str, name: str) -> JSON:
-        file = self.folder / folder / f"{name}.json"
-        packed = None if file.is_file() else self._batches.get(name)
-        found: JSON = packed.document(folder, name) if packed else read_json(file)
+        found: JSON = read_json(self.folder / folder / f"{name}.json", read_published)
         return found
-
-    @cached_property
-    def _batches(self) -> dict[str, Batch]:
-        return batches_of(self.folder)
 
     def _parts(self, document: str) -> Iterator[tuple[JSON, JSON]]:
         """Yield ``{unit, sensor}`` and the sensor's part of a document, where there is one."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import DamagedFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 _PACKAGE = Path(__file__).resolve().parent
 INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
@@ -50,8 +50,8 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     temporary.replace(path)
 
 
-def read_json(path: Path) -> Any:  # noqa: ANN401  (any JSON value)
-    """Read a JSON file that an earlier stage of a run wrote.
+def read_json(path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> Any:  # noqa: ANN401  (any JSON value)
+    """Read a JSON file that an earlier stage of a run wrote; ``read`` returns its content.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def read_json(path: Path) -> Any:  # noqa: ANN401  (any JSON value)
         If it does not exist or is not JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(read(path))
     except (OSError, ValueError) as error:
         reason = f"cannot be read, it is missing or damaged ({error}); the same command once more makes it again"
         raise DamagedFileError(reason, str(path)) from None

@@ -15,7 +15,7 @@ import os
 import zipfile
 import zlib
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
 from pipeline.errors import DamagedFileError
@@ -112,7 +112,11 @@ def as_bytes(content: Any) -> bytes:  # noqa: ANN401
 PACKS, WITH_PRIOR = "packs", "combined"
 STAGES = ("calibration", "validate", "diagnose", "export", "report")
 FAILED = ".failed.json"
-STAGE_OF = {"calibrations": "calibration", "validations": "validate", "diagnoses": "diagnose"}
+STAGE_OF = {  # folder of the results: the stage whose packs hold its files
+    "calibrations": "calibration", "validations": "validate", "diagnoses": "diagnose", "exports": "export",
+    "reports": "report", "certificates": "report",
+}  # fmt: skip
+DOCUMENTS = ("calibrations", "validations", "diagnoses")
 
 
 class Batch:
@@ -126,12 +130,17 @@ class Batch:
         report, name = self.packs["report"], f"{unit}{FAILED}"
         return cast("dict[str, Any]", report.json(name)) if name in report else None
 
+    def member(self, path: str, unit: str) -> tuple[Pack, str]:
+        """Return the pack and the member that is published of a unit as ``path``, below the results."""
+        folder, _, name = path.partition("/")
+        if folder == "calibrations" and self.failure(unit):
+            return self.packs["report"], f"{unit}.calibration.json"
+        return self.packs[STAGE_OF[folder]], path if folder == "certificates" else name
+
     def document(self, folder: str, unit: str) -> Any:  # noqa: ANN401  (a JSON document)
         """Return ``<folder>/<unit>.json`` as it is published."""
-        stage, name = STAGE_OF[folder], f"{unit}.json"
-        if stage == "calibration" and self.failure(unit):
-            stage, name = "report", f"{unit}.calibration.json"
-        return self.packs[stage].json(name)
+        pack, name = self.member(f"{folder}/{unit}.json", unit)
+        return pack.json(name)
 
     def files(self, unit: str) -> Iterator[tuple[str, bytes]]:
         """Yield the path and the content of each file that is published of a unit."""
@@ -140,8 +149,8 @@ class Batch:
         if self.failure(unit):
             yield f"calibrations/{unit}.json", report.read(f"{unit}.calibration.json")
             return
-        for folder, stage in STAGE_OF.items():
-            yield f"{folder}/{unit}.json", self.packs[stage].read(f"{unit}.json")
+        for folder in DOCUMENTS:
+            yield f"{folder}/{unit}.json", self.packs[STAGE_OF[folder]].read(f"{unit}.json")
         for part in diagnose.json(f"{unit}.json").values():
             if isinstance(part, dict) and (name := part.get("suggested_file")):
                 yield f"diagnoses/{name}", diagnose.read(name)
@@ -163,8 +172,42 @@ class Batch:
 
 def batches_of(results: Path) -> dict[str, Batch]:
     """Return the batch of each unit whose files are in packs; none where every unit has files of its own."""
+    packs = results / PACKS
+    return _batches(packs, packs.stat().st_mtime_ns, packs.stat().st_ino) if packs.is_dir() else {}
+
+
+def read_published(path: Path) -> bytes:
+    """Return a published file of a unit by its path, from the packs of the campaign where it has no file of its own.
+
+    Raises ``FileNotFoundError`` where there is neither, ``DamagedFileError`` where a pack is damaged.
+    """
+    results = next((folder for folder in path.parents[1:3] if (folder / PACKS).is_dir()), None)
+    if results is None or path.exists():
+        return path.read_bytes()
+    below = path.relative_to(results)
+    batches, name = batches_of(results), below.parts[1]
+    while name not in batches and (end := max(name.rfind("."), name.rfind("_"))) > 0:
+        name = name[:end]  # <unit>.json, <unit>_<sensor>_unknown.yaml
+    if name in batches and below.parts[0] in STAGE_OF:
+        pack, member = batches[name].member(below.as_posix(), name)
+        if member in pack:
+            return pack.read(member)
+    return path.read_bytes()  # raises FileNotFoundError
+
+
+def is_published(path: Path) -> bool:
+    """Return whether ``read_published`` returns a file."""
+    try:
+        return path.is_file() or bool(read_published(path))
+    except OSError:
+        return False
+
+
+@lru_cache(maxsize=4)
+def _batches(packs: Path, *_: int) -> dict[str, Batch]:
+    """Return ``batches_of``; the other arguments tell when the folder has been replaced."""
     found: dict[str, Batch] = {}
-    for folder in sorted((results / PACKS).glob("*")):
+    for folder in sorted(packs.glob("*")):
         batch = Batch(folder)
         pages = [name for name in batch.packs["report"].names() if "/" not in name]
         found |= {name.removesuffix(".html"): batch for name in pages if name.endswith(".html")}

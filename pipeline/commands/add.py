@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
@@ -14,9 +15,10 @@ from pipeline.commands.run import run_snakemake
 from pipeline.config.campaign import find_campaign, read_layers
 from pipeline.config.devices import edit_effects, sensor_and_effect
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
-from pipeline.files import read_json, write_atomically
+from pipeline.files import write_atomically
 from pipeline.model.effects import catalogue
 from pipeline.outcome import RESULTS, read_summary, run_command
+from pipeline.pack import read_published
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -73,16 +75,16 @@ def _write_suggested(arguments: argparse.Namespace) -> tuple[list[Path], list[st
     directory = find_campaign(arguments.campaign)
     diagnoses = Path(arguments.results) / directory.name / "diagnoses"
     document = diagnoses / f"{arguments.unit}.json"
-    if not document.is_file():
-        advice = "run the campaign first, or publish the unit's files (python -m pipeline unpack)"
-        raise MissingInputError(f"does not exist: {advice}", str(document))
-    parts = read_json(document)
+    try:
+        parts = json.loads(read_published(document))
+    except FileNotFoundError:
+        raise MissingInputError("does not exist: run the campaign first", str(document)) from None
     found = {s: parts[s] for s in SENSORS if parts.get(s) and parts[s].get("suggested_effect")}
     if not found:
         raise ConfigurationError("the diagnosis suggests no formula for this unit", str(document))
     written, names = [], []
     for sensor, part in found.items():
-        text, plain = (diagnoses / part["suggested_file"]).read_text(encoding="utf-8"), part["suggested_effect"]["name"]
+        text, plain = read_published(diagnoses / part["suggested_file"]).decode(), part["suggested_effect"]["name"]
         for name in chain([plain], (f"{plain}_{k}" for k in count(2))):
             file = directory / "effects" / f"{name}.yaml"
             own = text.replace(plain, name)

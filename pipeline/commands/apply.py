@@ -40,7 +40,11 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigurationError(f"--temperature-smoothing is {arguments.smoothing:g} s; it cannot be negative")
     compensation = load(arguments.calibration, arguments.python_effects)
     require_apart(arguments.log, arguments.output)
-    if arguments.output.exists() and arguments.output.samefile(arguments.calibration):
+    if (
+        arguments.output.exists()
+        and arguments.calibration.exists()
+        and arguments.output.samefile(arguments.calibration)
+    ):
         message = "the output would overwrite the calibration; choose another file for -o"
         raise InputError(message, str(arguments.output))
     profile = _profile(arguments.calibration, arguments.ingest)

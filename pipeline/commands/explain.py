@@ -22,7 +22,7 @@ from pipeline.history import read_history
 from pipeline.io.yaml_file import read_yaml
 from pipeline.model.calibration_file import sentences
 from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
-from pipeline.pack import PACKS
+from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--from", dest="format", metavar="FORMAT", help=words)
     arguments = parser.parse_args(argv)
     file = Path(arguments.campaign)
-    if file.is_file() and not _is_diagnosis(_json(file)):
+    if is_published(file) and not _is_diagnosis(_json(file)):
         counts = counts_of(sheets_of(arguments.sensor))
         try:
             sys.stdout.write(explain_calibration(read_any(file, arguments.format, counts)))
@@ -82,8 +82,9 @@ def main(argv: Sequence[str]) -> int:
     folder = Path(found.results) / found.folder
     texts = []
     for unit, document in found.diagnoses.items():
-        files = (folder / kind / f"{unit}.json" for kind in ("validations", "calibrations"))
-        validation, calibration = (read_json(file) if file.is_file() else {} for file in files)
+        validation, calibration = (
+            _json(folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
+        )
         texts.append(explain(unit, document, validation, found))
         texts[-1] += "".join(f"  {line}\n" for s in SENSORS for line in sentences(s, calibration.get(s)))
         texts[-1] += "".join(f"{line}\n" for line in board_lines(calibration)[1:])
@@ -97,7 +98,7 @@ def main(argv: Sequence[str]) -> int:
 def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
     """Return the diagnoses and failures of the units; ``MissingInputError`` if there are none."""
     given = Path(campaign)
-    if given.is_file():
+    if is_published(given):
         folder, files, failures = given.parent.parent, {given.stem: given}, {}
     else:
         folders = [folder for folder in (given, results / given.name) if (folder / "diagnoses").is_dir()]
@@ -107,14 +108,14 @@ def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
         failed = folder / "failures.json"
         failures = {failure["unit"]: failure for failure in (read_json(failed) if failed.is_file() else [])}
         files = {file.stem: file for file in sorted((folder / "diagnoses").glob("*.json"))}
+        files |= {unit: folder / "diagnoses" / f"{unit}.json" for unit in batches_of(folder)}
         order = [row["unit"] for row in read_summary(folder)] if (folder / "summary.csv").is_file() else []
         files = {u: files[u] for u in dict.fromkeys([*order, *files]) if u in files and u not in failures}
     absent = [unit for unit in units if unit not in files and unit not in failures]
     if absent:
         known = ", ".join(sorted([*files, *failures])[:12])
         raise MissingInputError(
-            f"no diagnosis of unit {', '.join(absent)}; there are those of {known or 'no unit'}"
-            + " (python -m pipeline unpack publishes others)" * any((folder / PACKS).glob("*")),
+            f"no diagnosis of unit {', '.join(absent)}; there are those of {known or 'no unit'}",
             str(folder / "diagnoses"),
         )
     diagnoses = {unit: _json(file) for unit, file in files.items() if not units or unit in units}
@@ -188,7 +189,7 @@ def _is_diagnosis(document: object) -> bool:
 def _json(file: Path) -> Any:  # noqa: ANN401
     """Return the content of a JSON file; None where it does not exist or is not JSON."""
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(read_published(file))
     except (OSError, ValueError):
         return None
 
@@ -206,7 +207,7 @@ def convert(argv: Sequence[str]) -> int:
     found = read_any(arguments.source, arguments.source_format, counts_of(sheets_of(arguments.sensor)))
     sheets = sheets_of(arguments.sensor, found)
     name = format_of(arguments.target.name if arguments.target_format is None else arguments.target_format)
-    if arguments.target.exists() and arguments.target.samefile(arguments.source):
+    if arguments.target.exists() and arguments.source.exists() and arguments.target.samefile(arguments.source):
         raise ConfigurationError("OUT is the file IN: choose another name", str(arguments.target))
     files, lost = write_converted(found, name, arguments.target, sheets)
     print(f"{arguments.source} ({found.name}): {' and '.join(found.sensors)}")

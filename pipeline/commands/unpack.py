@@ -16,6 +16,7 @@ from pipeline.errors import MissingInputError
 from pipeline.files import flushed_together, write_atomically
 from pipeline.history import read_history
 from pipeline.pack import batches_of
+from pipeline.report.pages import linked
 from pipeline.results_folder import PUBLISHED, record_written, repetitions, take_run
 from pipeline.stages.gather import publish_histories
 
@@ -48,6 +49,8 @@ def main(argv: Sequence[str]) -> int:
             for name, content in batches[unit].files(unit):
                 write_atomically(results / name, content)
         publish_histories(results, read_history(results), units)
+        index = results / "index.html"
+        write_atomically(index, linked(index.read_text(encoding="utf-8"), units))
     record_written(results, "", again, PUBLISHED)
     print("\n".join(str(results / "reports" / f"{unit}.html") for unit in units))
     return 0

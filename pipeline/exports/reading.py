@@ -25,6 +25,7 @@ from pipeline.exports.sensors import FACTORS, FUNCTIONS
 from pipeline.io.files import read_text
 from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.effects import effect
+from pipeline.pack import is_published, read_published
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
@@ -80,9 +81,9 @@ def read_any(file: Path, name: str | None = None, counts: Mapping[str, float | N
         If the format is not known, or the file does not hold what the format needs.
     """
     stated = None if name is None else format_of(name)
-    if not file.is_file():
+    if not is_published(file):
         raise MissingInputError("there is no such calibration", str(file))
-    text = read_text(file, LARGEST_BYTES, "a calibration")
+    text = _text(file)
     name = stated or _recognised(file, text)
     if name == CALIBRATION:
         document = read_calibration(file)
@@ -105,11 +106,15 @@ def _files_of(file: Path, declared: Format) -> list[Path]:
     if own is None:
         return [file]
     found = [file.with_name(file.name.removesuffix(own) + end) for end in ends]
-    return [each for each in found if each.is_file()]
+    return [each for each in found if is_published(each)]
+
+
+def _text(file: Path) -> str:
+    return read_text(file, LARGEST_BYTES, "a calibration") if file.exists() else read_published(file).decode()
 
 
 def _read_text(file: Path, name: str, declared: Format, counts: Mapping[str, float | None]) -> FoundCalibration:
-    text = read_text(file, LARGEST_BYTES, "a calibration")
+    text = _text(file)
     try:
         found = _read(file, name, declared, text_kinds.parsed(declared.reads["text"], text), counts)
     except (TemplateError, YAMLError, KeyError, ValueError, TypeError, np.linalg.LinAlgError) as error:

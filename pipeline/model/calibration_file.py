@@ -35,6 +35,7 @@ from pipeline.io.files import not_regular
 from pipeline.model.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import parameter_limits
+from pipeline.pack import read_published
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
@@ -115,10 +116,10 @@ def read_calibration(file: Path) -> dict[str, Any]:
         value is not what is expected.
     """
     try:
-        if other := not_regular(file):
+        if file.exists() and (other := not_regular(file)):
             _refuse(file, f"this {other}")
         document = json.loads(
-            file.read_text(encoding="utf-8"), object_pairs_hook=_without_repeats, parse_constant=_not_finite
+            read_published(file).decode(), object_pairs_hook=_without_repeats, parse_constant=_not_finite
         )
     except FileNotFoundError:
         raise MissingInputError("there is no such calibration", str(file)) from None

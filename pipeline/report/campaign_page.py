@@ -10,7 +10,7 @@ import pandas as pd
 
 from pipeline.outcome import VERDICTS, findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS
-from pipeline.report.chart import Dots, Figure, Layer, Panel, chart
+from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart
 from pipeline.report.held_out_section import FAR
 from pipeline.report.numbers import number, plain
 from pipeline.report.pages import script_data, template
@@ -18,7 +18,7 @@ from pipeline.report.strips import strips
 from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from pipeline.report.strips import Placed
 
@@ -26,6 +26,9 @@ JSON = dict[str, Any]
 FIRST = 100  # rows that a browser shows at once; it shows the others when asked
 NAMED = 3  # units that the finding of a chart names
 FEWEST_UNITS, FAR_SHOWN = 3, 30  # units, below which a distribution says nothing; units far from the others
+MOST_DOTS, FARTHEST = 2000, 50  # units, above which only the farthest from the noise are drawn as dots, and how many
+PARTS = 100  # of the fleet, each with its quantiles: one in 3.5 px
+MOST_GROUPS = 50  # serials of several units, and joint estimates, that are listed
 MOST_LOTS = 60  # of which medians are shown lot by lot
 
 
@@ -41,7 +44,7 @@ def render(
     placed: Mapping[str, Mapping[str, Placed]] | None = None,
     history: JSON | None = None,
     settings: JSON | None = None,
-    packed: bool = False,
+    published: Collection[str] | None = None,
 ) -> str:
     """Return ``index.html``.
 
@@ -49,17 +52,19 @@ def render(
     message, file`` of each failed unit; ``comparisons``: as of ``comparison_section.section``; ``page``: name of a
     further page; ``twins``: files of several units with the same content under different names; ``statistics``: as of
     ``fleet_statistics``; ``placed``: unit to its parameters, as of ``against_limits``; ``history``: as of
-    ``runs_data``; ``settings``: of the run, for the commands to continue with; ``packed``:
-    whether the pages of the units are published on request only.
+    ``runs_data``; ``settings``: of the run, for the commands to continue with; ``published``: units that have a page
+    of their own where pages are published on request only, None: all.
     """
     findings = findings_of(rows)
     frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     strip = strips(rows, placed or {})
+    fleet_figures = {f.name: (f, values) for sensor in SENSORS for f, values in _fleet_figure(sensor, frame)}
     text: str = template("campaign.html").render(
         campaign=campaign,
-        packed=packed,
+        published=published,
+        published_names=None if published is None else script_data(sorted(published)),
         rows=rows,
         failures=failures,
         twins=twins,
@@ -71,7 +76,8 @@ def render(
         fleet=_medians("all units", frame),
         lots=_lots(frame),
         groups=[(f"Serial {n}", [rows[i] for i in same.index]) for n, same in serials if len(same) > 1],
-        figures=[f for sensor in SENSORS if (f := _fleet_figure(sensor, frame))],
+        most_groups=MOST_GROUPS,
+        figures=[figure for figure, _ in fleet_figures.values()],
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
         strips=strip.figures,
         far_shown=FAR_SHOWN,
@@ -82,7 +88,7 @@ def render(
         history=history,
         history_data=script_data({"units": history["units"]}) if history else None,
         names=script_data([row["unit"] for row in rows]),
-        values=script_data(_fleet_values(rows) | strip.dots),
+        values=script_data({name: values for name, (_, values) in fleet_figures.items()} | strip.dots),
         first=FIRST,
         sections=comparisons,
         verdicts=VERDICTS,
@@ -133,50 +139,65 @@ def _lots(frame: pd.DataFrame) -> list[JSON]:
     return sorted(found, key=lambda medians: SENSORS.index(medians["sensor"]))
 
 
-def _fleet_values(rows: list[JSON]) -> JSON:
-    """Return the value of each dot of the charts, by chart and colour, in the order of the units."""
-    return {
-        f"fleet-{sensor}": {
-            colour: ["" if (v := r.get(f"{sensor}_{column}")) is None else f"{v:.6g}" for r in rows]
-            for colour, column in (("c3", "error_before"), ("c4", "noise_floor"), ("after", "error_after"))
-        }
-        for sensor in SENSORS
-    }
+def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Iterator[tuple[Figure, JSON]]:
+    """Draw the errors before and after, in the order of ``units.csv``, and give the value of each dot by its colour.
 
-
-def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Figure | None:
-    """Draw each unit's error before and after as a dot, in the order of ``units.csv``; None for few units."""
+    Each unit is a dot. Of more than ``MOST_DOTS`` units the farthest from the noise are; quantiles show all.
+    """
     unit, order = SENSOR_UNITS[sensor], np.arange(1.0, len(frame) + 1)
     errors = (pd.to_numeric(frame[f"{sensor}_{name}"]) for name in ("error_before", "error_after", "noise_floor"))
     before, after, floor = (v.where(v > 0).to_numpy(float) for v in errors)
     known = np.isfinite(after)
     count = int(known.sum())
     if count < FEWEST_UNITS:
-        return None
+        return
+    many = count > MOST_DOTS
     complete = known & (frame[f"{sensor}_verdict"] == "nothing_missing").to_numpy(bool)
-    layers: list[Layer] = [Dots(order, before, 3), Dots(order, floor, 4)]
-    legend = [("c3", "before"), ("c4", "noise floor")]
-    for chosen, colour, name in (
-        (complete, 2, "after, nothing missing"),
-        (known & ~complete, 0, "after, any other verdict"),
-    ):
-        if chosen.any():
-            layers.append(Dots(order[chosen], after[chosen], colour))
+    dotted = [(before, order > 0, 3, "before"), (floor, order > 0, 4, "noise floor")]
+    judged = [(after, complete, 2, "after, nothing missing"), (after, known & ~complete, 0, "after, any other verdict")]
+    layers: list[Layer] = []
+    legend, values = [], {}
+    drawn = known
+    if many:
+        for v, _, colour, name in [*dotted, (after, known, 5, "after")]:
+            layers += _quantiles(order, v, colour)
             legend.append((f"c{colour}", name))
+        drawn = np.zeros(len(frame), bool)
+        drawn[np.argsort(-np.nan_to_num(after / floor))[:FARTHEST]] = True
+        dotted = []
+    for v, of, colour, name in [*dotted, *judged]:
+        chosen = np.flatnonzero(of & drawn if v is after else of)
+        if v is not after or len(chosen):
+            layers.append(Dots(order[chosen], v[chosen], colour, units=tuple((chosen + 1).tolist()) if many else ()))
+            legend.append((f"c{colour}", name))
+            values[f"c{colour}" if many or v is not after else "after"] = [
+                f"{e:.6g}" if np.isfinite(e) else "" for e in (v[chosen] if many else v)
+            ]
     effects = ", ".join(f"{name} ({n} unit{'s' if n != 1 else ''})" for name, n in _missing(sensor, frame))
     words = f"Missing effects: {effects}." if effects else "No effect is named as missing."
     middle = [number(float(np.nanmedian(v))) if np.isfinite(v).any() else "not known" for v in (before, after, floor)]
     finding = f"{sensor.capitalize()}: {_farthest(frame['unit'].tolist(), after / floor, count)}"
-    caption = f"Error on held-out motion, each unit a dot. {words}"
-    return chart(
-        Figure(f"fleet-{sensor}", finding, caption, tuple(legend)),
-        f"Held-out error of {count} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
-        f"{middle[2]}. {words}",
-        [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
-        "unit, in the order of units.csv",
-        margin=0.03,
-        units="units",
+    each = f"the {FARTHEST} farthest from the noise as dots, median and 5 to 95 % of all" if many else "each unit a dot"
+    yield (
+        chart(
+            Figure(f"fleet-{sensor}", finding, f"Error on held-out motion, {each}. {words}", tuple(legend)),
+            f"Held-out error of {count} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
+            f"{middle[2]}. {words}",
+            [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
+            "unit, in the order of units.csv",
+            margin=0.03,
+            units="units",
+        ),
+        values,
     )
+
+
+def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Layer]:
+    """Return the median and the band from 5 to 95 % of neighbouring units."""
+    parts = [p for p in np.array_split(np.arange(len(order)), PARTS) if np.isfinite(values[p]).any()]
+    low, middle, high = np.array([np.nanquantile(values[p], [0.05, 0.5, 0.95]) for p in parts]).reshape(-1, 3).T
+    x = np.array([order[p].mean() for p in parts])
+    return [Area(low, high, colour, x), Line(x, middle, colour)]
 
 
 def _farthest(units: list[str], ratio: np.ndarray, known: int) -> str:

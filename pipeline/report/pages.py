@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import cache
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
@@ -15,9 +17,10 @@ from pipeline.report.numbers import measured, number, percent, percent_change, p
 from pipeline.report.parameters import convergence_of, monte_carlo_of, parameter_texts, stage_details
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Container, Iterable, Mapping
 
 FOLDER = Path(__file__).parent / "templates"
+PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # of a campaign's page
 
 
 def _figure(value: object) -> str:
@@ -37,8 +40,13 @@ def _environment() -> Environment:
     functions = (number, measured, percent, percent_change, probability, typeset, parameter_texts)
     environment.filters |= {function.__name__: function for function in functions}
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text, "numeric": "#{}".format}
-    environment.filters |= {"details": stage_details, "monte_carlo": monte_carlo_of, "convergence": convergence_of}
-    environment.globals["asset"] = asset
+    environment.filters |= {
+        "script_data": script_data,
+        "details": stage_details,
+        "monte_carlo": monte_carlo_of,
+        "convergence": convergence_of,
+    }
+    environment.globals |= {"asset": asset, "unit_link": unit_link}
     return environment
 
 
@@ -57,6 +65,29 @@ def compile_templates() -> None:
 def asset(name: str) -> Markup:
     """Return a style sheet or script of the templates' folder."""
     return Markup((FOLDER / name).read_text(encoding="utf-8"))  # noqa: S704  (our own file)
+
+
+def unit_link(unit: str, published: Container[str] | None) -> Markup:
+    """Return a unit's name with the link to its page, which ``published`` units have; None: all of them."""
+    link = published is None or unit in published
+    address = f' href="reports/{quote(unit)}.html"' if link else ""
+    return Markup(f"<a{address}>{escape(unit)}</a>")  # noqa: S704  (the name is escaped)
+
+
+def linked(page: str, units: Iterable[str]) -> str:
+    """Return a campaign's page with links to units whose pages have been published after it was made."""
+    for unit in units:
+        name, link = str(unit_link(unit, ())), str(unit_link(unit, None))
+        page = page.replace(name, link).replace(_in_json(name), _in_json(link))
+    found = PUBLISHED.search(page)
+    if found:
+        names = [*json.loads(found[1]), *units]
+        page = page.replace(found[0], found[0].replace(found[1], script_data(sorted(set(names)))))
+    return page
+
+
+def _in_json(text: str) -> str:
+    return str(script_data(text))[1:-1]
 
 
 def script_data(value: object) -> Markup:

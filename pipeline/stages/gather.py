@@ -216,7 +216,7 @@ def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path, lots: li
         placed={name: u.placed for name, u in units.items()},
         history=runs_data(entries, run["run"]),
         settings=run["run"],
-        packed=packed,
+        published={page.stem for page in (new / "reports").glob("*.html")} if packed else None,
     )
     write_atomically(new / "index.html", page)
 

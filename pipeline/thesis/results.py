@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.pack import Pack
+from pipeline.pack import Pack, read_published
 from pipeline.records import Noise
 from pipeline.stages.unit_files import recordings_of
 from pipeline.validation.samples import samples_of_motion
@@ -133,5 +133,8 @@ def matrix_of(row: Mapping[str, float], letter: str) -> Values:
 
 @cache
 def _read(path: Path) -> JSON:
-    found: JSON = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    try:
+        found: JSON = json.loads(read_published(path))
+    except FileNotFoundError:
+        return {}
     return found

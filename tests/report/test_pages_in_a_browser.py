@@ -1,5 +1,6 @@
 """The pages in headless Chromium: nothing leaves them, nothing fails in them, and what they offer works."""
 
+import csv
 import re
 import shutil
 from collections.abc import Iterator
@@ -123,6 +124,14 @@ def left_alone(page: Page, path: Path) -> bool:
     return (asked, page.wrong) == ([path.as_uri()], [])  # type: ignore[attr-defined]
 
 
+def scroll(page: Page, share: float) -> None:
+    """Scroll the table of all units, and wait until its rows are drawn."""
+    page.eval_on_selector(".tall", "(e, share) => { e.scrollTop = share * (e.scrollHeight - e.clientHeight) }", share)
+    page.evaluate(
+        "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 50))))"
+    )
+
+
 def column(page: Page, number: int) -> list[str]:
     cells = page.eval_on_selector_all(
         f"#all tbody tr > :nth-child({number})", "c => c.map((e) => e.textContent.trim())"
@@ -182,12 +191,38 @@ def test_the_table_of_all_units_sorts_by_keyboard_with_empty_cells_last(browser:
     page.keyboard.press("Enter")
     assert heading.get_attribute("aria-sort") == "descending"
     assert [float(v) for v in column(page, 9)] == pytest.approx(known[::-1][: len(first)], rel=5e-3)
-    page.get_by_role("button", name=f"Show all {UNITS}").click()
-    everything = column(page, 9)
-    assert len(everything) == UNITS
-    assert [i for i, v in enumerate(everything) if v == ""] == list(range(UNITS - FAILED, UNITS))
+    scroll(page, 1.0)
+    last = column(page, 9)
+    assert [i for i, v in enumerate(last) if v == ""] == list(range(len(last) - FAILED, len(last)))
     page.locator("#all thead tr:nth-child(2) th:nth-child(1) button").click()
-    assert column(page, 1) == [f"U{i}" for i in range(UNITS)]  # U10 after U9
+    names = column(page, 1)
+    assert names == [f"U{i}" for i in range(len(names))]  # U10 after U9
+    page.context.close()
+
+
+def test_of_a_long_table_the_rows_in_view_are_in_the_page_and_all_of_them_in_print(
+    browser: Browser, pages: Path
+) -> None:
+    page = opened(browser, pages / "campaign.html")
+    expected = [r["unit"] for r in fleet()]
+    page.eval_on_selector(".tall", "e => e.scrollIntoView()")
+    for share in (0.0, 0.5, 1.0):
+        scroll(page, share)
+        middle = "document.querySelector('.tall').getBoundingClientRect().top + 300"
+        row = f"document.elementFromPoint(100, {middle})?.closest('#all tbody tr')"
+        at = int(page.evaluate(f"{row}.ariaRowIndex")) - 3
+        assert at == pytest.approx(share * UNITS, abs=0.03 * UNITS)
+        shown = column(page, 1)
+        assert len(shown) <= 100
+        start = expected.index(shown[0])
+        assert shown == expected[start : start + len(shown)]
+        assert start <= at < start + len(shown)
+    assert page.get_attribute("#all", "aria-rowcount") == str(UNITS + 2)
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert column(page, 1) == expected
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert len(column(page, 1)) <= 100
+    assert left_alone(page, pages / "campaign.html")
     page.context.close()
 
 
@@ -206,14 +241,14 @@ def test_the_filter_finds_rows_by_words_and_leaves_out_others(browser: Browser, 
     box = page.get_by_label("Filter:")
     box.fill("missing effect staged")
     wanted = [i for i in range(UNITS) if i % 9 == 0 and i % 200 != 7]
-    assert page.locator("#shown").text_content() == f"100 of {len(wanted)} that match, of {UNITS} units shown"
+    assert page.locator("#shown").text_content() == f"{len(wanted)} of {UNITS} units match"
     assert set(column(page, 7)) == {"staged"}
     box.fill("missing effect -l0 -l1 -l2 -l3")
     assert sorted(column(page, 1)) == sorted(f"U{i}" for i in wanted if i >= 960)
     box.fill("no unit has this")
     assert column(page, 1) == []
     box.fill("")
-    assert len(column(page, 1)) == 100
+    assert 20 < len(column(page, 1)) <= 100
     page.context.close()
 
 
@@ -224,6 +259,36 @@ def test_a_dot_of_the_fleet_is_named(browser: Browser, pages: Path) -> None:
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowRight")
     assert page.locator(".readout b").first.text_content() == fleet()[1]["unit"]
+    page.context.close()
+
+
+def test_a_chart_of_many_units_shows_quantiles_and_names_the_farthest(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(campaign_page, "MOST_DOTS", UNITS // 2)
+    file = tmp_path / "campaign.html"
+    file.write_text(campaign_page.render("factory", fleet(), failures(), history=runs()))
+    known = sorted((r for r in fleet() if r["status"] == "ok"), key=lambda r: -r["accelerometer_error_after"])
+    farthest = {r["unit"]: f"{r['accelerometer_error_after']:.6g}" for r in known[: campaign_page.FARTHEST]}
+    page = opened(browser, file)
+    picture = page.locator("svg[data-names]").first
+    dots = "e => [...e.querySelectorAll('.layers .dots')].reduce((n, p) => n + p.dataset.units.split(' ').length, 0)"
+    assert picture.evaluate(dots) == campaign_page.FARTHEST
+    assert picture.locator(".band").count() == 3
+    picture.focus()
+    told = {}
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+        unit, row = page.locator(".readout b, .readout span").all_text_contents()[:2]
+        told[unit] = row.split()[-2]
+    assert told.items() <= farthest.items()
+    assert len(told) == 4
+    with page.expect_download() as saved:
+        page.locator("figure").first.hover()
+        page.get_by_role("button", name="CSV").first.click()
+    rows = csv.DictReader(saved.value.path().read_text().splitlines())
+    assert {row["unit"]: row["stated"] for row in rows if row["unit"]} == farthest
+    assert left_alone(page, file)
     page.context.close()
 
 

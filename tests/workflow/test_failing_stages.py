@@ -1,22 +1,25 @@
 """A fault in any stage fails one unit: its page names the cause, all others and the campaign's page are complete."""
 
 import csv
+import html
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 from whole_run import run_campaign, run_jobs
 
 import pipeline
 from pipeline import results_folder
-from pipeline.commands import unpack
+from pipeline.commands import add, apply, convert, explain, unpack
 from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.campaign import Campaign
-from pipeline.errors import DamagedFileError
+from pipeline.errors import ConfigurationError, DamagedFileError, InputError
 from pipeline.results_folder import HELD
 from pipeline.stages import batch, documents, gather
 
@@ -195,7 +198,7 @@ def test_units_beyond_the_limit_are_published_on_request_with_the_same_bytes(
     campaign, results = published
     run_gather(campaign)
     apart = shutil.copytree(results, tmp_path / "results" / results.name)
-    packed = load_campaign(dict(campaign.settings) | {"results": str(apart.parent), "overrides": "publish_limit=9"})
+    packed = load_campaign(dict(campaign.settings) | {"results": str(apart.parent), "overrides": "publish_limit=0"})
     run_gather(packed)
     files = {file.relative_to(apart).parts[0] for file in apart.rglob("*") if file.is_file()}
     assert files.isdisjoint(FOLDERS)
@@ -203,11 +206,15 @@ def test_units_beyond_the_limit_are_published_on_request_with_the_same_bytes(
     assert f"imu-calibration unpack {apart.name}" in (apart / "index.html").read_text()
     found, ordinary = (pipeline.load_campaign(folder) for folder in (apart, results))
     assert [vars(found.unit(u)) for u in packed.units] == [vars(ordinary.unit(u)) for u in packed.units]
+    assert links(apart / "index.html") == {"summary.csv", "parameters.parquet", "fleet.json"}
+    check_commands(apart, results, tmp_path, capsys)
     for unit in packed.units:
         unpack.main([str(apart), unit])
         HELD.pop().close()
         assert f"reports/{unit}.html" in capsys.readouterr().out
     unpacked = contents(apart)
+    assert {f"reports/{unit}.html" for unit in packed.units} < links(apart / "index.html")
+    assert all(links(page) for page in apart.glob("*/*.html"))
     assert {k for k, v in contents(results).items() if unpacked.get(k) != v} == {"index.html"}
     assert results_folder.repetitions(apart, "") == (0, [])
     run_gather(packed)
@@ -217,6 +224,41 @@ def test_units_beyond_the_limit_are_published_on_request_with_the_same_bytes(
     shutil.rmtree(apart / "calibrations")
     with pytest.raises(DamagedFileError, match=r"calibration\.zip"):
         pipeline.load_campaign(apart).unit("good")
+
+
+def links(page: Path) -> set[str]:
+    """Return where the links of a page lead, each to a file that exists."""
+    found = set(re.findall(r'href="([^"#:]+)"', html.unescape(page.read_text()).replace('\\"', '"')))
+    assert all((page.parent / unquote(link)).is_file() for link in found), page
+    return found
+
+
+def check_commands(packed: Path, ordinary: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Check that what takes a unit of results prints and writes the same where its files are in packs."""
+    bench = ordinary.parents[1] / ordinary.name
+    log = bench / "raw" / "good" / "accel_x.csv"
+    said, written = [], []
+    for name, results in {"packed": packed, "ordinary": ordinary}.items():
+        made = folder / name
+        made.mkdir()
+        calibration, exported = results / "calibrations" / "good.json", results / "exports" / "good" / "kalibr.yaml"
+        assert explain.main([str(results)]) == 0
+        assert explain.main([str(results), "good", "at_fit"]) == 0
+        assert explain.main([str(results / "diagnoses" / "good.json")]) == 0
+        assert explain.main([str(calibration)]) == 0
+        assert explain.main([str(exported)]) == 0
+        assert apply.main(["--calibration", str(calibration), str(log), "-o", str(made / "applied.csv")]) == 0
+        assert convert.main([str(calibration), str(made / "px4.params")]) == 0
+        with pytest.raises(ConfigurationError, match="suggests no formula"):
+            add.main([str(bench), "good", "--suggested", "--results", str(results.parent)])
+        with pytest.raises(InputError, match="failed"):
+            pipeline.load_calibration(results / "calibrations" / "at_ingest.json")
+        said.append(capsys.readouterr().out.replace(str(results.parent), "RESULTS").replace(str(made), "MADE"))
+        written.append({file.name: file.read_bytes() for file in made.iterdir()})
+    assert said[0] == said[1]
+    assert "at_fit\n  failed in stage fit" in said[0]
+    assert written[0] == written[1]
+    assert set(written[0]) == {"applied.csv", "px4.params"}
 
 
 def run_gather(campaign: Campaign) -> None:

@@ -14,7 +14,7 @@ told_.append(words_, " ", offered("List them first", () => {
   state.draw();
 }), " ", offered("Clear", () => { chosen.clear(); markChosen(); }));
 document.querySelector("main").append(told_);
-const unitsOf = (row) => placeOf.get(row.cells[0].textContent.trim());
+const unitOf = (row) => placeOf.get(row.cells[0]);
 function markChosen() {
   for (const [svg, x] of brushed)
     for (const layers of svg.querySelectorAll(".layers")) {
@@ -24,7 +24,10 @@ function markChosen() {
       ring.setAttribute("d", points.map((p) => `M${p[0]} ${p[1]}h0`).join(""));
       layers.insertBefore(ring, layers.querySelector(".dots"));
     }
-  for (const { rows } of tables.values()) for (const row of rows) row.classList.toggle("chosen", chosen.has(unitsOf(row)));
+  for (const { rows } of tables.values()) for (const row of rows) {
+    row.chosen = chosen.has(unitOf(row));
+    row.made?.classList.toggle("chosen", row.chosen);
+  }
   const names = [...chosen].slice(0, 5).map((i) => window.chartNames.units[i]).join(", ");
   words_.textContent = `${chosen.size} unit${chosen.size === 1 ? "" : "s"} marked: ${names}${chosen.size > 5 ? " and others" : ""}`;
   told_.hidden = !chosen.size;
@@ -34,8 +37,8 @@ window.choose = (units) => { // one is switched, several are added
   markChosen();
 };
 for (const table of tables.keys()) table.tBodies[0].addEventListener("click", (event) => {
-  const row = event.target.closest("tr");
-  if (row && !event.target.closest("a, button, summary") && unitsOf(row) !== undefined) window.choose([unitsOf(row)]);
+  const unit = placeOf.get(event.target.closest("tr")?.cells[0].textContent.trim());
+  if (unit !== undefined && !event.target.closest("a, button, summary")) window.choose([unit]);
 });
-if (brushed.length) shown.after(" ", offered("Mark in the charts", () => window.choose(state.found.map(unitsOf))));
+if (brushed.length) shown.after(" ", offered("Mark in the charts", () => window.choose(state.found.map(unitOf))));
 for (const hint of document.querySelectorAll(".chart-hint")) hint.append(" Click a dot or a row of a list, or drag with Ctrl over dots, to mark units everywhere.");

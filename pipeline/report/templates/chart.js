@@ -81,6 +81,7 @@ function detail(path, x, y, zoomed) { // draws the samples of a curve within the
 
 function prepare(svg) {
   const figure = svg.closest("figure"), x = scaleOf(svg), names = window.chartNames?.[svg.dataset.names], values = window.chartValues?.[svg.getAttribute("aria-labelledby").split("-t ")[0]];
+  const readable = names ? ".dots" : ".line, .dots, .strokes"; // beside dots that are units, lines are of many units
   const panels = [...svg.querySelectorAll(".panel")].map((group) => ({ group, y: scaleOf(group), layers: group.querySelector(".layers"), grid: group.querySelector(".grid"), ticks: group.querySelector(".ticks") }));
   const xTicks = svg.querySelector(":scope > .ticks"), xTop = +xTicks.firstElementChild?.getAttribute("y");
   const readout = document.createElement("div"), cursor = document.createElementNS(SVG, "path"), frame = document.createElementNS(SVG, "rect");
@@ -131,7 +132,7 @@ function prepare(svg) {
 
   const nearest = (panel, at, upright) => { // the vertex of each series that is nearest to a place in drawing units of the full view
     const found = new Map();
-    for (const path of panel.layers.querySelectorAll(".line, .dots, .strokes")) {
+    for (const path of panel.layers.querySelectorAll(readable)) {
       const colour = [...path.classList].find((c) => /^c\d$/.test(c));
       if (figure.classList.contains(`without-${colour}`)) continue;
       let best = null, least = Infinity;
@@ -238,7 +239,7 @@ function prepare(svg) {
   svg.addEventListener("dblclick", reset);
   svg.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const panel = panels[current], all = [...panel.layers.querySelectorAll(".line, .dots, .strokes")].flatMap((p) => pointsOf(p).map((q) => q[0]));
+    const panel = panels[current], all = [...panel.layers.querySelectorAll(readable)].flatMap((p) => pointsOf(p).map((q) => q[0]));
     const column = [...new Set(all)].sort((a, b) => a - b).filter((v) => v >= base(x, x.start) - 1 && v <= base(x, x.stop) + 1);
     const i = shown === null ? -1 : column.findIndex((v) => v >= shown), middle = valueAt(x, (x.start + x.stop) / 2), half = (x.view.high - x.view.low) / 2;
     if (event.shiftKey && event.key.startsWith("Arrow")) {

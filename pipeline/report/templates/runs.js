@@ -2,6 +2,7 @@
 // The comparison of two runs: for each unit its state after either run, where they differ.
 const history_ = JSON.parse(document.querySelector("#history-data").textContent), FIRST_ROWS = 100;
 const boxes = ["#run-a", "#run-b"].map((id) => document.querySelector(id));
+const published = JSON.parse(document.querySelector("#published")?.textContent ?? "null"); // null: every unit has a page
 const after = (states, run) => states.filter(([n]) => n <= run).pop()?.[1];
 const number = (v) => v === null || v === undefined ? "\u2013" : v === 0 ? "0" : v >= 1e-4 && v < 1e5 ? String(+v.toPrecision(3)) : v.toExponential(2);
 const words = (name) => (name ?? "").replaceAll("_", " ");
@@ -35,7 +36,8 @@ function compare() {
       if (i) cell.textContent = text;
       else {
         const link = document.createElement("a");
-        link.href = `reports/${encodeURIComponent(text)}.html`; link.textContent = text;
+        if (!published || published.includes(text)) link.href = `reports/${encodeURIComponent(text)}.html`;
+        link.textContent = text;
         cell.scope = "row"; cell.append(link);
       }
       row.append(cell);
