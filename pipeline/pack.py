@@ -130,12 +130,20 @@ class Batch:
         report, name = self.packs["report"], f"{unit}{FAILED}"
         return cast("dict[str, Any]", report.json(name)) if name in report else None
 
+    @property
+    def combined(self) -> Pack | None:
+        """Return the pack of what the priors of lots add or change, where there is one."""
+        path = self.packs["report"].path.with_name(f"{WITH_PRIOR}.zip")
+        return Pack(path) if path.is_file() else None
+
     def member(self, path: str, unit: str) -> tuple[Pack, str]:
         """Return the pack and the member that is published of a unit as ``path``, below the results."""
         folder, _, name = path.partition("/")
+        if (combined := self.combined) and f"{unit}/{path}" in combined:
+            return combined, f"{unit}/{path}"
         if folder == "calibrations" and self.failure(unit):
             return self.packs["report"], f"{unit}.calibration.json"
-        return self.packs[STAGE_OF[folder]], path if folder == "certificates" else name
+        return self.packs[STAGE_OF.get(folder, "report")], path if folder == "certificates" else name
 
     def document(self, folder: str, unit: str) -> Any:  # noqa: ANN401  (a JSON document)
         """Return ``<folder>/<unit>.json`` as it is published."""
@@ -164,8 +172,9 @@ class Batch:
 
     def _with_prior(self, unit: str) -> Iterator[tuple[str, bytes]]:
         """Yield the files that the prior of a lot adds, or that replace those without it."""
-        combined = Pack(self.packs["report"].path.with_name(f"{WITH_PRIOR}.zip"))
-        for name in combined.names() if combined.path.is_file() else ():
+        if not (combined := self.combined):
+            return
+        for name in combined.names():
             if name.startswith(f"{unit}/"):
                 yield name.removeprefix(f"{unit}/"), combined.read(name)
 
@@ -188,7 +197,7 @@ def read_published(path: Path) -> bytes:
     batches, name = batches_of(results), below.parts[1]
     while name not in batches and (end := max(name.rfind("."), name.rfind("_"))) > 0:
         name = name[:end]  # <unit>.json, <unit>_<sensor>_unknown.yaml
-    if name in batches and below.parts[0] in STAGE_OF:
+    if name in batches:
         pack, member = batches[name].member(below.as_posix(), name)
         if member in pack:
             return pack.read(member)

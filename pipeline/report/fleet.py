@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import io
 import math
+import sys
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -52,9 +53,12 @@ SIBLINGS = ["sensor", "method"]
 
 
 def unit_parameters(calibration: JSON) -> dict[str, Parameter]:
-    """Return every fitted parameter of a unit: ``<sensor>_bias_x``, ``<sensor>_<effect>_<symbol>``."""
+    """Return every fitted parameter of a unit: ``<sensor>_bias_x``, ``<sensor>_<effect>_<symbol>``.
+
+    Units of a fleet share the texts.
+    """
     return {
-        f"{sensor}_{p.name.replace('.', '_')}": p
+        sys.intern(f"{sensor}_{p.name.replace('.', '_')}"): p._replace(name=sys.intern(p.name), unit=sys.intern(p.unit))
         for sensor in SENSORS
         if calibration.get(sensor)
         for p in fitted_parameters(calibration[sensor])

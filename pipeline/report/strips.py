@@ -8,6 +8,7 @@ bias, error of a scale factor, or what one axis reads of another.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,10 @@ def against_limits(calibration: JSON, sheet: JSON) -> dict[str, Placed]:
     found = {}
     for sensor in SENSORS:
         rows = parameter_rows(calibration[sensor], sheet.get(sensor) or {}) if calibration.get(sensor) else []
-        found[sensor] = {r["name"]: (r["p"].value, r["limit"], unit_text(r["p"].unit)) for r in rows if r["limit"]}
+        limited = ((r["name"], r["p"], r["limit"]) for r in rows if r["limit"])
+        found[sensor] = {
+            sys.intern(name): (p.value, limit, sys.intern(unit_text(p.unit))) for name, p, limit in limited
+        }
     return found
 
 

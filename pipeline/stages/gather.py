@@ -17,7 +17,7 @@ from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.exports import exports
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record, unit_state
-from pipeline.pack import PACKS, STAGE_OF, STAGES, WITH_PRIOR, Batch, as_bytes, new_pack
+from pipeline.pack import DOCUMENTS, PACKS, STAGES, WITH_PRIOR, Batch, as_bytes, new_pack
 from pipeline.records import SENSORS
 from pipeline.report.campaign_page import render
 from pipeline.report.combined import combined_calibrations
@@ -50,7 +50,7 @@ class Gathered:
     row: JSON
     failure: JSON | None = None
     state: JSON = field(default_factory=dict)
-    inputs: list[JSON] = field(default_factory=list)
+    inputs: list[tuple[str, str]] = field(default_factory=list)  # file and SHA-256
     calibration: JSON | None = None  # where a joint estimate is asked for
     fitted: dict[str, Parameter] = field(default_factory=dict)
     placed: dict[str, Placed] = field(default_factory=dict)
@@ -116,7 +116,7 @@ def _with_lots(job: Job, rows: Mapping[str, dict[str, str]]) -> list[JSON]:
 
 def _files_with_prior(job: Job, batch: Batch, unit: str, priors: Mapping[str, Prior]) -> Files:
     """Return the files of a unit that its priors add or change."""
-    calibration, validation, diagnosis = (batch.document(folder, unit) for folder in STAGE_OF)
+    calibration, validation, diagnosis = (batch.document(folder, unit) for folder in DOCUMENTS)
     document = calibration_with_prior(calibration, priors)
     page = batch.packs["report"].read(f"{unit}.html").decode()
     files: Files = {f"reports/{unit}.html": with_card(page, calibration, document, priors)}
@@ -165,7 +165,7 @@ def _gathered(
         summary_row(unit, calibration, validation, diagnosis, row),
         failure,
         unit_state(calibration, validation, diagnosis, job.run["overrides"].get(unit, {}), job.units[unit]["config"]),
-        [{key: file[key] for key in ("file", "sha256")} for file in calibration.get("inputs") or []],
+        [(file["file"], file["sha256"]) for file in calibration.get("inputs") or []],
         calibration if job.run["combine"] == "serial" else None,
     )
 
@@ -231,16 +231,20 @@ def publish_histories(new: Path, entries: Sequence[JSON], units: Iterable[str]) 
             write_atomically(page, with_history(page.read_text(encoding="utf-8"), history, times))
 
 
-def same_files(inputs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[list[str]]:
+def same_files(inputs: Mapping[str, Sequence[tuple[str, str]]]) -> list[list[str]]:
     """Return the files of several units with the same content under different names.
 
-    One file that several units are calibrated from is not reported.
+    ``inputs``: unit to its files, each with its SHA-256. One file that several units are calibrated from is not
+    reported.
     """
-    known: dict[str, dict[str, str]] = {}
+    first: dict[str, tuple[str, str]] = {}
+    same: dict[str, dict[str, str]] = {}
     for unit, files in inputs.items():
-        for file in files:
-            known.setdefault(str(file["sha256"]), {}).setdefault(str(file["file"]), unit)
-    return [[f"{unit}: {file}" for file, unit in found.items()] for found in known.values() if len(found) > 1]
+        for file, digest in files:
+            known, owner = first.setdefault(digest, (file, unit))
+            if known != file:
+                same.setdefault(digest, {known: owner}).setdefault(file, unit)
+    return [[f"{unit}: {file}" for file, unit in found.items()] for found in same.values()]
 
 
 def _link(source: Path, target: Path) -> None:

@@ -136,8 +136,8 @@ def test_offset_and_drift_of_a_tables_own_clock_are_found_within_their_uncertain
 
 
 def test_the_same_recording_in_two_units_is_noted_on_the_page_of_the_campaign() -> None:
-    inputs = {unit: [{"file": f"raw/{unit}/log.csv", "sha256": "s"}] for unit in ("U1", "U2")}
-    inputs["U3"] = [{"file": "raw/U1/log.csv", "sha256": "s"}, {"file": "raw/U3/a.csv", "sha256": "t"}]
+    inputs = {unit: [(f"raw/{unit}/log.csv", "s")] for unit in ("U1", "U2")}
+    inputs["U3"] = [("raw/U1/log.csv", "s"), ("raw/U3/a.csv", "t")]
     twins = same_files(inputs)
     assert twins == [["U1: raw/U1/log.csv", "U2: raw/U2/log.csv"]]
     page = render("campaign", [], [], twins=twins)
