@@ -9,11 +9,15 @@
 # One job handles a batch of units; each writes one file, results/<campaign>/batches/<batch>/<stage>.zip.
 
 
-# With `--software-deployment-method apptainer` each job runs in it; without, it is not looked for (Containerfile).
-container: "imu-calibration.sif"
-
-
 include: "workflow/rules/common.smk"
+
+
+if DEPLOYED:
+
+    # With `--software-deployment-method apptainer` each job runs in it (Containerfile).
+    container: "imu-calibration.sif"
+
+
 include: "workflow/rules/gather.smk"
 
 
