@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.table_errors import Reference
     from pipeline.records import Recording, SensorCalibration, Values
 
-BY_CHANCE = 0.1  # of a variance, up to which a part of it may be chance: 0.00 to 0.05 without errors (docs/fleet.md)
+BY_CHANCE = 0.1  # of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not tell it: calibrate the unit again after switching it off"
