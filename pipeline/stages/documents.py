@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from pipeline.stages.batch import Job
 
 DOCUMENTS = ("calibration", "validate", "diagnose")  # stages whose documents are exported and shown
+MOVE = "record turns of 100 deg/s and more about all axes"
 LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
@@ -93,6 +94,8 @@ def _on_board(job: Job, unit: str, board: dict[str, Any]) -> dict[str, Any]:
             chips[other] = chip_document(_chip(job, reference), _chip(job, other))
         except PipelineError as error:
             chips[other] = {"refused": error.message}
+        except np.linalg.LinAlgError:
+            chips[other] = {"refused": f"the readings do not determine how {other} sits: {MOVE}"}
     return {"name": board["name"], "reference": reference, "chips": chips}
 
 
