@@ -71,7 +71,7 @@ def test_errors_of_the_table_cancel_between_chips_of_the_same_axes() -> None:
         rng = np.random.default_rng(3)
         pair = draw_chip(rng, np.eye(3), np.zeros(3)), draw_chip(rng, turn, PLACE)
         pair = pair[0], replace(pair[1], K=pair[0].K)
-        chips = table_board(rng, pair, dict.fromkeys("xyz", (60.0,)), orthogonality_deg=0.5)
+        chips = table_board(rng, pair, dict.fromkeys("xyz", (60.0,)), rate=20.0, orthogonality_deg=0.5)
         found = chip_document(*chips)
         source = "stated accuracies of the bench, accelerometers"
         line = next(b for b in found["uncertainty_budget"] if b["source"] == source)
