@@ -52,7 +52,7 @@ DRIVERS: dict[str, tuple[dict[float, float], dict[float, float], int, int]] = {
     ),
     "adxl345": (dict.fromkeys((2, 4, 8, 16), 3.9e-3 * G), {}, 13, 0),  # no-OS, adxl345.h: 0.0039 g
     "adxl355": ({2.048: 38.245e-6, 4.096: 76.490e-6, 8.192: 152.980e-6}, {}, 20, 0),  # m/s^2, no-OS, adxl355.h
-    "adis16448": ({18: G / 1200}, {1000: 0.04 / RAD}, 16, 16),  # Linux, adis16400.c
+    "adis16448": ({18: G / 1200}, {r: r / 25000 / RAD for r in (250, 500, 1000)}, 16, 16),  # PX4, ADIS16448.cpp
     "adis16470": ({40: G / 800}, {2000: 0.1 / RAD}, 16, 16),  # no-OS, adis1646x.c
     "stim300": (
         {r: G / 2**n for r, n in {2: 21, 5: 20, 10: 19, 30: 18, 80: 16}.items()},
