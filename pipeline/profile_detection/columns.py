@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     Triad = tuple[int, int, int]
 
 COUNTING = 0.98  # share of steps by exactly 1
+FEWEST_RISES = 4  # of a time for each fall; a noisy reading falls as often as it rises
 SCATTER = 0.2  # of intervals over their median: times of arrival, not of sampling
 TEMPERATURE_RANGE = (-60.0, 130.0)  # degC, of electronics and their tests
 
@@ -36,16 +37,16 @@ SENSOR_WORDS = {
     "gyroscope": {"g", "gy", "gyr", "gyro", "gyroscope", "w", "omega", "rotation", "rot", "angular"},
 }
 NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
-TIME_FIRST = {"t", "ts", "sec", "secs", "tow", "utc", "epoch", "elapsed", "date"}
+TIME_FIRST = {"t", "ts", "sec", "secs", "ms", "us", "ns", "tow", "utc", "epoch", "elapsed", "date"}
 TIME_WORDS = {
     "time", "timestamp", "stamp", "datetime", "millis", "micros", "seconds", "ticks", "zeit", "tiempo", "temps",
 }  # fmt: skip
-TABLE_WORDS = {"table", "turntable", "encoder", "enc"}
+TABLE_WORDS = {"table", "turntable", "encoder", "enc", "shaft"}
 TEMPERATURE_WORDS = {"temp", "temperature", "tmp"}
 OTHER_TEMPERATURES = {"baro", "barometer", "battery", "cpu"}
 TABLE_CHANNEL_WORDS = {
     "table_rate": {"rate", "speed", "velocity", "vel", "dps"},
-    "table_angle": {"angle", "position", "pos", "deg", "encoder", "enc"},
+    "table_angle": {"angle", "position", "pos", "deg", "cdeg", "encoder", "enc"},
 }
 SQUARED = (["s"], ["ms"], ["mps"])  # before a 2 that is a power, not an axis
 UNIT_ENDINGS = (
@@ -105,7 +106,8 @@ def stated_unit(name: str, channel: str) -> tuple[str | None, str]:
             candidate
             for candidate, spellings in UNIT_ENDINGS
             for s in spellings
-            if candidate in UNITS[channel] and (ending.endswith(f" {s}") or (ending == s and s in TIME_WORDS))
+            if candidate in UNITS[channel]
+            and (ending.endswith(f" {s}") or (ending == s and s in TIME_FIRST | TIME_WORDS))
         ]
         unit = found[0] if found else SPELLINGS.get(words[-1]) if len(words) > 1 else None
     return (unit, f"the name says {unit}") if unit in UNITS[channel] else (None, "")
@@ -137,6 +139,8 @@ def find_columns(layout: TextLayout) -> Columns:
         possible = channel != "temperature" or low < float(np.median(values)) < high or whole(values)
         if channel and channel not in found.others and possible:
             found.others[channel] = i
+        elif w == ["t"] and _is_temperature(values):
+            found.others.setdefault("temperature", i)
     texts = [n for i, n in enumerate(layout.names) if i not in layout.numbers]
     if texts:
         found.remarks.append(f"left out, as not all of it is numbers: {', '.join(texts)}")
@@ -192,7 +196,7 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
     of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
     named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
     unnamed = [] if found.layout.header else [i for i in rising if i not in counters]
-    candidates = [i for i in named if i in rising] or named or unnamed
+    candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
     steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
     if gap_free and steps.sum() > 0 and np.std(steps) > SCATTER * abs(float(np.median(steps))):
@@ -209,6 +213,18 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
             f"{found.layout.names[index]} does not increase at {back} rows: sessions one after the other (session: 1, "
             "2 .. reads one of them), or a counter that overflows"
         )
+
+
+def _advances(values: Values) -> bool:
+    """Return whether numbers rise far more often than they fall, as times of several sessions do."""
+    steps = np.diff(values)
+    return int(np.count_nonzero(steps > 0)) > FEWEST_RISES * int(np.count_nonzero(steps < 0))
+
+
+def _is_temperature(values: Values) -> bool:
+    """Return whether a column called T, which may be a time, holds degC."""
+    low, high = TEMPERATURE_RANGE
+    return not _advances(values) and low < float(np.median(values)) < high
 
 
 def _triad(words: dict[int, list[str]]) -> Triad | None:

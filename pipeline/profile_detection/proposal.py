@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.gravity_rotation import moves_of
+from pipeline.io.gravity_rotation import interval_of, moves_of
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
 from pipeline.profile_detection.columns import (
     TEMPERATURE_RANGE,
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
+CENTIDEGREES = "cdeg"  # in the name of a table's angle
 Entries = dict[str, dict[str, Any]]
 WIDTH = 116  # of comments in a proposed profile
 WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
@@ -174,7 +175,7 @@ def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
     time_s = _time(parts, proposal)
     force = _readings("accelerometer", parts)
     if force is not None:
-        interval = float(np.median(np.diff(time_s))) if time_s is not None else 1 / ASSUMED_HZ
+        interval = interval_of(time_s) if time_s is not None else 1 / ASSUMED_HZ
         guess = force_unit(force, interval)
         _add("accelerometer", parts, proposal, guess)
         proposal.remarks += other_range(guess, sensor)
@@ -289,6 +290,8 @@ def _by_table(columns: Columns, rate: Values, time_s: Values | None) -> Guess | 
     index = columns.others[channel]
     stated, _ = stated_unit(columns.layout.names[index], channel)
     multiplier, divisor = UNITS[channel][stated or {"table_rate": "deg/s", "table_angle": "deg"}[channel]]
+    if CENTIDEGREES in words_of(columns.layout.names[index]):
+        divisor *= 100
     values = columns.layout.numbers[index] * multiplier / divisor
     if channel == "table_angle":
         if time_s is None:
@@ -328,6 +331,9 @@ def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str)
         entries[channel] = {"column": layout.key(index), "unit": stated or usual, "optional": True}
         span = f"{values.min():.6g} to {values.max():.6g}"
         proposal.evidence[channel] = f"{why}: {span}" if stated else f"{span}, so {usual}"
+        if channel == "table_angle" and CENTIDEGREES in words_of(layout.names[index]):
+            entries[channel] |= {"unit": COUNTS, "counts_per_unit": 100.0}
+            proposal.evidence[channel] = f"the name says hundredths of a degree: {span}"
         if channel == "temperature" and not low < float(np.median(values)) < high:
             guess = temperature_counts(span, sensor)
             entries[channel] = {"column": layout.key(index), **guess.entry, "optional": True}

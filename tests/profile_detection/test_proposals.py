@@ -188,6 +188,43 @@ def test_counts_that_a_log_at_rest_does_not_tell_are_those_of_the_stated_sensor(
     assert config["ingest"]["csv"]["columns"]["gyro_z"]["counts_per_unit"] == 65.5
 
 
+@pytest.mark.parametrize("delimiter", [",", ";"])
+def test_a_temperature_called_t_beside_times_in_ms_is_no_time(tmp_path: Path, delimiter: str) -> None:
+    """A log of a turntable: counts, noisy degC in T, the shaft in hundredths of a degree, 4096 a g, 65.5 a deg/s."""
+    rng = np.random.default_rng(3)
+    time_s = np.arange(2000) * 0.01 + 920.0
+    angle = 15.0 * (1.0 - np.cos(time_s))
+    rate = 15.0 * np.sin(time_s)
+    force = np.column_stack([np.zeros(2000), np.sin(np.radians(angle)), np.cos(np.radians(angle))])
+    temperature = 32.5 + rng.normal(0.0, 0.03, 2000)
+    log = np.column_stack([
+        time_s * 1e3, np.rint(force * 4096 + rng.normal(0, 8, (2000, 3))),
+        np.rint(rate * 65.5), rng.integers(-3, 4, (2000, 2)), temperature, np.rint(angle * 100),
+    ])  # fmt: skip
+    file = tmp_path / "log.csv"
+    header = delimiter.join(["ms", "ax_lsb", "ay_lsb", "az_lsb", "gx_lsb", "gy_lsb", "gz_lsb", "T", "shaft_cdeg"])
+    np.savetxt(file, log, ["%.3f", *["%d"] * 6, "%.2f", "%d"], delimiter, header=header, comments="")
+    proposal = proposed(file)
+    assert proposal.complete, proposal.evidence
+    (columns,) = proposal.columns
+    assert proposal.csv["delimiter"] == delimiter
+    assert columns["time"] == {"column": "ms", "unit": "ms"}
+    assert columns["temperature"] == {"column": "T", "unit": "degC", "optional": True}
+    assert (columns["accel_x"]["counts_per_unit"], columns["gyro_z"]["counts_per_unit"]) == (4096.0, 65.5)
+    table = read_csv([file], csv_formats(proposal.ingest("mine", {})))
+    np.testing.assert_allclose(table.time_ns, time_s * 1e9, rtol=0, atol=1000)
+    np.testing.assert_allclose(table.values["table_angle"], angle, rtol=0, atol=0.006)
+    np.testing.assert_allclose(table.values["gyro_x"], rate, rtol=0, atol=0.008)
+
+
+def test_times_that_most_rows_share_with_the_row_before_are_proposed() -> None:
+    """Whole ms at 4 kHz: the median interval is zero."""
+    text = "t_ms,ax,ay,az\n" + "".join(f"{i // 4},0.01,0.02,0.99\n" for i in range(4000))
+    (proposal,) = propose([find_layout(text.encode(), "log.csv")])
+    assert proposal.columns[0]["time"] == {"column": "t_ms", "unit": "ms"}
+    assert proposal.columns[0]["accel_x"]["unit"] == "g"
+
+
 def test_a_log_without_known_names_gives_a_template() -> None:
     text = "t_us,p,q,r,s\n" + "".join(f"{10_000 * i},1,2,{i % 3},4\n" for i in range(100))
     (proposal,) = propose([find_layout(text.encode(), "log.csv")])
