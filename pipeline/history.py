@@ -221,8 +221,10 @@ def _changed_values(before: JSON, after: JSON) -> list[str]:
         for state in (before, after)
     )
     keys = [k for k in dict.fromkeys([*old, *new]) if old.get(k) != new.get(k)] if old and new else []
+    keys = [k for k in keys if not k.startswith("effects.")]
+    defined = [k for k in keys if k.startswith("user_effects.") and not (k in old and k in new)]  # named as effects
     arrow = "\N{RIGHTWARDS ARROW}"
-    return [f"{k}: {old.get(k, 'absent')} {arrow} {new.get(k, 'absent')}" for k in keys if not k.startswith("effects.")]
+    return [f"{k}: {old.get(k, 'absent')} {arrow} {new.get(k, 'absent')}" for k in keys if k not in defined]
 
 
 def dropped(entries: Sequence[JSON]) -> dict[tuple[str, int], list[str]]:
