@@ -184,7 +184,7 @@ def table_board(rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict
     ``plans``: turn axis to the rates of the gyroscope's recordings; the accelerometer's turn slowly.
     """
     settings, found = settings_of("acutronic"), []
-    settings["table"] |= table
+    settings["table"] = settings["table"] | table
     paths = [("accelerometer", a, table_path(a, [SLOW, -SLOW], rate, 360.0 / SLOW)) for a in "xyz"]
     paths += [("gyroscope", a, table_path(a, rates, rate)) for a, rates in plans.items()]
     for number, chip in enumerate(chips):
