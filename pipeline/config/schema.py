@@ -226,13 +226,14 @@ class Limits(Section):
 class Ingest(Section):
     """How files become recordings; ``pipeline.io`` documents the keys of ``csv``, ``mcap`` and ``checks``.
 
-    ``instance``: which sensor of a log that holds several; names in ``csv`` and ``mcap`` refer to it.
+    ``instance``: which sensor of a log that holds several; names in ``csv`` and ``mcap`` refer to it. A profile of text
+    logs needs no ``mcap``, one of logs of messages no ``csv``.
     """
 
     name: str
     instance: str | int | None = None
-    csv: dict[str, Any]
-    mcap: dict[str, Any]
+    csv: dict[str, Any] = {}
+    mcap: dict[str, Any] = {}
     checks: dict[str, Any] = {}
 
 

@@ -367,7 +367,7 @@ def as_yaml(proposal: Proposal, name: str) -> str:
     else:
         lines += ["  columns: # channel: the column's name (or index from 0) and its unit"]
         lines += _entries(proposal.columns[0], proposal.evidence, "    ")
-    return "\n".join([*lines, "", "mcap: {}"]) + "\n"
+    return "\n".join(lines) + "\n"
 
 
 def _fields(columns: Entries) -> Entries:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,19 @@ def test_composed_profile_is_sound(tmp_path: Path, name: str) -> None:
     check_ingest(config["ingest"], config["procedure"])
     assert config["ingest"]["name"] == name
     assert mcap_format(config["ingest"]).imu_topic is None
+
+
+@pytest.mark.parametrize(("section", "other"), [("csv", "mcap"), ("mcap", "csv")])
+def test_a_profile_without_the_other_section_is_read_with_its_defaults(
+    tmp_path: Path, section: str, other: str
+) -> None:
+    stated = profile("canonical_csv")["csv"] if section == "csv" else {"imu_topic": "/imu"}
+    file = tmp_path / "configs" / "ingest" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps({"name": "mine", section: stated}), encoding="utf-8")
+    ingest = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])["ingest"]
+    assert (ingest[section], ingest[other]) == (stated, {})
+    assert mcap_format(ingest).imu_topic == (None if section == "csv" else "/imu")
 
 
 def test_counts_of_the_arduino_profile_follow_the_sensor(tmp_path: Path) -> None:
