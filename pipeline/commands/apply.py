@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.field_logs.compensate import LogProfile, compensate_log, require_apart
+from pipeline.files import CONFIGS
 from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load
@@ -24,12 +25,14 @@ other cells stay as they are. Of an MCAP log, all messages stay byte for byte, a
 is added. Logs of other formats give CSV with the columns time_s, accel_x_g .. gyro_z_dps, temperature_degc.
 
 Columns, units, counts and axes of the log are those of the recordings with which the unit was calibrated, unless
---ingest names another profile. CSV and MCAP are read in a stream; logs of other formats are held in memory.
+--ingest names another profile, or its file. CSV and MCAP are read in a stream; logs of other formats are held in
+memory.
 
 examples:
   python -m pipeline apply --calibration results/demo/calibrations/U1.json drive.csv -o drive_calibrated.csv
   python -m pipeline apply --calibration U1.json drive.mcap -o drive_calibrated.mcap
   python -m pipeline apply --calibration U1.json counts.csv --ingest arduino_counts -o out.csv
+  python -m pipeline apply --calibration U1.json log.csv --ingest my_bench/configs/ingest/my_logger.yaml -o out.csv
 """
 
 
@@ -47,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
     ):
         message = "the output would overwrite the calibration; choose another file for -o"
         raise InputError(message, str(arguments.output))
-    profile = _profile(arguments.calibration, arguments.ingest)
+    profile = _profile(arguments.calibration, arguments.ingest, arguments.log)
     countdown = Countdown(arguments.log.stat().st_size if arguments.log.is_file() else 0)
     result = compensate_log(
         compensation, arguments.log, arguments.output, profile,
@@ -65,7 +68,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("apply", __doc__, EPILOG)
+    parser = parser_of("apply", __doc__, EPILOG, ("--ingest",))
     add = parser.add_argument
     add("log", type=Path, metavar="LOG", help=f"the log: .mcap, {', '.join(MESSAGE_FORMATS)}, or text")
     add(
@@ -77,8 +80,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     words = "file to write: MCAP for an MCAP log, else CSV; - for the standard output"
     add("-o", "--output", type=Path, required=True, metavar="OUT", help=words)
-    words = "how the log is read: a name in configs/ingest (default: as the recordings of the unit)"
-    add("--ingest", metavar="PROFILE", help=words)
     words = "MCAP: topic of the calibrated messages (default: that of the readings, with _calibrated at its end)"
     add("--topic", metavar="TOPIC", help=words)
     words = "time constant of the causal smoothing of the temperature, s; 0: none (default: %(default)g)"
@@ -88,20 +89,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _profile(calibration: Path, ingest: str | None) -> LogProfile:
-    """Return the layout of the log: that of the unit's recordings, or that of a named profile."""
+def _profile(calibration: Path, ingest: str | None, log: Path) -> LogProfile:
+    """Return the layout of the log: that of the unit's recordings, or that of a named profile or a profile's file."""
     document = read_calibration(calibration)
     profile = LogProfile.of_calibration(document, str(calibration))
     if ingest is None:
         return profile
-    from pipeline.config.compose import Composer  # noqa: PLC0415  (0.3 s that few logs need)
-    from pipeline.config.options import Problem  # noqa: PLC0415  (0.3 s that few logs need)
+    from pipeline.commands.readings import config_of_log  # noqa: PLC0415  (Hydra: 0.3 s that few logs need)
 
-    composer = Composer(Path())
     sensor = document.get("sensor")
-    layers = [f"sensor={sensor}"] if sensor in composer.options["sensor"] else []
-    try:
-        composed = composer.unit(str(document.get("unit")), [*layers, f"ingest={ingest}"])
-    except Problem as error:
-        raise ConfigurationError(str(error)) from None
-    return LogProfile(composed["ingest"], profile.axis_maps)
+    known = (CONFIGS / "sensor" / f"{sensor}.yaml").is_file()
+    config = config_of_log(log, ingest, sensor if known else None)
+    return LogProfile(config["ingest"], profile.axis_maps)

@@ -11,7 +11,7 @@ from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.compose import Composer
-from pipeline.config.options import Problem
+from pipeline.config.options import Problem, nearest
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
 from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES
@@ -109,7 +109,7 @@ def named(profile: str, file: Path, campaign: Path | None) -> str:
     Raises
     ------
     ConfigurationError
-        If files of that name hold different profiles.
+        If files of that name hold different profiles, or there is none.
     """
     known = [root / "ingest" / f"{profile}.yaml" for root in (CONFIGS, *([campaign / "configs"] if campaign else []))]
     if Path(profile).suffix in (".yaml", ".yml") or any(place.is_file() for place in known):
@@ -120,7 +120,10 @@ def named(profile: str, file: Path, campaign: Path | None) -> str:
     found = {f.resolve(): f.read_bytes() for place in places if (f := place / f"{profile}.yaml").is_file()}
     if len(set(found.values())) > 1:
         raise ConfigurationError(f"--ingest {profile} is one of {', '.join(map(str, found))}; name its path")
-    return str(next(iter(found), profile))
+    if not found:
+        valid = nearest(profile, {f.stem for place in known for f in place.parent.glob("*.yaml")})
+        raise ConfigurationError(f"--ingest {profile}: no such ingest{valid}; name a profile of your own by its file")
+    return str(next(iter(found)))
 
 
 def composed(profile: str, sensor: str | None, campaign: Path | None, more: Sequence[str] = ()) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from pipeline.field_logs.compensate import Block
 from pipeline.field_logs.log_checks import DECIMALS
 from pipeline.io.arrow import text_scalar, times_as_decimals, to_arrow, to_numpy
 from pipeline.io.channel_table import in_house_unit
-from pipeline.io.csv_layout import Layout, find_faults
+from pipeline.io.csv_layout import Layout, find_faults, other_separator
 from pipeline.io.ingest_settings import csv_formats, mcap_format
 from pipeline.io.text_log import TextLog
 from pipeline.io.units import (
@@ -132,11 +132,12 @@ class CsvLog:
             if present:
                 self.places[signal] = [i for c in present if (i := _index(c, names)) is not None]
         if not any(sensor in self.places for sensor in SENSORS):
-            told = "--ingest names the profile that describes this log"
+            told = "--ingest names the profile, or its file, that describes this log"
             if {CANONICAL[c] for c in (*ACCELEROMETER, *GYROSCOPE)} & set(names):
                 told = f"these are the columns that this command writes: the log is compensated already, else {told}"
             expected = ", ".join(str(self.columns[c].column) for s in SENSORS for c in TRIADS[s] if c in self.columns)
-            raise InputError(f"no column of a sensor; expected {expected}, got {', '.join(names)[:200]}; {told}", where)
+            got = f"{', '.join(names)[:200]}{other_separator(names)}"
+            raise InputError(f"no column of a sensor; expected {expected}, got {got}; {told}", where)
 
     def _new_names(self, names: list[str]) -> list[str]:
         new = list(names)

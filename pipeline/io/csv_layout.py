@@ -109,11 +109,13 @@ def _check_unit(column: Column, name: str, where: str) -> None:
 def _missing_message(missing: list[str], names: list[str]) -> str:
     near = {m: difflib.get_close_matches(m, names, 1) for m in missing}
     hints = [f"{m} (nearest: {n[0]})" if n else m for m, n in near.items()]
-    message = f"column {', '.join(hints)} missing; found {', '.join(names)[:300]}"
+    return f"column {', '.join(hints)} missing; found {', '.join(names)[:300]}{other_separator(names)}"
+
+
+def other_separator(names: list[str]) -> str:
+    """Return a hint at the separators in a header that was read as one name; empty for none."""
     separators = [repr(c) for c in ",;\t| " if c in names[0]] if len(names) == 1 else []
-    if separators:
-        message += f"; is the separator {' or '.join(separators)}? Set ingest.csv.delimiter"
-    return message
+    return f"; is the separator {' or '.join(separators)}? Set ingest.csv.delimiter" if separators else ""
 
 
 def _what_to_do(

@@ -326,6 +326,28 @@ def test_another_profile_is_named_on_the_command_line(calibration: Path, log: Pa
         main([*arguments, "--ingest", "phase_of_the_moon"])
 
 
+def test_a_log_with_another_separator_is_named_so_and_read_by_the_campaigns_own_profile(
+    calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_profile(calibration, counts_profile(delimiter="semicolon"))
+    counts = raw_counts()
+    rows = [f"{10 * i},{','.join(map(str, row))}" for i, row in enumerate(counts.tolist())]
+    (tmp_path / "log.csv").write_text("time_ms,ax,ay,az,gx,gy,gz\n" + "\n".join(rows) + "\n")
+    arguments = ["--calibration", str(calibration), str(tmp_path / "log.csv"), "-o", str(tmp_path / "out.csv")]
+    with pytest.raises(InputError, match="is the separator ','"):
+        main(arguments)
+    own = tmp_path / "bench" / "configs" / "ingest" / "logger.yaml"
+    own.parent.mkdir(parents=True)
+    own.write_text(json.dumps({"name": "logger", "csv": counts_profile(delimiter="comma")}), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for profile in ("logger", str(own)):
+        main([*arguments, "--ingest", profile])
+        after = columns(tmp_path / "out.csv")
+        found = np.array([after[name] for name in VALUES], float).T
+        np.testing.assert_allclose(found, expected_of_counts(calibration, counts), atol=1e-12, rtol=1e-13)
+        (tmp_path / "out.csv").unlink()
+
+
 @pytest.mark.parametrize("block_bytes", [97, 1 << 20])
 def test_a_log_of_other_dress_keeps_it(calibration: Path, tmp_path: Path, block_bytes: int) -> None:
     dress = {"delimiter": ";", "decimal": ",", "comment": "#", "skip_lines": 1}
