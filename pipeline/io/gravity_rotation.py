@@ -57,9 +57,8 @@ class Move:
         return float(np.degrees(np.arccos(np.clip(self.before @ self.after, -1.0, 1.0))))
 
 
-def interval_of(time_s: Values) -> float:
-    """Return the usual interval of times in s; their mean step forward where most are written twice."""
-    steps = np.diff(time_s)
+def interval_of(steps: Values) -> float:
+    """Return the usual interval of times by their steps; the mean step forward where most times are written twice."""
     middle = float(np.median(steps))
     return middle if middle > 0 else float(np.mean(np.maximum(steps, 0.0)))
 
@@ -90,7 +89,7 @@ def _keeps_its_direction(means: Values) -> bool:
 def moves_of(force: Values, rate: Values, time_s: Values) -> list[Move]:
     """Return the moves between rests in which gravity turned by more than 20 degrees; (n, 3) readings in any unit."""
     steps = np.diff(time_s, append=2 * time_s[-1] - time_s[-2])
-    rests = rests_of(force, interval_of(time_s))
+    rests = rests_of(force, interval_of(steps))
     found: list[Move] = []
     for (a, b), (c, d) in itertools.pairwise(rests):
         if len(found) == MOST_MOVES or time_s[c] - time_s[b - 1] > LONGEST_MOVE_S:

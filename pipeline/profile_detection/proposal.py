@@ -175,7 +175,7 @@ def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
     time_s = _time(parts, proposal)
     force = _readings("accelerometer", parts)
     if force is not None:
-        interval = interval_of(time_s) if time_s is not None else 1 / ASSUMED_HZ
+        interval = interval_of(np.diff(time_s)) if time_s is not None else 1 / ASSUMED_HZ
         guess = force_unit(force, interval)
         _add("accelerometer", parts, proposal, guess)
         proposal.remarks += other_range(guess, sensor)
