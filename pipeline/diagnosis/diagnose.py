@@ -201,7 +201,8 @@ def _doubts_of_gravity(accelerometer: Mapping[str, Any]) -> list[str]:
     if accelerometer["verdict"] in IN_DOUBT:
         return [f"{who} has the verdict {accelerometer['verdict']}"]
     missing = [name for name in accelerometer["selected"] if of_the_angle(name)]
-    return [f"{who} misses {' and '.join(missing)}: add it to effects.accelerometer"] if missing else []
+    fault = "an error of the table that shifts the mountings: add it to effects.accelerometer"
+    return [f"{who} misses {' and '.join(missing)}, {fault}"] if missing else []
 
 
 def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> dict[str, Any]:

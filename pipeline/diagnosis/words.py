@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.candidates import OTHER
+from pipeline.estimation.candidates import HELD, OTHER, TILT, is_held
 from pipeline.model.effects import catalogue
-from pipeline.model.effects.base import largest_by_unit, unit_of
+from pipeline.model.effects.base import Owner, largest_by_unit, unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -17,6 +17,7 @@ ANSWERS = "What is missing, with 95 % probability"
 IN_DOUBT = "The most probable of the sets that were tried, all of which the verdict doubts"
 MOST_ANSWERS = 4  # of an answer set in a sentence
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
+UNCHANGED = 0.005  # of an rms error: half a unit of its third digit, or less
 UNKNOWN = {
     "temperature": "repeat the sequence at two steady temperatures, and while it heats and cools",
     "time": "return to the first pose at the end, and repeat the sequence once the unit is warm",
@@ -116,8 +117,18 @@ def _selected(entry: Mapping[str, Any], sensor: str, most_values: int | None, *,
     if entry["look_alikes"]:
         alike = ", ".join(f"{plain(a['effect'])} ({100 * a['share']:.0f} %)" for a in entry["look_alikes"])
         lines.append(f"Its signal is similar to that of {alike}.")
+    if entry["effect"] == TILT and any(is_held(p) for p in entry["parameters"].values()):
+        lines.append(HELD)
     before, after = entry["held_out_error_before"], entry["held_out_error_after"]
-    if before is not None and after is not None:
+    owner = known.owner if known else Owner.SENSOR
+    of_bench = owner != Owner.SENSOR
+    if of_bench:
+        lines.append(f"It is a property of the {owner}, not of the sensor.")
+    if of_bench and before and after is not None and abs(after - before) < UNCHANGED * before:
+        lines[-1] = (
+            f"{lines[-1][:-1]}, and the rms error on held-out motion ({after:.3g} {unit_of(sensor)}) is the same."
+        )
+    elif before is not None and after is not None:
         given = ", with the functional form below fitted too" if with_form else ""
         lines.append(
             "It changes the rms error on held-out motion (of the vector, where its direction is logged) "
@@ -128,6 +139,8 @@ def _selected(entry: Mapping[str, Any], sensor: str, most_values: int | None, *,
 
 def _value(name: str, parameter: Mapping[str, Any]) -> str:
     unit = "" if parameter["unit"] == "1" else f" {parameter['unit']}"
+    if is_held(parameter):
+        return f"{name} = 0{unit} (held)"
     uncertainty = parameter["standard_uncertainty"]
     spread = f" +- {2 * uncertainty:.2g}" if uncertainty else ""
     return f"{name} = {parameter['value']:.4g}{spread}{unit}"
@@ -139,7 +152,9 @@ def _goodness(found: Mapping[str, Any] | None) -> list[str]:
         return []
     share, count = 100 * found["share_worse"], found["simulations"]
     line = f"Of {count} simulations from the fitted model, {share:.0f} % fit worse than the readings"
-    return [f"{line}." if share >= 1.0 else f"{line}: the model is not complete."]
+    if share < 1.0:
+        return [f"{line}: the model is not complete."]
+    return [f"{line}: no sign that an effect is missing; a complete model gives any share, half on average."]
 
 
 def _driven(entry: Mapping[str, Any]) -> str:
@@ -204,13 +219,16 @@ def _how_sure(part: Mapping[str, Any]) -> list[str]:
     if sets:
         said = [f"{_answer(each['effects'])} ({each['probability']:.2g})" for each in sets[:MOST_ANSWERS]]
         more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
-        head = IN_DOUBT if part["verdict"] in ("unexplained", "reference_in_doubt") else ANSWERS
-        lines.append(f"{head}: {listed([*said, *more], 'or')}.")
+        answers = listed([*said, *more], "or")
         if part["verdict"] == "nothing_missing" and sets[0]["effects"]:
             lines.append(
-                f"The verdict is that of the selection, whose thresholds {_answer(sets[0]['effects'])} does not pass: "
-                "probabilities and selection disagree, and only further recordings decide."
+                f"The selection decides the verdict, and {_answer(sets[0]['effects'])} does not pass its thresholds; "
+                f"the probabilities, which do not decide, are {answers}: probabilities and selection disagree, and "
+                "only further recordings decide."
             )
+        else:
+            head = IN_DOUBT if part["verdict"] in ("unexplained", "reference_in_doubt") else ANSWERS
+            lines.append(f"{head}: {answers}.")
     if part.get("to_distinguish"):
         lines.append(f"These recordings cannot distinguish them; this one would: {part['to_distinguish']}.")
     if part.get("upper_limit"):

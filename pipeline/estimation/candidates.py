@@ -37,7 +37,13 @@ if TYPE_CHECKING:
 OTHER = "other_"  # how the names of free curves begin
 DEGREE, CYCLES = 5, 8  # as in the tests that find a dependence (pipeline.diagnosis.residual_dependence)
 AUTO = "auto"  # in place of a list of effects: what the diagnosis selects
-MOUNTING, ZERO = "mounting", "encoder_zero"
+MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
+HELD_DEG = 1e-4  # standard deviation of a tilt that is held at 0: a hundredth of a good encoder's accuracy
+HELD = (
+    "The part of the tilt about the shaft is the same as a common zero of the turns: the recordings do not determine "
+    "it beside the mountings or zeros, table.levelling_deg does not state it, and it is held at 0."
+)
+ONE_SHAFT = 0.999  # cosine between shafts; mountings of 2 deg turn the level frame by as much
 SEAT_DEG = 5.0  # where mountings are fitted and the table's config states no size: the default tolerance of ingest
 SECOND_SHARE = 0.1  # of the likelier one's prior probability, by assumption
 SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
@@ -95,7 +101,7 @@ def starts_of(
             raise ConfigurationError(
                 f"effects.{sensor} names {name}, which is an effect of the {this.sensors[0]} alone"
             )
-        prior = None if isinstance(observed, str) else prior_of(this, observed, accelerometer)
+        prior = None if isinstance(observed, str) else prior_of(this, observed, accelerometer, names)
         starts = this.starts(sensor) if prior is None or this.nonlinear else [prior.mean]
         values = [fitted[name]] if name in fitted else starts
         values = [v for v in values if len(v) == len(this.parameters(sensor))] or this.starts(sensor)
@@ -108,14 +114,21 @@ def turns_of(observations: Observations) -> dict[str, str]:
     return {part.name: part.motion.setup for part in observations.parts if part.motion.axis is not None}
 
 
-def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibration | None) -> NormalPrior | None:
+def prior_of(
+    this: Effect, observed: Observations, accelerometer: SensorCalibration | None, beside: Sequence[str] = ()
+) -> NormalPrior | None:
     """Return what is known of an effect of the bench before the fit; None for other effects.
 
     Each parameter is ``N(0, s^2)``, s as the table's config states it. For the rotations of the unit, where the
-    accelerometer was fitted with them, its estimate: both sensors share the frame of the mean of the mountings.
+    accelerometer was fitted with them, its estimate: both sensors share the frame of the mean of the mountings. For the
+    tilt of the table beside mountings or zeros: see ``tilt_like_zeros``.
 
-    ``accelerometer``: for the gyroscope.
+    ``accelerometer``: for the gyroscope. ``beside``: the effects of the fit.
     """
+    if this.name == TILT:
+        along = tilt_like_zeros([part.motion for part in observed.parts], beside)
+        width = observed.levelling_deg or HELD_DEG
+        return None if along is None else NormalPrior(np.zeros(2), np.outer(along, along) / width**2)
     if this.name != MOUNTING:
         stated = observed.bench.get(this.name)
         return None if stated is None else NormalPrior(np.zeros(1), np.full((1, 1), stated**-2))
@@ -138,6 +151,29 @@ def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibrat
     covariance[np.ix_(here, here)] = accelerometer.covariance[np.ix_(first + there, first + there)]
     covariance += np.kron(np.full((len(mine),) * 2, np.diag(covariance)[here].mean()), np.eye(3))
     return NormalPrior(mean, np.asarray(np.linalg.inv(covariance), np.float64))
+
+
+def tilt_like_zeros(motions: Sequence[Motion], beside: Sequence[str]) -> Values | None:
+    """Return the direction, of (d_x, d_y), in which a tilt is the same as a rotation of the unit in every turn.
+
+    It is the direction of the shaft, where one level shaft makes all turns and each has a mounting or a zero of its
+    own: readings do not determine this part of the tilt, whose prior is the table's levelling, or which is held at 0.
+    None: readings determine both parts.
+    """
+    owner = next((effect(name) for name in (MOUNTING, ZERO) if name in beside), None)
+    if owner is None or any(m.axis is None or m.level is None for m in motions):
+        return None
+    turns = {(m.setup or m.recording if owner.name == MOUNTING else m.recording, m.axis) for m in motions}
+    shafts = np.array([m.level[0, :2, m.axis] for m in motions if m.level is not None])
+    if len(dict(turns)) < len(turns) or np.min(np.abs(shafts @ shafts[0])) < ONE_SHAFT:
+        return None
+    return np.asarray(shafts[0] / np.linalg.norm(shafts[0]), np.float64)
+
+
+def is_held(parameter: Mapping[str, Any]) -> bool:
+    """Return whether a tilt was held at 0, by its ``value, standard_uncertainty``."""
+    u = parameter.get("standard_uncertainty")
+    return u is not None and u < 10.0 * HELD_DEG and abs(parameter["value"]) < 0.01 * HELD_DEG
 
 
 def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.candidates import parameter_names, require_available, starts_of
+from pipeline.estimation.candidates import HELD, TILT, parameter_names, require_available, starts_of
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
 from pipeline.estimation.engine import AVERAGED_OUT, RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
@@ -269,7 +269,7 @@ def require_observable(observations: Observations, fit: Fit, scale: Values) -> N
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
     free = np.ones(len(names), bool)  # a prior determines the others
     for at, term in zip(design.slices, fit.terms, strict=True):
-        free[at] = term.prior is None
+        free[at] = term.prior is None or np.linalg.matrix_rank(term.prior.precision) < len(term.values)
     names = [name for name, own in zip(names, free, strict=True) if own]
     size = design.sizes()[:-1][free]
     products = design.products([WHITE])[0][0, :-1, :-1][np.ix_(free, free)]
@@ -375,7 +375,8 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
 
     lines = [noise_contribution(errors, whole, prior)]
     for name, prior_part in design.prior_covariances(fit.setting).items():
-        lines.append(bench_contribution(name, change @ prior_part @ change.T))
+        remark = HELD if name == TILT and not observations.levelling_deg else ""
+        lines.append(bench_contribution(name, change @ prior_part @ change.T, remark))
     return budgeted(found, reference, errors, lines, settings, results, names)
 
 

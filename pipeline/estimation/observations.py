@@ -76,6 +76,7 @@ class Observations:
     bench: Mapping[str, float] = field(default_factory=dict)
     mounting_in_doubt: bool = False  # whether one mounting does not explain all turns (note ``N-SEATS``)
     angle_deg: float = 0.0  # standard uncertainty of the angle at each stop; 0 where noise hides it
+    levelling_deg: float = 0.0  # standard uncertainty of the table's level; 0: not stated
     white: float = 0.0  # standard deviation of a sample's white noise, mean of the axes; 0: not known
 
     @cached_property
@@ -227,7 +228,8 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
     doubt = any(note.code == "N-SEATS" for recording in recordings for note in recording.notes)
     bench = stated_priors(table)
     angle = float(table.get("angle_accuracy_deg") or 0.0) if table.get("motion") == "logged" else 0.0
-    return Observations(sensor, tuple(parts), earth_of(table) is not None, bench, doubt, angle)
+    level = float(table.get("levelling_deg") or 0.0)
+    return Observations(sensor, tuple(parts), earth_of(table) is not None, bench, doubt, angle, level)
 
 
 def _in_time(part: Part) -> tuple[bool, str, float]:

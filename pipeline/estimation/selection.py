@@ -129,7 +129,7 @@ class _Search:
         combinations_ = starts_of(configured, observations, known, accelerometer)
         self.base = fit_best(observations, combinations_, self.start, self.settings)
         self.effects = candidates_for(observations, configured)
-        self.priors = {e.name: prior_of(e, observations, accelerometer) for e in self.effects}
+        self.priors = {e.name: prior_of(e, observations, accelerometer, configured) for e in self.effects}
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base

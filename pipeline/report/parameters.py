@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.estimation.candidates import TILT, is_held
 from pipeline.records import AXES
 from pipeline.report.numbers import measured, number, plain, unit_text
 
@@ -104,9 +105,15 @@ def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
             found.append((p, f"{axes[0]} reads of {axes[1]}", sheet.get("cross_axis")))
         else:
             found.append((p, f"Scale factor error {axes}", sheet.get("scale_factor")))
-    found += [(p, p.words, effects.get(p.name.partition(".")[0])) for p in fitted[12:]]
+    found += [(p, _of_effect(p), effects.get(p.name.partition(".")[0])) for p in fitted[12:]]
     bounds = (limit if isinstance(limit, int | float) and limit > 0 else None for *_, limit in found)
     return [{"p": p, "name": name, "limit": bound} for (p, name, _), bound in zip(found, bounds, strict=True)]
+
+
+def _of_effect(p: Parameter) -> str:
+    """Return the name of an effect's parameter, and whether it was held."""
+    held = p.name.startswith(TILT) and is_held({"value": p.value, "standard_uncertainty": p.standard_uncertainty})
+    return f"{p.words} (not determined, held at 0)" if held else p.words
 
 
 def stage_details(stage: JSON) -> list[str]:

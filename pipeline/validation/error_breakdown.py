@@ -139,7 +139,12 @@ def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples
 
 
 def _elsewhere(fitted: FittedEffect, samples: Samples) -> bool:
-    """Return whether an effect is that of another session than the held-out recording's, in which it is zero."""
+    """Return whether the recording is without an effect: of another session, or a tilt where the magnitude is compared.
+
+    A tilt turns the specific force: its magnitude stays the same.
+    """
+    if samples.motion is None and fitted.name.partition(SEPARATOR)[0] == "table_tilt":
+        return True
     return SEPARATOR in fitted.name and fitted.name.partition(SEPARATOR)[2] != samples.setup
 
 

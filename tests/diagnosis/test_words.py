@@ -44,6 +44,33 @@ def test_the_fit_without_the_effects_is_named() -> None:
 def test_probabilities_against_the_verdict_are_said(answer: list[str], *, disagree: bool) -> None:
     said = " ".join(in_words(part("nothing_missing", [], [(answer, 0.91)]), "gyroscope"))
     assert ("probabilities and selection disagree" in said) is disagree
+    assert ("What is missing" in said) is not disagree
+
+
+def test_an_effect_of_the_bench_is_no_fault_of_the_sensor() -> None:
+    found = part("missing_effect", ["lever_arm"], [])
+    assert "It is a property of the mounting, not of the sensor." in in_words(found, "accelerometer")
+    found["ranking"][0] |= {"held_out_error_before": 2.863e-3, "held_out_error_after": 2.859e-3}
+    said = " ".join(in_words(found, "accelerometer"))
+    assert "not of the sensor, and the rms error on held-out motion (0.00286 g) is the same." in said
+    assert "It changes the rms error" not in said
+    found["ranking"][0]["held_out_error_after"] = 2e-3
+    assert "from 0.002863 to 0.002 g" in " ".join(in_words(found, "accelerometer"))
+
+
+@pytest.mark.parametrize(("share", "says"), [(0.98, "no sign that an effect is missing"), (0.0, "is not complete")])
+def test_the_share_of_simulations_says_what_is_expected(share: float, says: str) -> None:
+    found = part("nothing_missing", [], []) | {"goodness_of_fit": {"share_worse": share, "simulations": 199}}
+    assert says in " ".join(in_words(found, "gyroscope"))
+
+
+def test_a_tilt_that_is_held_is_no_estimate() -> None:
+    found = part("missing_effect", ["table_tilt"], [])
+    u = {"unit": "deg", "standard_uncertainty": 1e-4}
+    found["ranking"][0]["parameters"] = {"d_x": {**u, "value": 1e-9}, "d_y": {**u, "value": 0.02}}
+    said = " ".join(in_words(found, "accelerometer"))
+    assert "d_x = 0 deg (held), d_y = 0.02 +- 0.0002 deg" in said
+    assert "the same as a common zero of the turns" in said
 
 
 def test_an_effect_that_contains_another_needs_no_distinction() -> None:

@@ -101,6 +101,32 @@ def test_a_mounting_is_as_uncertain_for_the_gyroscope_as_gravity_leaves_it() -> 
     assert of_matrix.min() > 0.5 * np.radians(of_turns[across].min())
 
 
+@pytest.mark.parametrize(("azimuth_of", "held"), [("turn_axis", True), ("level_x", False)])
+def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(azimuth_of: str, *, held: bool) -> None:
+    recordings, seats = seated_anew(0, 1.0)
+    whole = settings()
+    whole["table"]["azimuth_of"] = azimuth_of
+    plain = fit("accelerometer", recordings, None, whole)
+    whole["effects"]["accelerometer"] = ["table_tilt"]
+    tilted = fit("accelerometer", recordings, None, whole)
+    assert plain.covariance is not None
+    assert tilted.covariance is not None
+    u, wider = (np.sqrt(np.diag(found.covariance)) for found in (plain, tilted))
+    d = tilted.effects[-1].values
+    if held:
+        assert wider[3:12].max() < 1.1 * u[3:12].max()  # 100 times with that part of the tilt free
+        assert np.abs(errors_over_u(tilted, seats)).max() < 4.0
+        assert abs(d[0]) < 1e-6
+        assert abs(d[1]) < 4.0 * wider[-1]  # the part across the shaft is estimated; the truth is 0
+        whole["table"]["levelling_deg"] = 0.1
+        stated = fit("accelerometer", recordings, None, whole)
+        assert stated.covariance is not None
+        assert np.sqrt(stated.covariance[-2, -2]) == pytest.approx(0.1, rel=0.01)
+    else:
+        assert np.abs(d / wider[-2:]).max() < 4.0
+        assert wider[-2:].min() > 1e-3  # by the readings, not by a prior
+
+
 def test_without_mountings_the_same_turns_leave_a_wrong_matrix() -> None:
     recordings, seats = seated_anew(0, 1.0)
     plain = settings()

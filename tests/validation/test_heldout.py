@@ -232,7 +232,7 @@ def test_an_effect_of_another_session_leaves_the_expected_error_as_it_is() -> No
     plain = calibration("gyroscope")
     recording = replace(read(held_out(300), gyroscope=plain), table_attitude=None, setup="B")
     without = validate(plain, [recording], noise_of("gyroscope"), SETTINGS)
-    for name in ("mounting", "table_tilt"):
+    for name in ("mounting", "table_axis_nonorthogonality"):
         parts = {
             session: validate(
                 calibration("gyroscope", fitted(f"{name}@{session}", "gyroscope", 0.5)),
@@ -247,6 +247,19 @@ def test_an_effect_of_another_session_leaves_the_expected_error_as_it_is() -> No
         assert parts["A"]["steps"][-1]["rms_error"] == without["steps"][-1]["rms_error"]
         assert parts["B"]["expected_rms_error"] is None
         assert f"because {name}@B is left out" in parts["B"]["notes"][1]
+
+
+def test_a_tilt_of_the_table_leaves_the_magnitude_and_its_expected_error_as_they_are() -> None:
+    plain = calibration("accelerometer")
+    recording = replace(read(held_out(300), accelerometer=plain), table_attitude=None)
+    noise = noise_of("accelerometer")
+    without = validate(plain, [recording], noise, SETTINGS)
+    tilted = validate(
+        calibration("accelerometer", fitted("table_tilt", "accelerometer", 0.5)), [recording], noise, SETTINGS
+    )
+    assert tilted["notes"] == without["notes"]
+    np.testing.assert_allclose(tilted["expected_rms_error"], without["expected_rms_error"], rtol=0.02)
+    assert tilted["steps"][-1]["rms_error"] == without["steps"][-1]["rms_error"]
 
 
 @pytest.mark.parametrize(("name", "size"), [("time_offset", 0.03), ("low_pass_lag", 0.03), ("clock_rate", 300.0)])
