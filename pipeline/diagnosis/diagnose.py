@@ -10,14 +10,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.findings import Case, document_of
 from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
 from pipeline.errors import ConvergenceError, NotObservableError
-from pipeline.estimation.candidates import MOUNTING, OTHER, configured_effects
+from pipeline.estimation.candidates import AUTO, MOUNTING, OTHER, TILT, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.model.effects import catalogue, effect
+from pipeline.records import coverage_factor
 from pipeline.validation.heldout import last_error
 
 if TYPE_CHECKING:
@@ -92,7 +95,7 @@ def diagnose(
         if moves and "largest_expected_rms_deg" in moves:
             evidence = replace(evidence, moves=(moves["rms_deg"]["after"], moves["largest_expected_rms_deg"]))
         if by_gravity and gravity:
-            evidence = replace(evidence, doubts=[*evidence.doubts, *_doubts_of_gravity(gravity)])
+            evidence = replace(evidence, doubts=[*evidence.doubts, *_doubts_of_gravity(gravity, case)])
         verdict = judged(document, evidence)
         return verdict, full or may_be_unknown(verdict["verdict"], evidence)
 
@@ -195,14 +198,34 @@ def _seats_explained(document: Mapping[str, Any], sensor: str, found: Findings |
     return sensor == "accelerometer" and left is not None and left <= EXPLAINED
 
 
-def _doubts_of_gravity(accelerometer: Mapping[str, Any]) -> list[str]:
-    """Return why the mountings that an accelerometer determines may be wrong."""
+def _doubts_of_gravity(accelerometer: Mapping[str, Any], case: Case) -> list[str]:
+    """Return why the mountings that an accelerometer determines may be wrong.
+
+    A tilt that the accelerometer misses is no doubt where fitting it shifts no mounting by more than its uncertainty.
+    """
     who = "the accelerometer, which determines the mountings,"
     if accelerometer["verdict"] in IN_DOUBT:
         return [f"{who} has the verdict {accelerometer['verdict']}"]
     missing = [name for name in accelerometer["selected"] if of_the_angle(name)]
+    if missing == [TILT] and _tilt_is_within_uncertainty(case):
+        return []
     fault = "an error of the table that shifts the mountings: add it to effects.accelerometer"
     return [f"{who} misses {' and '.join(missing)}, {fault}"] if missing else []
+
+
+def _tilt_is_within_uncertainty(case: Case) -> bool:
+    """Return whether the mountings by gravity with a tilt of the table are those without it, within their U."""
+    effects, known = case.settings["effects"], case.accelerometer
+    listed = effects["accelerometer"]
+    with_tilt = [*([] if listed == AUTO else listed), TILT]
+    settings = {**case.settings, "effects": {**effects, "accelerometer": with_tilt}}
+    other = mountings_by_gravity(case.recordings, settings)
+    if known is None or other is None or known.covariance is None:
+        return False
+    before, after = ({e.name: e.values for e in found.effects}[MOUNTING] for found in (known, other))
+    first = known.parameter_names().index(next(n for n in known.parameter_names() if n.startswith(f"{MOUNTING}.")))
+    u = np.sqrt(np.diag(known.covariance)[first : first + len(before)])
+    return bool(np.all(np.abs(after - before) < coverage_factor(known.effective_freedom()[first]) * u))
 
 
 def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> dict[str, Any]:

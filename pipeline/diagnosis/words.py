@@ -154,7 +154,7 @@ def _goodness(found: Mapping[str, Any] | None) -> list[str]:
     line = f"Of {count} simulations from the fitted model, {share:.0f} % fit worse than the readings"
     if share < 1.0:
         return [f"{line}: the model is not complete."]
-    return [f"{line}: no sign that an effect is missing; a complete model gives any share, half on average."]
+    return [f"{line}: a complete model gives any share, half on average; below 1 % shows that it is not complete."]
 
 
 def _driven(entry: Mapping[str, Any]) -> str:

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "study"))
-from bench_units import judged
+from bench_units import drawn, judged
+
+from pipeline.diagnosis.diagnose import _doubts_of_gravity
+from pipeline.diagnosis.findings import Case
+from pipeline.estimation.effects import mountings_by_gravity
+from pipeline.preprocessing.checks import check_recordings
+from pipeline.records import SensorCalibration
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import read_config
+from pipeline.study.run import settings_of
 
 
 def test_an_effect_of_the_accelerometer_is_not_taken_for_mountings() -> None:
@@ -25,3 +36,18 @@ def test_mountings_are_in_doubt_where_the_accelerometer_shows_an_error_of_the_ta
     gyroscope = found["sensors"]["gyroscope"]
     assert gyroscope["verdict"] == "reference_in_doubt"
     assert "the accelerometer, which determines the mountings, misses" in gyroscope["reason"]
+
+
+@pytest.mark.parametrize(("tilt_deg", "doubted"), [(0.01, False), (0.6, True)])
+def test_a_tilt_that_shifts_no_mounting_is_no_doubt_about_the_gyroscope(tilt_deg: float, *, doubted: bool) -> None:
+    description, _ = drawn("seats", 62, 0, 0.0)
+    description = replace(description, effects={"accelerometer.table_tilt": [0.0, tilt_deg]})
+    recordings, _ = simulate_unit(description, 62, 0)
+    recordings = [replace(r, table_attitude=None) for r in recordings]
+    settings = settings_of(description.sensor, "reference_least_squares")
+    settings = {**settings, "table": {"name": description.table, **read_config("table", description.table)}}
+    recordings = check_recordings(recordings, settings)
+    by_gravity = mountings_by_gravity(recordings, settings)
+    case = Case(SensorCalibration("gyroscope"), recordings, None, settings, by_gravity, ["mounting"])
+    found = _doubts_of_gravity({"verdict": "missing_effect", "selected": ["table_tilt"]}, case)
+    assert bool(found) is doubted
