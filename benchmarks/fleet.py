@@ -118,10 +118,12 @@ def _run(folder: str, cores: int) -> tuple[float, list[float], list[float]]:
         spent[name] += float(used_s)
         jobs[name] += 1
         largest = max(largest, float(kilobytes) / 1024)
-    units = len(list(Path(folder, "results/fleet/reports").glob("*.html")))
+    results = Path(folder, "results/fleet")  # beyond publish_limit, pages are in packs
+    units = len((results / "summary.csv").read_text(encoding="utf-8").splitlines()) - 1
+    files = sum(file.is_file() for file in results.rglob("*"))
     for name, seconds in spent.items():
         print(f"{name:12s} {jobs[name]:4d} processes {1000 * seconds / units:7.1f} ms a unit")
-    print(f"all stages, {units} pages: {1000 * used / units:.0f} ms CPU a unit, {used:.0f} s in all")
+    print(f"all stages, {units} units, {files} files: {1000 * used / units:.0f} ms CPU a unit, {used:.0f} s in all")
     print(f"{wall:.0f} s on {cores} cores; {largest:.0f} MB in the largest process")
     return used, floors, speeds
 
