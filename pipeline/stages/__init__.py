@@ -1,15 +1,17 @@
 """The stages of a run: a function each, which reads the files of a unit, calls the library, and returns files."""
 
-MODULES = {  # stage: the module of its function ``<stage>_unit`` or ``<stage>_batch``, in the order of a run
+# Stage: the module of its function ``<stage>_unit`` or ``<stage>_batch``, in the order of a run. A change of the code
+# that a module imports repeats its stages, so that a change of pages does not repeat calibrations.
+MODULES = {
     "collect": "ingest",
     "ingest": "ingest",
-    "filter": "ingest",
+    "filter": "filter",
     "fit": "fit",
-    "validate": "evaluate",
-    "diagnose": "evaluate",
-    "calibration": "documents",
-    "export": "documents",
-    "report": "documents",
+    "validate": "validate",
+    "diagnose": "diagnose",
+    "calibration": "calibration",
+    "export": "export",
+    "report": "report",
     "gather": "gather",
     "verdict": "batch",
 }

@@ -1,8 +1,4 @@
-"""Stages collect, ingest and filter: a unit's files become one Parquet file with its recordings, and their noise.
-
-The noise is estimated once, of the filtered readings, for all stages after it (``<unit>.noise.json``). Without a filter
-the readings are those of ingest (``unit_files.recordings_of``).
-"""
+"""Stages collect and ingest: a unit's files become one Parquet file with its recordings."""
 
 from __future__ import annotations
 
@@ -18,10 +14,8 @@ from pipeline.io.parquet import to_parquet
 from pipeline.io.read import read_recordings
 from pipeline.pack import FAILED, as_bytes, new_pack
 from pipeline.preprocessing.checks import check_recordings
-from pipeline.signal.filters import apply_filter
 from pipeline.signal.segments import cut, held_out_windows
 from pipeline.stages.batch import failure_of
-from pipeline.stages.unit_files import noise_file, recordings_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -114,12 +108,3 @@ def _ingested(directory: Path, folder: Path, settings: dict[str, Any]) -> list[R
         file = str(path.relative_to(directory)) if path.is_relative_to(directory) else str(path)
         named.append(replace(recording, source=recording.source | {"file": file}))
     return named
-
-
-def filter_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Filter the readings of a unit as configured, and estimate their noise."""
-    recordings, files = recordings_of(job.inputs, unit), {}
-    if settings["filter"]["name"] != "none":
-        recordings = [apply_filter(r, settings["filter"]) for r in recordings]
-        files = {f"{unit}.parquet": to_parquet(recordings)}
-    return files | noise_file(unit, recordings, settings)

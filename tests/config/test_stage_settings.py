@@ -8,6 +8,8 @@ from whole_run import settings_names
 
 from pipeline.config import load_campaign, stage_settings
 from pipeline.model.effects import built_in
+from pipeline.report import unit_page
+from pipeline.stages import MODULES
 
 SHEET = """unit,method,overrides
 A1,,
@@ -94,7 +96,13 @@ def test_a_change_of_sheet_or_device_concerns_the_batch_of_the_unit(tmp_path: Pa
     assert batches() == {"0002", "0003", "0004"}
 
 
-@pytest.mark.parametrize("stage", ["evaluate", "documents"])
+@pytest.mark.parametrize("stage", ["validate", "diagnose", "calibration", "export", "report"])
 def test_the_digest_of_a_stage_contains_the_files_of_the_built_in_effects(stage: str) -> None:
     read = {file.name for file in stage_settings._closure(f"pipeline.stages.{stage}")}
     assert {f"{name}.yaml" for name in built_in()} <= read
+
+
+def test_a_change_of_a_page_repeats_no_stage_before_the_pages() -> None:
+    page = Path(unit_page.__file__)
+    of = {stage: stage_settings._closure(f"pipeline.stages.{module}") for stage, module in MODULES.items()}
+    assert {stage for stage, files in of.items() if page in files} == {"report"}

@@ -11,7 +11,7 @@ import yaml
 
 from pipeline.model.calibration_file import implausible, sentences
 from pipeline.records import FittedEffect, SensorCalibration
-from pipeline.stages.documents import judged
+from pipeline.stages.calibration import judged
 
 CONFIGS = Path(__file__).parents[2] / "configs/sensor"
 

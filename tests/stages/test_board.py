@@ -11,7 +11,7 @@ from stage_files import write_pack
 from pipeline.io.parquet import to_parquet
 from pipeline.pack import FAILED, Pack
 from pipeline.stages.batch import Job
-from pipeline.stages.documents import _on_board
+from pipeline.stages.calibration import _on_board
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,7 +15,7 @@ rule calibration:
         mem_mb=1000,
         runtime=10,
     params:
-        code=code_digest("pipeline.stages.documents"),
+        code=code_digest("pipeline.stages.calibration"),
     shell:
         "{RUN} calibration --config {input.settings:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --output {output:q} > {log:q} 2>&1"

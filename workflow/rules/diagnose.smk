@@ -16,7 +16,7 @@ rule diagnose:
         mem_mb=1000,
         runtime=10,
     params:
-        code=code_digest("pipeline.stages.evaluate"),
+        code=code_digest("pipeline.stages.diagnose"),
     shell:
         "{RUN} diagnose --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --output {output:q} > {log:q} 2>&1"

@@ -15,7 +15,7 @@ rule validate:
         mem_mb=1000,
         runtime=10,
     params:
-        code=code_digest("pipeline.stages.evaluate"),
+        code=code_digest("pipeline.stages.validate"),
     shell:
         "{RUN} validate --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"

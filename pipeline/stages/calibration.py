@@ -1,13 +1,12 @@
-"""Stages calibration, export and report: the published documents of a unit.
+"""Stage calibration: the published calibration of a unit.
 
-A fit that makes held-out motion significantly worse than the raw readings is null in the calibration, with the reason.
-A unit without any calibrated sensor has failed; it has a page and a calibration document with the cause.
+A fit that makes held-out motion significantly worse than the raw readings is null in it, with the reason. A unit
+without any calibrated sensor has failed.
 """
 
 from __future__ import annotations
 
 import platform
-import traceback
 from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -15,22 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline import __version__
-from pipeline.diagnosis.words import in_words
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.estimation.chip_document import chip_document
 from pipeline.estimation.chip_rows import Chip
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.estimation.rest_means import rests_by_use
-from pipeline.exports import exports
 from pipeline.io.channel_table import axis_maps
 from pipeline.model.calibration_file import implausible
 from pipeline.pack import FAILED
 from pipeline.records import SENSORS, SensorCalibration
-from pipeline.report.certificate import certificate, certificate_page
-from pipeline.report.dcc import digital_certificate
-from pipeline.report.pages import failure_page
-from pipeline.report.recording_section import sensor_temperature
-from pipeline.report.unit_page import render
 from pipeline.stages.unit_files import recordings_of
 
 if TYPE_CHECKING:
@@ -40,7 +31,6 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
     from pipeline.stages.batch import Job
 
-DOCUMENTS = ("calibration", "validate", "diagnose")  # stages whose documents are exported and shown
 MOVE = "record turns of 100 deg/s and more about all axes"
 LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
@@ -166,43 +156,3 @@ def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
         }
         for r in recordings
     ]
-
-
-def export_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Write the calibration in the formats of other tools."""
-    calibration, validation, diagnosis = (job.inputs[stage].json(f"{unit}.json") for stage in DOCUMENTS)
-    written = exports(calibration, settings, validation, diagnosis)
-    return {f"{unit}/{file}": text for file, text in written.items()}
-
-
-def report_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Write the page and the calibration report (certificate) of a unit."""
-    calibration, validation, diagnosis = (job.inputs[s].json(f"{unit}.json") for s in DOCUMENTS)
-    recordings = recordings_of(job.inputs, unit)
-    words = {sensor: in_words(diagnosis[sensor], sensor, most_values=3) for sensor in SENSORS}
-    page = render(calibration, validation, diagnosis, recordings, settings, words=words)
-    report = certificate(calibration, validation, settings, sensor_temperature(recordings))
-    kinds = {"json": report, "html": certificate_page(unit, report), "xml": digital_certificate(unit, report)}
-    return {f"{unit}.html": page} | {f"certificates/{unit}.{kind}": made for kind, made in kinds.items() if made}
-
-
-def report_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:
-    """Return the page and the calibration document of a unit that failed."""
-    document = header(unit, settings) | {"status": "failed", "error": failure, "inputs": []}
-    document |= {"accelerometer": None, "gyroscope": None, "not_calibrated": {}}
-    try:
-        page = _page_of_failed(job, document, settings)
-    except Exception:  # noqa: BLE001  (every unit has a page, whatever fails)
-        traceback.print_exc()
-        page = failure_page(unit, failure)
-    return {f"{unit}.calibration.json": document, f"{unit}.html": page}
-
-
-def _page_of_failed(job: Job, document: dict[str, Any], settings: dict[str, Any]) -> str:
-    """Add what was ingested before the failure to a unit's document, and return its page."""
-    unit = document["unit"]
-    recordings = recordings_of(job.inputs, unit) if f"{unit}.noise.json" in job.inputs["filter"] else []
-    if recordings:
-        document["inputs"] = inputs(recordings)
-        document["rests"] = rests_by_use(recordings, settings)
-    return render(document, None, None, recordings, settings)

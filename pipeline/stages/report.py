@@ -1,0 +1,56 @@
+"""Stage report: the page of each unit, those that failed included, and the calibration report of the others."""
+
+from __future__ import annotations
+
+import traceback
+from typing import TYPE_CHECKING, Any
+
+from pipeline.diagnosis.words import in_words
+from pipeline.estimation.rest_means import rests_by_use
+from pipeline.records import SENSORS
+from pipeline.report.certificate import certificate, certificate_page
+from pipeline.report.dcc import digital_certificate
+from pipeline.report.pages import failure_page
+from pipeline.report.recording_section import sensor_temperature
+from pipeline.report.unit_page import render
+from pipeline.stages.calibration import header, inputs
+from pipeline.stages.unit_files import recordings_of
+
+if TYPE_CHECKING:
+    from pipeline.pack import Files
+    from pipeline.stages.batch import Job
+
+DOCUMENTS = ("calibration", "validate", "diagnose")  # stages whose documents are shown
+
+
+def report_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
+    """Write the page and the calibration report (certificate) of a unit."""
+    calibration, validation, diagnosis = (job.inputs[s].json(f"{unit}.json") for s in DOCUMENTS)
+    recordings = recordings_of(job.inputs, unit)
+    words = {sensor: in_words(diagnosis[sensor], sensor, most_values=3) for sensor in SENSORS}
+    page = render(calibration, validation, diagnosis, recordings, settings, words=words)
+    report = certificate(calibration, validation, settings, sensor_temperature(recordings))
+    kinds = {"json": report, "html": certificate_page(unit, report), "xml": digital_certificate(unit, report)}
+    return {f"{unit}.html": page} | {f"certificates/{unit}.{kind}": made for kind, made in kinds.items() if made}
+
+
+def report_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:
+    """Return the page and the calibration document of a unit that failed."""
+    document = header(unit, settings) | {"status": "failed", "error": failure, "inputs": []}
+    document |= {"accelerometer": None, "gyroscope": None, "not_calibrated": {}}
+    try:
+        page = _page_of_failed(job, document, settings)
+    except Exception:  # noqa: BLE001  (every unit has a page, whatever fails)
+        traceback.print_exc()
+        page = failure_page(unit, failure)
+    return {f"{unit}.calibration.json": document, f"{unit}.html": page}
+
+
+def _page_of_failed(job: Job, document: dict[str, Any], settings: dict[str, Any]) -> str:
+    """Add what was ingested before the failure to a unit's document, and return its page."""
+    unit = document["unit"]
+    recordings = recordings_of(job.inputs, unit) if f"{unit}.noise.json" in job.inputs["filter"] else []
+    if recordings:
+        document["inputs"] = inputs(recordings)
+        document["rests"] = rests_by_use(recordings, settings)
+    return render(document, None, None, recordings, settings)
