@@ -128,11 +128,11 @@ def record(
     results: Path,
     units: Mapping[str, JSON],
     settings: Mapping[str, Any],
-    sections: Mapping[str, Mapping[str, str]] | None = None,
+    sections: Mapping[str, Any] | None = None,
 ) -> list[JSON]:
     """Append the states of the units (name to state) that differ from the last ones; return all entries.
 
-    ``results`` are those of the campaign, ``settings`` those of the run, ``sections`` the values behind each digest.
+    ``results`` are those of the campaign, ``settings`` those of the run, ``sections`` of the configurations by digest.
     Raises ``InputError`` as ``read_history``.
     """
     entries = read_history(results)
@@ -145,7 +145,7 @@ def record(
         now = datetime.now(UTC).isoformat(timespec="seconds")
         told = {key for entry in entries for key in entry.get("sections") or {}}
         used = {key for state in changed.values() for key in (state.get("config") or {}).values()} - told
-        new = {key: dict(values) for key, values in (sections or {}).items() if key in used}
+        new = {key: flat(section) for key, section in (sections or {}).items() if key in used}
         entry = {
             "run": number,
             "time": now,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.config.schema import OF_BENCH
 from pipeline.config.user_effects import effects_for
 from pipeline.files import CONFIGS
-from pipeline.history import digest, flat
+from pipeline.history import digest
 from pipeline.io.files import recording_files
 
 if TYPE_CHECKING:
@@ -242,10 +242,10 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
     }
 
 
-def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, str]]]:
-    """Return the digest of each section of each unit's configuration, and the values behind each digest."""
+def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, Any]]:
+    """Return the digest of each section of each unit's configuration, and the section behind each digest."""
     known: dict[int, str] = {}  # units share the sections that no override of theirs changes
-    values: dict[str, dict[str, str]] = {}
+    values: dict[str, Any] = {}
     found: dict[str, dict[str, str]] = {}
     for name, unit in campaign.units.items():
         found[name] = {}
@@ -255,7 +255,7 @@ def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, 
             own = {k: v for k, v in content.items() if k != "folder"} if section == "procedure" else content
             if section == "procedure" or id(content) not in known:
                 known[id(content)] = digest(own)
-                values.setdefault(known[id(content)], flat(own))
+                values.setdefault(known[id(content)], own)
             found[name][section] = known[id(content)]
     return found, values
 
