@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.commands import parser_of
-from pipeline.commands.readings import Reading, absolute, campaign_of, config_of_log, grouped
+from pipeline.commands.readings import Reading, campaign_of, config_of_log, grouped, recordings_of_files
 from pipeline.commands.trial import try_unit
 from pipeline.config.campaign import find_campaign, load_campaign
 from pipeline.config.options import nearest
 from pipeline.errors import ConfigurationError, IngestError, PipelineError
 from pipeline.files import write_atomically
-from pipeline.io.files import SUFFIXES, candidate_files, recording_files
+from pipeline.io.files import SUFFIXES, recording_files
 from pipeline.model.data_sheet import settings_of_ranges
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.proposal import as_yaml, propose
@@ -132,32 +132,10 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Told]]]:
             raise ConfigurationError(
                 f"no unit {known[0]!r}{nearest(known[0], campaign.units)}", str(directory / "units.csv")
             )
-        chosen, others = _recordings_of(files, campaign, known) if files else ({unit: [] for unit in known}, [])
+        chosen, others = recordings_of_files(files, campaign, known) if files else ({unit: [] for unit in known}, [])
         units += [(f"unit {unit}", partial(_check_unit, campaign, unit, names)) for unit, names in chosen.items()]
         logs += _logs_of_campaign(others, campaign, known) if others else []
     return [*units, *((str(log.files[0]), partial(_check_log, log)) for log in logs)]
-
-
-def _recordings_of(
-    files: Sequence[Path], campaign: Campaign, units: Sequence[str]
-) -> tuple[dict[str, list[str]], list[Path]]:
-    """Return which recordings of which units files are, and the files that are none."""
-    known: dict[Path, tuple[str, str]] = {}
-    for unit in units:
-        config, folder = campaign.units[unit].config, campaign.folder(unit)
-        for name, candidates in candidate_files(config["procedure"], config["ingest"]).items():
-            for file in (folder / f for parts in candidates for f in parts):
-                known.setdefault(absolute(file), (unit, name))
-                known.setdefault(file.resolve(), (unit, name))
-    chosen: dict[str, list[str]] = {}
-    others = []
-    for file in files:
-        unit, name = known.get(absolute(file)) or known.get(file.resolve()) or ("", "")
-        if not unit:
-            others.append(file)
-        elif name not in chosen.setdefault(unit, []):
-            chosen[unit].append(name)
-    return chosen, others
 
 
 def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Namespace) -> list[Reading]:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.commands import parser_of
-from pipeline.commands.readings import campaign_of, config_of_log
+from pipeline.commands.readings import campaign_of, config_of_log, recordings_of_files
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.io.files import MESSAGE_FORMATS, candidate_files, recording_files
+from pipeline.io.files import MESSAGE_FORMATS, recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.planning.guide import MOST, Turn, in_words, most_informative_turn, next_face_or_turn, progress_of, propose
@@ -134,11 +134,8 @@ def _source(arguments: argparse.Namespace) -> Source:
     files = tuple(arguments.files)
     if campaign is not None and not (arguments.sensor or arguments.procedure or arguments.ingest):
         loaded = load_campaign({"campaign": str(campaign)})
-        for name, unit in loaded.units.items():
-            folder, candidates = loaded.folder(name), candidate_files(unit.config["procedure"], unit.config["ingest"])
-            own = {(folder / f).resolve() for files in candidates.values() for parts in files for f in parts}
-            if first.resolve() in own:
-                return Source(_by_hand(unit.config), folder, files)
+        for unit in recordings_of_files([first], loaded, [*loaded.units])[0]:
+            return Source(_by_hand(loaded.units[unit].config), loaded.folder(unit), files)
     more = [f"procedure={arguments.procedure}"] if arguments.procedure else []
     return Source(_by_hand(config_of_log(first, arguments.ingest, arguments.sensor, more)), None, files)
 

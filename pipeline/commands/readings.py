@@ -14,7 +14,7 @@ from pipeline.config.compose import Composer
 from pipeline.config.options import Problem, nearest
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
-from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES
+from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES, candidate_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
@@ -22,6 +22,7 @@ from pipeline.preprocessing.checks import check_recordings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.config.campaign import Campaign
     from pipeline.records import Recording
 
 DEFAULT_PROFILE = "canonical_csv"
@@ -87,6 +88,28 @@ def campaign_of(file: Path) -> Path | None:
     """Return the campaign that a file, or the link to it, lies in; None where it lies in none."""
     above = [*absolute(file).parents, *file.resolve().parents]
     return next((d for d in above if (d / "units.csv").is_file()), None)
+
+
+def recordings_of_files(
+    files: Sequence[Path], campaign: Campaign, units: Sequence[str]
+) -> tuple[dict[str, list[str]], list[Path]]:
+    """Return which recordings of which units files are, and the files that are none."""
+    known: dict[Path, tuple[str, str]] = {}
+    for unit in units:
+        config, folder = campaign.units[unit].config, campaign.folder(unit)
+        for name, candidates in candidate_files(config["procedure"], config["ingest"]).items():
+            for file in (folder / f for parts in candidates for f in parts):
+                known.setdefault(absolute(file), (unit, name))
+                known.setdefault(file.resolve(), (unit, name))
+    chosen: dict[str, list[str]] = {}
+    others = []
+    for file in files:
+        unit, name = known.get(absolute(file)) or known.get(file.resolve()) or ("", "")
+        if not unit:
+            others.append(file)
+        elif name not in chosen.setdefault(unit, []):
+            chosen[unit].append(name)
+    return chosen, others
 
 
 def config_of_log(

@@ -14,10 +14,10 @@ from pipeline.estimation.chips import (
     axes_of,
     matrix_of,
     place_of,
-    rotation_of,
     vector_of,
 )
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
+from pipeline.model.kinematics import turn_by_vector
 from pipeline.records import AXES, SENSOR_UNITS, coverage_factor
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def _of_vector(R: Values) -> Values:
     """Return what a small turn before R, ``R exp([phi x])``, does to the vector of R: (3, 3) array."""
     step, columns = 1e-6, []
     for phi in step * np.eye(3):
-        v, w = vector_of(R @ rotation_of(-phi)), vector_of(R @ rotation_of(phi))
+        v, w = vector_of(R @ turn_by_vector(-phi)), vector_of(R @ turn_by_vector(phi))
         if v @ w < 0.0:  # both sides of half a turn
             w = w * (1.0 - 2.0 * np.pi / np.linalg.norm(w))
         columns.append((w - v) / (2.0 * step))

@@ -16,7 +16,8 @@ from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.noise import prior_of
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects.base import STANDARD_GRAVITY
-from pipeline.records import SENSORS, noise_of_steps
+from pipeline.model.kinematics import skew
+from pipeline.records import MEDIAN_SIZE, SENSORS, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,7 +35,6 @@ FOLLOWED = 0.1  # fourth difference over the range of five samples, above which 
 LEAST_SAMPLES = 12  # of a recording: a quintic spline and its edges
 GAP = 1.5  # sampling intervals
 EDGE = 2  # samples at each end of a stretch, where a spline's derivative errs
-NORMAL_MEDIAN = 0.6745  # median of |x| of a standard normal x
 
 
 @dataclass(frozen=True)
@@ -181,17 +181,12 @@ def clear_of(a: Means, b: Means, R: Values) -> dict[str, Values]:
     found = {}
     for name in set(a) & {*SENSORS, *(f"{s}'" for s in SENSORS)}:
         difference = b[name] @ R - a[name]
-        noise = np.median(np.abs(difference - np.median(difference, axis=0)), axis=0) / NORMAL_MEDIAN
+        noise = MEDIAN_SIZE * np.median(np.abs(difference - np.median(difference, axis=0)), axis=0)
         centre = a[name].mean(axis=0) * (name == "accelerometer")
         found[name] = (np.abs(a[name] - centre) > CLEAR * noise).astype(float)
     if "gyroscope" in found:
         found["turn"] = found["gyroscope"][:, :, None] * found["gyroscope"][:, None, :]
     return found
-
-
-def cross(v: Values) -> Values:
-    """Return the matrices [v x] of (n, 3) vectors: (n, 3, 3) array."""
-    return np.cross(v[:, None, :], np.eye(3)).transpose(0, 2, 1)
 
 
 def lever(turn: Values, alpha: Values) -> Values:
@@ -200,13 +195,13 @@ def lever(turn: Values, alpha: Values) -> Values:
     ``turn``: (n, 3, 3), omega omega^T, rad^2/s^2. ``alpha``: (n, 3), deg/s^2.
     """
     square = turn - np.trace(turn, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    return np.asarray((square + cross(np.radians(alpha))) / STANDARD_GRAVITY)
+    return np.asarray((square + skew(np.radians(alpha))) / STANDARD_GRAVITY)
 
 
 def columns_of(sensor: str, x: Means) -> list[tuple[str, Values]]:
     """Return the columns of a sensor's fit by the signals of one chip: kind and (n, 3, p) array."""
     n = len(x["time"])
-    columns = [("rotation", -cross(x[sensor]))]
+    columns = [("rotation", -skew(x[sensor]))]
     if sensor == "accelerometer" and "turn" in x:
         columns.append(("lever_arm", lever(x["turn"], x["gyroscope'"])))
     return [*columns, ("time_offset", x[sensor + "'"][:, :, None]), ("bias", np.tile(np.eye(3), (n, 1, 1)))]

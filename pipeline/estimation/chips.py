@@ -27,7 +27,6 @@ from pipeline.estimation.chip_rows import (
     blocks_of,
     clear_of,
     columns_of,
-    cross,
     joined,
     lever,
     rows_of,
@@ -37,6 +36,7 @@ from pipeline.estimation.chip_rows import (
 from pipeline.estimation.engine import LinearMap, assess_noise, scaled_inverse
 from pipeline.estimation.gauss_markov import Prior
 from pipeline.estimation.uncertainty_budget import own_and_bench
+from pipeline.model.kinematics import turn_by_vector
 from pipeline.records import AXES, SENSORS
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def place_of(reference: Chip, other: Chip) -> Found:
     estimate = _combined(fits, _errors(fits, R, (a, b), clear, moving, blocks, (reference, other)), on_table=on_table)
     for sensor, shift in offset.items():
         estimate.values[estimate.names.index(f"time_offset_{sensor}")] += shift
-    R = R @ rotation_of(estimate.values[:3])
+    R = R @ turn_by_vector(estimate.values[:3])
     return Found(R, estimate, fits, moving, joined(held_out) if held_out else None)
 
 
@@ -148,17 +148,10 @@ def _solved(sensors: Sequence[str], a: Means, b: Means) -> tuple[Values, Means, 
         weights = [scaled_inverse(fit.inverse[:3, :3]) for fit in fits]
         moments = [W @ fit.step[:3] for W, fit in zip(weights, fits, strict=True)]
         turn = np.linalg.solve(np.sum(weights, axis=0), np.sum(moments, axis=0))
-        R = R @ rotation_of(turn)
+        R = R @ turn_by_vector(turn)
         if np.linalg.norm(turn) < SMALL:
             break
     return R, clear, [_fit(s, R, a, b, clear) for s in sensors]
-
-
-def rotation_of(vector: Values) -> Values:
-    """Return the rotation by a vector, rad: (3, 3) array (Rodrigues' formula)."""
-    angle = float(np.linalg.norm(vector))
-    K = cross(np.asarray(vector)[None])[0]
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * K @ K)
 
 
 def vector_of(R: Values) -> Values:

@@ -19,6 +19,7 @@ import numpy as np
 
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
+from pipeline.records import MEDIAN_SIZE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +35,6 @@ GRID = np.geomspace(0.01, 10.0, 64)  # of tau, over the spread of the estimates;
 OMEGA = 0.5  # standard deviation of log tau within a kind: axes differ by a factor of 1.6 (assumption)
 ALIKE = np.exp(-0.5 * (np.log(GRID[:, None] / GRID) / OMEGA) ** 2)
 ALIKE /= ALIKE.sum(axis=1, keepdims=True)  # (common tau of the kind, tau of a parameter)
-ROBUST = 1.4826  # median absolute deviation to standard deviation, of normal values
 FAR_AT_FIRST = 5.0  # robust standard deviations, beyond which a unit is at first no sibling; all are tested again
 ROUNDS = 20  # at most, until the siblings stay the same: a set that goes to and fro ends here
 
@@ -97,7 +97,7 @@ def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tup
     _, first = np.unique(np.where(able, device, -1), return_index=True)
     able = able & np.isin(np.arange(len(x)), first)
     away = np.abs(x - np.median(x[able], axis=0))
-    near = able & np.all(away <= FAR_AT_FIRST * ROBUST * np.median(away[able], axis=0), axis=1)
+    near = able & np.all(away <= FAR_AT_FIRST * MEDIAN_SIZE * np.median(away[able], axis=0), axis=1)
     siblings = near if near.sum() > FEWEST else able
     for _ in range(ROUNDS):
         of_device = np.full(int(device.max()) + 1, -1)

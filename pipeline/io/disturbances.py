@@ -33,7 +33,15 @@ import numpy as np
 
 from pipeline.io.quality_flags import GAP
 from pipeline.io.units import STANDARD_GRAVITY
-from pipeline.records import SENSOR_UNITS, conjugate_product, continuous, level_in_body, median, noise_of_steps
+from pipeline.records import (
+    MEDIAN_SIZE,
+    SENSOR_UNITS,
+    conjugate_product,
+    continuous,
+    level_in_body,
+    median,
+    noise_of_steps,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,7 +51,6 @@ if TYPE_CHECKING:
 
 # 10 and 7 standard deviations: below 3e-12 by chance for normal noise; half of L as a margin.
 BEYOND, ALLOWED, JUMP = 10.0, 1.5, 7.0
-MEDIAN_SIZE = 1.4826  # 1 / (the 75 % quantile of the normal distribution): standard deviation over median |x|
 AROUND_S, FEWEST_AROUND = 0.5, 6  # on either side
 REST_S, FEWEST_OF_REST = 2.0, 40  # where the unit rests, more samples make the median more precise
 LATE_S = 0.1  # a delay of a low-cost filter or of the log

@@ -34,6 +34,7 @@ from pipeline.preprocessing.evidence import (
     ratio_quartiles,
     refusal,
 )
+from pipeline.records import MEDIAN_SIZE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,7 +70,6 @@ FEWEST = 10  # intervals at constant rate
 MOSTLY_EVEN = 0.7  # of the angle that is turned
 WHOLE_TURN_DEG = 330.0  # of gravity's phase, from which its harmonics are told apart from its slope
 ALIKE_SAMPLES = 64.0  # neighbours whose residuals go together, by which the variance of the slope is enlarged
-MEDIAN_SIZE = 1.4826  # of a normal distribution, standard deviation over median deviation
 SIGNIFICANT = 6.0  # standard uncertainties, as in pipeline.signal.rests
 QUARTZ = 2e-4  # relative: two quartz clocks of +-100 ppm each
 CURVED_PHASE = 1e-2  # relative: clocks without quartz, and what lever arms leave of gravity's phase

@@ -13,6 +13,7 @@ from pipeline.records.calibration import (
 )
 from pipeline.records.recording import (
     AXES,
+    MEDIAN_SIZE,
     SENSORS,
     Encoding,
     Index,
@@ -34,6 +35,7 @@ from pipeline.records.recording import (
 
 __all__ = [
     "AXES",
+    "MEDIAN_SIZE",
     "NORMAL",
     "RECTANGULAR",
     "SENSORS",

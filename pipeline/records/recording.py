@@ -43,6 +43,7 @@ CLIPPED_OR_STUCK = 0b110  # bits 1 and 2 of ``Recording.flags``
 OF_SAMPLES = (
     "time_ns", "accelerometer", "gyroscope", "temperature", "table_angle", "table_rate", "table_attitude", "flags",
 )  # fmt: skip
+MEDIAN_SIZE = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard deviation 1: 0.67449 sqrt(2)
 
 

@@ -36,7 +36,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.files import write_atomically
-from pipeline.records import SENSORS
+from pipeline.records import MEDIAN_SIZE, SENSORS
 from pipeline.report.parameters import Parameter, fitted_parameters
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Par
 
 def _spread(values: pd.DataFrame) -> pd.Series:
     """Return 1.4826 times the median absolute deviation: the standard deviation where the values are normal."""
-    return 1.4826 * (values - values.median()).abs().median()
+    return MEDIAN_SIZE * (values - values.median()).abs().median()
 
 
 def _distributions(values: pd.DataFrame, _: pd.DataFrame) -> Iterable[tuple[str, JSON]]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.model.kinematics import table_motion
 from pipeline.model.measurement import predicted_reading
-from pipeline.records import AXES, SENSOR_UNITS, SensorCalibration
+from pipeline.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, SensorCalibration
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
@@ -106,7 +106,7 @@ def white_noise(residual: Residual, noise: JSON | None) -> Values:
     if noise and noise.get("white"):
         gain = float(residual.recording.filter.get("noise_gain", 1.0))
         return np.asarray(np.hypot(gain * np.array(noise["white"], float), residual.reference_noise))
-    sigma: Values = 1.4826 * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0)
+    sigma: Values = MEDIAN_SIZE * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0)
     return sigma
 
 

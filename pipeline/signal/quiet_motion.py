@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import median, noise_of_steps
+from pipeline.records import MEDIAN_SIZE, median, noise_of_steps
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 
 if TYPE_CHECKING:
@@ -187,7 +187,6 @@ RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests di
 TREMOR_LIMIT_DPS = 2.5
 SAME_DEG = 2.0  # the limit of a rest in ``pipeline.signal.rests``
 ROUNDING = 1e-6  # relative, of a difference of decimals
-NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 
 
 def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: float, shortest: int) -> Spans:
@@ -214,7 +213,7 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     off = [np.abs(mean - r) for (mean, _), r in zip(of_parts, reference, strict=True)]
     differences = np.concatenate([np.abs(np.diff(part, axis=0)) for part in parts])
     white = noise_of_steps(differences) / np.sqrt(size)
-    spread = NORMAL * np.array([median(own) for own in off])
+    spread = MEDIAN_SIZE * np.array([median(own) for own in off])
     noise = np.array([median(variance) for _, variance in of_parts])
     spread = np.where(resting[:, None], spread, np.median(spread, axis=0))
     count = counts_of(differences)

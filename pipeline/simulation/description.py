@@ -19,6 +19,7 @@ What a unit leaves out is drawn at random from the sensor's data sheet. The keys
 from __future__ import annotations
 
 import os
+from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -188,9 +189,13 @@ def _read_mapping(path: Path) -> dict[str, Any]:
     return data
 
 
-@cache
 def read_config(group: str, name: str) -> dict[str, Any]:
-    """Return ``read_option``; of a sensor, ``completed``."""
+    """Return ``read_option``; of a sensor, ``completed``. Each call returns a copy, which a caller may change."""
+    return deepcopy(_config(group, name))
+
+
+@cache
+def _config(group: str, name: str) -> dict[str, Any]:
     found = read_option(group, name)
     return completed(found, read_option(group, "generic")) if group == "sensor" else found
 
