@@ -130,7 +130,7 @@ class Batch:
         report, name = self.packs["report"], f"{unit}{FAILED}"
         return cast("dict[str, Any]", report.json(name)) if name in report else None
 
-    @property
+    @cached_property
     def combined(self) -> Pack | None:
         """Return the pack of what the priors of lots add or change, where there is one."""
         path = self.packs["report"].path.with_name(f"{WITH_PRIOR}.zip")

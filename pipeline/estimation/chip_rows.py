@@ -53,33 +53,33 @@ class Chip:
 
 @dataclass(frozen=True)
 class Shared:
-    """A recording of both chips: stamps, truths by sensor and sound samples, first of the reference chip."""
+    """A recording of both chips: stamps, truths by sensor and valid samples, first of the reference chip."""
 
     held_out: bool
     interval: float
     time: tuple[Values, Values]
     truth: tuple[Means, Means]
-    sound: tuple[Mask, Mask]
+    valid: tuple[Mask, Mask]
 
     def rows(self, offsets: Mapping[str, float]) -> tuple[Means, Means] | None:
         """Return the rows by each chip, the second one's stamps moved by its offsets, s; None: there are none."""
         from scipy.interpolate import CubicSpline  # noqa: PLC0415  (0.3 s, needed by boards only)
 
-        (time, theirs), (one, two), sound = self.time, self.truth, self.sound[0]
+        (time, theirs), (one, two), valid = self.time, self.truth, self.valid[0]
         if any(offsets.values()) or not np.array_equal(time, theirs):
-            known = (self.sound[1] & np.append(np.diff(theirs) <= GAP * self.interval, True)).astype(float)
+            known = (self.valid[1] & np.append(np.diff(theirs) <= GAP * self.interval, True)).astype(float)
             moved = {}
             for sensor, values in two.items():
                 at = time - offsets[sensor]
                 moved[sensor] = CubicSpline(theirs, values)(at)
-                sound = sound & (np.interp(at, theirs, known, 0.0, 0.0) > 1.0 - 1e-9)
+                valid = valid & (np.interp(at, theirs, known, 0.0, 0.0) > 1.0 - 1e-9)
             two = moved
         else:
-            sound = sound & self.sound[1]
+            valid = valid & self.valid[1]
         for truth in (one, two):
             if "gyroscope" in truth:
-                sound = sound & _followed(truth["gyroscope"])
-        a, b = (_means(time, truth, sound, self.interval) for truth in (one, two))
+                valid = valid & _followed(truth["gyroscope"])
+        a, b = (_means(time, truth, valid, self.interval) for truth in (one, two))
         return (a, b) if len(a["time"]) else None
 
 
@@ -93,21 +93,21 @@ def shared(reference: Chip, other: Chip, sensors: Sequence[str]) -> list[Shared]
         every = [[s for s in sensors if r.reading(s) is not None] == list(sensors) for r in (recording, twin)]
         overlap = recording.time_ns[0] < twin.time_ns[-1] and twin.time_ns[0] < recording.time_ns[-1]
         if all(every) and overlap:
-            one, sound = _truth(reference, recording, sensors)
+            one, valid = _truth(reference, recording, sensors)
             two, known = _truth(other, twin, sensors)
             held, times = recording.role == "validation", (recording.time, twin.time)
-            found.append(Shared(held, recording.interval, times, (one, two), (sound, known)))
+            found.append(Shared(held, recording.interval, times, (one, two), (valid, known)))
     return found
 
 
 def _truth(chip: Chip, recording: Recording, sensors: Sequence[str]) -> tuple[Means, Mask]:
-    """Return what the readings of a chip say is true, and which samples are sound."""
+    """Return what the readings of a chip say is true, and which samples are valid."""
     readings = {s: np.asarray(recording.reading(s)) for s in sensors}
-    sound = recording.valid & np.all([np.isfinite(v).all(axis=1) for v in readings.values()], axis=0)
-    given: dict[str, Any] = {s: np.where(sound[:, None], v, 0.0) for s, v in readings.items()}
+    valid = recording.valid & np.all([np.isfinite(v).all(axis=1) for v in readings.values()], axis=0)
+    given: dict[str, Any] = {s: np.where(valid[:, None], v, 0.0) for s, v in readings.items()}
     made = Compensation(chip.calibrations["accelerometer"], chip.calibrations["gyroscope"], chip.unit)
     truth = made.apply(**given, temperature=recording.temperature, time=recording.time)
-    return {s: np.asarray(getattr(truth, s)) for s in sensors}, np.asarray(sound)
+    return {s: np.asarray(getattr(truth, s)) for s in sensors}, np.asarray(valid)
 
 
 def rows_of(
@@ -140,12 +140,12 @@ def _followed(rate: Values) -> Mask:
     return np.asarray(spread < 0.5)
 
 
-def _means(time: Values, signals: Mapping[str, Values], sound: Mask, interval: float) -> Means:
+def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: float) -> Means:
     """Return the rows of one chip: time, f, w, their derivatives, and the mean of omega omega^T (n, 3, 3)."""
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by boards only)
 
     k = max(round(ROW_S / interval), 1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], sound, [False]]).astype(int)))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], valid, [False]]).astype(int)))
     gaps = np.flatnonzero(np.diff(time) > GAP * interval) + 1
     found: dict[str, list[Values]] = {}
     for first, last in edges.reshape(-1, 2):

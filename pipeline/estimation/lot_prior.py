@@ -36,7 +36,7 @@ OMEGA = 0.5  # standard deviation of log tau within a kind: axes differ by a fac
 ALIKE = np.exp(-0.5 * (np.log(GRID[:, None] / GRID) / OMEGA) ** 2)
 ALIKE /= ALIKE.sum(axis=1, keepdims=True)  # (common tau of the kind, tau of a parameter)
 FAR_AT_FIRST = 5.0  # robust standard deviations, beyond which a unit is at first no sibling; all are tested again
-ROUNDS = 20  # at most, until the siblings stay the same: a set that goes to and fro ends here
+ROUNDS = 20  # at most, until the siblings stay the same; two sets that alternate end here
 
 
 class Prediction(NamedTuple):

@@ -92,11 +92,11 @@ def gather_batch(job: Job) -> None:
 
 def _with_lots(job: Job, rows: Mapping[str, dict[str, str]]) -> list[JSON]:
     """Write what the priors of the lots change, ``combined.zip`` of each batch; return what ``fleet.json`` tells."""
-    batches = {name: Batch(job.output.parent / name) for name in job.run["batches"]}
     if job.run["combine"] != "lot":
-        for name in batches:
+        for name in job.run["batches"]:
             (job.output.parent / name / f"{WITH_PRIOR}.zip").unlink(missing_ok=True)
         return []
+    batches = {name: Batch(job.output.parent / name) for name in job.run["batches"]}
     found = []
     for name, units in job.run["batches"].items():
         for unit in units:
