@@ -21,7 +21,7 @@ from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.campaign import Campaign
 from pipeline.errors import ConfigurationError, DamagedFileError, InputError
 from pipeline.results_folder import HELD
-from pipeline.stages import batch, documents, gather
+from pipeline.stages import batch, gather, report
 
 STAGES = ("ingest", "filter", "fit", "calibration", "validate", "diagnose", "export", "report", "gather")
 FOLDERS = ("calibrations", "validations", "diagnoses", "reports", "certificates", "exports")
@@ -36,7 +36,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         shutil.copytree(simulated, directory / "raw" / name)
     (directory / "units.csv").write_text("unit\n" + "\n".join(names) + "\n")
     campaign = load_campaign({"campaign": str(directory), "results": str(directory.parent / "results")})
-    files_of, read_unit, render = batch._files_of, gather._read_unit, documents.render
+    files_of, read_unit, render = batch._files_of, gather._read_unit, report.render
 
     def faulty(module: Any, job: batch.Job, unit: str, settings: dict[str, Any]) -> Any:
         real = getattr(module, f"{job.stage}_unit")
@@ -62,7 +62,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, "_files_of", faulty)
         patch.setattr(gather, "_read_unit", faulty_gather)
-        patch.setattr(documents, "render", faulty_render)
+        patch.setattr(report, "render", faulty_render)
         assert run_jobs(campaign) == 1
     return campaign, campaign.results
 
