@@ -33,15 +33,7 @@ def study(argv: Sequence[str]) -> int:
     from pipeline.study.cases import FAMILIES  # noqa: PLC0415  (what a comparison with the thesis does not need)
     from pipeline.study.page import DIAGRAM, page  # noqa: PLC0415
     from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study  # noqa: PLC0415
-    from pipeline.study.scores import (  # noqa: PLC0415
-        all_figures,
-        cases_of,
-        figures,
-        in_the_catalogue,
-        mean_excess_gone,
-        numbers,
-        reliability_diagram,
-    )
+    from pipeline.study.scores import answer_scores, cases_of, family_scores, reliability_diagram  # noqa: PLC0415
 
     parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder for the truth and the results")
@@ -65,20 +57,9 @@ def study(argv: Sequence[str]) -> int:
     )
     countdown.end()
     cases = cases_of(read_lines(arguments.directory / TRUTH), read_lines(arguments.directory / RESULTS))
-    for figure in [*all_figures(cases), *figures(cases)]:
-        low, high = figure.interval
-        print(
-            f"{figure.name:<75} {figure.hits:>4} of {figure.total:<4} {100 * low:5.1f} to {100 * high:5.1f} %"
-            f"  {figure.goal:<8} {' '.join(figure.misses[:8])}"
-        )
-    for each in numbers(cases):
-        print(f"{each.name}: {each.value:.2g} (n = {each.total})  {each.goal}")
-    mean = mean_excess_gone(in_the_catalogue(cases))
-    if mean.total > 1:
-        print(
-            f"held-out excess that is gone: {100 * mean.value:.1f} % +- {196 * mean.error:.1f} %, "
-            f"least {100 * mean.least:.0f} % (n = {mean.total})"
-        )
+    for score in [*family_scores(cases), *answer_scores(cases)]:
+        name, n, value, interval, goal = score.cells
+        print(f"{name:<92} {n:>5} {value:>8} {interval:<16} {goal:<9} {' '.join(score.misses[:8])}".rstrip())
     if arguments.table:
         command = f"python -m pipeline study DIR --families {arguments.families} --n {arguments.n}"
         diagram = arguments.table.parent / "images" / DIAGRAM

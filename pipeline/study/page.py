@@ -10,14 +10,11 @@ import pandas as pd
 from pipeline.model.effects import effect
 from pipeline.study.cases import FAINT, SIZES
 from pipeline.study.scores import (
-    Z,
-    all_figures,
-    figures,
+    answer_scores,
+    family_scores,
     first_is_right,
-    in_the_catalogue,
     mean_excess_gone,
     named,
-    numbers,
     reliability,
     warned,
     wilson,
@@ -25,6 +22,8 @@ from pipeline.study.scores import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
+    from pipeline.study.scores import Score
 
 JSON = dict[str, Any]
 Rows = list[list[Any]]
@@ -74,17 +73,19 @@ def page(cases: Sequence[JSON], command: str) -> str:
     code = " and ".join(sorted({f"`{case['code']}`" for case in cases if "code" in case})) or "unknown"
     said = table_of(cases)
     faults = [[case["key"], case["error"]] for case in cases if "error" in case]
+    families, answers = family_scores(cases), [score.cells for score in answer_scores(cases)]
+    reliable = [[f"{float(name):.2g}", *cells] for name, *cells, _ in (bin_.cells for bin_ in reliability(cases))]
     parts = [
         HEAD.format(command=command, code=code),
-        _table(FIGURE_HEAD, _figures(cases)),
-        _section("Answer sets, probabilities and upper limits", ANSWER_TEXT, FIGURE_HEAD, _answers(cases)),
-        _section("Are probabilities right?", RELIABLE_TEXT, RELIABLE_HEAD, _reliable(cases)),
+        _table(FIGURE_HEAD, [score.cells for score in families]),
+        _section("Answer sets, probabilities and upper limits", ANSWER_TEXT, FIGURE_HEAD, answers),
+        _section("Are probabilities right?", RELIABLE_TEXT, RELIABLE_HEAD, reliable),
         _section("Detection by size", SIZE_TEXT, ["sensor", "effect", "x1", "x0.3", "x0.1"], found_at(said)),
         _section("Detection by signal", SIGNAL_TEXT, ["lambda", "n", "selected", "95 % interval"], by_signal(cases)),
         _section("Called something else", "", ["sensor", "hidden", "said", "cases"], confusions(said)),
         _section("Taken out of the catalogue", "", ["sensor", "hidden", "said", "warning", "cases"], instead(said)),
         _section("Physics in another form than the catalogue's", SHAPE_TEXT, SHAPE_HEAD, of_shapes(cases)),
-        _section("Cases that miss a goal", MISS_TEXT, ["case", "unit", "hidden", "said"], _misses(cases)),
+        _section("Cases that miss a goal", MISS_TEXT, ["case", "unit", "hidden", "said"], _misses(cases, families)),
         _section("Faults", "", ["case", "error"], faults),
         _section("What data-sheet size is", DATA_SHEET, ["model", "sensor", "effect", "size", "unit"], _data_sheet()),
     ]
@@ -100,33 +101,6 @@ def _section(title: str, text: str, head: Sequence[str], rows: Rows) -> str:
     if not rows:
         return ""
     return "\n".join([f"## {title}\n", *([f"{text}\n"] if text else []), _table(head, rows)])
-
-
-def _figures(cases: Sequence[JSON]) -> Rows:
-    rows = [[f.name, f.total, _percent(f.hits / f.total), _between(*f.interval), f.goal] for f in all_figures(cases)]
-    mean = mean_excess_gone(in_the_catalogue(cases))
-    if mean.total > 1:
-        interval = _between(mean.value - Z * mean.error, mean.value + Z * mean.error)
-        name = "held-out excess over the noise floor that is gone with what was selected, mean"
-        rows.append([name, mean.total, _percent(mean.value), interval, ">= 98 %"])
-    return rows
-
-
-def _answers(cases: Sequence[JSON]) -> Rows:
-    rows = [[f.name, f.total, _percent(f.hits / f.total), _between(*f.interval), f.goal] for f in figures(cases)]
-    return rows + [[n.name, n.total, f"{n.value:.2g}", "", n.goal] for n in numbers(cases)]
-
-
-def _reliable(cases: Sequence[JSON]) -> Rows:
-    return [[f"{b.said:.2g}", b.total, _percent(b.hits / b.total), _between(*b.interval)] for b in reliability(cases)]
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
-
-
-def _between(low: float, high: float) -> str:
-    return f"{100 * low:.1f} to {100 * high:.1f} %"
 
 
 def table_of(cases: Iterable[JSON]) -> pd.DataFrame:
@@ -208,16 +182,15 @@ def of_shapes(cases: Sequence[JSON]) -> Rows:
         with_warning = sum(case["verdict"] != "unexplained" and warned(case) for case in own)
         silent = sum(bool(case["selected"]) and not warned(case) for case in own)
         name, count = Counter(map(_said, own)).most_common(1)[0]
-        mean = mean_excess_gone(own)
-        gone = f"{100 * mean.value:.0f} % (n = {mean.total})" if mean.total > 1 else ""
+        gone = "".join(f"{100 * mean.value:.0f} % (n = {mean.total})" for mean in mean_excess_gone(own))
         counts = [len(own), unexplained, with_warning, silent, len(own) - unexplained - with_warning - silent]
         rows.append([family.replace("_", " "), *counts, f"{name} ({count})", gone])
     return rows
 
 
-def _misses(cases: Sequence[JSON]) -> Rows:
+def _misses(cases: Sequence[JSON], scores: Sequence[Score]) -> Rows:
     by_key = {key: case for case in cases for key in (case["key"], f"{case['key']} {case['sensor']}")}
-    keys = [key for figure in all_figures(cases) if figure.goal for key in figure.misses]
+    keys = [key for score in scores if score.goal for key in score.misses]
     rows = []
     for key in keys[:LISTED]:
         case = by_key[key]

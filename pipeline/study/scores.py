@@ -11,12 +11,12 @@ selected.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.report.chart import Dots, Line, Panel, chart
-from pipeline.report.chart import Figure as Chart
+from pipeline.report.chart import Dots, Figure, Line, Panel, chart
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -120,19 +120,26 @@ PLAN: list[tuple[str, str, Callable[[JSON], bool], str]] = [
 ]
 
 
-class Figure(NamedTuple):
-    """A share of some cases; ``misses`` names the cases that do not belong to it, in order."""
+class Score(NamedTuple):
+    """A line of a table: a share of ``total`` cases with its 95 % interval, or a mean or median without one.
+
+    ``misses`` names the cases that do not belong to the share, in order.
+    """
 
     name: str
-    hits: int
+    value: float
     total: int
-    goal: str
+    goal: str = ""
+    interval: tuple[float, float] | None = None
     misses: tuple[str, ...] = ()
 
     @property
-    def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the share."""
-        return wilson(self.hits, self.total)
+    def cells(self) -> list[Any]:
+        """Name, n, value, interval and goal as a table shows them."""
+        if self.interval is None:
+            return [self.name, self.total, f"{self.value:.2g}", "", self.goal]
+        low, high = (100.0 * end for end in self.interval)
+        return [self.name, self.total, f"{100.0 * self.value:.1f} %", f"{low:.1f} to {high:.1f} %", self.goal]
 
 
 def wilson(hits: int, total: int) -> tuple[float, float]:
@@ -143,11 +150,17 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
-def share(name: str, cases: Iterable[JSON], right: Callable[[JSON], bool], goal: str) -> Figure:
-    """Return the share of cases for which ``right`` holds; a fault never is."""
-    judged = [(_name(case), "error" not in case and right(case)) for case in cases]
-    misses = tuple(case for case, good in judged if not good)
-    return Figure(name, len(judged) - len(misses), len(judged), goal, misses)
+def share(name: str, right: Mapping[str, bool] | Sequence[bool], goal: str = "") -> list[Score]:
+    """Return the share of what is right, by the name of each case or without names; nothing of no cases."""
+    named_cases = right if isinstance(right, Mapping) else dict(enumerate(right))
+    hits, total = sum(map(bool, named_cases.values())), len(named_cases)
+    misses = tuple(str(case) for case, good in named_cases.items() if not good)
+    return [Score(name, hits / total, total, goal, wilson(hits, total), misses)] if total else []
+
+
+def _judged(cases: Iterable[JSON], right: Callable[[JSON], bool]) -> dict[str, bool]:
+    """Return for each case whether ``right`` holds; of a fault it never does."""
+    return {_name(case): "error" not in case and right(case) for case in cases}
 
 
 def _name(case: JSON) -> str:
@@ -160,41 +173,33 @@ def is_null(case: JSON) -> bool:
     return str(case["family"]).startswith("null")
 
 
-def all_figures(cases: Sequence[JSON]) -> list[Figure]:
-    """Return the figures of every family that was run."""
-    found = []
+def family_scores(cases: Sequence[JSON]) -> list[Score]:
+    """Return the scores of every family that was run, and the held-out excess that is gone."""
+    found: list[Score] = []
     for family, name, right, goal in PLAN:
         own = [c for c in cases if c["family"] == family]
         if family == "removed":
             own = [c for c in own if "error" in c or hard_to_replace(c)]
-        found.append(share(name, own, right, goal))
+        found += share(name, _judged(own, right), goal)
         able = [c for c in own if stands_out(c)]
         if family in MAY_HIDE and len(able) < len(own):
-            found.append(share(OF_WHICH, able, right, ""))
+            found += share(OF_WHICH, _judged(able, right))
     for family in sorted({c["family"] for c in cases if is_null(c)}):
         own = [c for c in cases if c["family"] == family]
         name = f"nothing hidden, {family.removeprefix('null_')}: nothing selected"
-        found.append(share(name, own, nothing_selected, ">= 99 %"))
-    return [figure for figure in found if figure.total]
+        found += share(name, _judged(own, nothing_selected), ">= 99 %")
+    return found + mean_excess_gone(in_the_catalogue(cases))
 
 
-class Mean(NamedTuple):
-    """The mean share of the held-out excess that is gone, its standard error, the least share, and of how many."""
-
-    value: float
-    error: float
-    least: float
-    total: int
-
-
-def mean_excess_gone(cases: Iterable[JSON]) -> Mean:
-    """Return the mean over the units whose held-out excess is over 5 % of the noise floor."""
+def mean_excess_gone(cases: Iterable[JSON]) -> list[Score]:
+    """Return the mean over the units whose held-out excess is over 5 % of the noise floor; nothing below two units."""
     gone = [excess_gone(case) for case in cases if "error" not in case]
     values = np.array([value for value in gone if value is not None])
     if len(values) < 2:
-        return Mean(float("nan"), float("nan"), float("nan"), len(values))
-    error = float(values.std(ddof=1) / np.sqrt(len(values)))
-    return Mean(float(values.mean()), error, float(values.min()), len(values))
+        return []
+    mean, half = float(values.mean()), Z * float(values.std(ddof=1) / np.sqrt(len(values)))
+    least = f"held-out excess over the noise floor that is gone with what was selected, mean (least {values.min():.0%})"
+    return [Score(least, mean, len(values), ">= 98 %", (mean - half, mean + half))]
 
 
 def in_the_catalogue(cases: Iterable[JSON]) -> list[JSON]:
@@ -205,7 +210,8 @@ def in_the_catalogue(cases: Iterable[JSON]) -> list[JSON]:
 SETS = (
     "single", "one_axis", "staged", "lost", "coarse", "cold", "pairs", "pairs_wander", "triples", "unseen", "null",
 )  # fmt: skip  # families whose truth is a set of effects of the catalogue that the recordings can show
-LIMITS = {"limit_30": "0.3", "limit_60": "0.6", "limit_100": "1"}  # family to the share of the detection size
+# Family: the share of the detection size, and the goal of the median limit over the truth.
+LIMITS = {"limit_30": ("0.3", 4.0), "limit_60": ("0.6", 2.2), "limit_100": ("1", 1.6)}
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)  # of said probabilities
 GOAL, FAMILY_GOAL, SIZE_GOAL = ">= 93.6 %", ">= 90 %", 3.0
 STYLE = (
@@ -213,7 +219,6 @@ STYLE = (
     "path{fill:none;stroke:currentColor;stroke-width:1.5;vector-effect:non-scaling-stroke}.grid{stroke:#d0d7de}"
     ".dots{stroke-width:6;stroke-linecap:round}.dashed{stroke-dasharray:4}.c2{color:#1d5fbf}.c5{color:#8b949e}</style>"
 )
-RATIO_GOAL = {"limit_30": 4.0, "limit_60": 2.2, "limit_100": 1.6}  # of the median limit over the truth
 
 
 def family_of(case: JSON) -> str:
@@ -242,24 +247,25 @@ def answered(cases: Iterable[JSON]) -> list[JSON]:
     return [c for c in cases if family_of(c) in SETS and ("error" in c or "answer_set" in c)]
 
 
-def figures(cases: Sequence[JSON]) -> list[Figure]:
-    """Return the shares of answer sets that hold the truth, and of upper limits that hold it."""
+def answer_scores(cases: Sequence[JSON]) -> list[Score]:
+    """Return the scores of answer sets and upper limits: which hold the truth, and how large they are."""
     known = answered(cases)
-    found = [share("truth in the 95 % answer set", known, in_the_set, GOAL)]
+    found = share("truth in the 95 % answer set", _judged(known, in_the_set), GOAL)
     for family in SETS:
         own = [c for c in known if family_of(c) == family]
-        found.append(share(f"... {family}", own, in_the_set, "" if family == "triples" else FAMILY_GOAL))
-    found += [share("most probable answer: exactly the truth", known, best_is_exact, "")]
-    found += [share("... selected: exactly the truth", known, _selected_is_exact, "")]
-    for family, size in LIMITS.items():
-        over = ratios(cases, family)
-        name = f"upper limits at {size} x the detection size: above the truth"
-        found.append(Figure(name, int(np.sum(over >= 1.0)), len(over), GOAL))
-    return [figure for figure in found if figure.total]
-
-
-def _selected_is_exact(case: JSON) -> bool:
-    return exact({**case, "hidden": true_set(case)})
+        found += share(f"... {family}", _judged(own, in_the_set), "" if family == "triples" else FAMILY_GOAL)
+    found += share("most probable answer: exactly the truth", _judged(known, best_is_exact))
+    found += share("... selected: exactly the truth", _judged(known, lambda c: exact({**c, "hidden": true_set(c)})))
+    over = {size: ratios(cases, family) for family, (size, _) in LIMITS.items()}
+    for size, each in over.items():
+        found += share(f"upper limits at {size} x the detection size: above the truth", (each >= 1.0).tolist(), GOAL)
+    sizes = [len(case["answer_set"]) for case in known if "error" not in case]
+    found += [Score("answers in a set, mean", float(np.mean(sizes)), len(sizes), f"<= {SIZE_GOAL:g}")] if sizes else []
+    for size, goal in LIMITS.values():
+        name = f"upper limit at {size} x the detection size over the truth, median"
+        if len(over[size]):
+            found.append(Score(name, float(np.median(over[size])), len(over[size]), f"<= {goal:g}"))
+    return found
 
 
 def ratios(cases: Iterable[JSON], family: str) -> np.ndarray:
@@ -273,54 +279,17 @@ def ratios(cases: Iterable[JSON], family: str) -> np.ndarray:
     return np.array(over)
 
 
-class Number(NamedTuple):
-    """A mean or median that has a goal."""
-
-    name: str
-    value: float
-    total: int
-    goal: str
-
-
-def numbers(cases: Sequence[JSON]) -> list[Number]:
-    """Return the mean size of the answer sets, and the median of the upper limits over the truth."""
-    sizes = [len(case["answer_set"]) for case in answered(cases) if "error" not in case]
-    found = [Number("answers in a set, mean", float(np.mean(sizes)), len(sizes), f"<= {SIZE_GOAL:g}")] if sizes else []
-    for family, size in LIMITS.items():
-        over = ratios(cases, family)
-        name = f"upper limit at {size} x the detection size over the truth, median"
-        if len(over):
-            found.append(Number(name, float(np.median(over)), len(over), f"<= {RATIO_GOAL[family]:g}"))
-    return found
-
-
-class Bin(NamedTuple):
-    """Probabilities that were said, and how many of their effects are there."""
-
-    said: float  # mean
-    hits: int
-    total: int
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the true share."""
-        return wilson(self.hits, self.total)
-
-
-def reliability(cases: Sequence[JSON]) -> list[Bin]:
-    """Return the said probabilities of all effects of the cases in bins, the smallest first."""
+def reliability(cases: Sequence[JSON]) -> list[Score]:
+    """Return the share that is true of what was said with a probability; the name is the mean probability of a bin."""
     pairs = [
         (probability, name in true_set(case))
         for case in answered(cases)
         if "error" not in case
         for name, probability in case["probability"].items()
     ]
-    said, there = (np.array(column) for column in zip(*pairs, strict=True)) if pairs else (np.zeros(0), np.zeros(0))
+    said, there = np.array(pairs, float).reshape(-1, 2).T
     place = np.clip(np.searchsorted(EDGES, said, side="right") - 1, 0, len(EDGES) - 2)
-    return [
-        Bin(float(said[place == k].mean()), int(there[place == k].sum()), int(np.sum(place == k)))
-        for k in np.unique(place)
-    ]
+    return [each for k in np.unique(place) for each in share(repr(float(said[place == k].mean())), there[place == k])]
 
 
 def reliability_diagram(cases: Sequence[JSON]) -> str:
@@ -328,12 +297,14 @@ def reliability_diagram(cases: Sequence[JSON]) -> str:
     bins = reliability(cases)
     if not bins:
         return ""
-    said, true = np.array([b.said for b in bins]), np.array([b.hits / b.total for b in bins])
+    said, true = np.array([float(b.name) for b in bins]), np.array([b.value for b in bins])
     low, high = np.array([b.interval for b in bins]).T
     ends = np.array([0.0, 1.0])
     total = sum(b.total for b in bins)
-    figure = Chart("reliability", f"Probabilities of effects against the share of them that is there (n = {total})")
-    points = "; ".join(f"said {b.said:.2g}: {b.hits} of {b.total}" for b in bins)
+    figure = Figure("reliability", f"Probabilities of effects against the share of them that is there (n = {total})")
+    points = "; ".join(
+        f"said {at:.2g}: {round(b.value * b.total)} of {b.total}" for at, b in zip(said, bins, strict=True)
+    )
     panel = Panel([Line(ends, ends, 5, "dashed"), Dots(said, true, 2, low, high)], "true share", 300, limits=(0.0, 1.0))
     drawn = chart(figure, points, [panel], "said probability; bars: 95 % intervals", margin=0.02)
     head, tail = str(drawn.svg).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1).split("</title>", 1)

@@ -8,18 +8,17 @@ import pytest
 
 from pipeline.study.page import by_signal, confusions, found_at, instead, of_shapes, page, table_of
 from pipeline.study.scores import (
-    all_figures,
+    answer_scores,
     cases_of,
     exact,
     excess_gone,
-    figures,
+    family_scores,
     first_is_right,
     hard_to_replace,
     in_the_catalogue,
     in_the_set,
     mean_excess_gone,
     not_silent,
-    numbers,
     ratios,
     reliability,
     reliability_diagram,
@@ -62,8 +61,8 @@ def test_what_another_effect_replaces_is_no_test_of_a_warning() -> None:
     for share, counts in ((0.96, False), (0.94, True)):
         whole = said("a", look_alikes={"a": {"b": share}})
         assert hard_to_replace(case | said("b", whole=whole)) is counts
-        figures = all_figures([case | said("b", key=case["key"], whole=whole)])
-        assert [(f.hits, f.total) for f in figures] == ([(0, 1)] if counts else [])
+        scores = family_scores([case | said("b", key=case["key"], whole=whole)])
+        assert [(s.value, s.total) for s in scores] == ([(0.0, 1)] if counts else [])
     assert not hard_to_replace(case | said("b", whole=said("b")))
 
 
@@ -76,22 +75,24 @@ def test_a_unit_in_which_nothing_is_selected_counts_with_all_of_its_excess() -> 
     held = [{"before": 2.0, "after": after, "floor": 1.0} for after in (1.0, 2.0)]
     cases = [truth("a") | said(held_out=entry) for entry in held]
     cases.append(truth(key="shape_band-00000", shape="band") | said(held_out=held[1]))
-    mean = mean_excess_gone(in_the_catalogue(cases))
-    assert (mean.value, mean.least, mean.total) == (0.5, 0.0, 2)
-    assert mean.error == pytest.approx(0.5)
+    (mean,) = mean_excess_gone(in_the_catalogue(cases))
+    assert (mean.value, mean.total) == (0.5, 2)
+    assert mean.name.endswith("(least 0%)")
+    assert mean.interval == pytest.approx((0.5 - 0.98, 0.5 + 0.98))
+    assert mean_excess_gone(cases[:1]) == []
 
 
 def test_a_fault_is_a_miss() -> None:
     lines = [{"key": "single-00000", "error": "ValueError: x"}]
-    figure = all_figures(cases_of([truth("a")], lines))[0]
-    assert (figure.hits, figure.total, figure.misses) == (0, 1, ("single-00000",))
+    score = family_scores(cases_of([truth("a")], lines))[0]
+    assert (score.value, score.total, score.misses) == (0.0, 1, ("single-00000",))
 
 
 def test_both_sensors_of_a_unit_count_where_nothing_is_hidden() -> None:
     case = truth(key="null_white-00003")
     lines = [said(key=case["key"]), said("a", key=case["key"], sensor="accelerometer")]
-    (figure,) = all_figures(cases_of([case], lines))
-    assert (figure.hits, figure.total, figure.misses) == (1, 2, ("null_white-00003 accelerometer",))
+    (score,) = family_scores(cases_of([case], lines))
+    assert (score.value, score.total, score.misses) == (0.5, 2, ("null_white-00003 accelerometer",))
 
 
 def test_tables_count_what_was_said() -> None:
@@ -115,7 +116,7 @@ def test_units_in_which_every_effect_stands_out_are_counted_by_themselves() -> N
         truth("a", "b", key=key, signal_left=left) | said(*selected, key=key)
         for key, (left, selected) in zip(keys, lefts, strict=True)
     ]
-    assert [(f.hits, f.total) for f in all_figures(cases)] == [(1, 2), (1, 1)]
+    assert [(s.value, s.total) for s in family_scores(cases)] == [(0.5, 2), (1.0, 1)]
     assert by_signal(cases) == [
         ["60 to 100", 1, "0 %", "0 to 79 %"],
         ["100 to 200", 1, "100 %", "21 to 100 %"],
@@ -151,9 +152,11 @@ def test_the_truth_must_be_one_of_the_answers_by_its_own_name() -> None:
     assert not in_the_set(pair | answer(("a",), ("b",)) | {"look_alikes": {"a": {"b": 1.0}}})
     assert in_the_set(truth("a", key="unseen-00000") | said() | answer(()))
     assert not in_the_set(truth(key="null_white-00000") | said() | answer(("a",)))
-    shares = {f.name: (f.hits, f.total) for f in figures([pair | answer(("a", "b")), pair | answer(("a",))])}
-    assert shares["truth in the 95 % answer set"] == (1, 2)
-    assert shares["most probable answer: exactly the truth"] == (1, 2)
+    keys = ["pairs-00000", "pairs-00001"]
+    cases = [pair | answer(names) | {"key": key} for key, names in zip(keys, (("a", "b"), ("a",)), strict=True)]
+    shares = {s.name: (s.value, s.total) for s in answer_scores(cases)}
+    assert shares["truth in the 95 % answer set"] == (0.5, 2)
+    assert shares["most probable answer: exactly the truth"] == (0.5, 2)
 
 
 def test_limits_are_counted_where_the_effect_was_not_selected() -> None:
@@ -163,14 +166,13 @@ def test_limits_are_counted_where_the_effect_was_not_selected() -> None:
         truth("a", key="limit_30-00000") | said() | answer((), upper_limit=each) for each in (limits, low, {}, limits)
     ]
     assert ratios(cases, "limit_30").tolist() == [1.5, 0.5, 1.5]
-    assert [(f.hits, f.total) for f in figures(cases)] == [(2, 3)]
-    assert [(n.value, n.total) for n in numbers(cases)] == [(1.5, 3)]
+    assert [(s.value, s.total) for s in answer_scores(cases)] == [(pytest.approx(2 / 3), 3), (1.5, 3)]
 
 
 def test_said_probabilities_are_compared_with_the_share_that_is_true() -> None:
     cases = [truth("a") | said() | answer((), probability={"a": p, "b": 0.02}) for p in (0.6, 0.6, 0.97)]
     cases += [truth("b") | said() | answer((), probability={"a": 0.6, "b": 0.02})]
-    found = [(b.said, b.hits, b.total) for b in reliability(cases)]
-    assert found == [(pytest.approx(0.02), 1, 4), (pytest.approx(0.6), 2, 3), (pytest.approx(0.97), 1, 1)]
+    found = [(float(b.name), b.value, b.total) for b in reliability(cases)]
+    assert found == [(pytest.approx(0.02), 0.25, 4), (pytest.approx(0.6), pytest.approx(2 / 3), 3), (0.97, 1.0, 1)]
     assert reliability_diagram(cases).count("<svg xmlns=") == 1
     assert reliability_diagram([]) == ""
