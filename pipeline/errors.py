@@ -49,7 +49,11 @@ class IngestError(InputError):
     ----------
     fact : str
         The message without byte and hint.
+    sessions : int
+        Of a log that was restarted: how many parts it has.
     """
+
+    sessions: int = 0
 
     def __init__(
         self, message: str, file: str | None = None, *, code: str = "damaged", offset: int | None = None, hint: str = ""

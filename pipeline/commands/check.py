@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import textwrap
 from dataclasses import replace
@@ -189,7 +190,7 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
             text, found = _refusal_of(read[name], error)
             told.append(text)
             refused += found
-    if trial.failure and not refused:
+    if trial.failure and (not refused or trial.failure["code"] == "missing_file"):
         place = trial.failure["file"] or f"unit {unit}"
         refused.append(Refused(trial.failure["code"], trial.failure["message"], place))
         file = [("file", trial.failure["file"])] if trial.failure["file"] else []
@@ -226,8 +227,12 @@ def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
 
 def _facts_of_recording(reading: Reading, campaign: Campaign, trial: Trial) -> list[Line]:
     """Return what a recording holds, as ingest leaves it; of one that ingest cuts, the parts as well."""
-    ((name, _),) = reading.settings["procedure"]["recordings"].items()
-    parts = [r for r in trial.recordings if campaign.recorded / r.source["file"] == reading.files[0]]
+    ((name, entry),) = reading.settings["procedure"]["recordings"].items()
+    parts = [
+        r
+        for r in trial.recordings
+        if campaign.recorded / r.source["file"] == reading.files[0] and r.source.get("session") == entry.get("session")
+    ]
     if [part.name for part in parts] == [name]:
         return [*_topics(reading), *facts(parts[0], reading.settings["sensor"])]
     whole = reading.recording()
@@ -249,7 +254,27 @@ def _topics(reading: Reading, *, fields: bool = False) -> list[Line]:
 def _refusal_of(reading: Reading, error: PipelineError) -> Told:
     lines = [("REFUSED", f"{_place(error.file, reading.files)}{error.message}"), ("code", error.code)]
     refused = Refused(error.code, error.message, error.file or str(reading.files[0]), reading)
-    return _told_of(reading, [*lines, *_topics(reading, fields=error.code == "missing_topic")]), [refused]
+    text = _told_of(reading, [*lines, *_topics(reading, fields=error.code == "missing_topic")])
+    parts = getattr(error, "sessions", 0)
+    return f"{text}\n\n{_recipe(reading, parts)}" if parts else text, [refused]
+
+
+def _recipe(reading: Reading, parts: int) -> str:
+    """Return what the user writes to use all parts of a log that was restarted."""
+    ((name, entry),) = reading.settings["procedure"]["recordings"].items()
+    if "file" not in entry:
+        return "To use all parts, check the file where it lies in your campaign: check then prints the settings."
+    here = {k: v for k, v in entry.items() if v is not None}
+    lines = [f"procedure.recordings.{name}.session=1"]
+    for part in range(2, parts + 1):
+        values = ", ".join(f"{k}: {json.dumps(v)}" for k, v in (here | {"session": part}).items())
+        lines.append(f"'procedure.recordings.{name}_{part}={{{values}}}'")
+    listed = "\n".join(f"  - {line}" for line in lines)
+    return (
+        "To use all parts, write into devices/UNIT.yaml of your campaign (or into campaign.yaml, for all units):\n\n"
+        f"overrides:\n{listed}\n\n"
+        "A part that these lines do not name is not used. Lines between the parts are left out."
+    )
 
 
 def _place(file: str | None, files: Sequence[Path]) -> str:

@@ -54,7 +54,7 @@ class Reading:
     def recording(self) -> Recording:
         """Return the recording, not compared with others."""
         ((name, entry),) = self.settings["procedure"]["recordings"].items()
-        table = read_table(self.files, self.settings["ingest"])
+        table = read_table(self.files, self.settings["ingest"], session=entry.get("session"))
         return to_recording(name, entry, table, self.settings["sensor"], checks_of(self.settings["ingest"]))
 
     def checked(self) -> Recording:
@@ -94,21 +94,22 @@ def recordings_of_files(
     files: Sequence[Path], campaign: Campaign, units: Sequence[str]
 ) -> tuple[dict[str, list[str]], list[Path]]:
     """Return which recordings of which units files are, and the files that are none."""
-    known: dict[Path, tuple[str, str]] = {}
+    known: dict[Path, tuple[str, list[str]]] = {}
     for unit in units:
         config, folder = campaign.units[unit].config, campaign.folder(unit)
         for name, candidates in candidate_files(config["procedure"], config["ingest"]).items():
             for file in (folder / f for parts in candidates for f in parts):
-                known.setdefault(absolute(file), (unit, name))
-                known.setdefault(file.resolve(), (unit, name))
+                for path in {absolute(file), file.resolve()}:
+                    owner, names = known.setdefault(path, (unit, []))
+                    names += [name] if owner == unit else []
     chosen: dict[str, list[str]] = {}
     others = []
     for file in files:
-        unit, name = known.get(absolute(file)) or known.get(file.resolve()) or ("", "")
+        unit, names = known.get(absolute(file)) or known.get(file.resolve()) or ("", [])
         if not unit:
             others.append(file)
-        elif name not in chosen.setdefault(unit, []):
-            chosen[unit].append(name)
+            continue
+        chosen[unit] = list(dict.fromkeys([*chosen.get(unit, []), *names]))
     return chosen, others
 
 

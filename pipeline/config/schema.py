@@ -125,6 +125,7 @@ class RecordingFile(Section):
     setup: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] | None = None
     program: list[Rest | Turn | Repeated] | None = None
     windows: list[Window] | None = None
+    session: Annotated[int, Field(ge=1)] | None = None
 
 
 class Faces(Section):

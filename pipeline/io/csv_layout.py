@@ -31,13 +31,14 @@ if TYPE_CHECKING:
 NUMBER = re.compile(r"\s*[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?\s*")
 LISTED = 5  # lines named in a refusal
 LEAVE_A_GAP = "ingest.csv.bad_rows=drop leaves a gap in place of such rows"
+PARTS = "if the logger was restarted, read each part as a recording of its own, by its key session (docs/troubleshooting.md)"
 HINTS = {
     "bad_row": LEAVE_A_GAP,
     "nul": LEAVE_A_GAP,
     "not_a_number": LEAVE_A_GAP,
     "not_finite": "ingest.csv.nan=gap leaves a gap in place of such rows",
     "decimal_comma": "set ingest.csv.decimal=',' and a delimiter that is none",
-    "restarted": "the log was restarted: set ingest.csv.session=1, 2 .. to read one part of it",
+    "restarted": PARTS,
 }
 END_OF_NUMBER = re.compile(r"[\d.,eE+-]+")
 
@@ -50,28 +51,33 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
     number, searched for a header that was not expected there.
     """
     twice = sorted({n for n in names if n and names.count(n) > 1})
-    if twice:
-        message = f"column name {', '.join(twice)} stands more than once in the header"
-        raise IngestError(message, where, code="duplicate_column")
     found: list[tuple[Column, int]] = []
     lacking: list[Column] = []
+    contradictions = []
     for column in settings.columns:
         wanted = column.column
         index = wanted if isinstance(wanted, int) else names.index(wanted) if wanted in names else len(names)
         if index < len(names):
-            _check_unit(column, names[index], where)
+            contradictions += _contradiction(column, names[index])
             found.append((column, index))
         elif not column.optional:
             lacking.append(column)
     absent = _channels_of_absent_sensor(lacking, found, len(names))
     missing = [str(column.column) for column in lacking if column.channel not in absent]
+    others = contradictions
+    if twice:
+        others = [f"column name {', '.join(twice)} stands more than once in the header", *others]
     if missing:
         numbers = bool(settings.header) and all(
             NUMBER.fullmatch(n) for name in names for n in re.split(r"[;\t| ]+", name)
         )
-        message = _missing_message(missing, names)
-        hint = _what_to_do(missing, names, settings, below, numbers=numbers)
-        raise IngestError(message, where, code="no_header" if numbers else "missing_column", hint=hint)
+        message = "; ".join([_missing_message(missing, names), *others])
+        hint = "" if twice else _what_to_do(missing, names, settings, below, numbers=numbers)
+        code = "duplicate_column" if twice else "no_header" if numbers else "missing_column"
+        raise IngestError(message, where, code=code, hint=hint)
+    if others:
+        code = "duplicate_column" if twice else "unit_contradiction"
+        raise IngestError("; ".join(others), where, code=code)
     return found
 
 
@@ -96,14 +102,15 @@ def _channels_of_absent_sensor(missing: list[Column], found: list[tuple[Column, 
     return absent[0] if absent and other and columns - len(found) < len(absent[0]) else ()
 
 
-def _check_unit(column: Column, name: str, where: str) -> None:
+def _contradiction(column: Column, name: str) -> list[str]:
+    """Return what is wrong where the header states another unit than the profile."""
     stated = unit_in_brackets(name)
-    if stated is not None and stated != column.unit and stated in UNITS[column.channel]:
-        message = (
-            f"the header says that {name!r} is in {stated}, ingest.csv.columns.{column.channel}.unit says "
-            f"{column.unit}; one of them is wrong"
-        )
-        raise IngestError(message, where, code="unit_contradiction")
+    if stated is None or stated == column.unit or stated not in UNITS[column.channel]:
+        return []
+    return [
+        f"the header says that {name!r} is in {stated}, ingest.csv.columns.{column.channel}.unit says "
+        f"{column.unit}; one of them is wrong"
+    ]
 
 
 def _missing_message(missing: list[str], names: list[str]) -> str:
@@ -206,17 +213,23 @@ class Fault:
 
 
 def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> IngestError:
-    """Return the error that names the first bad line of a log and how many there are (``more``: at least)."""
+    """Return the error that names the first bad line of a log and how many there are (``more``: at least).
+
+    It says what to do about each kind of fault.
+    """
     worst = next((f for f in faults if f.kind == "restarted"), faults[0])
     others = [str(f.line) for f in faults if f is not worst]
     said = ""
     if others:
         count = f"at least {len(others)}" if more else str(len(others))
-        said = f" ({count} more such lines, up to line {faults[-1].line}"
+        kinds = sorted({f.kind for f in faults} - {worst.kind})
+        other = f", {', '.join(kinds)} among them" if kinds else ""
+        said = f" ({count} more {'such' if not kinds else 'bad'} lines{other}, up to line {faults[-1].line}"
         if len(others) > 1:
             said += f": {', '.join(others[: LISTED - 1])}{' ..' if len(others) >= LISTED else ''}"
         said += ")"
-    return IngestError(worst.message + said, f"{layout.path}:{worst.line}", code=worst.kind, hint=HINTS[worst.kind])
+    hint = "; ".join(dict.fromkeys(HINTS[f.kind] for f in (worst, *faults)))
+    return IngestError(worst.message + said, f"{layout.path}:{worst.line}", code=worst.kind, hint=hint)
 
 
 def find_faults(layout: Layout, body: bytes, lines: Integers, before: tuple[int, str] | None) -> Iterator[Fault]:

@@ -64,7 +64,13 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
 def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
     """Return the channels of one file."""
     rows = read_rows(path, settings, checks)
-    rows, time_ns = in_order(rows, times_of(rows, settings), settings, checks)
+    refused = rows.refused
+    try:
+        rows, time_ns = in_order(rows, times_of(rows, settings), settings, checks)
+    except IngestError as error:
+        raise also(refused, error) if refused else error from None
+    if refused:
+        raise refused
     notes = rows.notes
     if settings.rate_hz is not None:
         detail = f"no time column: rows counted at {settings.rate_hz:g} Hz"
@@ -87,6 +93,15 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
         notes=notes,
         flags=rows.flags,
     )
+
+
+def also(first: IngestError, second: IngestError) -> IngestError:
+    """Return a refusal for two faults of one file."""
+    line = (second.file or "").rpartition(":")[2]
+    place = f"line {line}: " if line.isdigit() else ""
+    both = IngestError(f"{first.message}. Also {place}{second.message}", first.file, code=first.code)
+    both.sessions = second.sessions
+    return both
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:

@@ -17,6 +17,7 @@ from pipeline.io.csv_times import (
     EXACT_BELOW_S,
     LONGEST_S,
     exact_times,
+    lines_of_session,
     over_budget,
     seconds_per_unit,
     time_column,
@@ -58,6 +59,8 @@ class Rows:
         Rows before which the header was repeated.
     flags : (n,) array of uint16, or None
         Rows that were sorted.
+    refused : IngestError, or None
+        The refusal of lines that are no rows; it is raised once the times are read, to name their faults as well.
     """
 
     layout: Layout
@@ -69,6 +72,7 @@ class Rows:
     repaired: int = 0
     restarts: tuple[int, ...] = ()
     flags: NDArray[np.uint16] | None = None
+    refused: IngestError | None = None
 
     def place(self, row: int) -> str:
         """Return ``path:line`` of a row."""
@@ -126,7 +130,6 @@ class _RowReader:
         """Return all rows, without those that may be dropped."""
         if self.layout is None:
             raise self.log.no_rows()
-        notes, repaired = self._drop_faults(self.layout, checks)
         columns = {
             k: np.concatenate([b.pop(k) for b in self.blocks]) for k in list(self.blocks[0] if self.blocks else ())
         }
@@ -138,10 +141,12 @@ class _RowReader:
             raise refusal(self.layout, self.faults)
         lines, exact_ns = columns.pop(LINES), columns.pop(EXACT, None)
         restarts = np.searchsorted(lines, [f.line for f in self.faults if f.kind == "restarted"])
-        notes = [*self.log.notes, *self.notes, *notes]
-        return Rows(
-            self.layout, self.log.sha256, columns, lines, exact_ns, tuple(notes), repaired, tuple(restarts.tolist())
-        )
+        rows = Rows(self.layout, self.log.sha256, columns, lines, exact_ns, (), 0, tuple(restarts.tolist()))
+        if self.faults and self.settings.session is not None:
+            part = lines_of_session(rows, self.settings)
+            self.faults, self.refused = ([f for f in found if f.line in part] for found in (self.faults, self.refused))
+        notes, repaired, refused = self._drop_faults(self.layout, checks, int(lines[-1]))
+        return replace(rows, notes=(*self.log.notes, *self.notes, *notes), repaired=repaired, refused=refused)
 
     def _find_layout(self, body: bytes, lines: Integers) -> Layout:
         """Return which column holds which channel."""
@@ -189,18 +194,18 @@ class _RowReader:
         out_of_range = largest >= LONGEST_S  # refused later
         return {EXACT: np.zeros(len(numbers[index]), np.int64) if out_of_range else exact_times(layout, body)}
 
-    def _drop_faults(self, layout: Layout, checks: Checks) -> tuple[list[Note], int]:
-        """Return notes on the lines that are dropped, and how many count against the limit of repairs."""
+    def _drop_faults(self, layout: Layout, checks: Checks, last: int) -> tuple[list[Note], int, IngestError | None]:
+        """Return notes on the lines that are dropped, how many count against the limit of repairs, and a refusal."""
         if not self.faults:
-            return [], 0
+            return [], 0, None
         final = self.faults[-1]
-        end = max(final.line, int(self.blocks[-1][LINES][-1]) if self.blocks else 0)
+        end = max(final.line, last)
         cut = {final.line} if final.short and final.line == end else set()
         tail = [f for f in self.faults if f.line in cut or f.parted_before in cut]
         others = [f for f in self.faults if f not in tail and f.kind != "restarted"]
         refused = [f for f in self.refused if f not in tail]
         if refused:
-            raise refusal(layout, refused)
+            return [], 0, refusal(layout, refused)
         if len(others) > checks.repaired_rows * self.row_count:
             raise over_budget(refusal(layout, others), len(others), self.row_count, checks)
         notes = [
@@ -216,7 +221,7 @@ class _RowReader:
                 detail = f"{what}, each a gap; the longest run is {_longest_run(dropped)} long; the first: "
                 detail += dropped[0].message
                 notes.append(Note(code, len(dropped), dropped[0].line, dropped[-1].line, detail))
-        return notes, len(others)
+        return notes, len(others), None
 
 
 def _longest_run(faults: list[Fault]) -> int:

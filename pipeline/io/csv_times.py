@@ -13,12 +13,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from decimal import Decimal
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import IngestError
+from pipeline.io.csv_layout import PARTS
 from pipeline.io.quality_flags import REPAIRED
 from pipeline.io.timestamps import sorted_once, time_error
 from pipeline.io.units import UNITS
@@ -38,6 +40,8 @@ DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # of whole nanoseconds
 COARSEST = 0.01  # of the median interval
 NEAR = 2.5  # intervals
 LARGEST_DISPLACEMENT = 5  # rows
+MOST_LISTED = 5  # parts of a log, in a refusal
+SHORTEST_PART = 10  # rows; fewer are rows with a wrong time
 RESET_INTERVALS = 5  # a time that falls back by more begins another session
 
 
@@ -117,8 +121,7 @@ def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks)
     A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time
     that differ, and more repairs than ``checks`` allows.
     """
-    unit = "s" if settings.rate_hz is not None else time_column(rows.layout)[0].unit
-    tick_ns = float(settings.tick_ns or UNITS["time"][unit][0])
+    tick_ns = _tick_ns(rows, settings)
     if settings.session is not None:
         rows, time_ns = _one_session(rows, time_ns, settings.session, tick_ns)
     if bool(np.all(np.diff(time_ns) > 0)):
@@ -128,7 +131,7 @@ def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks)
     back = np.flatnonzero(np.diff(time_ns) <= 0)
     if back.size == 0:
         return rows, time_ns
-    error = _refusal(rows, time_ns, int(back[0]) + 1)
+    error = _refusal(rows, time_ns, int(back[0]) + 1, tick_ns)
     order, twice, same = sorted_once(time_ns, rows.numbers.values())
     displacement = int(np.abs(order - np.arange(len(order))).max())
     if displacement > LARGEST_DISPLACEMENT:
@@ -162,15 +165,25 @@ def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks)
     return rows, time_ns[order[keep]]
 
 
-def _refusal(rows: Rows, time_ns: Integers, row: int) -> IngestError:
-    """Return the refusal of a row whose time does not increase, with the earlier rows that it and the next repeat."""
+def _refusal(rows: Rows, time_ns: Integers, row: int, tick_ns: float) -> IngestError:
+    """Return the refusal of a row whose time does not increase, with the earlier rows that it and the next repeat.
+
+    Where the time falls back for good, the refusal names the parts of the log.
+    """
     error = time_error(time_ns, rows.place(row), row)
     start, count = next(((a, n) for at, a, n in _repeats(rows, time_ns) if at == row), (row, 0))
-    if count <= 1:
-        return error
-    ends = rows.lines[[row, row + count - 1, start, start + count - 1]].tolist()
-    text = "lines {} to {} repeat lines {} to {} exactly: delete them, or set ingest.csv.session to read one part"
-    return IngestError(error.fact, error.file, code=error.code, hint=text.format(*ends))
+    if count > 1:
+        ends = rows.lines[[row, row + count - 1, start, start + count - 1]].tolist()
+        hint = "lines {} to {} repeat lines {} to {} exactly: delete them".format(*ends)
+        error = IngestError(error.fact, error.file, code=error.code, hint=hint)
+    starts = _starts(rows, time_ns, tick_ns)
+    if len(starts) > 1 and min(np.diff([*starts, len(time_ns)])) >= SHORTEST_PART:
+        ends = [(int(rows.lines[a]), int(rows.lines[b - 1])) for a, b in pairwise([*starts, len(time_ns)])]
+        lines = "; ".join(f"{first} to {last}" for first, last in ends[:MOST_LISTED])
+        fact = f"{error.message if count > 1 else error.fact}; the log has {len(starts)} parts, lines {lines}{' ..' * (len(ends) > MOST_LISTED)}"
+        error = IngestError(fact, error.file, code=error.code, hint=PARTS)
+        error.sessions = len(starts)
+    return error
 
 
 def _repeats(rows: Rows, time_ns: Integers) -> list[tuple[int, int, int]]:
@@ -248,16 +261,33 @@ def _unwrap(time_ns: Integers, tick_ns: float) -> tuple[Integers, list[tuple[int
     return time_ns, []
 
 
-def _one_session(rows: Rows, time_ns: Integers, session: int, tick_ns: float) -> tuple[Rows, Integers]:
-    """Return one part of a log that was restarted: at a repeated header, or where time falls back for good."""
+def _starts(rows: Rows, time_ns: Integers, tick_ns: float) -> list[int]:
+    """Return the rows where a log was started: at a repeated header, or where time falls back for good."""
     steps = np.diff(time_ns)
     forward = steps[steps > 0]
     longest = RESET_INTERVALS * float(np.median(forward)) if forward.size else 0.0
     wrapped = {row for row, _ in _unwrap(time_ns, tick_ns)[1]} if not rows.restarts else set()
     resets = {int(r) + 1 for r in np.flatnonzero(steps < -longest)} - wrapped
-    starts = sorted({0, *resets, *rows.restarts} - {len(time_ns)})
+    return sorted({0, *resets, *rows.restarts} - {len(time_ns)})
+
+
+def _tick_ns(rows: Rows, settings: CsvFormat) -> float:
+    unit = "s" if settings.rate_hz is not None else time_column(rows.layout)[0].unit
+    return float(settings.tick_ns or UNITS["time"][unit][0])
+
+
+def lines_of_session(rows: Rows, settings: CsvFormat) -> range:
+    """Return the lines of the part that is read of a log that was restarted."""
+    assert settings.session is not None  # noqa: S101  (the caller reads one part)
+    part, _ = _one_session(rows, times_of(rows, settings), settings.session, _tick_ns(rows, settings))
+    return range(int(part.lines[0]), int(part.lines[-1]) + 1)
+
+
+def _one_session(rows: Rows, time_ns: Integers, session: int, tick_ns: float) -> tuple[Rows, Integers]:
+    """Return one part of a log that was restarted."""
+    starts = _starts(rows, time_ns, tick_ns)
     if session > len(starts):
-        message = f"ingest.csv.session is {session}, and the log was started {len(starts)} times"
+        message = f"session is {session}, and the log was started {len(starts)} times"
         raise IngestError(message, rows.layout.path, code="session")
     start, stop = [*starts, len(time_ns)][session - 1 : session + 1]
     index = np.arange(start, stop)

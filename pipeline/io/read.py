@@ -30,9 +30,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from pipeline.errors import InputError
     from pipeline.io.channel_table import ChannelTable
     from pipeline.io.ingest_settings import Checks, CsvFormat
     from pipeline.records import Values
+
+
+MOST_NAMED = 5  # files in the refusal of another
 
 
 def read_recordings(
@@ -52,30 +56,43 @@ def read_recordings(
     MissingInputError
         If files that are not optional do not exist; one error names all.
     InputError
-        If a file cannot be used; ``file`` holds its path, and line where there is one.
+        If files cannot be used; ``file`` holds the path of the first, and line where there is one.
     """
     files = recording_files(procedure, ingest, folder)
     wanted = candidate_files(procedure, ingest)
-    _check_complete(procedure, files, wanted, folder)
+    refused = _missing(procedure, files, wanted, folder)
     checks, formats = checks_of(ingest), cache(lambda: csv_formats(ingest))
     recordings = []
     for name, paths in files.items():
-        table = read_table(paths, ingest, formats)
         there = [f for c in wanted[name] for f in c if os.path.exists(f"{folder}/{f}")]  # noqa: PTH110  (fast)
         other = [f for f in there if folder / f not in paths]
-        recording = to_recording(name, procedure["recordings"][name], table, sensor, checks)
+        entry = procedure["recordings"][name]
+        try:
+            table = read_table(paths, ingest, formats, entry.get("session"))
+            recording = to_recording(name, entry, table, sensor, checks)
+        except IngestError as error:
+            refused.append(error)
+            continue
         if other:
             detail = f"{', '.join(other)} exists too and was not read"
             recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(other), 0, 0, detail)))
         recordings.append(recording)
+    if refused:
+        raise _with_others(refused)
     _check_different(recordings)
     return _compare_clocks(recordings)
 
 
 def read_table(
-    paths: Sequence[Path], ingest: Mapping[str, Any], formats: Callable[[], list[CsvFormat]] | None = None
+    paths: Sequence[Path],
+    ingest: Mapping[str, Any],
+    formats: Callable[[], list[CsvFormat]] | None = None,
+    session: int | None = None,
 ) -> ChannelTable:
-    """Read the file or files of one recording, by their suffix; ``formats`` returns ``csv_formats(ingest)``."""
+    """Read the file or files of one recording, by their suffix; ``formats`` returns ``csv_formats(ingest)``.
+
+    ``session``: which part, from 1, of a text log that was restarted.
+    """
     if paths[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS):
         from pipeline.io.mcap import read_log  # noqa: PLC0415  (the decoder costs what a text log need not pay)
 
@@ -84,25 +101,44 @@ def read_table(
 
     if paths[0].suffix == ".gcsv":
         return read_gcsv(paths[0], checks_of(ingest))
-    return read_csv(paths, formats() if formats else csv_formats(ingest), checks_of(ingest))
+    layouts = formats() if formats else csv_formats(ingest)
+    if session is None:
+        return read_csv(paths, layouts, checks_of(ingest))
+    table = read_csv(paths, [f.model_copy(update={"session": session}) for f in layouts], checks_of(ingest))
+    return replace(table, source={**table.source, "session": session})
 
 
-def _check_complete(
-    procedure: Mapping[str, Any], files: Mapping[str, list[Path]], wanted: Mapping[str, list[list[str]]], folder: Path
-) -> None:
-    """Raise one error that names all missing files."""
-    missing = []
+def _with_others(refused: list[InputError]) -> InputError:
+    """Return the first refusal, with file and code of the others."""
+    first, *others = refused
+    if others:
+        listed = "; ".join(f"{error.file} ({error.code})" for error in others[:MOST_NAMED])
+        more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
+        first.message += f". Also refused: {listed}{more}"
+    return first
+
+
+def _missing(
+    procedure: Mapping[str, Any], files: dict[str, list[Path]], wanted: Mapping[str, list[list[str]]], folder: Path
+) -> list[InputError]:
+    """Return an error that names all missing files; recordings of which parts are missing are taken out of ``files``."""
+    missing, incomplete = [], []
     for name, candidates in wanted.items():
         if name not in files:
             if not procedure["recordings"][name].get("optional", False):
                 missing.append(f"{name} (tried {_tried(candidates)})")
             continue
         taken = next(c for c in candidates if any(folder / f in files[name] for f in c))
-        missing += [f"{name} ({f})" for f in taken if folder / f not in files[name]]
-    if missing:
-        reason = "" if folder.is_dir() else "; the folder does not exist"
-        message = f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, files)}"
-        raise MissingInputError(message, str(folder))
+        lacking = [f"{name} ({f})" for f in taken if folder / f not in files[name]]
+        missing += lacking
+        incomplete += [name] if lacking else []
+    if not missing:
+        return []
+    reason = "" if folder.is_dir() else "; the folder does not exist"
+    message = f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, files)}"
+    for name in incomplete:
+        files.pop(name)
+    return [MissingInputError(message, str(folder))]
 
 
 def _tried(candidates: Sequence[Sequence[str]]) -> str:
@@ -181,10 +217,13 @@ def _stack(values: dict[str, Values], channels: Sequence[str]) -> Values | None:
 
 
 def _check_different(recordings: Sequence[Recording]) -> None:
-    """Refuse one file under two names: held-out data would not be held out, or one axis would stand for another."""
-    seen: dict[str, Recording] = {}
+    """Refuse one file under two names: held-out data would not be held out, or one axis would stand for another.
+
+    The parts of a log that was restarted differ in their ``session``.
+    """
+    seen: dict[tuple[str, int | None], Recording] = {}
     for recording in recordings:
-        twin = seen.setdefault(recording.source["sha256"], recording)
+        twin = seen.setdefault((recording.source["sha256"], recording.source.get("session")), recording)
         if twin is not recording:
             message = (
                 f"recordings {twin.name} and {recording.name} are the same file, byte for byte "

@@ -188,10 +188,9 @@ def time_error(time_ns: Integers, place: str, row: int) -> IngestError:
     count = int(np.count_nonzero(steps <= 0))
     message = (
         f"time {what} {time_ns[row] / 1e9:.9g} s after {time_ns[row - 1] / 1e9:.9g} s ({count} such samples); time has "
-        "to increase: a log that was restarted belongs in two files"
+        "to increase"
     )
-    hint = "" if repeats else "or set ingest.csv.session=1, 2 .. to read one part of it"
-    return IngestError(message, place, code=code, hint=hint)
+    return IngestError(message, place, code=code, hint="" if repeats else "a log that was restarted belongs in two files")
 
 
 def slower_first(first: Integers, second: Integers) -> bool:

@@ -287,3 +287,28 @@ def test_an_encoder_that_is_not_connected_is_told_and_refused_where_a_run_needs_
     assert "the table did not turn, or its encoder is not connected" in checked.words
     assert "the sensor did not move" not in checked.words
     assert Checked(capsys, linked / "raw" / "U" / "gyro_z.csv").code == 2
+
+
+def test_the_parts_of_a_log_whose_clock_fell_back_are_used_by_the_settings_that_check_prints(
+    linked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = linked / "raw" / "U" / "accel_x.csv"
+    header, *rows = log.read_text().splitlines()
+    again = [f"{float(row.partition(',')[0]) - 75.0:.3f},{row.partition(',')[2]}" for row in rows[440:]]
+    log.unlink()
+    log.write_text("\n".join([header, *rows[:430], "rst cause:2", *again]) + "\n")
+    (linked / "raw" / "U" / "gyro_y.csv").unlink()
+    (linked / "raw" / "U" / "gyro_y.csv").write_text(f"{header}\n")
+    refused = Checked(capsys, "--campaign", linked)
+    assert refused.code == 2
+    assert "accel_x.csv:432: refused (bad_row)" in refused.err
+    assert "gyro_y.csv: refused (no_rows)" in refused.err
+    assert f"the log has 2 parts, lines 2 to 431; 433 to {432 + len(again)}" in refused.words
+    (linked / "raw" / "U" / "gyro_y.csv").unlink()
+    (linked / "raw" / "U" / "gyro_y.csv").symlink_to(DEMO / "mpu6050-1" / "gyro_y.csv")
+    recipe = refused.out[refused.out.index("overrides:") :].partition("\n\n")[0]
+    (linked / "devices").mkdir()
+    (linked / "devices" / "U.yaml").write_text(recipe + "\n")
+    assert "unit U: 9 recordings, no refusal" in Checked(capsys, "--campaign", linked).out
+    both = Checked(capsys, log)
+    assert f"session 2 of 2: lines 433 to {432 + len(again)} were read" in both.words

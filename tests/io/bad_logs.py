@@ -256,7 +256,7 @@ def cases() -> dict[str, Case]:
             whole.partition(b"\n")[2], kept=ALL, settings={"csv/header": False, "csv/columns": indexed()}
         ),
         "17": one(
-            text([*ROWS[:1500], HEADER, *ROWS[:1500]]), fault="restarted", says="set ingest.csv.session", line=1502
+            text([*ROWS[:1500], HEADER, *ROWS[:1500]]), fault="restarted", says="by its key session", line=1502
         ),
         "17 session": one(
             text([*ROWS[:1500], HEADER, *ROWS[:1500]]),
@@ -372,7 +372,7 @@ def cases() -> dict[str, Case]:
         "33 part of it twice": one(
             text([*ROWS[:1500], *ROWS[200:1000]]),
             fault="time_back",
-            says="lines 1502 to 2301 repeat lines 202 to 1001 exactly: delete them, or set ingest.csv.session",
+            says="lines 1502 to 2301 repeat lines 202 to 1001 exactly: delete them; the log has 2 parts, lines 2 to 1501; 1502 to 2301",
             line=1502,
         ),
         "33 a block twice": one(text([*ROWS[:1500], *ROWS[1480:]]), notes=("N-REPEAT",), kept=ALL),
@@ -386,6 +386,18 @@ def cases() -> dict[str, Case]:
         ),
         "33 session": one(
             text([*ROWS[:1500], *ROWS[200:1000]]), notes=("N-SESSION",), kept=ALL[200:1000], settings={"csv/session": 2}
+        ),
+        "10 and a restart": one(
+            text([*ROWS[:1500], "rst cause:2", "boot", *ROWS[200:1000]]),
+            fault="bad_row",
+            says="1 more such lines.*Also line 1504: time goes back.*2 parts, lines 2 to 1501; 1504 to 2303",
+            line=1502,
+        ),
+        "33 session and text": one(
+            text([*ROWS[:1500], "rst cause:2", "boot", *ROWS[200:1000]]),
+            notes=("N-SESSION",),
+            kept=ALL[200:1000],
+            settings={"csv/session": 2},
         ),
         "34": one(text(reordered()), notes=("N-SORT",), kept=ALL, flags={700: NEVER_DIES, 701: NEVER_DIES}),
         "35 same": one(text([*ROWS[:10], *ROWS[9:]]), notes=("N-DUP",), kept=ALL),

@@ -152,6 +152,13 @@ def test_number_cut_at_the_end_of_the_file_never_counts(tmp_path: Path, canonica
         assert set(recording.gyroscope[:, 2]) == {0.3}
 
 
+def test_all_faulty_files_of_a_unit_are_named_together(tmp_path: Path, canonical: dict[str, Any]) -> None:
+    (tmp_path / "a.csv").write_text("time_s\n0\n1\n")
+    (tmp_path / "b.csv").write_bytes(b"")
+    with pytest.raises(MissingInputError, match=r"c \(tried .*a\.csv:1 \(missing_column\); .*b\.csv \(empty\)"):
+        read_recordings(procedure("a", "b", "c"), canonical, SENSOR, tmp_path)
+
+
 def test_missing_files_are_named_together_with_what_was_tried(tmp_path: Path, canonical: dict[str, Any]) -> None:
     write_canonical_csv(tmp_path / "b.csv", make_recording())
     with pytest.raises(MissingInputError) as caught:
