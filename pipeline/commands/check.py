@@ -197,13 +197,15 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
         lines = [*file, ("REFUSED", trial.failure["message"]), ("code", trial.failure["code"])]
         told.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
     elif not names and not refused:
-        notes = [
-            f"{r.name} {', '.join(codes)}"
-            for r in trial.recordings
-            if (codes := dict.fromkeys(n.code for n in r.notes))
-        ]
         lines = [(sensor, f"null: {reason}") for sensor, reason in trial.not_calibrated.items()]
-        lines += [("notes", "; ".join(notes))] if notes else []
+        noted: dict[str, dict[str, str]] = {}
+        for recording in trial.recordings:
+            for note in recording.notes:
+                noted.setdefault(note.code, {}).setdefault(recording.name, note.detail)
+        for code, details in noted.items():
+            name, detail = next(iter(details.items()))
+            others = f"; likewise {', '.join([*details][1:])}" if len(details) > 1 else ""
+            lines.append(("notes" if code == next(iter(noted)) else "", f"{code} {name}: {detail}{others}"))
         told.append(
             "\n".join(
                 [f"unit {unit}: {len(trial.recordings)} recordings, no refusal", *([as_text(lines)] if lines else [])]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 NUMBER = re.compile(r"\s*[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?\s*")
 LISTED = 5  # lines named in a refusal
 LEAVE_A_GAP = "ingest.csv.bad_rows=drop leaves a gap in place of such rows"
-PARTS = "if the logger was restarted, read each part as a recording of its own, by its key session (docs/troubleshooting.md)"
+PARTS = "if the logger was restarted, make each part a recording, by its key session (docs/troubleshooting.md)"
 HINTS = {
     "bad_row": LEAVE_A_GAP,
     "nul": LEAVE_A_GAP,
@@ -107,10 +107,8 @@ def _contradiction(column: Column, name: str) -> list[str]:
     stated = unit_in_brackets(name)
     if stated is None or stated == column.unit or stated not in UNITS[column.channel]:
         return []
-    return [
-        f"the header says that {name!r} is in {stated}, ingest.csv.columns.{column.channel}.unit says "
-        f"{column.unit}; one of them is wrong"
-    ]
+    where = f"ingest.csv.columns.{column.channel}.unit"
+    return [f"the header says that {name!r} is in {stated}, {where} says {column.unit}; one of them is wrong"]
 
 
 def _missing_message(missing: list[str], names: list[str]) -> str:

@@ -180,7 +180,8 @@ def _refusal(rows: Rows, time_ns: Integers, row: int, tick_ns: float) -> IngestE
     if len(starts) > 1 and min(np.diff([*starts, len(time_ns)])) >= SHORTEST_PART:
         ends = [(int(rows.lines[a]), int(rows.lines[b - 1])) for a, b in pairwise([*starts, len(time_ns)])]
         lines = "; ".join(f"{first} to {last}" for first, last in ends[:MOST_LISTED])
-        fact = f"{error.message if count > 1 else error.fact}; the log has {len(starts)} parts, lines {lines}{' ..' * (len(ends) > MOST_LISTED)}"
+        lines += " .." * (len(ends) > MOST_LISTED)
+        fact = f"{error.message if count > 1 else error.fact}; the log has {len(starts)} parts, lines {lines}"
         error = IngestError(fact, error.file, code=error.code, hint=PARTS)
         error.sessions = len(starts)
     return error

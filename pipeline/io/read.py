@@ -121,7 +121,7 @@ def _with_others(refused: list[InputError]) -> InputError:
 def _missing(
     procedure: Mapping[str, Any], files: dict[str, list[Path]], wanted: Mapping[str, list[list[str]]], folder: Path
 ) -> list[InputError]:
-    """Return an error that names all missing files; recordings of which parts are missing are taken out of ``files``."""
+    """Return an error that names all missing files; recordings that lack a part are taken out of ``files``."""
     missing, incomplete = [], []
     for name, candidates in wanted.items():
         if name not in files:

@@ -190,7 +190,8 @@ def time_error(time_ns: Integers, place: str, row: int) -> IngestError:
         f"time {what} {time_ns[row] / 1e9:.9g} s after {time_ns[row - 1] / 1e9:.9g} s ({count} such samples); time has "
         "to increase"
     )
-    return IngestError(message, place, code=code, hint="" if repeats else "a log that was restarted belongs in two files")
+    hint = "" if repeats else "a log that was restarted belongs in two files"
+    return IngestError(message, place, code=code, hint=hint)
 
 
 def slower_first(first: Integers, second: Integers) -> bool:

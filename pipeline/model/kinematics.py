@@ -56,6 +56,16 @@ def earth_rate(latitude_deg: float, azimuth_deg: float) -> Values:
     return EARTH_RATE_DPS * direction
 
 
+def normal_gravity_g(latitude_deg: float) -> float:
+    """Return gravity at sea level by WGS 84, g.
+
+    ``9.7803253359 (1 + 0.00193185265241 s) / sqrt(1 - 0.00669437999014 s) m/s^2`` with ``s = sin^2 latitude``
+    (NIMA TR8350.2, eq. 4-1).
+    """
+    s = float(np.sin(np.radians(latitude_deg))) ** 2
+    return float(9.7803253359 * (1.0 + 0.00193185265241 * s) / np.sqrt(1.0 - 0.00669437999014 * s) / 9.80665)
+
+
 def earth_of(table: Mapping[str, Any]) -> Values | None:
     """Return Earth's rotation in the level frame, None where the table's latitude or azimuth is not set."""
     latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")

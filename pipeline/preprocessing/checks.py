@@ -15,16 +15,18 @@ in rows or time, cut, or with rows left out.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.io.quality_flags import BY_CHANCE
+from pipeline.model.kinematics import normal_gravity_g
 from pipeline.preprocessing.at_rest import check_axes, check_static
 from pipeline.preprocessing.evidence import place, refusal
 from pipeline.preprocessing.mounting import check_mounting
 from pipeline.preprocessing.reference import check_motion, check_turns
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, Note
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 
 FEWEST, APART = 20, 8  # rows, see above
 DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
+SAME_GRAVITY_G = 1e-4  # gravity changes by as much over 0.3 km of height
 OF_DECIMALS = 200  # samples by which the decimals are told: a finer reading ends in a zero in a tenth of them
 MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
 
@@ -57,7 +60,26 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     check_shared_rows(recordings)
     check_axes(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
-    return check_motion(check_mounting(turns, settings), delays, settings)
+    return _with_gravity(check_motion(check_mounting(turns, settings), delays, settings), settings["table"])
+
+
+def _with_gravity(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recording]:
+    """Add a note where gravity is left at 1 g and the latitude that is stated has another."""
+    latitude = table.get("latitude_deg")
+    read = [k for k, r in enumerate(recordings) if r.accelerometer is not None]
+    if latitude is None or table.get("gravity_g") != 1.0 or not read:
+        return recordings
+    gravity = normal_gravity_g(float(latitude))
+    if abs(gravity - 1.0) < SAME_GRAVITY_G:
+        return recordings
+    detail = (
+        f"table.gravity_g is 1, its default; at latitude {latitude:g} deg gravity is {gravity:.5f} g at sea level, and "
+        f"0.000315 g less for each km of height: set table.gravity_g={gravity:.5f}, else the scale of the "
+        f"accelerometer is wrong by {abs(gravity - 1.0):.3%}"
+    )
+    first = recordings[read[0]]
+    recordings[read[0]] = replace(first, notes=(*first.notes, Note("N-GRAVITY", 1, 0, 0, detail)))
+    return recordings
 
 
 def check_shared_rows(recordings: Sequence[Recording]) -> None:

@@ -255,9 +255,7 @@ def cases() -> dict[str, Case]:
         "16 indexed": one(
             whole.partition(b"\n")[2], kept=ALL, settings={"csv/header": False, "csv/columns": indexed()}
         ),
-        "17": one(
-            text([*ROWS[:1500], HEADER, *ROWS[:1500]]), fault="restarted", says="by its key session", line=1502
-        ),
+        "17": one(text([*ROWS[:1500], HEADER, *ROWS[:1500]]), fault="restarted", says="by its key session", line=1502),
         "17 session": one(
             text([*ROWS[:1500], HEADER, *ROWS[:1500]]),
             notes=("N-SESSION",),
@@ -372,7 +370,7 @@ def cases() -> dict[str, Case]:
         "33 part of it twice": one(
             text([*ROWS[:1500], *ROWS[200:1000]]),
             fault="time_back",
-            says="lines 1502 to 2301 repeat lines 202 to 1001 exactly: delete them; the log has 2 parts, lines 2 to 1501; 1502 to 2301",
+            says="lines 1502 to 2301 repeat lines 202 to 1001 exactly: delete them; the log has 2 parts, lines 2 to 15",
             line=1502,
         ),
         "33 a block twice": one(text([*ROWS[:1500], *ROWS[1480:]]), notes=("N-REPEAT",), kept=ALL),

@@ -106,3 +106,12 @@ def test_a_static_recording_of_another_unit_is_in_doubt(number: int, doubts: int
     static = next(r for r in other if r.role == "static")
     checked = check_static([static if r.role == "static" else r for r in own], settings_of("mpu6050"))
     assert len(doubts_of("accelerometer", checked)) == doubts
+
+
+def test_gravity_that_was_left_at_1_g_is_noted_with_that_of_the_latitude() -> None:
+    placed = SETTINGS | {"table": SETTINGS["table"] | {"latitude_deg": 52.2946, "azimuth_deg": 0.0}}
+    details = [n.detail for r in check_recordings(list(sound()), placed) for n in r.notes if n.code == "N-GRAVITY"]
+    (stated,) = (float(g) for g in re.findall(r"table.gravity_g=([\d.]+)", *details))
+    assert stated == pytest.approx(9.81252 / 9.80665, abs=5e-5)  # PTB Braunschweig, 80 m above the sea
+    here = placed | {"table": placed["table"] | {"gravity_g": stated}}
+    assert not [n for r in check_recordings(list(sound()), here) for n in r.notes if n.code == "N-GRAVITY"]
