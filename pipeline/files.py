@@ -53,10 +53,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 def read_json(path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> Any:  # noqa: ANN401  (any JSON value)
     """Read a JSON file that an earlier stage of a run wrote; ``read`` returns its content.
 
-    Raises
-    ------
-    DamagedFileError
-        If it does not exist or is not JSON.
+    Raises ``DamagedFileError`` if it does not exist or is not JSON.
     """
     try:
         return json.loads(read(path))

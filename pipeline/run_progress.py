@@ -224,10 +224,7 @@ class Monitor(logging.Handler):
     def begin(self, *, quiet: bool, plain: bool) -> None:
         """Hold the results, wait for jobs that a killed run has left, and start to print the progress.
 
-        Raises
-        ------
-        BusyError
-            If another run holds the results.
+        Raises ``BusyError`` if another run holds the results.
         """
         take_run(self.results)
         while jobs_at_work(self.results):

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import read_effect_files, register
-from pipeline.planning.changes import best_changes, helps_most
+from pipeline.planning.changes import Gain, best_changes, helps_most
 from pipeline.planning.plan import plan_of, plan_text, side_by_side
 from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.planning.changes import Gain
 
 FILE = "simulation.yaml"
 EPILOG = """\

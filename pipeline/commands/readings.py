@@ -128,12 +128,8 @@ def named(profile: str, file: Path, campaign: Path | None) -> str:
     """Return a profile as it is to be read: a name that is known, or the only saved file of that name.
 
     A file is looked for in the working directory, in the folders about the log, and in ``configs/ingest`` of each of
-    these and of the campaigns below the working directory.
-
-    Raises
-    ------
-    ConfigurationError
-        If files of that name hold different profiles, or there is none.
+    these and of the campaigns below the working directory. Raises ``ConfigurationError`` if files of that name hold
+    different profiles, or there is none.
     """
     known = [root / "ingest" / f"{profile}.yaml" for root in (CONFIGS, *([campaign / "configs"] if campaign else []))]
     if Path(profile).suffix in (".yaml", ".yml") or any(place.is_file() for place in known):

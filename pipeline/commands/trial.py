@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config.campaign import cut_batches
+from pipeline.config.campaign import Campaign, cut_batches
 from pipeline.config.stage_settings import settings_of_jobs
 from pipeline.io.parquet import from_parquet
 from pipeline.model.effects import forget, register_user_effects
@@ -22,7 +22,6 @@ from pipeline.stages import MODULES
 from pipeline.stages.batch import FITS, Job, failure_of, merge_common
 
 if TYPE_CHECKING:
-    from pipeline.config.campaign import Campaign
     from pipeline.records import Recording
 
 

@@ -36,14 +36,13 @@ from pipeline.model.checked import WrongValueError, each, fields, flag, items, m
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import parameter_limits
 from pipeline.pack import read_published
-from pipeline.records import AXES, SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
+from pipeline.records import AXES, SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration, Values
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from pipeline.model.checked import Check
-    from pipeline.records import Values
 
 SCHEMA_VERSION = 1  # of the files that this version writes
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
@@ -107,13 +106,8 @@ _DOCUMENT = fields(
 def read_calibration(file: Path) -> dict[str, Any]:
     """Return the document of a calibrated unit.
 
-    Raises
-    ------
-    MissingInputError
-        If the file does not exist.
-    InputError
-        If it cannot be read, belongs to another schema version or to a failed unit, holds no calibrated sensor, or a
-        value is not what is expected.
+    Raises ``MissingInputError`` if the file does not exist, ``InputError`` if it cannot be read, belongs to another
+    schema version or to a failed unit, holds no calibrated sensor, or a value is not what is expected.
     """
     try:
         if file.exists() and (other := not_regular(file)):
@@ -149,12 +143,8 @@ def read_calibration(file: Path) -> dict[str, Any]:
 def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibration | None:
     """Return the calibration of one sensor of ``read_calibration``; None where it is not calibrated.
 
-    Raises
-    ------
-    InputError
-        If matrix, covariance or an effect is not what it should be.
-    ConfigurationError
-        If an effect is not known.
+    Raises ``InputError`` if matrix, covariance or an effect is not what it should be, ``ConfigurationError`` if an
+    effect is not known.
     """
     part = document[sensor]
     if part is None:

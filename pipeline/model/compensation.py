@@ -23,7 +23,7 @@ from pipeline.model.effects import load_python_effect, register
 from pipeline.model.effects.base import OF_THE_ROOM
 from pipeline.model.log_motion import SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.model.measurement import Truths
-    from pipeline.records import FittedEffect, Motion, SensorCalibration, Values
 
 SMOOTHING_S = 3.0  # 30 samples of a thermometer at 10 Hz; a package warms up in minutes
 BLOCK = 8192  # samples that are computed at once: their arrays stay in the processor's cache

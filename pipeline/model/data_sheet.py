@@ -32,10 +32,7 @@ def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str
 def range_settings(key: str, value: Any, sensor: Mapping[str, Any]) -> list[tuple[str, Any]]:  # noqa: ANN401  (the user's)
     """Return what an override stands for: itself, or the figures of the range that it chooses.
 
-    Raises
-    ------
-    ConfigurationError
-        If the sensor's file does not list the range.
+    Raises ``ConfigurationError`` if the sensor's file does not list the range.
     """
     group, _, rest = key.partition(".")
     part, _, leaf = rest.partition(".")
@@ -52,12 +49,8 @@ def range_settings(key: str, value: Any, sensor: Mapping[str, Any]) -> list[tupl
 def settings_of_ranges(sensor: Mapping[str, Any], wanted: Sequence[float | None]) -> list[str]:
     """Return the overrides that set the range of the accelerometer, g, then of the gyroscope, deg/s; None: as it is.
 
-    They are ``range`` of a sensor whose file lists its ranges, else full scale and counts per unit.
-
-    Raises
-    ------
-    ConfigurationError
-        If there are more ranges than sensors, one is not positive, or the file does not list it.
+    They are ``range`` of a sensor whose file lists its ranges, else full scale and counts per unit. Raises
+    ``ConfigurationError`` if there are more ranges than sensors, one is not positive, or the file does not list it.
     """
     parts = [part for part in SENSORS if sensor.get(part)]
     if len(wanted) > len(parts) or not all(value is None or value > 0.0 for value in wanted):

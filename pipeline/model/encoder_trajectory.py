@@ -19,12 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import median
+from pipeline.records import Values, median
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from pipeline.records import Values
 
 
 TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3  # a good encoder's resolution; 17 ug of specific force

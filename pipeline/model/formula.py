@@ -149,10 +149,8 @@ class Formula:
 def parse(text: str, where: str | None = None) -> Formula:
     """Read a formula; messages name ``where``, its file and line.
 
-    Raises
-    ------
-    ConfigurationError
-        If it is anything but numbers, signals and functions, too long or too deep; with the position in the text.
+    Raises ``ConfigurationError`` if it is anything but numbers, signals and functions, too long or too deep; with the
+    position in the text.
     """
     line = " ".join(text.split())
     if not line:

@@ -27,7 +27,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.model.encoder_trajectory import EncoderTrajectory
-from pipeline.records import AXES, Motion, conjugate_product, continuous
+from pipeline.records import AXES, Motion, Recording, Values, conjugate_product, continuous
 from pipeline.signal.encoder_rate import rate_by_angle
 from pipeline.signal.filters import temperature_of
 from pipeline.signal.rests import still_samples
@@ -35,7 +35,6 @@ from pipeline.signal.rests import still_samples
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipeline.records import Recording, Values
 
 EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
 UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # see above

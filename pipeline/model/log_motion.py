@@ -27,12 +27,10 @@ import numpy as np
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, turning_direction
-from pipeline.records import Motion
+from pipeline.records import FittedEffect, Motion, Values
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-    from pipeline.records import FittedEffect, Values
 
     Known = tuple[float, Values]  # the last sample that is not missing: time in s, value
 
@@ -110,10 +108,7 @@ def log_motion(
 def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
     """Return the fields of a motion that effects look at.
 
-    Raises
-    ------
-    ConfigurationError
-        If one needs what no log of a sensor holds, such as a table's angle.
+    Raises ``ConfigurationError`` if one needs what no log of a sensor holds, such as a table's angle.
     """
     seen: set[str] = set()
     for fitted in effects:
@@ -160,10 +155,7 @@ class ExponentialRegression:
     def apply(self, time: Values, temperature: Values) -> Values:
         """Return the line at each sample: (n,) array, degC; a row without a temperature (NaN) is given the line's.
 
-        Raises
-        ------
-        InputError
-            If time goes back by more than the line can bear.
+        Raises ``InputError`` if time goes back by more than the line can bear.
         """
         stretch = np.floor(time / (STRETCH * self.memory))
         cuts = np.flatnonzero(stretch[1:] != stretch[:-1]) + 1

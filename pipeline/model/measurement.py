@@ -19,14 +19,13 @@ import numpy as np
 
 from pipeline.errors import ConvergenceError
 from pipeline.model.effects import effect_of, owner_of
-from pipeline.model.effects.base import Owner, truth
+from pipeline.model.effects.base import Effect, Owner, truth
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.model.effects.base import Effect
     from pipeline.records import FittedEffect, Motion, SensorCalibration, Values
 
     Truths = dict[str, Values]

@@ -18,19 +18,16 @@ from pipeline.estimation.rest_means import ROLE
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import Owner
 from pipeline.model.kinematics import LEVEL_AT_ZERO
-from pipeline.planning.plan import plan_of, share_text, size_text
+from pipeline.planning.plan import Document, plan_of, share_text, size_text
 from pipeline.records import AXES, SENSORS
 from pipeline.signal.rests import SETTLING_S
-from pipeline.simulation.description import course_of, read_config
-from pipeline.simulation.procedures import FERRARIS, ONE_RECORDING, TABLE_PROCEDURES, TRANSIT, plan
+from pipeline.simulation.description import UnitDescription, course_of, read_config
+from pipeline.simulation.procedures import FERRARIS, ONE_RECORDING, TABLE_PROCEDURES, TRANSIT, Course, plan
 from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from pipeline.planning.plan import Document
-    from pipeline.simulation.description import UnitDescription
-    from pipeline.simulation.procedures import Course
 
 FASTER_DPS = (100.0, 200.0)  # rates that are proposed, within a low-cost range of 250 deg/s
 CLEARLY_FASTER = 1.3  # than the procedure's fastest rate, for a rate to be proposed

@@ -31,19 +31,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import Term
-from pipeline.estimation.gauss_markov import GaussMarkov, Setting
+from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, log_likelihood, project_out
 from pipeline.estimation.ranking import RIDGE
-from pipeline.estimation.selection import ALIKE, DELAYS, GATE_BIC, GATE_P
+from pipeline.estimation.selection import ALIKE, DELAYS, GATE_BIC, GATE_P, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.gauss_markov import Blocks
     from pipeline.estimation.multi_position import selection as by_hand
-    from pipeline.estimation.selection import Selection
     from pipeline.records import Noise, Values
 
     Squares = tuple[Values, Values, Values]  # of draws, of draws with signals, of signals

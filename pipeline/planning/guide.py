@@ -45,18 +45,15 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import COLUMNS, IDEAL, PLACE, ROWS, triangle
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
-from pipeline.estimation.rest_means import ROLE, holdout_interval, orientations_of, rest_means
-from pipeline.records import AXES, coverage_factor
-from pipeline.signal.rests import WINDOW_S, find_rests
+from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
+from pipeline.records import AXES, Recording, SensorCalibration, Values, coverage_factor
+from pipeline.signal.rests import WINDOW_S, Rest, find_rests
 from pipeline.signal.segments import multiples
 from pipeline.simulation.trajectory import rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.rest_means import Orientations
-    from pipeline.records import Recording, SensorCalibration, Values
-    from pipeline.signal.rests import Rest
 
 SHARPNESS = 8  # of the norm that stands for the largest U: within 32 % of it for nine parameters, smooth
 SWEEPS = 10  # of the exchange; it ends by itself after two or three

@@ -28,16 +28,14 @@ from pipeline.estimation.selection import unselected
 from pipeline.model.data_sheet import assumed_figures
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
-from pipeline.planning.detection_limits import RestLimits, TurntableLimits
+from pipeline.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
 from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import course_of, read_config
+from pipeline.simulation.description import UnitDescription, course_of, read_config
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.planning.detection_limits import Detection, DetectionLimits
-    from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.trajectory import Planned
 
 CLEARLY_LARGER = 1.2  # times the smallest size, from which on the size at which an effect is named is printed
@@ -54,12 +52,8 @@ Document = dict[str, Any]
 def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: bool = False) -> Document:
     """Return the plan of a unit's procedure with further recordings.
 
-    With ``half_only``, ``almost_sure`` and ``named`` are left out.
-
-    Raises
-    ------
-    ConfigurationError
-        If a name is not known or the course cannot be run.
+    With ``half_only``, ``almost_sure`` and ``named`` are left out. Raises ``ConfigurationError`` if a name is not known
+    or the course cannot be run.
     """
     simulated = simulate_procedure(unit, extra)
     return {
@@ -114,10 +108,7 @@ def _limits(sensor: str, simulated: SimulatedProcedure) -> tuple[DetectionLimits
 def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Selection:
     """Return what the selection makes of a simulated procedure by hand.
 
-    Raises
-    ------
-    NotObservableError
-        If bias and matrix cannot be determined, or there are no rests.
+    Raises ``NotObservableError`` if bias and matrix cannot be determined, or there are no rests.
     """
     sections = {"sensor": simulated.sheets, "table": simulated.table, "procedure": simulated.procedure}
     settings: dict[str, Any] = {**sections, "effects": {"accelerometer": [], "gyroscope": []}}
@@ -171,10 +162,7 @@ class SimulatedProcedure:
 def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> SimulatedProcedure:
     """Simulate a procedure and further recordings in memory, without the unit's effects and the table's imperfections.
 
-    Raises
-    ------
-    ConfigurationError
-        If sensor, table or procedure are not known, or the course cannot be run.
+    Raises ``ConfigurationError`` if sensor, table or procedure are not known, or the course cannot be run.
     """
     faultless = replace(
         unit, effects={}, imperfections=FAULTLESS, held_out={}, temperature={**ROOM, **unit.temperature}

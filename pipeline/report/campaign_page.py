@@ -14,13 +14,12 @@ from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart
 from pipeline.report.held_out_section import FAR
 from pipeline.report.numbers import number, plain
 from pipeline.report.pages import script_data, template
-from pipeline.report.strips import strips
+from pipeline.report.strips import Placed, strips
 from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
 
-    from pipeline.report.strips import Placed
 
 JSON = dict[str, Any]
 FIRST = 100  # rows that a browser shows at once; it shows the others when asked

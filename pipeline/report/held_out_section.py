@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.records import SENSOR_UNITS, SENSORS, Noise, SensorCalibration
+from pipeline.records import SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration
 from pipeline.report.chart import Area, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
@@ -18,7 +18,6 @@ from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.samples import OTHER, samples_of_motion
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
     from pipeline.report.axis import Values
 
 JSON = dict[str, Any]

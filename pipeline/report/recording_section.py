@@ -6,16 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, Recording
 from pipeline.report.chart import Figure, Layer, Line, Panel, chart
 from pipeline.report.numbers import NOTHING, number, plain
-from pipeline.signal.rests import rests_from_table
+from pipeline.signal.rests import Rest, rests_from_table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.records import Recording
-    from pipeline.signal.rests import Rest
 
 JSON = dict[str, Any]
 LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.model.kinematics import table_motion
 from pipeline.model.measurement import predicted_reading
-from pipeline.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, SensorCalibration
+from pipeline.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, Motion, Recording, SensorCalibration
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Motion, Recording
     from pipeline.report.axis import Values
 
 JSON = dict[str, Any]

@@ -5,14 +5,14 @@ One file that works offline: style, script and charts are inline, and its conten
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipeline.files import json_text
 from pipeline.model.calibration_file import sentences
 from pipeline.outcome import VERDICTS, commands_of, place, run_command
-from pipeline.records import SENSOR_UNITS, SENSORS
+from pipeline.records import SENSOR_UNITS, SENSORS, Recording
 from pipeline.report.diagnosis_section import evidence_figures, limit_rows, ranking_rows, upper_limits
 from pipeline.report.held_out_section import (
     FAR,
@@ -29,9 +29,6 @@ from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters, parameter_rows
 from pipeline.report.recording_section import environment, recording_rows, rest_rows, rests_logged, segments
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
-
-if TYPE_CHECKING:
-    from pipeline.records import Recording
 
 JSON = dict[str, Any]
 

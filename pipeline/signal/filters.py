@@ -49,12 +49,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.records import Note, Recording, noise_of_steps
+from pipeline.records import Integers, Note, Recording, Values, noise_of_steps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.records import Integers, Values
 
 GAP = 1.5  # medians of the interval: a lost sample makes two of one
 JITTER = 0.1  # of the interval: beyond it samples count as uneven

@@ -45,13 +45,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import MEDIAN_SIZE, median, noise_of_steps
+from pipeline.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from pipeline.records import Mask, Recording, Values
 
     Spans = list[tuple[int, int]]
 

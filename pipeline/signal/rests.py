@@ -26,14 +26,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import median, noise_of_steps
+from pipeline.records import Integers, Mask, Recording, Values, median, noise_of_steps
 from pipeline.signal.filters import filter_autocovariance, stretch_starts
 from pipeline.signal.quiet_motion import RATE_LIMIT_DPS, counts_of, creep_in, quiet_pieces, windows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from pipeline.records import Integers, Mask, Recording, Values
 
     Spans = list[tuple[int, int]]
 

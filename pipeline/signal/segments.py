@@ -34,13 +34,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.records import AXES, Note, rate_of_attitude
+from pipeline.records import AXES, Mask, Note, Recording, Values, rate_of_attitude
 from pipeline.signal.rests import RATE_AT_REST_DPS, find_rests, runs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Mask, Recording, Values
 
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
 BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # of rest that a segment takes with it

@@ -20,15 +20,13 @@ from pipeline.estimation.chip_rows import Chip
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.channel_table import axis_maps
 from pipeline.model.calibration_file import implausible
-from pipeline.pack import FAILED
-from pipeline.records import SENSORS, SensorCalibration
+from pipeline.pack import FAILED, Files
+from pipeline.records import SENSORS, Recording, SensorCalibration
 from pipeline.stages.unit_files import recordings_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.pack import Files
-    from pipeline.records import Recording
     from pipeline.stages.batch import Job
 
 MOVE = "record turns of 100 deg/s and more about all axes"

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.uncertainty_budget import with_stated
-from pipeline.pack import Pack
+from pipeline.pack import Files, Pack
 from pipeline.records import SensorCalibration
 from pipeline.stages.unit_files import load_noises, recordings_of
 
 if TYPE_CHECKING:
-    from pipeline.pack import Files
     from pipeline.stages.batch import Job
 
 NOT_LAST = "no"  # value of the option --last

@@ -17,27 +17,24 @@ from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.exports import exports
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record, unit_state
-from pipeline.pack import DOCUMENTS, PACKS, STAGES, WITH_PRIOR, Batch, as_bytes, new_pack
+from pipeline.pack import DOCUMENTS, PACKS, STAGES, WITH_PRIOR, Batch, Files, as_bytes, new_pack
 from pipeline.records import SENSORS
 from pipeline.report.campaign_page import render
 from pipeline.report.combined import combined_calibrations
 from pipeline.report.comparison_section import section, unit_figures
 from pipeline.report.fleet import fleet_statistics, unit_parameters, write_parameters
-from pipeline.report.lot import calibration_with_prior, estimates, priors_of, with_card
+from pipeline.report.lot import Prior, calibration_with_prior, estimates, priors_of, with_card
 from pipeline.report.pages import failure_page
 from pipeline.report.run_section import runs_data, times_of, with_history
 from pipeline.report.strips import Placed, against_limits
 from pipeline.report.summary import summary_row, write_summary
 from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
-from pipeline.stages.batch import failure_of, record_output
+from pipeline.stages.batch import Job, failure_of, record_output
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from pipeline.pack import Files
-    from pipeline.report.lot import Prior
     from pipeline.report.parameters import Parameter
-    from pipeline.stages.batch import Job
 
 JSON = dict[str, Any]
 NEW = ".new"  # folder of the new set, below the results

@@ -12,17 +12,15 @@ from pipeline.errors import IngestError, PipelineError
 from pipeline.io.files import candidate_files, recording_files, unchanged
 from pipeline.io.parquet import to_parquet
 from pipeline.io.read import read_recordings
-from pipeline.pack import FAILED, as_bytes, new_pack
+from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.segments import cut, held_out_windows
-from pipeline.stages.batch import failure_of
+from pipeline.stages.batch import Job, failure_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.pack import Files, Pack
     from pipeline.records import Recording
-    from pipeline.stages.batch import Job
 
 
 def collect_batch(job: Job) -> None:

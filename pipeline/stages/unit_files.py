@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.estimation.noise import estimate_noise, noise_of
 from pipeline.io.parquet import from_parquet
-from pipeline.records import SENSORS, Noise, SensorCalibration
+from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.pack import Files, Pack
-    from pipeline.records import Recording
 
 
 def recordings_of(packs: Mapping[str, Pack], unit: str) -> list[Recording]:

@@ -43,17 +43,15 @@ from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, Recording, Values
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from pipeline.simulation.session import Streams, random_environment
-from pipeline.study.cases import COURSES, OF_TEMPERATURE
+from pipeline.study.cases import COURSES, OF_TEMPERATURE, Case
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Recording, Values
-    from pipeline.study.cases import Case
 
 INTERVAL_S = 0.12  # the default of ``UnitDescription``
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}

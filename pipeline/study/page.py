@@ -10,6 +10,7 @@ import pandas as pd
 from pipeline.model.effects import effect
 from pipeline.study.cases import FAINT, SIZES
 from pipeline.study.scores import (
+    Score,
     answer_scores,
     family_scores,
     first_is_right,
@@ -23,7 +24,6 @@ from pipeline.study.scores import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.study.scores import Score
 
 JSON = dict[str, Any]
 Rows = list[list[Any]]

@@ -29,16 +29,14 @@ from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import fit_stage
 from pipeline.model.effects import leaving_out
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, Recording, SensorCalibration
 from pipeline.study.bench import at_detection, recordings_of, signals_left
-from pipeline.study.cases import REFERENCE, draw
+from pipeline.study.cases import REFERENCE, Case, draw
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from pipeline.records import Recording, SensorCalibration
-    from pipeline.study.cases import Case
 
 TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
 JSON = dict[str, Any]
@@ -57,12 +55,8 @@ def run_study(
 ) -> None:
     """Run the first ``count`` cases of each family that have no result in ``directory``.
 
-    ``progress`` gets how many of how many are done.
-
-    Raises
-    ------
-    ConfigurationError
-        If the directory holds cases of another seed.
+    ``progress`` gets how many of how many are done. Raises ``ConfigurationError`` if the directory holds cases of
+    another seed.
     """
     directory.mkdir(parents=True, exist_ok=True)
     others = {line["seed"] for line in read_lines(directory / TRUTH)} - {seed}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.report.comparison import mean_of
+from pipeline.report.comparison import Estimate, mean_of
 from pipeline.report.numbers import number
 from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, in_words
 from pipeline.thesis.seeds import CAUSES, INTERVAL_S, LOST, TIME_CONSTANT_S
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from pipeline.report.comparison import Estimate
 
 CONFIRMED, REFUTED, NONE, OPEN = "confirmed", "refuted", "no difference", "not decided"
 KINDS = {CONFIRMED: "good", REFUTED: "bad", NONE: "warn", OPEN: "warn"}  # CSS classes

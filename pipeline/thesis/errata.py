@@ -31,7 +31,7 @@ import pandas as pd
 
 from pipeline.report.numbers import MINUS, number
 from pipeline.thesis.conclusions import Errors, gain_of_filter
-from pipeline.thesis.results import AXES, DEVICES, RATES, matrix_of, read_printed, values
+from pipeline.thesis.results import AXES, DEVICES, JSON, RATES, Results, matrix_of, read_printed, values
 from pipeline.thesis.seeds import CAUSES, LOST, TIME_CONSTANT_S
 from pipeline.thesis.tables import ACCELEROMETER, GYROSCOPE
 
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.records import Values
-    from pipeline.thesis.results import JSON, Results
 
 BANGKOK = 9.783  # m/s^2, WGS 84 normal gravity at 13.7 deg N
 STANDARD = 9.80665  # m/s^2, standard gravity (CGPM 1901)

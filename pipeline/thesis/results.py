@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.pack import Pack, read_published
-from pipeline.records import Noise
+from pipeline.records import Noise, Recording, Values
 from pipeline.stages.unit_files import recordings_of
 from pipeline.validation.samples import samples_of_motion
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from pipeline.records import Recording, Values
 
 JSON = dict[str, Any]
 AXES = "xyz"

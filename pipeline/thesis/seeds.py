@@ -39,12 +39,12 @@ from pipeline.estimation.accelerometer.turn_extremes import (
 from pipeline.estimation.gyroscope import staged as gyroscope
 from pipeline.estimation.gyroscope.cholesky_lu import turns_of
 from pipeline.estimation.stages import apply_correction
-from pipeline.estimation.turns import parts_of
+from pipeline.estimation.turns import Part, parts_of
 from pipeline.model.measurement import linear_truth
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, Recording, Values
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import read_config, read_description
+from pipeline.simulation.description import Description, UnitDescription, read_config, read_description
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
 from pipeline.simulation.session import received
 from pipeline.thesis.results import AXES, DEVICES, SILENT
@@ -56,9 +56,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.turns import Part
-    from pipeline.records import Recording, Values
-    from pipeline.simulation.description import Description, UnitDescription
 
 FOUND = ("O_y", "O_z", "M", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
 COLUMNS = ("set", "seed", "cause", "method", *FOUND, "error")

@@ -15,14 +15,13 @@ import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
 from pipeline.signal.rests import find_rests
-from pipeline.thesis.results import AXES, DEVICES, TABLES, in_words, read_printed, values
+from pipeline.thesis.results import AXES, DEVICES, JSON, TABLES, Results, in_words, read_printed, values
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from pipeline.records import Recording, Values
-    from pipeline.thesis.results import JSON, Results
 
     Cells = Iterator[JSON]
 

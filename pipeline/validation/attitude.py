@@ -28,14 +28,12 @@ from pipeline.estimation.multi_position.moves import moves_of, observed_rests
 from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect
-from pipeline.records import continuous, level_in_body
+from pipeline.records import Noise, Recording, SensorCalibration, Values, continuous, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
-
-    from pipeline.records import Noise, Recording, SensorCalibration, Values
 
 
 MINUTE = 60.0  # s over which a drift is stated

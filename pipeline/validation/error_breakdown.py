@@ -23,14 +23,11 @@ from pipeline.model.effects.base import truth
 from pipeline.model.effects.mounting import SEPARATOR, Mounting
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, linear_truth, solve
-from pipeline.records import Motion
-from pipeline.validation.samples import OTHER
+from pipeline.records import FittedEffect, Motion, SensorCalibration, Values
+from pipeline.validation.samples import OTHER, Samples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from pipeline.records import FittedEffect, SensorCalibration, Values
-    from pipeline.validation.samples import Samples
 
     Corrected = tuple[Values, Values, Values | None]  # vector, magnitude, truth
 

@@ -34,13 +34,12 @@ from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED
 from pipeline.model.measurement import inverse_of
 from pipeline.validation.error_breakdown import last_step
-from pipeline.validation.samples import mean_squares
+from pipeline.validation.samples import Samples, mean_squares
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.records import Noise, SensorCalibration, Values
-    from pipeline.validation.samples import Samples
 
 
 LACK_OF_FIT = "lack of fit"  # the part of a budget's line that no noise explains: 0 in a model that is right

@@ -24,14 +24,13 @@ from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.model.measurement import linear_truth
 from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude, left_out
 from pipeline.validation.expected_error import expected_rms_error, linearized
-from pipeline.validation.samples import samples_of_motion, samples_of_rests, squared_norm_errors
+from pipeline.validation.samples import Samples, samples_of_motion, samples_of_rests, squared_norm_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Noise, Recording, SensorCalibration, Values
     from pipeline.signal.rests import Rest
-    from pipeline.validation.samples import Samples
 
 LEVEL = 1e-3  # probability that a calibration as good as none is refused
 STRETCHES, FEWEST = 20, 5  # a stretch of a recording of minutes is longer than the correlation time of most wander

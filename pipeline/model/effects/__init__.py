@@ -81,10 +81,7 @@ def leaving_out(names: Iterable[str]) -> Iterator[None]:
 def register(effect: Effect) -> None:
     """Add a user's effect to the catalogue of this process; it replaces one of the same name.
 
-    Raises
-    ------
-    ConfigurationError
-        If a built-in effect has that name.
+    Raises ``ConfigurationError`` if a built-in effect has that name.
     """
     if effect.name in built_in_files():
         raise ConfigurationError(f"effect {effect.name}: a built-in effect is called so; give yours another name")
@@ -94,10 +91,7 @@ def register(effect: Effect) -> None:
 def register_user_effects(section: Mapping[str, Any]) -> None:
     """Register the effects that a job's configuration carries: ``formulas`` and ``python`` (paths and hashes).
 
-    Raises
-    ------
-    ConfigurationError
-        If one is not as it should be.
+    Raises ``ConfigurationError`` if one is not as it should be.
     """
     for definition in section.get("formulas", ()):
         register(effect_from(definition, f"effect {definition.get('name')} of the campaign"))
@@ -114,10 +108,7 @@ def forget(*names: str) -> None:
 def effect(name: str) -> Effect:
     """Return one effect by name; ``<effect>@<setup>`` is that of one session (``pipeline.model.effects.mounting``).
 
-    Raises
-    ------
-    ConfigurationError
-        If there is none of that name.
+    Raises ``ConfigurationError`` if there is none of that name.
     """
     if name in _registered:
         return _registered[name]
@@ -131,10 +122,7 @@ def effect(name: str) -> Effect:
 def effect_of(fitted: FittedEffect) -> Effect:
     """Return the effect that was fitted: from its own definition where it carries one, else from the catalogue.
 
-    Raises
-    ------
-    ConfigurationError
-        If it was defined in Python and the file has not been named, or has changed.
+    Raises ``ConfigurationError`` if it was defined in Python and the file has not been named, or has changed.
     """
     if fitted.definition is None:
         return effect(fitted.name)
@@ -186,10 +174,7 @@ def built_in_files() -> dict[str, Path]:
 def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
     """Return the effects of YAML files, by name.
 
-    Raises
-    ------
-    ConfigurationError
-        With a line for each faulty file.
+    Raises ``ConfigurationError`` with a line for each faulty file.
     """
     found: dict[str, Effect] = {}
     problems = []
@@ -206,10 +191,7 @@ def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
 def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
     """Return the effect of one YAML file.
 
-    Raises
-    ------
-    ConfigurationError
-        If it is faulty, with the line.
+    Raises ``ConfigurationError`` if it is faulty, with the line.
     """
     text = read_text(file, LARGEST_BYTES, "an effect")
     given = load_yaml(text, str(file), LARGEST_SIZE)

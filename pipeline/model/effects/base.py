@@ -19,13 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.records import SENSOR_UNITS, SENSORS, Motion
+from pipeline.records import SENSOR_UNITS, SENSORS, Motion, Values
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from pipeline.records import Values
 
 
 REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets

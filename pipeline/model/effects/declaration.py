@@ -21,7 +21,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.checked import WrongValueError, each, expected, fields, flag, items, one_of, text
+from pipeline.model.checked import Check, WrongValueError, each, expected, fields, flag, items, one_of, text
 from pipeline.model.effects.base import Owner, Parameter
 from pipeline.model.formula import SIGNALS, Formula, parse
 from pipeline.records import AXES, SENSORS
@@ -29,7 +29,6 @@ from pipeline.records import AXES, SENSORS
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipeline.model.checked import Check
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
 TERM = re.compile(r"[A-Za-z](?=.{0,19}$)[A-Za-z0-9_]*\*?[A-Za-z0-9_]*")

@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.model.effects.base import Effect, Layout, length, per_axis, truth, turning_direction
+from pipeline.model.effects.base import Effect, Layout, Parameter, length, per_axis, truth, turning_direction
 from pipeline.model.formula import OF_THE_MOTION, SIGNALS, c_number
-from pipeline.records import AXES
+from pipeline.records import AXES, Motion, Values
 
 if TYPE_CHECKING:
-    from pipeline.model.effects.base import Parameter
     from pipeline.model.effects.declaration import Declaration, Term
-    from pipeline.records import Motion, Values
 
 
 AS_DECLARED = (
@@ -100,10 +98,7 @@ class FormulaEffect(DeclaredEffect):
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the formulas' values in the shape of the layout.
 
-        Raises
-        ------
-        InputError
-            If a value is not finite where its signals are, or the recording does not hold a signal.
+        Raises ``InputError`` if a value is not finite where its signals are, or the recording does not hold a signal.
         """
         del values
         signals = {name: self._signal(name, sensor, motion) for name in self._names}

@@ -299,10 +299,7 @@ class _InSession(Effect):
 def in_session(name: str, base: Effect) -> Effect:
     """Return the effect ``<base>@<session>``.
 
-    Raises
-    ------
-    ConfigurationError
-        If the effect moves the motion in time, or is not linear in its parameters.
+    Raises ``ConfigurationError`` if the effect moves the motion in time, or is not linear in its parameters.
     """
     if base.moves or base.nonlinear:
         raise ConfigurationError(
