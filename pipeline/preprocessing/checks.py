@@ -60,7 +60,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     check_shared_rows(recordings)
     check_axes(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
-    return _with_gravity(check_motion(check_mounting(turns, settings), delays, settings), settings["table"])
+    return _with_gravity(check_motion(check_mounting(turns, settings), delays, settings), settings.get("table") or {})
 
 
 def _with_gravity(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recording]:
