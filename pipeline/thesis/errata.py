@@ -106,8 +106,7 @@ def _twice_subtracted(results: Results) -> Erratum:
 
 def _order_of_matrix(results: Results) -> Erratum:
     rate = np.diag([60.0 * (1 - e) for e in (-0.027, -0.010, 0.002)])
-    fit = results.fit("mpu6050-1-gyro-60dps-staged", "gyroscope")
-    matrix = np.array(fit["matrix"]) if fit else np.eye(3)
+    _, matrix = results.calibration("mpu6050-1-gyro-60dps-staged", "gyroscope")
     S = rate @ np.linalg.solve(matrix.T, np.eye(3))
     wrong = np.linalg.solve(S.T, rate).T
     right = np.linalg.solve(S, rate)
@@ -163,7 +162,7 @@ def _percentages(errors: pd.DataFrame) -> Erratum:
 
 def _cosines(results: Results) -> Erratum:
     unit = "mpu6050-1-stop-1s"
-    staged = results.error(f"{unit}-staged", "accelerometer")
+    staged, least_squares = (results.errors(f"{unit}-{m}", "accelerometer")[1] for m in ("staged", "least-squares"))
     parts = [results.parameter(f"{unit}-staged", "accelerometer", "orthogonality", f"O_P_{a}") for a in "yz"]
     return Erratum(
         "Stages 2 and 3 multiply readings by cosines",
@@ -172,8 +171,7 @@ def _cosines(results: Results) -> Erratum:
         "MPU6050 (1), stop 1 s: the true non-orthogonality of up to 0.29 deg makes O "
         f"{' and '.join(number(p, 6) for p in parts)}; the cross terms that it would need are "
         f"{number(np.radians(0.286), 2)}. Mean |e| after: {number(staged)} g with the stages, "
-        f"{number(results.error(f'{unit}-least-squares', 'accelerometer'))} g with the nine parameters of least "
-        "squares.",
+        f"{number(least_squares)} g with the nine parameters of least squares.",
     )
 
 
@@ -236,18 +234,17 @@ def _bias_of_mark2(parameters: pd.DataFrame, results: Results) -> Erratum:
 
 
 def _side(results: Results) -> Erratum:
-    fit = results.fit("mpu6050-1-stop-1s-staged", "accelerometer")
-    bias = abs(fit["bias"][2]) if fit else None
+    bias, _ = results.calibration("mpu6050-1-stop-1s-staged", "accelerometer")
     return Erratum(
         "Stages 2 and 3 choose the side by the sign of the reading before its bias is removed",
         "By the sign of the compensated reading",
-        f"On z of MPU6050 (1) the wrong side is taken within {number(bias)} g of level.",
+        f"On z of MPU6050 (1) the wrong side is taken within {number(abs(bias[2]))} g of level.",
     )
 
 
 def _anisotropy(errors: pd.DataFrame, results: Results) -> Erratum:
     isotropic = float(np.linalg.norm([-3.837, 0.003, 0.255])) / 2.0  # mean of |u . b| over all directions u
-    ours = {d: results.error(f"{d}-gyro-20dps-printed", "gyroscope", "raw") for d in DEVICES}
+    ours = {d: results.errors(f"{d}-gyro-20dps-printed", "gyroscope")[0] for d in DEVICES}
     own = errors[(errors["sensor"] == "gyroscope") & (errors["metric"] == "mean_abs_error")]
     told = own.drop_duplicates("device", keep="last").set_index("device")["before"]
     parts = [f"{name} {number(ours[d])} against {number(told[d])} printed" for d, name in DEVICES.items()]
@@ -278,28 +275,27 @@ def agreements(printed: Path, results: Results) -> pd.DataFrame:
     rows = _on_precise_table(printed, "accel_parameters")
     median = rows.groupby("device")[BIAS].median()
     for title, method in reversed(ACCELEROMETER.items()):
-        fits = list(_fits(rows, results, "accelerometer", method))
-        bias = [np.array(fit["bias"]) - median.loc[row["device"]].to_numpy() for row, fit in fits]
-        product = [np.diag(fit["matrix"]) - TRUE_SCALE[row["device"]] for row, fit in fits]
-        found.append(("Bias of the accelerometer, g, from the median of the printed", title, 0.002, bias))
+        fits = [
+            (row, *results.calibration(f"{row['set']}-{method}", "accelerometer")) for row in rows.to_dict("records")
+        ]
+        off = [bias - median.loc[row["device"]].to_numpy() for row, bias, _ in fits]
+        product = [np.diag(matrix) - TRUE_SCALE[row["device"]] for row, _, matrix in fits]
+        found.append(("Bias of the accelerometer, g, from the median of the printed", title, 0.002, off))
         found.append(("O M S of the accelerometer, from the truth", title, 0.005, product))
     rows = _on_precise_table(printed, "gyro_parameters")
     for title, method in reversed(GYROSCOPE.items()):
         fits = list(_fits(rows, results, "gyroscope", method))
-        bias = [np.array(fit["bias"]) - values(row, "b_{}_dps") for row, fit in fits]
-        matrix = [np.transpose(fit["matrix"]) - matrix_of(row, "M") for row, fit in fits]
-        found.append(("Bias of the gyroscope, deg/s, from the printed", title, 0.02, bias))
-        found.append(("Matrix of the gyroscope, from the printed", title, 0.002, matrix))
+        off = [bias - values(row, "b_{}_dps") for row, bias, _ in fits]
+        change = [matrix.T - matrix_of(row, "M") for row, _, matrix in fits]
+        found.append(("Bias of the gyroscope, deg/s, from the printed", title, 0.02, off))
+        found.append(("Matrix of the gyroscope, from the printed", title, 0.002, change))
     what = "Cholesky and LU from the stages, over the expanded uncertainty of the difference"
     found.append((what, "inverted", 1.0, list(_cholesky(results))))
     out = []
     for what, title, bound, differences in found:
-        size = np.abs(np.ravel(differences))
-        largest = size.max() if size.size else np.nan
-        within = int(np.sum(size <= bound))
-        out.append(
-            {"what": what, "method": title, "bound": bound, "largest": largest, "within": within, "count": size.size}
-        )
+        size = pd.Series(np.abs(np.ravel(differences))).dropna()
+        about = {"what": what, "method": title, "bound": bound, "largest": size.max()}
+        out.append(about | {"within": (size <= bound).sum(), "count": len(size)})
     return pd.DataFrame(out)
 
 
@@ -308,11 +304,9 @@ def _on_precise_table(printed: Path, name: str) -> pd.DataFrame:
     return rows[rows["rate_table"] == "acutronic"]
 
 
-def _fits(rows: pd.DataFrame, results: Results, sensor: str, method: str) -> Iterator[tuple[JSON, JSON]]:
+def _fits(rows: pd.DataFrame, results: Results, sensor: str, method: str) -> Iterator[tuple[JSON, Values, Values]]:
     for row in rows.to_dict("records"):
-        fit = results.fit(f"{row['set']}-{method}", sensor)
-        if fit is not None:
-            yield row, fit
+        yield row, *results.calibration(f"{row['set']}-{method}", sensor)
 
 
 def _cholesky(results: Results) -> Iterator[Values]:
@@ -326,8 +320,8 @@ def _cholesky(results: Results) -> Iterator[Values]:
 def scatters(printed: Path, seeds: pd.DataFrame) -> pd.DataFrame:
     """Return the scatter of O, S and b of each device on the precise table.
 
-    Columns: ``device``, ``quantity``, ``printed``, one for each of ``CAUSES`` (each includes those before it), and
-    ``unexplained``.
+    Columns: ``device``, ``quantity``, ``printed``, one for each of ``CAUSES`` (each includes those before it),
+    ``unexplained`` and ``share``, which noise and lost samples explain of the printed variance.
     """
     rows = _on_precise_table(printed, "accel_parameters")
     seeds = seeds[seeds["method"] == "printed"]
@@ -348,6 +342,7 @@ def scatters(printed: Path, seeds: pd.DataFrame) -> pd.DataFrame:
                 found = drawn[columns].mul(drawn["M"] if quantity == "S" else 1.0, axis=0)
                 row[CAUSES[cause]] = _size(found, centre)
             row["unexplained"] = np.sqrt(max(0.0, row["printed"] ** 2 - row[LOST] ** 2))
+            row["share"] = min(1.0, (row[LOST] / row["printed"]) ** 2)
             out.append(row)
     return pd.DataFrame(out)
 

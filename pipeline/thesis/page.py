@@ -24,7 +24,7 @@ from pipeline.report.pages import template
 from pipeline.thesis.conclusions import KINDS, Errors, conclusions
 from pipeline.thesis.errata import agreements, errata, scatters
 from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, SILENT, STOPS, Results, in_words, read_printed
-from pipeline.thesis.seeds import CAUSES, LOST, device_of
+from pipeline.thesis.seeds import CAUSES, device_of
 from pipeline.thesis.tables import all_tables
 from pipeline.validation.samples import samples_of_motion
 
@@ -55,7 +55,8 @@ def render(campaign: Path, folder: Path) -> str:
         key_of(c["table"], c["block"], c["row"], c["column"]) if c["large"] else "" for c in cells.to_dict("records")
     ]
     page: str = template("thesis.html").render(
-        tables=[_table(number, own) for number, own in cells.groupby("table", sort=False)],
+        tables=cells.groupby("table", sort=False),
+        text=_text,
         figures=all_figures(printed, results, rows, scatter),
         errata=errata(printed, results, rows),
         conclusions=conclusions(rows),
@@ -63,17 +64,8 @@ def render(campaign: Path, folder: Path) -> str:
         difference=_difference,
         agreements=agreements(printed, results).to_dict("records"),
         explanations=sorted(e for e in EXPLANATIONS if e.key in set(cells["key"])),
-        scatter=[
-            {
-                "device": DEVICES[row["device"]],
-                "quantity": row["quantity"],
-                "printed": row["printed"],
-                "causes": [row[cause] for cause in CAUSES],
-                "unexplained": row["unexplained"],
-                "share": min(1.0, (row[LOST] / row["printed"]) ** 2),
-            }
-            for row in scatter.to_dict("records")
-        ],
+        scatter=scatter.to_dict("records"),
+        devices=DEVICES,
         causes=CAUSES,
         seeds=rows["seed"].nunique(),
         cells=len(cells),
@@ -82,35 +74,12 @@ def render(campaign: Path, folder: Path) -> str:
     return page
 
 
-def _table(number: str, cells: pd.DataFrame) -> JSON:
-    blocks = [
-        {
-            "title": title,
-            "rows": [
-                {"label": label, "cells": [_cell(cell) for cell in row.to_dict("records")]}
-                for label, row in block.groupby("row", sort=False)
-            ],
-        }
-        for title, block in cells.groupby("block", sort=False)
-    ]
-    return {
-        "id": number.replace(".", "-").replace(" ", "-"),
-        "number": number,
-        "title": cells["title"].iloc[0],
-        "columns": list(cells["column"].unique()),
-        "blocks": blocks,
-    }
-
-
-def _cell(cell: JSON) -> JSON:
-    def text(value: float, sign: str = "") -> str:
-        if math.isnan(value):
-            return NOTHING
-        rounded = f"{value:{sign}.{cell['digits']}f}"
-        return rounded.lstrip("+-") if float(rounded) == 0.0 else rounded.replace("-", MINUS)
-
-    texts = {"printed": text(cell["printed"]), "ours": text(cell["ours"]), "difference": text(cell["difference"], "+")}
-    return {**texts, "key": cell["key"]}
+def _text(value: float, digits: int, sign: str = "") -> str:
+    """Return a value of a cell to so many decimals, with its sign where ``sign`` is ``+``."""
+    if math.isnan(value):
+        return NOTHING
+    rounded = f"{value:{sign}.{digits}f}"
+    return rounded.lstrip("+-") if float(rounded) == 0.0 else rounded.replace("-", MINUS)
 
 
 def _difference(estimate: Estimate) -> tuple[str, str]:
@@ -315,7 +284,7 @@ def _legend(texts: Iterable[str]) -> tuple[tuple[str, str], ...]:
 
 def _after(results: Results, name: str, sensor: str, methods: Sequence[str]) -> list[float]:
     """Return the mean |e| after calibration by each method; 0 where a unit failed."""
-    return [results.error(f"{name}-{method}", sensor) or 0.0 for method in methods]
+    return [float(np.nan_to_num(results.errors(f"{name}-{method}", sensor)[1])) for method in methods]
 
 
 def _per_procedure(results: Results, told: pd.Series[float], device: str, sensor: str) -> Figure:
@@ -361,7 +330,7 @@ def _tables(results: Results, told: pd.Series[float]) -> Figure:
         ("accelerometer", "stop-1s", 0.069),
         ("gyroscope", "gyro-60dps", 1.724),
     ):
-        before = results.error(f"mpu6050-1-{procedure}-printed", sensor, "raw") or 1.0
+        before = np.nan_to_num(results.errors(f"mpu6050-1-{procedure}-printed", sensor)[0], nan=1.0)
         short = {"accelerometer": "accel.", "gyroscope": "gyro"}[sensor]
         for table, infix in (("", ""), (", home", "mark2-")):
             name = f"mpu6050-1-{infix}{procedure}"

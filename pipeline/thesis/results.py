@@ -70,28 +70,31 @@ class Results:
         part: JSON | None = _read(self.folder / "calibrations" / f"{unit}.json").get(sensor)
         return part
 
-    def parameter(self, unit: str, sensor: str, stage: str, name: str) -> float | None:
-        """Return a parameter that a stage estimated, or None."""
+    def calibration(self, unit: str, sensor: str) -> tuple[Values, Values]:
+        """Return bias and matrix of a sensor, NaN where the unit failed."""
+        fit = self.fit(unit, sensor) or {"bias": [np.nan] * 3, "matrix": [[np.nan] * 3] * 3}
+        return np.array(fit["bias"]), np.array(fit["matrix"])
+
+    def parameter(self, unit: str, sensor: str, stage: str, name: str) -> float:
+        """Return a parameter that a stage estimated, or NaN."""
         for found in (self.fit(unit, sensor) or {}).get("stages", ()):
             if found["name"] == stage and name in found["parameters"]:
                 return float(found["parameters"][name]["value"])
-        return None
+        return np.nan
 
     def correction(self, unit: str, sensor: str) -> JSON | None:
         """Return how the last stage of a fit corrects readings."""
         stages = (self.fit(unit, sensor) or {}).get("stages", ())
         return stages[-1]["correction"] if stages else None
 
-    def step(self, unit: str, sensor: str, name: str) -> JSON:
-        """Return a step of a unit's held-out errors: ``raw``, or ``last`` for the last stage's."""
+    def errors(self, unit: str, sensor: str, metric: str = "mean_abs_error") -> tuple[float, float, float]:
+        """Return a held-out error of the raw readings, that after the last stage, and the change in percent, or NaN."""
         steps = (_read(self.folder / "validations" / f"{unit}.json").get(sensor) or {}).get("steps", ())
-        found = [s for s in steps if (s["name"].startswith("stage:") if name == "last" else s["name"] == name)]
-        return found[-1] if found else {}
-
-    def error(self, unit: str, sensor: str, name: str = "last") -> float | None:
-        """Return the mean |e| of a step."""
-        value: float | None = self.step(unit, sensor, name).get("mean_abs_error")
-        return value
+        before, after = (
+            float(np.array([np.nan, *(s[metric] for s in steps if s["name"].startswith(kind))], float)[-1])
+            for kind in ("raw", "stage:")
+        )
+        return before, after, 100.0 * (before - after) / before
 
     def recordings(self, unit: str, role: str) -> list[Recording]:
         """Return the filtered recordings of a role; none where the unit failed."""
@@ -101,14 +104,14 @@ class Results:
                 return [r for r in recordings_of(packs, unit) if r.role == role]
         return []
 
-    def with_printed(self, name: str, sensor: str, parameters: Mapping[str, float]) -> float | None:
-        """Return the mean |e| that printed parameters leave on the held-out motion of a set of recordings.
+    def with_printed(self, name: str, sensor: str, parameters: Mapping[str, float]) -> float:
+        """Return the mean |e| that printed parameters leave on the held-out motion of a set of recordings, or NaN.
 
         ``S (O M a - b)`` for the accelerometer (eq. 3.2), ``(g - b) M S`` for the gyroscope (3.45).
         """
         held_out = self.recordings(f"{name}-printed", "validation")
         if not held_out:
-            return None
+            return np.nan
         samples = samples_of_motion(sensor, held_out[0], SILENT, {"gravity_g": 1.0})
         assert samples is not None  # noqa: S101  (the table logs its rate)
         if sensor == "accelerometer":

@@ -8,23 +8,24 @@ beyond its rounding.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
 from pipeline.signal.rests import find_rests
-from pipeline.thesis.results import AXES, DEVICES, JSON, TABLES, Results, in_words, read_printed, values
+from pipeline.thesis.results import AXES, DEVICES, TABLES, Results, in_words, read_printed, values
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from pipeline.records import Recording, Values
 
-    Cells = Iterator[JSON]
+    Cells = Iterator[tuple[Any, ...]]
 
+COLUMNS = ("table", "title", "block", "row", "column", "printed", "ours", "digits")
 LARGE = 0.25  # of the printed value, from which the page explains a difference
 ACCELEROMETER = {
     "as printed: the largest and smallest samples": "printed",
@@ -40,36 +41,45 @@ METRICS = {
 APPLIED = "by the printed parameters, applied to our held-out motion"
 STAGES = {"O": "orthogonality", "M": "misalignment", "b": "bias", "S": "scale_factor"}
 # Of the comparison of methods: what its two methods are, by reading of the thesis.
-READINGS = {
+COMPARED = {
     "accelerometer": {
-        "by the staged method as printed": {"staged": "printed", "nonlinear_least_squares": "least-squares"},
-        "by the staged method with its errata corrected": {
-            "staged": "staged",
-            "nonlinear_least_squares": "least-squares",
-        },
+        "by the staged method as printed": ("printed", "least-squares"),
+        "by the staged method with its errata corrected": ("staged", "least-squares"),
     },
     "gyroscope": {
-        "as printed: Cholesky and LU's forward matrix applied as if it were the correction": {
-            "staged": "staged",
-            "cholesky_lu": "cholesky-printed",
-        },
-        "inverted: Cholesky and LU's matrix as it is meant": {"staged": "staged", "cholesky_lu": "cholesky"},
+        "as printed: Cholesky and LU's forward matrix applied as if it were the correction": (
+            *("staged", "cholesky-printed"),
+        ),
+        "inverted: Cholesky and LU's matrix as it is meant": ("staged", "cholesky"),
     },
 }
+CHANGES = ("before", "after", "change_percent")  # columns of printed errors
 SHORT = {"staged": "staged", "nonlinear_least_squares": "least squares", "cholesky_lu": "Cholesky and LU"}
 PAPER = "gy-521"
 SEGMENT_DEG = 45.0  # the paper turns in steps of 45 deg
 
 
+# By sensor: file of the printed parameters, our methods, and rows: label, column of the file, stage, and the names of
+# the parameters whose mean is meant (of a factor, both sides).
+PARAMETERS: dict[str, tuple[str, dict[str, str], list[tuple[str, str, str, list[str]]]]] = {
+    "accelerometer": ("accel_parameters", ACCELEROMETER, [
+        (f"{q}{a}{', g' if q == 'b' else ''}", f"{q}_{a}{'_g' if q == 'b' else ''}", stage,
+         [f"b_{a}"] if q == "b" else [f"{q}_P_{a}", f"{q}_N_{a}"])
+        for q, stage in STAGES.items() for a in AXES
+    ]),
+    "gyroscope": ("gyro_parameters", GYROSCOPE, [
+        *((f"b{a}, deg/s", f"b_{a}_dps", "bias", [f"b_{a}"]) for a in AXES),
+        *((f"M{i}{j}", f"M{i}{j}", "orthogonality_and_misalignment", [f"M_{i}{j}"]) for i in "123" for j in "123"),
+        *((f"S{a}", f"S_{a}", "scale_factor", [f"S_{a}"]) for a in AXES),
+    ]),
+}  # fmt: skip
+
+
 def all_tables(printed: Path, results: Results) -> pd.DataFrame:
     """Return the cells of tables 5.1 to 5.26, then of those of the paper."""
-    cells = [
-        *_parameter_tables(printed, results),
-        *_error_tables(printed, results),
-        *_method_tables(printed, results),
-    ]
-    cells.sort(key=lambda cell: int(cell["table"].partition(".")[2]))
-    return with_differences(pd.DataFrame([*cells, *_paper_tables(printed, results)]).astype({"ours": float}))
+    tables = (_parameter_tables, _error_tables, _method_tables)
+    cells = sorted((c for t in tables for c in t(printed, results)), key=lambda c: int(c[0].partition(".")[2]))
+    return with_differences(pd.DataFrame([*cells, *_paper_tables(printed, results)], columns=list(COLUMNS)))
 
 
 def with_differences(cells: pd.DataFrame) -> pd.DataFrame:
@@ -83,27 +93,12 @@ def _cells(
     place: tuple[str, str, str, str],
     columns: Iterable[str],
     printed: Iterable[float],
-    ours: Iterable[float | None],
+    ours: Iterable[float],
     digits: int = 3,
 ) -> Cells:
     """Yield the cells of one row; ``place``: table, title, block and row."""
-    table, title, block, row = place
     for column, told, own in zip(columns, printed, ours, strict=True):
-        yield {
-            "table": table,
-            "title": title,
-            "block": block,
-            "row": row,
-            "column": column,
-            "printed": float(told),
-            "ours": own,
-            "digits": digits,
-        }
-
-
-def change(before: float | None, after: float | None) -> float | None:
-    """Return the change in percent, ``100 (before - after) / before``."""
-    return None if not before or after is None else 100.0 * (before - after) / before
+        yield (*place, column, float(told), float(own), digits)
 
 
 def _title(what: str, rows: pd.DataFrame) -> str:
@@ -112,61 +107,30 @@ def _title(what: str, rows: pd.DataFrame) -> str:
 
 def _parameter_tables(printed: Path, results: Results) -> Cells:
     """Yield the cells of tables 5.1 to 5.7 and 5.15 to 5.18."""
-    for sensor, name, methods, quantities in (
-        ("accelerometer", "accel_parameters", ACCELEROMETER, _ACCELEROMETER_ROWS),
-        ("gyroscope", "gyro_parameters", GYROSCOPE, _GYROSCOPE_ROWS),
-    ):
-        for table, rows in read_printed(printed, name).groupby("table", sort=False):
-            title = _title(f"{sensor.capitalize()}: parameters", rows)
-            columns = [in_words(p) for p in rows["procedure"]]
+    for sensor, (file, methods, quantities) in PARAMETERS.items():
+        for table, rows in read_printed(printed, file).groupby("table", sort=False):
+            title, columns = _title(f"{sensor.capitalize()}: parameters", rows), rows["procedure"].map(in_words)
             for block, method in methods.items():
                 for label, column, stage, names in quantities:
-                    ours = [_mean_parameter(results, f"{s}-{method}", sensor, stage, names) for s in rows["set"]]
-                    yield from _cells((table, title, block, label), columns, rows[column], ours)
-
-
-# Label, column of the file, stage and names of the parameters whose mean is meant: of a factor, both sides.
-_ACCELEROMETER_ROWS = [
-    (f"{q}{a}{', g' if q == 'b' else ''}", f"{q}_{a}{'_g' if q == 'b' else ''}", stage,
-     [f"b_{a}"] if q == "b" else [f"{q}_P_{a}", f"{q}_N_{a}"])
-    for q, stage in STAGES.items()
-    for a in AXES
-]  # fmt: skip
-_GYROSCOPE_ROWS = [
-    *((f"b{a}, deg/s", f"b_{a}_dps", "bias", [f"b_{a}"]) for a in AXES),
-    *((f"M{i}{j}", f"M{i}{j}", "orthogonality_and_misalignment", [f"M_{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)),
-    *((f"S{a}", f"S_{a}", "scale_factor", [f"S_{a}"]) for a in AXES),
-]
-
-
-def _mean_parameter(results: Results, unit: str, sensor: str, stage: str, names: Sequence[str]) -> float | None:
-    found = [results.parameter(unit, sensor, stage, name) for name in names]
-    return None if None in found else sum(v for v in found if v is not None) / len(found)
+                    found = [[results.parameter(f"{s}-{method}", sensor, stage, n) for n in names] for s in rows["set"]]
+                    yield from _cells((table, title, block, label), columns, rows[column], np.mean(found, axis=1))
 
 
 def _error_tables(printed: Path, results: Results) -> Cells:
     """Yield the cells of tables 5.8 to 5.14 and 5.19 to 5.22."""
-    parameters = {
-        row["set"]: row
-        for name in ("accel_parameters", "gyro_parameters")
-        for row in read_printed(printed, name).to_dict("records")
-    }
+    files = (read_printed(printed, name).to_dict("records") for name, *_ in PARAMETERS.values())
+    parameters = {row["set"]: row for rows in files for row in rows}
     for table, rows in read_printed(printed, "errors").groupby("table", sort=False):
         sensor, unit = rows["sensor"].iloc[0], rows["unit"].iloc[0]
-        title = _title(f"{sensor.capitalize()}: held-out error", rows)
-        by_metric = {metric: rows[rows["metric"] == metric] for metric in METRICS}
+        title, by_metric = _title(f"{sensor.capitalize()}: held-out error", rows), dict(iter(rows.groupby("metric")))
         sets = by_metric["mean_abs_error"]["set"]
-        columns = [in_words(p) for p in by_metric["mean_abs_error"]["procedure"]]
-        for block, method in (ACCELEROMETER if sensor == "accelerometer" else GYROSCOPE).items():
+        columns = by_metric["mean_abs_error"]["procedure"].map(in_words)
+        for block, method in PARAMETERS[sensor][1].items():
             for metric, label in METRICS.items():
-                ours: dict[str, list[float | None]] = {
-                    when: [results.step(f"{s}-{method}", sensor, step).get(metric) for s in sets]
-                    for when, step in (("before", "raw"), ("after", "last"))
-                }
-                ours["change_percent"] = [change(*pair) for pair in zip(ours["before"], ours["after"], strict=True)]
-                for column, found in ours.items():
-                    row = f"{label}: change, %" if column == "change_percent" else f"{label}, {unit}: {column}"
-                    yield from _cells((table, title, block, row), columns, by_metric[metric][column], found)
+                found = [results.errors(f"{s}-{method}", sensor, metric) for s in sets]
+                names = (f"{label}, {unit}: before", f"{label}, {unit}: after", f"{label}: change, %")
+                for row, column, ours in zip(names, CHANGES, np.transpose(found), strict=True):
+                    yield from _cells((table, title, block, row), columns, by_metric[metric][column], ours)
         applied = [results.with_printed(s, sensor, parameters[s]) for s in sets]
         place = (table, title, APPLIED, f"mean |e|, {unit}: after")
         yield from _cells(place, columns, by_metric["mean_abs_error"]["after"], applied)
@@ -177,32 +141,30 @@ def _method_tables(printed: Path, results: Results) -> Cells:
     for table, rows in read_printed(printed, "method_comparison").groupby("table", sort=False):
         sensor, unit = rows["sensor"].iloc[0], rows["bias_unit"].iloc[0]
         columns = [f"{DEVICES[d]}, {SHORT[m]}" for d, m in zip(rows["device"], rows["method"], strict=True)]
-        by_parameters, by_errors = (
-            f"{sensor.capitalize()}: {what} by two methods" for what in ("parameters", "held-out error")
-        )
-        for block, methods in READINGS[sensor].items():
-            pairs = [(device, methods[m]) for device, m in zip(rows["device"], rows["method"], strict=True)]
-            own = "stop-1s" if sensor == "accelerometer" else "gyro-20dps"
-            fits = [results.fit(f"{device}-{own}-{method}", sensor) for device, method in pairs]
-            for i, j in ((i, j) for i in range(3) for j in range(3) if i == j or sensor == "gyroscope"):
-                # readings are row vectors in the thesis: its matrix is the transpose of ours
-                ours = [None if fit is None else fit["matrix"][j][i] for fit in fits]
-                row = f"R{i + 1}{j + 1}"
-                yield from _cells((table, by_parameters, block, row), columns, rows[row], ours)
-            for k, axis in enumerate(AXES):
-                ours = [None if fit is None else fit["bias"][k] for fit in fits]
-                yield from _cells((table, by_parameters, block, f"b{axis}, {unit}"), columns, rows[f"b_{axis}"], ours)
-            # the STIM300's errors are those of continuous 0.5 deg/s (erratum 5)
-            stim = "continuous-0.5dps" if sensor == "accelerometer" else own
-            units = [f"{device}-{stim if device == 'stim300' else own}-{method}" for device, method in pairs]
-            before = [results.error(u, sensor, "raw") for u in units]
-            after = [results.error(u, sensor) for u in units]
-            for row, column, ours in (
-                (f"mean |e|, {unit}: before", "mean_error_before", before),
-                (f"mean |e|, {unit}: after", "mean_error_after", after),
-                ("mean |e|: change, %", "change_percent", [change(*p) for p in zip(before, after, strict=True)]),
-            ):
-                place = (rows["error_table"].iloc[0], by_errors, block, row)
+        head = f"{sensor.capitalize()}: {{}} by two methods"
+        own = "stop-1s" if sensor == "accelerometer" else "gyro-20dps"
+        # the STIM300's errors are those of continuous 0.5 deg/s (erratum 5)
+        other = {"stim300": "continuous-0.5dps"} if sensor == "accelerometer" else {}
+        for block, (staged, method) in COMPARED[sensor].items():
+            units = [
+                (d, staged if m == "staged" else method) for d, m in zip(rows["device"], rows["method"], strict=True)
+            ]
+            fits = [results.calibration(f"{device}-{own}-{m}", sensor) for device, m in units]
+            # readings are row vectors in the thesis: its matrix is the transpose of ours
+            found = {
+                f"R{i + 1}{j + 1}": (f"R{i + 1}{j + 1}", [matrix[j, i] for _, matrix in fits])
+                for i in range(3)
+                for j in range(3)
+                if i == j or sensor == "gyroscope"
+            }
+            found |= {f"b{a}, {unit}": (f"b_{a}", [bias[k] for bias, _ in fits]) for k, a in enumerate(AXES)}
+            for row, (column, ours) in found.items():
+                yield from _cells((table, head.format("parameters"), block, row), columns, rows[column], ours)
+            errors = [results.errors(f"{d}-{other.get(d, own)}-{m}", sensor) for d, m in units]
+            names = (f"mean |e|, {unit}: before", f"mean |e|, {unit}: after", "mean |e|: change, %")
+            told = ("mean_error_before", "mean_error_after", "change_percent")
+            for row, column, ours in zip(names, told, np.transpose(errors), strict=True):
+                place = (rows["error_table"].iloc[0], head.format("held-out error"), block, row)
                 yield from _cells(place, columns, rows[column], ours)
 
 
@@ -223,7 +185,7 @@ def _paper_tables(printed: Path, results: Results) -> Cells:
         yield from _cells(("paper 4", title, "", row), AXES, errors, own, 4)
 
 
-def _paper_1(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float | None, int]]:
+def _paper_1(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float, int]]:
     unit, method = f"{PAPER}-orientations", "nonlinear_least_squares"
     names = {
         "scale_factor_diagonal_S_a": [(f"S{a}", f"scale_factor_{a}", 1.0) for a in AXES],
@@ -232,37 +194,33 @@ def _paper_1(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float,
         ],
         "bias": [(f"b{a}, g", f"bias_{a}", 1.0) for a in AXES],
     }
+    rmse = dict(zip(("before", "after"), results.errors(unit, "accelerometer", "rms_error"), strict=False))
     for row in rows.to_dict("records"):
         for axis, (label, name, factor) in zip(AXES, names.get(row["quantity"], ()), strict=False):
-            found = results.parameter(unit, "accelerometer", method, name)
-            yield label, row[axis], None if found is None else factor * found, 4
+            yield label, row[axis], factor * results.parameter(unit, "accelerometer", method, name), 4
         if row["quantity"].startswith("rmse"):
             when = row["quantity"].removeprefix("rmse_")
-            step = results.step(unit, "accelerometer", "raw" if when == "before" else "last")
-            yield f"RMSE {when}, g", row["x"], step.get("rms_error"), 6
+            yield f"RMSE {when}, g", row["x"], rmse[when], 6
 
 
-def _paper_2(positions: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float | None, int]]:
+def _paper_2(positions: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float, int]]:
     """Yield the mean reading of the axis that points up or down, before and after the 24 orientations' calibration."""
     means = _rest_means(results.recordings(f"{PAPER}-six-positions", "rests"))
-    fit = results.fit(f"{PAPER}-orientations", "accelerometer")
+    bias, matrix = results.calibration(f"{PAPER}-orientations", "accelerometer")
     for row in positions.to_dict("records"):
         ideal = values(row, "{}_ideal_g")
-        before = after = None
-        if fit is not None and len(means):
-            reading = means[np.argmax(means @ ideal)]
-            before = float(reading @ np.abs(ideal))
-            after = float((np.array(fit["matrix"]) @ (reading - fit["bias"])) @ np.abs(ideal))
-        yield f"{row['axis']} up: before, g", row["mean_before_g"], before, 3
-        yield f"{row['axis']} up: after, g", row["mean_after_g"], after, 3
+        reading = means[np.argmax(means @ ideal)]
+        yield f"{row['axis']} up: before, g", row["mean_before_g"], reading @ np.abs(ideal), 3
+        yield f"{row['axis']} up: after, g", row["mean_after_g"], (matrix @ (reading - bias)) @ np.abs(ideal), 3
 
 
 def _rest_means(recordings: list[Recording]) -> Values:
     rests = [(r, rest) for r in recordings for rest in find_rests(r)]
-    return np.array([np.asarray(r.accelerometer)[rest.start : rest.stop].mean(axis=0) for r, rest in rests])
+    means = [np.asarray(r.accelerometer)[rest.start : rest.stop].mean(axis=0) for r, rest in rests]
+    return np.array(means or [np.full(3, np.nan)])
 
 
-def _paper_3(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float | None, int]]:
+def _paper_3(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float, int]]:
     for row in rows.to_dict("records"):
         names = {
             "scale_factor_diagonal_S_g": [f"S_{a}" for a in AXES],
@@ -274,15 +232,13 @@ def _paper_3(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float,
             yield name.replace("_", ""), row[axis], ours, 4
 
 
-def _paper_4(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, Values, Sequence[float | None]]]:
-    fit = results.fit(f"{PAPER}-gyro-20dps", "gyroscope")
+def _paper_4(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, Values, Values]]:
+    bias, matrix = results.calibration(f"{PAPER}-gyro-20dps", "gyroscope")
     turns = {r.axis: r for r in results.recordings(f"{PAPER}-gyro-20dps", "gyroscope")}
     for row in rows.to_dict("records"):
         about, when = AXES[int(row["row"]) - 1], row["quantity"].rpartition("_")[2]
-        ours: list[float | None] = [None] * 3
-        if fit is not None and about in turns:
-            matrix = np.array(fit["matrix"]) if when == "after" else np.eye(3)
-            ours = _angle_errors(turns[about], np.array(fit["bias"]), matrix).tolist()
+        used = matrix if when == "after" else np.eye(3)
+        ours = _angle_errors(turns[about], bias, used) if about in turns else np.full(3, np.nan)
         yield f"about {about}: {when}, deg", values(row, "{}"), ours
 
 
