@@ -6,10 +6,11 @@ before, so that a fleet's history grows with what changes. A run that changes no
 A unit's state is::
 
     {"status", "error", "config_sha256", "config": {section: digest}, "recordings": {file: digest},
-     "overrides": {key: value}, "accelerometer": {"effects", "error", "floor", "verdict", "selected"} or null,
-     "gyroscope": likewise}
+     "overrides": {key: value}, "accelerometer": {"effects", "error", "floor", "verdict", "selected", "uncertainty"} or
+     null, "gyroscope": likewise}
 
-where ``error`` is the held-out rms error of the last step and ``floor`` its noise floor, in g or deg/s. The values of a
+where ``error`` is the held-out rms error of the last step and ``floor`` its noise floor, in g or deg/s, and
+``uncertainty`` the largest expanded uncertainty of ``bias`` and ``matrix``. The values of a
 section stand once, under its digest, in ``sections`` of the first entry that has it.
 """
 
@@ -20,6 +21,8 @@ import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.files import write_json
@@ -105,8 +108,15 @@ def unit_state(
             "floor": held_out.get("noise_floor"),
             "verdict": found.get("verdict"),
             "selected": found.get("selected") or [],
+            "uncertainty": _largest(fitted.get("expanded_uncertainty") or {}),
         }
     return state
+
+
+def _largest(uncertainty: Mapping[str, Any]) -> dict[str, float]:
+    """Return the largest expanded uncertainty of bias and matrix, where they have one."""
+    found = {key: np.asarray(uncertainty.get(key) or np.nan, float) for key in ("bias", "matrix")}
+    return {key: float(np.nanmax(values)) for key, values in found.items() if np.isfinite(values).any()}
 
 
 def read_history(results: Path) -> list[JSON]:

@@ -190,8 +190,24 @@ def _changes(entries: Sequence[JSON]) -> list[str]:
             floor = after[sensor].get("floor")
             ratio = f", {errors[1] / floor:.3g} times the noise floor" if floor else ""
             told = f"held-out error {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}{ratio}"
+            uncertainty = uncertainty_words(before[sensor], after[sensor], UNITS[sensor])
+            told += f"\n  {uncertainty}" if uncertainty else ""
             found.append((factor, f"{unit}, {sensor}: {words}; {told}"))
     return [line for _, line in sorted(found, key=lambda f: -f[0])]
+
+
+def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:
+    """Return how the expanded uncertainties of bias and matrix changed, in words; empty where they did not.
+
+    ``before``, ``after``: states of a sensor in the history.
+    """
+    was, now = (state.get("uncertainty") or {} for state in (before, after))
+    told = [
+        f"{key} {was[key] * scale:.2g} -> {now[key] * scale:.2g} {of}"
+        for key, scale, of in (("bias", 1.0, unit), ("matrix", 100.0, "%"))
+        if key in was and key in now and abs(now[key] - was[key]) > SMALLEST_CHANGE * was[key]
+    ]
+    return f"largest expanded uncertainty (95 %): {', '.join(told)}" if told else ""
 
 
 def run_command(settings: Mapping[str, Any]) -> str:

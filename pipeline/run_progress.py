@@ -10,9 +10,9 @@ where
 
 A job handles a batch of units and writes to its log which one it is at: ``stage: unit (3 of 50)``.
 
-On a terminal one line is redrawn each second in place of Snakemake's blocks for each job (``--printshellcmds`` and
-``--verbose`` keep those, and Snakemake's log file always has them). Elsewhere a line is printed each half minute, with
-``--quiet`` none.
+The line stands in place of Snakemake's blocks for each job (``--printshellcmds`` and ``--verbose`` keep those, and
+Snakemake's log file always has them). On a terminal it is redrawn each second; elsewhere it is printed each half minute,
+with ``--quiet`` not at all.
 """
 
 from __future__ import annotations
@@ -231,7 +231,7 @@ class Monitor(logging.Handler):
             print("Waiting for jobs of a killed run that are still running ...", file=self.stream, flush=True)
             time.sleep(2)
         terminal = self.stream.isatty() and not plain
-        if terminal or quiet:
+        if quiet or not plain:
             self._filter_job_blocks(CLEAR_LINE if terminal and not quiet else "")
         if not quiet:
             threading.Thread(target=self._print_progress, kwargs={"terminal": terminal}, daemon=True).start()

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.history import difference, dropped, of_units
-from pipeline.outcome import add_command
+from pipeline.outcome import add_command, uncertainty_words
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Figure
 from pipeline.report.group_charts import Point, bars
@@ -37,6 +37,12 @@ def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[i
     for run, state in states:
         change = difference(before, state) if before else None
         words = change.words() if change else []
+        words += [
+            f"{sensor}, {told}"
+            for sensor in SENSORS
+            if (parts := (before.get(sensor), state.get(sensor))) and all(parts)
+            if (told := uncertainty_words(*parts, SENSOR_UNITS[sensor]).replace("->", "\N{RIGHTWARDS ARROW}"))
+        ]
         entries.append({"run": run, "time": times[run], "state": state, "change": change, "words": words})
         before = state
     figures = [figure for sensor in SENSORS if (figure := _chart(sensor, entries))]

@@ -131,6 +131,7 @@ def test_the_held_out_error_falls_to_its_floor_and_the_other_unit_stays(loop: Lo
     assert "missing:" not in loop.said["added"]
     told = f"{HIDDEN}, gyroscope: + g_sensitivity; held-out error {before:.3g} -> {after:.3g} deg/s, "
     assert told + f"{after / floor_after:.3g} times the noise floor\n" in loop.said["added"]
+    assert re.search(r"largest expanded uncertainty \(95 %\): .*matrix [\d.]+ -> [\d.]+ %\n", loop.said["added"])
 
 
 def test_the_history_draws_the_fall_with_what_was_added(loop: Loop) -> None:
