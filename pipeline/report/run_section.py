@@ -37,12 +37,9 @@ def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[i
     for run, state in states:
         change = difference(before, state) if before else None
         words = change.words() if change else []
-        words += [
-            f"{sensor}, {told}"
-            for sensor in SENSORS
-            if (parts := (before.get(sensor), state.get(sensor))) and all(parts)
-            if (told := uncertainty_words(*parts, SENSOR_UNITS[sensor]).replace("->", "\N{RIGHTWARDS ARROW}"))
-        ]
+        for sensor in SENSORS:
+            told = uncertainty_words(before.get(sensor) or {}, state.get(sensor) or {}, SENSOR_UNITS[sensor])
+            words += [f"{sensor}, {told.replace('->', '→')}"] if told else []
         entries.append({"run": run, "time": times[run], "state": state, "change": change, "words": words})
         before = state
     figures = [figure for sensor in SENSORS if (figure := _chart(sensor, entries))]
