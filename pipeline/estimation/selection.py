@@ -33,7 +33,7 @@ from pipeline.estimation.ranking import Ranking, Score
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -62,27 +62,6 @@ WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must exp
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
 
 
-@dataclass
-class Selection:
-    """What was selected, and how every candidate did."""
-
-    names: list[str]  # selected effects, in order
-    steps: dict[str, Score]  # of each selected effect when it was accepted
-    alone: dict[str, Score]  # of each candidate against the base
-    fit: Fit  # base, configured and selected effects
-    base: Fit  # base and configured effects
-    first: Ranking  # the linear problem of the base
-    ranking: Ranking  # the linear problem with the selected effects at their values
-    observations: Observations
-    start: Start
-    settings: list[Setting]
-    limits: dict[str, Values] = field(default_factory=dict)
-
-    def chosen(self) -> list[int]:
-        """Return the indices of the selected effects among the ranking's candidates."""
-        return [self.ranking.indices(name)[0] for name in self.names]
-
-
 def select(
     observations: Observations,
     configured: Sequence[str],
@@ -91,122 +70,130 @@ def select(
     known: SensorCalibration | None = None,
     *,
     accelerometer: SensorCalibration | None = None,
+    search: bool = True,
 ) -> Selection:
     """Select effects.
 
     ``configured``: effects that are in the model already. ``sheet``: the sensor's section of the configuration.
     ``known``: its effects are starts for the configured ones. ``accelerometer``, for the gyroscope: its mountings.
+    ``search``: without it, no effect is scored: base and the candidates' products alone.
     """
-    return _Search(observations, configured, noise, sheet, known, accelerometer=accelerometer).run()
+    observations = weighted(observations, noise)
+    start, settings = ordinary_base(observations, noise), selection_grid(noise)
+    base = fit_best(observations, starts_of(configured, observations, known, accelerometer), start, settings)
+    candidates = {
+        e.name: Term(
+            e,
+            np.zeros(len(e.parameters(observations.sensor))),
+            prior=prior_of(e, observations, accelerometer, configured),
+        )
+        for e in candidates_for(observations, configured)
+    }
+    ranking = Ranking(
+        observations, *_columns(base, base, candidates.values(), observations.sensor), base.K, start.scale, settings
+    )
+    limits = limits_of(observations.sensor, sheet)
+    found = Selection(observations, noise, sheet, start, settings, limits, candidates, base, base, ranking, ranking)
+    if search:
+        found.run()
+    return found
 
 
-def unselected(
-    observations: Observations, configured: Sequence[str], noise: Noise | None, sheet: Mapping[str, Any]
-) -> Selection:
-    """Return a selection before its first round: the base and the candidates' products, no effect scored yet."""
-    return _Search(observations, configured, noise, sheet, None).found({})
+def _columns(fit: Fit, base: Fit, candidates: Iterable[Term], sensor: str) -> tuple[list[Term], list[Term]]:
+    """Return configured effects and candidates as columns: at fitted values, others at each of their starts."""
+    fitted = {term.effect.name: replace(term, full=False) for term in fit.terms}
+    found: list[Term] = []
+    for term in candidates:
+        if term.effect.name in fitted:
+            found.append(fitted[term.effect.name])
+        elif term.effect.moves:
+            found.append(term)
+        else:
+            found += [Term(term.effect, values) for values in term.effect.starts(sensor)]
+    return [replace(fitted[term.effect.name], full=True) for term in base.terms], found
 
 
-class _Search:
-    """The state of a selection."""
+@dataclass
+class Selection:
+    """What was selected, how every candidate did, and the search for it."""
 
-    def __init__(
-        self,
-        observations: Observations,
-        configured: Sequence[str],
-        noise: Noise | None,
-        sheet: Mapping[str, Any],
-        known: SensorCalibration | None,
-        *,
-        accelerometer: SensorCalibration | None = None,
-    ) -> None:
-        observations = weighted(observations, noise)
-        self.observations = observations
-        self.start = ordinary_base(observations, noise)
-        self.settings = selection_grid(noise)
-        self.noise, self.sheet = noise, sheet
-        self.limits = limits_of(observations.sensor, sheet)
-        combinations_ = starts_of(configured, observations, known, accelerometer)
-        self.base = fit_best(observations, combinations_, self.start, self.settings)
-        self.effects = candidates_for(observations, configured)
-        self.priors = {e.name: prior_of(e, observations, accelerometer, configured) for e in self.effects}
-        self.names: list[str] = []
-        self.steps: dict[str, Score] = {}
-        self.fit = self.base
-        self.fits: dict[tuple[str, ...], Fit] = {}
-        self.first = self.ranking = self._ranking()
+    observations: Observations
+    noise: Noise | None
+    sheet: Mapping[str, Any]
+    start: Start
+    settings: list[Setting]
+    limits: dict[str, Values]
+    candidates: dict[str, Term]  # where nothing is known of them but their priors
+    base: Fit  # base and configured effects
+    fit: Fit  # base, configured and selected effects
+    first: Ranking  # the linear problem of the base
+    ranking: Ranking  # the linear problem with the selected effects at their values
+    names: list[str] = field(default_factory=list)  # selected effects, in order
+    steps: dict[str, Score] = field(default_factory=dict)  # of each selected effect when it was accepted
+    alone: dict[str, Score] = field(default_factory=dict)  # of each candidate against the base
+    fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)  # of base, configured and further effects
 
-    def run(self) -> Selection:
-        alone = {score.name: score for score in self._scores()}
-        self._forward(alone)
+    def chosen(self) -> list[int]:
+        """Return the indices of the selected effects among the ranking's candidates."""
+        return self._selected(self.names)
+
+    def run(self) -> None:
+        """Search."""
+        self.alone = {score.name: score for score in self._scores()}
+        self._forward()
         if not self.names and self._inflated():
             self._pairs()
         if self.names:
             self._fit_selected()
             if self._other_delay():
-                self._forward(alone)
+                self._forward()
                 self._fit_selected()
-        return self.found(alone)
 
-    def found(self, alone: dict[str, Score]) -> Selection:
-        """Return what is selected so far."""
-        state = self.fit, self.base, self.first, self.ranking
-        known = self.observations, self.start, self.settings, self.limits
-        return Selection(self.names, self.steps, alone, *state, *known)
-
-    def _forward(self, alone: dict[str, Score]) -> None:
+    def _forward(self) -> None:
         for _ in range(3 * MOST):
             if len(self.names) == MOST:
                 return
-            best = self._best(self._scores() if self.names else list(alone.values()))
+            best = self._best(self._scores() if self.names else list(self.alone.values()))
             if best is None:
                 if not self._exchange():
                     return
                 continue
             if not self.names:
-                alone[best.name] = best
+                self.alone[best.name] = best
             self.names.append(best.name)
             self.steps[best.name] = best
-            self._accept(best.name)
+            K = self.fit.K
+            self._fit_selected()
+            moved = effect(best.name).nonlinear or effect(best.name).moves or np.abs(self.fit.K - K).max() > ANOTHER_K
+            if moved:  # the candidates' columns depend on what has changed
+                self._rebuild()
             self._drop()
             self._drop_refuted()
             self._merge()
 
-    def _accept(self, name: str) -> None:
-        """Fit with the new effect; rebuild the candidates if their columns depend on what has changed."""
-        K = self.fit.K
-        self._fit_selected()
-        if effect(name).nonlinear or effect(name).moves or np.abs(self.fit.K - K).max() > ANOTHER_K:
-            self.ranking = self._ranking()
-
-    def _ranking(self) -> Ranking:
-        """Build the linear problem: configured effects in the base, the others as candidates."""
-        fitted = {term.effect.name: replace(term, full=False) for term in self.fit.terms}
-        configured = [replace(fitted[term.effect.name], full=True) for term in self.base.terms]
-        candidates = []
-        for this in self.effects:
-            if this.name in fitted:
-                candidates.append(fitted[this.name])
-            elif this.moves:
-                start = np.zeros(len(this.parameters(self.observations.sensor)))
-                candidates.append(Term(this, start, prior=self.priors[this.name]))
-            else:
-                candidates += [Term(this, values) for values in this.starts(self.observations.sensor)]
-        return Ranking(self.observations, configured, candidates, self.fit.K, self.start.scale, self.settings)
+    def _rebuild(self) -> None:
+        """Build the candidates' columns at the fit."""
+        terms = _columns(self.fit, self.base, self.candidates.values(), self.observations.sensor)
+        self.ranking = Ranking(self.observations, *terms, self.fit.K, self.start.scale, self.settings)
 
     def _selected(self, names: Sequence[str]) -> list[int]:
         return [self.ranking.indices(name)[0] for name in names]
 
+    def _beside(self, names: Sequence[str]) -> dict[str, Score]:
+        """Return what each candidate brings beside some of the selected effects, best first."""
+        return {s.name: s for s in self.ranking.scores(self._selected(names), self.limits)}
+
     def _scores(self) -> list[Score]:
         """Score all candidates; those of timing or with a time constant that compete are fitted to their optimum."""
-        scores = self.ranking.scores(self._selected(self.names), self.limits)
+        scores = self._beside(self.names).values()
         top = max((s.delta_bic for s in scores if s.admissible), default=0.0)
-        return [self._refined(s) if self._competes(s, top) else s for s in scores]
-
-    def _competes(self, score: Score, top: float) -> bool:
-        this = effect(score.name)
-        share = MOVER_SHARE if this.moves else CONSTANT_SHARE
-        return bool(this.nonlinear) and score.delta_bic > max(GATE_BIC, share * top)
+        found = []
+        for score in scores:
+            this = effect(score.name)
+            share = MOVER_SHARE if this.moves else CONSTANT_SHARE
+            competes = bool(this.nonlinear) and score.delta_bic > max(GATE_BIC, share * top)
+            found.append(self._refined(score) if competes else score)
+        return found
 
     def _refined(self, score: Score) -> Score:
         """Return the score of a nonlinear candidate at its own optimum."""
@@ -215,7 +202,7 @@ class _Search:
         term = Term(this, score.values if start is None else start)
         terms = [*self.base.terms, *self._terms(), term]
         fit = fit_terms(self.observations, terms, self.start, self.settings)
-        self.fits[(*self.names, score.name)] = fit
+        self.fits[*self.names, score.name] = fit
         before, _ = self.ranking.of_model(self._selected(self.names))
         from scipy.special import chdtrc  # noqa: PLC0415  (as in Ranking)
 
@@ -229,12 +216,8 @@ class _Search:
             values=values,
             uncertainty=uncertainty,
             log_likelihood=fit.log_likelihood,
-            plausible=self._plausible(score.name, values, uncertainty),
+            plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= self.limits.get(score.name, np.inf))),
         )
-
-    def _plausible(self, name: str, values: Values, uncertainty: Values) -> bool:
-        limits = self.limits.get(name)
-        return limits is None or bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits))
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
         """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
@@ -244,7 +227,7 @@ class _Search:
         best = max(worth, key=lambda name: worth[name])
         if best == DELAYS[1] and worth.get(DELAYS[0], 0.0) > worth[best] - CLEARLY:
             best = DELAYS[0]
-        tied = [e.name for e in self.effects if worth.get(e.name, 0.0) > worth[best] - TIE]
+        tied = [name for name in self.candidates if worth.get(name, 0.0) > worth[best] - TIE]
         name = best if best in DELAYS else tied[0]
         return next(s for s in scores if s.name == name)
 
@@ -258,7 +241,7 @@ class _Search:
         if self._overlaps(score.name, self.names):
             return False
         real = score.name != DELAYS[1] or score.values[0] > 0
-        significant = score.delta_bic > self._gate(score.name) and score.p_value * len(self.effects) < GATE_P
+        significant = score.delta_bic > self._gate(score.name) and score.p_value * len(self.candidates) < GATE_P
         return bool(score.admissible and significant and real and self._matters(score, beside))
 
     def _overlaps(self, name: str, selected: Sequence[str]) -> bool:
@@ -286,7 +269,7 @@ class _Search:
     def _refit(self) -> None:
         """Fit configured and selected effects together and rebuild the candidates there."""
         self._fit_selected()
-        self.ranking = self._ranking()
+        self._rebuild()
 
     def _fit_selected(self) -> None:
         if tuple(self.names) in self.fits:
@@ -299,16 +282,7 @@ class _Search:
     def _terms(self) -> list[Term]:
         """Return the selected effects at their fitted values, or at those of the step that accepted them."""
         held = {term.effect.name: term for term in self.fit.terms}
-        bound = {e.name: e for e in self.effects}
-        return [
-            held.get(name) or Term(bound[name], self.steps[name].values, prior=self.priors[name]) for name in self.names
-        ]
-
-    def _own(self, name: str) -> float:
-        """Return the delta BIC that a selected effect brings beside the others."""
-        others = self._selected([n for n in self.names if n != name])
-        scores = {s.name: s for s in self.ranking.scores(others, self.limits)}
-        return scores[name].delta_bic if name in scores else float("-inf")
+        return [held.get(n) or replace(self.candidates[n], values=self.steps[n].values) for n in self.names]
 
     def _forget(self, gone: Sequence[str]) -> None:
         """Take effects out of what is selected and fitted."""
@@ -319,7 +293,10 @@ class _Search:
 
     def _drop(self) -> None:
         for name in list(self.names):
-            if not effect(name).moves and self._own(name) < 0.0:
+            if effect(name).moves:
+                continue
+            own = self._beside([n for n in self.names if n != name]).get(name)
+            if own is None or own.delta_bic < 0.0:
                 self._forget([name])
                 if effect(name).nonlinear:
                     self._refit()
@@ -347,16 +324,15 @@ class _Search:
 
     def _merge(self) -> None:
         """Replace two selected effects by one that contains the first, where that explains about as much."""
-        for general in self.effects:
-            part = next((n for n in self.names if n in general.contains), None)
-            if part is None or general.name in self.names or not self.ranking.indices(general.name):
+        for general, term in self.candidates.items():
+            part = next((n for n in self.names if n in term.effect.contains), None)
+            if part is None or general in self.names or not self.ranking.indices(general):
                 continue
             for other in [n for n in self.names if n != part and not effect(n).moves]:
                 kept = [n for n in self.names if n not in (part, other)]
-                if self._criterion([*kept, general.name]) > self._criterion(self.names) - GATE_BIC:
-                    scores = self.ranking.scores(self._selected(kept), self.limits)
-                    self.steps[general.name] = next(s for s in scores if s.name == general.name)
-                    self.names[self.names.index(part)] = general.name
+                if self._criterion([*kept, general]) > self._criterion(self.names) - GATE_BIC:
+                    self.steps[general] = self._beside(kept)[general]
+                    self.names[self.names.index(part)] = general
                     self._forget([part, other])
                     self._refit()
                     return
@@ -364,8 +340,7 @@ class _Search:
     def _criterion(self, names: Sequence[str]) -> float:
         """Return ``2 log L - k log N`` of base and some candidates, at the values of the ranking."""
         found, _ = self.ranking.of_model(self._selected(names))
-        parameters = {e.name: len(e.parameters(self.observations.sensor)) for e in self.effects}
-        count = sum(parameters[n] for n in names)
+        count = sum(len(self.candidates[n].values) for n in names)
         return 2.0 * found - count * float(np.log(self.ranking.samples))
 
     def _exchange(self) -> bool:
@@ -374,15 +349,11 @@ class _Search:
             if effect(name).moves:
                 continue
             others = [n for n in self.names if n != name]
-            scores = self.ranking.scores(self._selected(others), self.limits)
-            own = next((s.delta_bic for s in scores if s.name == name), float("-inf"))
-            rivals = [
-                s
-                for s in scores
-                if s.name != name and s.admissible and not effect(s.name).moves and not self._overlaps(s.name, others)
-            ]
-            if rivals and rivals[0].delta_bic > own + GATE_BIC:
-                rival = rivals[0]
+            scores = self._beside(others)
+            own = scores.pop(name).delta_bic if name in scores else float("-inf")
+            able = (s for s in scores.values() if s.admissible and not effect(s.name).moves)
+            rival = next((s for s in able if not self._overlaps(s.name, others)), None)
+            if rival is not None and rival.delta_bic > own + GATE_BIC:
                 self.names[self.names.index(name)] = rival.name
                 self.steps[rival.name] = rival
                 self._forget([name])
@@ -395,7 +366,7 @@ class _Search:
         """Take a lag for a delay, or the reverse, if it is clearly better beside all that was selected."""
         name = next((n for n in self.names if n in DELAYS), None)
         other = next((n for n in DELAYS if n != name), "")
-        if name is None or len(self.names) == 1 or other not in [e.name for e in self.effects]:
+        if name is None or len(self.names) == 1 or other not in self.candidates:
             return False
         place = self.names.index(name)
         terms = self._terms()
@@ -446,13 +417,11 @@ class _Search:
         if best[1] < 0:
             return
         names = [self.ranking.candidates[j].effect.name for j in best[1:]]
-        first = self.ranking.scores([best[2]], self.limits)
-        second = self.ranking.scores([best[1]], self.limits)
-        scores = [next(s for s in found if s.name == n) for found, n in zip((first, second), names, strict=True)]
+        steps = {}
+        for name, partner in zip(names, best[:0:-1], strict=True):
+            scores = self.ranking.scores([partner], self.limits)
+            steps[name] = next(s for s in scores if s.name == name)
         tried = len(able) * (len(able) - 1) / 2
-        partners = ([best[2]], [best[1]])
-        if all(
-            self._passes(s, partner) and s.p_value * tried < GATE_P for s, partner in zip(scores, partners, strict=True)
-        ):
-            self.names = names
-            self.steps = dict(zip(names, scores, strict=True))
+        pairs = zip(steps.values(), best[:0:-1], strict=True)
+        if all(self._passes(s, [partner]) and s.p_value * tried < GATE_P for s, partner in pairs):
+            self.names, self.steps = names, steps

@@ -24,7 +24,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
-from pipeline.estimation.selection import unselected
+from pipeline.estimation.selection import select
 from pipeline.model.data_sheet import assumed_figures
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
@@ -101,7 +101,7 @@ def _limits(sensor: str, simulated: SimulatedProcedure) -> tuple[DetectionLimits
     if is_multi_position(sensor, simulated.recordings):
         selected = select_by_hand(sensor, simulated)
         return RestLimits(selected, noise), not_observable_by_hand(selected, [])
-    selection = unselected(observe(sensor, simulated.recordings, simulated.table), [], noise, sheet)
+    selection = select(observe(sensor, simulated.recordings, simulated.table), [], noise, sheet, search=False)
     return TurntableLimits(selection, noise), not_observable(selection, [])
 
 
