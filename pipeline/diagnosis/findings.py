@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.diagnosis.words import next_experiment, to_distinguish
 from pipeline.estimation.candidates import OTHER
+from pipeline.estimation.design import placed
 from pipeline.estimation.posterior import CERTAIN
 from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
 from pipeline.model.effects import effect
@@ -180,14 +181,12 @@ def _entry(found: Findings, name: str) -> dict[str, Any]:
 def _estimates(found: Findings, score: Score) -> tuple[dict[str, Any], bool]:
     """Return the parameters, and whether they are plausible: of the fit of all selected, or of the effect alone."""
     values, uncertainty, plausible = score.values, score.uncertainty, score.plausible
-    at = len(found.covariance) - sum(len(term.values) for term in found.terms)
-    for term in found.terms:
-        own = slice(at, at + len(term.values))
-        at = own.stop
-        if term.effect.name == score.name and score.name in found.selected:
-            values, uncertainty = term.values, np.sqrt(np.clip(np.diag(found.covariance)[own], 0.0, None))
-            if score.name in found.limits:
-                plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= found.limits[score.name]))
+    base = len(found.covariance) - sum(len(term.values) for term in found.terms)
+    if score.name in found.selected:
+        term, own = placed(found.terms, base)[score.name]
+        values, uncertainty = term.values, np.sqrt(np.clip(np.diag(found.covariance)[own], 0.0, None))
+        if score.name in found.limits:
+            plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= found.limits[score.name]))
     described = effect(score.name).of_recordings(found.turns).parameters(found.sensor)
     return {
         p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}

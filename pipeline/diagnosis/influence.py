@@ -28,7 +28,7 @@ import numpy as np
 
 from pipeline.diagnosis.residual_dependence import bases_of, curves_of, smooth_tests
 from pipeline.diagnosis.residual_regression import ProjectedCurves, columns_of_fit, each_explains
-from pipeline.estimation.design import BASE
+from pipeline.estimation.design import BASE, placed
 from pipeline.estimation.gauss_markov import GaussMarkov, Products
 from pipeline.estimation.generalized_least_squares import design_at
 from pipeline.estimation.observations import without_each_recording
@@ -61,16 +61,13 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     """
     if not names:
         return []
-    own, at = {}, BASE
-    for term in selection.fit.terms:
-        own[term.effect.name] = term, np.arange(at, at + len(term.values))
-        at += len(term.values)
+    own = placed(selection.fit.terms)
     design = design_at(selection.observations.weakened, selection.fit)
     whole = design.products([selection.fit.setting])[0]
     without_each = _without_each(selection)
     found = []
     for name in names:
-        term, index = own[name]
+        term, index = own[name][0], np.arange(own[name][1].start, own[name][1].stop)
         gains = _gains_of_blocks(selection, design, whole, term, index)
         recordings = _of_recordings(selection, whole, index, gains, without_each)
         found.append(

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.functional_forms import columns_of, signals_of
-from pipeline.estimation.design import BASE
+from pipeline.estimation.design import BASE, placed
 from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.generalized_least_squares import design_at
 from pipeline.estimation.multi_position.fit import solve
@@ -85,7 +85,7 @@ def plots(
 def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     """Return the added-variable plot of the first selected effect: its clearest coefficient on each axis."""
     sensor, fit = selection.observations.sensor, selection.fit
-    term, own = _first_selected(fit.terms, selection.names[0], BASE)
+    term, own = placed(fit.terms)[selection.names[0]]
     uncertainty = np.sqrt(np.clip(np.diag(fit.covariance)[own], 1e-300, None))
     white = regression.residual - regression.wander(fit.setting)
     sigma = regression.white_noise(white)
@@ -110,7 +110,7 @@ def _added_variable(regression: _Columns, selection: Selection) -> JSON:
 def added_variable_of_rests(selection: by_hand.Selection) -> JSON | None:
     """Return the same of rests by hand, a point a rest; None where the first effect shows mostly in the moves."""
     model, found = selection.model, selection.fits[-1]
-    term, own = _first_selected(found.state.terms, selection.names[0], model.directions.shape[1])
+    term, own = placed(found.state.terms, model.directions.shape[1])[selection.names[0]]
     equations = model.equations(found.state)
     columns = equations.columns
     white, _ = equations.whitened(found.noise, np.column_stack([columns, equations.residual]))
@@ -140,13 +140,6 @@ def added_variable_of_rests(selection: by_hand.Selection) -> JSON | None:
             }
         )
     return {"effect": selection.names[0], "unit": unit_of(model.sensor), "panels": panels}
-
-
-def _first_selected(terms: Sequence[Term], name: str, base: int) -> tuple[Term, slice]:
-    """Return the term of an effect, and where its parameters lie after so many of the base."""
-    order = [term.effect.name for term in terms].index(name)
-    at = base + sum(len(term.values) for term in terms[:order])
-    return terms[order], slice(at, at + len(terms[order].values))
 
 
 def _coefficient(term: Term, sensor: str, j: int, uncertainty: float) -> JSON:

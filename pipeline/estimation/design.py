@@ -17,7 +17,8 @@ Errors e of the angle at the stops of the table (``pipeline.estimation.table_err
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -70,6 +71,19 @@ class Term:
                 return (slope @ K.T)[:, :, None]
         of = self.effect.columns if self.full else self.effect.regressors
         return of(sensor, motion, K, self.values)
+
+
+def placed(terms: Sequence[Term], base: int = BASE) -> dict[str, tuple[Term, slice]]:
+    """Return each term and where its parameters lie after so many of the base, by the name of its effect."""
+    edges = np.cumsum([base, *(len(term.values) for term in terms)]).tolist()
+    return {t.effect.name: (t, slice(*edge)) for t, edge in zip(terms, pairwise(edges), strict=True)}
+
+
+def stepped(terms: Sequence[Term], step: Values) -> tuple[list[Term], Values]:
+    """Return terms after a step of their parameters, and the part of it that was taken: effects may refuse some."""
+    moved = [replace(t, values=t.effect.stepped(t.values, step[at])) for t, at in placed(terms, 0).values()]
+    taken = [new.values - old.values for new, old in zip(moved, terms, strict=True)]
+    return moved, np.concatenate([np.zeros(0), *taken])
 
 
 def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion:

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import HELD, TILT, parameter_names, require_available, starts_of
-from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
+from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base, placed, stepped
 from pipeline.estimation.engine import AVERAGED_OUT, RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
@@ -89,7 +89,9 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     solved = _solve(_at(observations, terms, bias, K, start.scale), observations, settings)
     while rounds < ROUNDS and not converged:
         rounds += 1
-        bias, K, terms, taken = _stepped(bias, K, terms, solved.step)
+        bias, K = bias + solved.step[:3], K + solved.step[3:BASE].reshape(3, 3)
+        terms, taken = stepped(terms, solved.step[BASE:])
+        taken = np.concatenate([solved.step[:BASE], taken])
         small = np.maximum(
             SMALL_STEP * np.sqrt(np.diag(solved.best_covariance)), np.where(np.arange(len(taken)) < BASE, 1e-12, 0.0)
         )
@@ -116,18 +118,6 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         solved.rank,
         start.scale,
     )
-
-
-def _stepped(bias: Values, K: Values, terms: Sequence[Term], step: Values) -> tuple[Values, Values, list[Term], Values]:
-    """Return bias, K and terms after a step, and what of the step was taken."""
-    moved, taken, at = [], [step[:BASE]], BASE
-    for term in terms:
-        size = len(term.values)
-        values = term.effect.stepped(term.values, step[at : at + size])
-        moved.append(replace(term, values=values))
-        taken.append(values - term.values)
-        at += size
-    return bias + step[:3], K + step[3:BASE].reshape(3, 3), moved, np.concatenate(taken)
 
 
 def _at(observations: Observations, terms: Sequence[Term], bias: Values, K: Values, scale: Values) -> Design:
@@ -382,16 +372,14 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
 
 def fit_in_mean_frame(fit: Fit) -> tuple[Fit, Values]:
     """Return a fit in the frame of the mean of the mountings, and the map of its errors to those there."""
-    at = BASE
-    for place, term in enumerate(fit.terms):
-        own = slice(at, at + len(term.values))
-        at = own.stop
-        if isinstance(term.effect, Mounting):
-            K, theta = in_mean_frame(fit.K, term.values)
-            change = errors_in_mean_frame(K, theta, own, len(fit.covariance))
-            terms = (*fit.terms[:place], replace(term, values=theta), *fit.terms[place + 1 :])
-            return replace(fit, K=K, terms=terms, covariance=change @ fit.covariance @ change.T), change
-    return fit, np.eye(len(fit.covariance))
+    found = next((each for each in placed(fit.terms).values() if isinstance(each[0].effect, Mounting)), None)
+    if found is None:
+        return fit, np.eye(len(fit.covariance))
+    mounting, own = found
+    K, theta = in_mean_frame(fit.K, mounting.values)
+    change = errors_in_mean_frame(K, theta, own, len(fit.covariance))
+    terms = tuple(replace(term, values=theta) if term is mounting else term for term in fit.terms)
+    return replace(fit, K=K, terms=terms, covariance=change @ fit.covariance @ change.T), change
 
 
 def with_matrix(values: Values) -> Values:

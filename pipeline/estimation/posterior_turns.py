@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, over_limits, time_constants
-from pipeline.estimation.design import BASE, Design, Start, Term
+from pipeline.estimation.design import BASE, Design, Start, Term, placed
 from pipeline.estimation.evidence import Problem, Version
 from pipeline.estimation.gauss_markov import WHITE, random_walks
 from pipeline.estimation.generalized_least_squares import design_beside, fit_terms
@@ -100,7 +100,7 @@ def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
     """Return the terms of an effect and their prior log weights."""
     held, width = next((t for t in fit.terms if t.effect.name == term.effect.name), None), None
     if held is not None and term.effect.nonlinear:
-        last = BASE + sum(len(t.values) for t in fit.terms[: fit.terms.index(held) + 1]) - 1
+        last = placed(fit.terms)[term.effect.name][1].stop - 1
         width = float(np.sqrt(fit.covariance[last, last]) / max(abs(held.values[-1]), 1e-300))
     found = time_constants(term.effect, sensor, held, width, between=bool(fit.terms))
     second = float(np.log(SECOND_SHARE)) if term.effect.name in SECOND[sensor] else 0.0

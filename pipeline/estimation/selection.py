@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
-from pipeline.estimation.design import BASE, Start, Term, ordinary_base
+from pipeline.estimation.design import Start, Term, ordinary_base, placed
 from pipeline.estimation.gauss_markov import selection_grid
 from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms
 from pipeline.estimation.observations import weighted
@@ -303,12 +303,9 @@ class Selection:
 
     def _drop_refuted(self) -> None:
         """Drop what the full fit does not need: the columns of the last ranking were those of another matrix."""
-        at = BASE + sum(len(term.values) for term in self.base.terms)
         refuted = []
-        for term in self.fit.terms[len(self.base.terms) :]:
-            block = slice(at, at + len(term.values))
-            at = block.stop
-            if term.effect.name not in self.names or term.effect.moves:
+        for name, (term, block) in placed(self.fit.terms).items():
+            if name not in self.names or term.effect.moves:
                 continue
             covariance = self.fit.covariance[block, block]
             size = np.sqrt(np.diag(covariance))
@@ -317,7 +314,7 @@ class Selection:
             correlation = (covariance / np.outer(*[np.where(known, size, 1.0)] * 2))[np.ix_(known, known)]
             wald = float(z @ np.linalg.lstsq(correlation, z, rcond=1e-9)[0])
             if wald < len(z) * float(np.log(self.ranking.samples)):
-                refuted.append(term.effect.name)
+                refuted.append(name)
         self._forget(refuted)
         if refuted:
             self._refit()
@@ -378,15 +375,14 @@ class Selection:
         if gain <= (CLEARLY if other == DELAYS[1] else 0.0):
             return False
         step = self.steps.pop(name)
-        found = fit.terms[len(self.base.terms) + place]
-        at = BASE + sum(len(t.values) for t in fit.terms[: len(self.base.terms) + place])
+        found, at = placed(fit.terms)[other]
         self.names[place] = other
         self.steps[other] = replace(
             step,
             name=other,
             delta_bic=step.delta_bic + gain,
             values=found.values,
-            uncertainty=np.sqrt(np.diag(fit.covariance)[at : at + len(found.values)]),
+            uncertainty=np.sqrt(np.diag(fit.covariance)[at]),
         )
         self.fits[tuple(self.names)] = fit
         self._refit()

@@ -35,6 +35,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import parameter_names
+from pipeline.estimation.design import placed
 from pipeline.estimation.engine import Posterior
 from pipeline.estimation.least_squares import gauss_newton
 from pipeline.estimation.multi_position.likelihood import NEW, project_out
@@ -267,13 +268,10 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
 def plausible(model: Model, found: Fit, limits: Limits) -> bool:
     """Return whether every effect is within its limits or its uncertainty reaches them."""
     uncertainty = np.sqrt(np.diag(found.covariance))
-    at, within = model.directions.shape[1], True
-    for term in found.state.terms:
-        own = slice(at, at + len(term.values))
-        limit = limits.get(term.effect.name, np.full(len(term.values), np.inf))
-        within &= bool(np.all(np.abs(term.values) - 2.0 * uncertainty[own] <= limit))
-        at = own.stop
-    return within
+    return all(
+        bool(np.all(np.abs(term.values) - 2.0 * uncertainty[own] <= limits.get(name, np.inf)))
+        for name, (term, own) in placed(found.state.terms, model.directions.shape[1]).items()
+    )
 
 
 def require_observable(model: Model, found: Fit, limits: Limits) -> None:

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from pipeline.estimation.design import Term
+from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner
@@ -38,6 +38,7 @@ from pipeline.records import Motion
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
@@ -160,15 +161,9 @@ def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
     """Return the parameters after a step, and the part of it that was taken: effects may refuse some."""
     count = model.directions.shape[1]
     change = model.directions @ step[:count]
-    terms, taken, at = [], [step[:count]], count
-    for term in state.terms:
-        size = len(term.values)
-        values = term.effect.stepped(term.values, step[at : at + size])
-        taken.append(values - term.values)
-        terms.append(Term(term.effect, values))
-        at += size
+    terms, taken = design.stepped(state.terms, step[count:])
     moved = State(state.bias + change[:3], state.matrix + change[3:].reshape(3, 3), tuple(terms))
-    return moved, np.concatenate(taken)
+    return moved, np.concatenate([step[:count], taken])
 
 
 def motion_of(time: Values, force: Values, rate: Values, temperature: Values, *, still: bool) -> Motion:
