@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.multi_position.faces_and_turns import faces_of
-from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
+from pipeline.estimation.multi_position.model import Block, State, effect_readings, motion_of, stacked
 from pipeline.estimation.rest_means import HELD_OUT, rests_of
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.faces_and_turns import Faces
+    from pipeline.estimation.multi_position.model import Equations
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
 
@@ -84,20 +85,17 @@ class AccelerometerModel:
         own = slice(self.stretches)
         hold = np.zeros((3, len(error), self.stretches))
         hold[:, range(self.stretches), range(self.stretches)] = (along * self.white / error[:, None]).T[:, own]
-        equations = Equations(
-            residual=(target - length) / error,
-            base=full @ self.directions / error[:, None],
-            effects=[columns(term) for term in state.terms],
-            candidates=[columns(term) for term in candidates],
-            scatter=np.square(np.median(error) / error)[None],
-            bias=hold,
-            start=rests.start[own],
-            length=rests.length[own],
-            joined=rests.select(own).joined,
-            error=error,
+        of_rests = Block(
+            (target - length) / error,
+            full / error[:, None],
+            columns,
+            error,
+            hold,
+            (rests.start[own], rests.length[own], rests.recording[own]),
+            scattered=True,
         )
         if self.faces is None:
-            return equations
+            return stacked([of_rests], self, state, candidates)
         W = self.faces.weights() / self.gravity
         WM = W @ state.matrix
         wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,m,c->r", WM**2, rests.share, self.white**2))
@@ -107,16 +105,14 @@ class AccelerometerModel:
             Z = term.effect.columns(self.sensor, motion, K, term.values)
             return np.asarray(np.einsum("rmc,mcp->rp", -WM, Z) / wide[:, None])
 
-        return equations.followed_by(
-            {
-                "residual": -np.einsum("rmc,mc->r", W, force) / wide,
-                "base": np.concatenate([-WM.sum(axis=1), moved], axis=1) @ self.directions / wide[:, None],
-                "effects": [of_faces(term) for term in state.terms],
-                "candidates": [of_faces(term) for term in candidates],
-                "bias": np.einsum("rmc,c->crm", WM, self.white) / wide[:, None],
-                "error": self.gravity * wide,
-            }
+        faces = Block(
+            -np.einsum("rmc,mc->r", W, force) / wide,
+            np.concatenate([-WM.sum(axis=1), moved], axis=1) / wide[:, None],
+            of_faces,
+            self.gravity * wide,
+            np.einsum("rmc,c->crm", WM, self.white) / wide[:, None],
         )
+        return stacked([of_rests, faces], self, state, candidates)
 
     def specific_force(self, state: State, rests: Rests) -> tuple[Values, Values]:
         """Return the specific force of each rest, g, and v: (m, 3) arrays."""

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.multi_position.model import effect_readings, motion_of
+from pipeline.estimation.multi_position.model import Block, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import sound_span, trapezoids
 from pipeline.estimation.rest_means import ROLE
 from pipeline.records import AXES
@@ -111,8 +111,8 @@ class Turns:
     value: Values
     error: Values
 
-    def equations(self, state: State, candidates: Sequence[Term], white: Values, directions: Values) -> dict[str, Any]:
-        """Return residual, columns and errors, as of ``model.Equations``; ``white`` (3,) is the noise of a sample."""
+    def equations(self, state: State, white: Values) -> Block:
+        """Return the equations; ``white`` (3,) is the noise of a sample."""
         WM = self.rows @ state.matrix
         motion, v = self._samples(state)
         total = np.einsum("ts,tsi->ti", self.weight, v)
@@ -125,13 +125,8 @@ class Turns:
             Z = term.effect.columns("gyroscope", motion, state.K, term.values).reshape(*self.weight.shape, 3, -1)
             return np.asarray(-np.einsum("rtc,ts,tscp->rp", WM, self.weight, Z) / error[:, None])
 
-        return {
-            "residual": (self.value - np.einsum("rtc,tc->r", WM, total)) / error,
-            "base": np.concatenate([bias, matrix], axis=1) @ directions / error[:, None],
-            "effects": [columns(term) for term in state.terms],
-            "candidates": [columns(term) for term in candidates],
-            "error": error,
-        }
+        residual = (self.value - np.einsum("rtc,tc->r", WM, total)) / error
+        return Block(residual, np.concatenate([bias, matrix], axis=1) / error[:, None], columns, error)
 
     def described(self, state: State) -> list[dict[str, Any]]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""

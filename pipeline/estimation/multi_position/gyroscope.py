@@ -32,7 +32,7 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import require_turns, turns_of
-from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
+from pipeline.estimation.multi_position.model import Block, effect_readings, motion_of, stacked
 from pipeline.estimation.multi_position.moves import moves_of, observed_rests, tangents, to_the_end
 from pipeline.model.kinematics import skew
 
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.faces_and_turns import Turns
     from pipeline.estimation.multi_position.fit import Fit
+    from pipeline.estimation.multi_position.model import Equations, State
     from pipeline.estimation.multi_position.moves import Gravity, Moves
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
@@ -97,43 +98,12 @@ class GyroscopeModel:
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
         """Return the linear form at some parameters."""
-        pieces = [self._at_rest(state, candidates)]
+        blocks = [self._at_rest(state)]
         if self.moves is not None:
-            pieces.append(self._of_moves(state, candidates))
-        sizes = [len(piece["residual"]) for piece in pieces]
-        stretches = [piece["bias"].shape[2] for piece in pieces]
-        bias = np.zeros((3, sum(sizes), sum(stretches)))
-        scatter = np.zeros((len(pieces), sum(sizes)))
-        row = column = 0
-        for kind, piece in enumerate(pieces):
-            own = slice(row, row + sizes[kind])
-            bias[:, own, column : column + stretches[kind]] = piece["bias"]
-            scatter[kind, own] = np.square(np.median(piece["error"]) / piece["error"])
-            row, column = own.stop, column + stretches[kind]
-        recording = np.concatenate([piece["recording"] for piece in pieces])
-        same = recording[:, None] == recording
-
-        def stacked(name: str) -> Any:  # noqa: ANN401
-            return np.concatenate([piece[name] for piece in pieces])
-
-        equations = Equations(
-            residual=stacked("residual"),
-            base=stacked("base") @ self.directions,
-            effects=[np.concatenate(z) for z in zip(*(piece["effects"] for piece in pieces), strict=True)],
-            candidates=[np.concatenate(z) for z in zip(*(piece["candidates"] for piece in pieces), strict=True)],
-            scatter=scatter,
-            bias=bias,
-            start=stacked("start"),
-            length=stacked("length"),
-            joined=np.ones_like(same) if self.rests.clock_shared else same,
-            error=stacked("error"),
-            common=_blocks([piece["common"] for piece in pieces], sizes),
-            direction=_blocks([piece.get("direction") for piece in pieces], sizes),
-        )
-        if self.turns is None:
-            return equations
-        of_turns = self.turns.equations(state, candidates, self.white, self.directions)
-        return equations.followed_by({**of_turns, "bias": np.zeros((3, len(self.turns.value), column))})
+            blocks.append(self._of_moves(state))
+        if self.turns is not None:
+            blocks.append(self.turns.equations(state, self.white))
+        return stacked(blocks, self, state, candidates)
 
     def samples(self) -> float:
         """Return how many samples are behind the equations."""
@@ -172,7 +142,7 @@ class GyroscopeModel:
         predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
         across = np.linalg.norm(np.cross(predicted, self.after), axis=1)
         error = np.degrees(np.arctan2(across, np.einsum("ki,ki->k", predicted, self.after)))
-        own = self._of_moves(state, ())["error"].reshape(-1, 2)
+        own = self._of_moves(state).error.reshape(-1, 2)
         return error, np.sqrt(0.25 * np.pi * np.sum(own**2, axis=1))
 
     def largest_direction_error(
@@ -186,22 +156,23 @@ class GyroscopeModel:
         ``covariance``: (p, p), of bias and matrix first. ``freedom``: (p,), degrees of freedom. ``scatter``: of moves
         and of directions over the noise, as the fit found it. ``ratio``: of the bias wander to the white noise.
         """
-        piece = self._of_moves(state, ())
-        n = len(piece["residual"])
-        S = (1.0 + float(scatter.get("scatter_of_moves") or 0.0) ** 2) * np.eye(n) + piece["common"]
-        S = S + float(scatter.get("scatter_of_directions") or 0.0) ** 2 * piece["direction"]
-        S = S + ratio**2 * np.einsum("cnk,cmk->nm", piece["bias"], piece["bias"])
+        block = self._of_moves(state)
+        n = len(block.residual)
+        S = (1.0 + float(scatter.get("scatter_of_moves") or 0.0) ** 2) * np.eye(n) + np.asarray(block.common)
+        S = S + float(scatter.get("scatter_of_directions") or 0.0) ** 2 * np.asarray(block.direction)
+        held = np.asarray(block.bias)
+        S = S + ratio**2 * np.einsum("cnk,cmk->nm", held, held)
         rng = np.random.default_rng(0)
         drawn = draw_normal(rng, S, DRAWS)
         errors = draw_normal(rng, covariance[:12, :12], DRAWS)
         for own in (slice(0, 3), slice(3, 12)):  # the wander makes those of the bias fewer
             few = min(float(freedom[own].min()), MANY)
             errors[:, own] *= np.sqrt(few / rng.chisquare(few, (DRAWS, 1)))
-        drawn += errors @ piece["base"].T
-        rms = np.sqrt(2.0 * np.mean((drawn * piece["error"]) ** 2, axis=1))
+        drawn += errors @ block.base.T
+        rms = np.sqrt(2.0 * np.mean((drawn * block.error) ** 2, axis=1))
         return float(np.quantile(rms, 1.0 - TAIL))
 
-    def _at_rest(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
+    def _at_rest(self, state: State) -> Block:
         rests, K = self.rests, state.K
         motion = motion_of(rests.time, self.force, np.zeros_like(self.force), rests.temperature, still=True)
         error = np.sqrt(rests.share[:, None]) * self.white
@@ -217,18 +188,16 @@ class GyroscopeModel:
             Z = term.effect.columns(self.sensor, motion, K, term.values) / error[:, :, None]
             return np.asarray(Z.reshape(3 * m, -1))
 
-        return {
-            "residual": (left / error).ravel(),
-            "base": (base / error[:, :, None]).reshape(3 * m, 12),
-            "effects": [columns(term) for term in state.terms],
-            "candidates": [columns(term) for term in candidates],
-            "bias": bias.reshape(3, 3 * m, m),
-            "error": error.ravel(),
-            "start": rests.start,
-            "length": rests.length,
-            "recording": rests.recording,
-            "common": self._of_creep(K, error),
-        }
+        return Block(
+            (left / error).ravel(),
+            (base / error[:, :, None]).reshape(3 * m, 12),
+            columns,
+            error.ravel(),
+            bias.reshape(3, 3 * m, m),
+            (rests.start, rests.length, rests.recording),
+            scattered=True,
+            common=self._of_creep(K, error),
+        )
 
     def _of_creep(self, K: Values, error: Values) -> Values | None:
         """Return the covariance of the rests' equations by what is not known of their creep: (3 m, 3 m) array."""
@@ -244,7 +213,7 @@ class GyroscopeModel:
         out[np.arange(m), :, np.arange(m)] = own
         return out.reshape(3 * m, 3 * m)
 
-    def _of_moves(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
+    def _of_moves(self, state: State) -> Block:
         moves = self.moves
         assert moves is not None  # noqa: S101
         motion, v, A = self._turned(state)
@@ -276,20 +245,18 @@ class GyroscopeModel:
         error = np.sqrt(np.einsum("kii->ki", variance)).ravel()
         shared = np.einsum("kij,kjmc,mcp->kip", W, directions, self.shared).reshape(n, -1)
         leaning = np.einsum("kij,kjmc,mcd->kimd", W, directions, self.across).reshape(n, -1)
-        return {
-            "residual": np.einsum("kij,kj->ki", W, apart).ravel() - shared @ self.known["gravity"].moved,
-            "base": (W @ base).reshape(n, 12),
-            "effects": [columns(term) for term in state.terms],
-            "candidates": [columns(term) for term in candidates],
-            "bias": bias.reshape(3, n, moves.count),
-            "error": error,
-            "common": self._common(W, directions) + shared @ shared.T,
-            "shared": shared,
-            "direction": float(np.median(error)) ** 2 * leaning @ leaning.T,  # errors as large as a typical white one
-            "start": moves.time[:, 0],
-            "length": moves.time[:, -1] - moves.time[:, 0],
-            "recording": self.every.recording[moves.after],
-        }
+        return Block(
+            np.einsum("kij,kj->ki", W, apart).ravel() - shared @ self.known["gravity"].moved,
+            (W @ base).reshape(n, 12),
+            columns,
+            error,
+            bias.reshape(3, n, moves.count),
+            (moves.time[:, 0], moves.time[:, -1] - moves.time[:, 0], self.every.recording[moves.after]),
+            scattered=True,
+            common=self._common(W, directions) + shared @ shared.T,
+            direction=float(np.median(error)) ** 2 * leaning @ leaning.T,  # errors as large as a typical white one
+            shared=shared,
+        )
 
     def _directions(self, E: Values, A: Values) -> Values:
         """Return what an error of each rest's direction does to each move: (k, 2, m, 3) array."""
@@ -312,7 +279,7 @@ class GyroscopeModel:
         """Return the errors of the accelerometer's bias and matrix, as the moves tell them: (12,) array."""
         equations = self.equations(found.state)
         shared = np.zeros((len(equations.residual), 12))
-        shared[self.of_moves] = self._of_moves(found.state, ())["shared"]
+        shared[self.of_moves] = self._of_moves(found.state).shared
         white, _ = equations.whitened(found.noise, np.column_stack([shared, equations.residual]))
         return np.asarray(-self.known["gravity"].root @ (white[:, :12].T @ white[:, 12]))
 
@@ -343,15 +310,6 @@ class GyroscopeModel:
         shape = (-1, 3)
         warmth = self.moves.temperature.ravel()
         return motion_of(self.moves.time.ravel(), force.reshape(shape), rate.reshape(shape), warmth, still=False)
-
-
-def _blocks(blocks: Sequence[Values | None], sizes: Sequence[int]) -> Values | None:
-    """Return blocks along the diagonal, zeros where one is None; None where all are."""
-    if all(block is None for block in blocks):
-        return None
-    from scipy.linalg import block_diag  # noqa: PLC0415  (0.1 s that only fits pay)
-
-    return np.asarray(block_diag(*(np.zeros((n, n)) if b is None else b for b, n in zip(blocks, sizes, strict=True))))
 
 
 def model_of(

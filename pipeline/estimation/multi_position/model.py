@@ -25,7 +25,7 @@ Both sensors' models have: ``kinds`` of scatter (1: rests; 2: rests and moves), 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from pipeline.model.effects.base import Owner
 from pipeline.records import Motion
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.rest_means import Rests
     from pipeline.model.effects.base import Effect
-    from pipeline.records import Mask, Values
+    from pipeline.records import Index, Mask, Values
 
     Model: TypeAlias = AccelerometerModel | GyroscopeModel
 
@@ -105,24 +105,6 @@ class Equations:
             _kernels={},
         )
 
-    def followed_by(self, more: Mapping[str, Any]) -> Equations:
-        """Return these equations and further ones, of stated faces or turns, that no scatter adds to.
-
-        ``more``: residual, base, effects, candidates, bias and error.
-        """
-        count = len(more["residual"])
-        known: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name), more[name]]) for name in ("residual", "base", "error")
-        }
-        for name in ("effects", "candidates"):
-            known[name] = [np.concatenate(z) for z in zip(getattr(self, name), more[name], strict=True)]
-        for name in ("common", "direction"):
-            block = getattr(self, name)
-            known[name] = None if block is None else np.pad(block, ((0, count), (0, count)))
-        scatter = np.pad(self.scatter, ((0, 0), (0, count)))
-        bias = np.concatenate([self.bias, more["bias"]], axis=1)
-        return replace(self, **known, scatter=scatter, bias=bias, _kernels={})
-
     def variance(self, noise: NoiseHypothesis) -> Values:
         """Return the diagonal of C by white noise and scatter: (n,) array."""
         return np.asarray(1.0 + np.square(noise.scatter) @ self.scatter)
@@ -155,6 +137,64 @@ class Equations:
         solved, failed = dtrtrs(L, values, lower=1)
         assert failed == 0  # noqa: S101
         return solved, 2.0 * float(np.sum(np.log(np.diag(L))))
+
+
+@dataclass(frozen=True)
+class Block:
+    """Equations of one kind, over the white noise of each: rests, moves, faces or turns; symbols of ``Equations``."""
+
+    residual: Values  # (n,)
+    base: Values  # (n, 12), of bias and matrix
+    columns: Callable[[Term], Values]  # (n, p), of an effect
+    error: Values  # (n,)
+    bias: Values | None = None  # (3, n, t); None: zeros
+    stretches: tuple[Values, Values, Index] | None = None  # start, length, recording; None: those of the rests
+    scattered: bool = False  # whether the scatter of a kind of its own adds to them
+    # each (n, n); None: zeros
+    common: Values | None = None
+    direction: Values | None = None
+    shared: Values | None = None  # (n, 12); what the errors of the accelerometer's calibration do to moves
+
+
+def stacked(blocks: Sequence[Block], model: Model, state: State, candidates: Sequence[Term]) -> Equations:
+    """Return the equations of some blocks, those of the rests first."""
+    from scipy.linalg import block_diag  # noqa: PLC0415  (0.1 s that only fits pay)
+
+    rows = np.cumsum([0, *(len(block.residual) for block in blocks)])
+    times = [block.stretches for block in blocks if block.stretches is not None]
+    start, length, recording = (np.concatenate([time[k] for time in times]) for k in range(3))
+    scatter = np.zeros((sum(block.scattered for block in blocks), rows[-1]))
+    bias, column = np.zeros((3, rows[-1], len(start))), 0
+    for kind, (block, own) in enumerate(zip(blocks, map(slice, rows[:-1], rows[1:]), strict=True)):
+        if block.scattered:
+            scatter[kind, own] = np.square(np.median(block.error) / block.error)
+        if block.bias is not None:
+            first = 0 if block.stretches is None else column
+            bias[:, own, first : first + block.bias.shape[2]] = block.bias
+        column += 0 if block.stretches is None else len(block.stretches[0])
+
+    def together(name: str) -> Values | None:
+        parts = [getattr(block, name) for block in blocks]
+        if all(part is None for part in parts):
+            return None
+        sizes = [(n, n) for n in np.diff(rows)]
+        return np.asarray(block_diag(*(np.zeros(n) if p is None else p for p, n in zip(parts, sizes, strict=True))))
+
+    same = recording[:, None] == recording
+    return Equations(
+        residual=np.concatenate([block.residual for block in blocks]),
+        base=np.concatenate([block.base for block in blocks]) @ model.directions,
+        effects=[np.concatenate([block.columns(term) for block in blocks]) for term in state.terms],
+        candidates=[np.concatenate([block.columns(term) for block in blocks]) for term in candidates],
+        scatter=scatter,
+        bias=bias,
+        start=start,
+        length=length,
+        joined=np.ones_like(same) if model.rests.clock_shared else same,
+        error=np.concatenate([block.error for block in blocks]),
+        common=together("common"),
+        direction=together("direction"),
+    )
 
 
 def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:

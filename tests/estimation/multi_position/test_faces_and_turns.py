@@ -112,12 +112,12 @@ def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) 
     noise = noise_of("gyroscope", whole.recordings, whole.settings)
     model = model_of(whole.recordings, gyroscope, noise, whole.settings)
     assert model is not None
-    piece = model._of_moves(State(gyroscope.bias, gyroscope.matrix), ())
+    moves = model._of_moves(State(gyroscope.bias, gyroscope.matrix))
     for x in range(3):
         R = np.zeros((3, 3))
         R[(x + 1) % 3, (x + 2) % 3], R[(x + 2) % 3, (x + 1) % 3] = -1.0, 1.0
-        turned = piece["base"] @ np.append(np.zeros(3), (R @ gyroscope.matrix).ravel())
-        by_accelerometer = piece["shared"] @ np.linalg.lstsq(piece["shared"], turned)[0]
+        turned = moves.base @ np.append(np.zeros(3), (R @ gyroscope.matrix).ravel())
+        by_accelerometer = moves.shared @ np.linalg.lstsq(moves.shared, turned)[0]
         assert np.linalg.norm(turned) * FACE > 20.0  # standard deviations of the moves' noise
         assert np.linalg.norm(turned - by_accelerometer) * FACE < 0.2
 
