@@ -13,21 +13,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis import multi_position, turntable
-from pipeline.diagnosis.findings import Case, document_of
+from pipeline.diagnosis.findings import Case, Findings, document_of
 from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
 from pipeline.errors import ConvergenceError, NotObservableError
 from pipeline.estimation.candidates import AUTO, MOUNTING, OTHER, TILT, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.model.effects import catalogue, effect
-from pipeline.records import coverage_factor
+from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
 from pipeline.validation.heldout import last_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.diagnosis.findings import Findings
-    from pipeline.records import Noise, Recording, SensorCalibration
 
 IN_DOUBT = ("reference_in_doubt", "unexplained")  # verdicts on an accelerometer whose mountings may be wrong
 REFERENCE, SEATS = (

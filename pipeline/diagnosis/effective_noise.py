@@ -18,15 +18,12 @@ import numpy as np
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
 from pipeline.model.measurement import linear_truth
-from pipeline.records import FittedEffect
+from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, Values
 from pipeline.validation.error_breakdown import last_step
-from pipeline.validation.samples import samples_of_motion
+from pipeline.validation.samples import Samples, samples_of_motion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from pipeline.records import Noise, Recording, SensorCalibration, Values
-    from pipeline.validation.samples import Samples
 
 
 AVERAGING_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position

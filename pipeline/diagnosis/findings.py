@@ -15,16 +15,14 @@ import numpy as np
 
 from pipeline.diagnosis.words import next_experiment, to_distinguish
 from pipeline.estimation.candidates import OTHER
-from pipeline.estimation.design import placed
-from pipeline.estimation.posterior import CERTAIN
+from pipeline.estimation.design import Term, placed
+from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.design import Term
-    from pipeline.estimation.posterior import Answers
     from pipeline.estimation.ranking import Score
     from pipeline.records import Noise, Recording, SensorCalibration, Values
 

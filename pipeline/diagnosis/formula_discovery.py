@@ -22,26 +22,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis import functional_forms as forms
-from pipeline.diagnosis.functional_form_search import CLEARLY, PRICE, Forms, search, without_effects
+from pipeline.diagnosis.functional_form_search import CLEARLY, PRICE, Forms, Scored, search, without_effects
 from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.diagnosis.residual_regression import ProjectedCurves
 from pipeline.diagnosis.words import listed
 from pipeline.estimation.design import Term
-from pipeline.estimation.generalized_least_squares import fit_terms
-from pipeline.estimation.observations import without_each_recording, without_rows
-from pipeline.estimation.selection import FAR_ABOVE, select
+from pipeline.estimation.generalized_least_squares import Fit, fit_terms
+from pipeline.estimation.observations import Observations, without_each_recording, without_rows
+from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.model.effects import catalogue, effect_from, forget, register
-from pipeline.model.effects.base import unit_of
+from pipeline.model.effects.base import Effect, unit_of
 from pipeline.model.formula import SIGNALS, parse
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
 
-    from pipeline.diagnosis.functional_form_search import Scored
-    from pipeline.estimation.generalized_least_squares import Fit
-    from pipeline.estimation.observations import Observations
-    from pipeline.estimation.selection import Selection
-    from pipeline.model.effects.base import Effect
     from pipeline.records import Noise, SensorCalibration, Values
 
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis import functional_forms as forms
-from pipeline.diagnosis.functional_forms import Form, Span
-from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
+from pipeline.diagnosis.functional_forms import Factor, Form, Span
+from pipeline.diagnosis.residual_regression import Gain, ProjectedCurves, Scan
 from pipeline.estimation.design import true_motion
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import truth
@@ -28,8 +28,6 @@ from pipeline.model.formula import parse
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.diagnosis.functional_forms import Factor
-    from pipeline.diagnosis.residual_regression import Gain
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.selection import Selection
     from pipeline.records import Values

@@ -20,14 +20,13 @@ import numpy as np
 
 from pipeline.diagnosis.words import listed
 from pipeline.model.effects.base import truth, unit_of
-from pipeline.model.formula import parse
+from pipeline.model.formula import Formula, parse
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from pipeline.diagnosis.residual_regression import Curves
     from pipeline.estimation.observations import Observations
-    from pipeline.model.formula import Formula
     from pipeline.records import Motion, Values
 
 CYCLES = range(1, 13)

@@ -28,25 +28,21 @@ import numpy as np
 
 from pipeline.diagnosis.residual_dependence import bases_of, curves_of, smooth_tests
 from pipeline.diagnosis.residual_regression import ProjectedCurves, columns_of_fit, each_explains
-from pipeline.estimation.design import BASE, placed
+from pipeline.estimation.design import BASE, Design, Term, placed
 from pipeline.estimation.gauss_markov import GaussMarkov, Products
-from pipeline.estimation.generalized_least_squares import design_at
-from pipeline.estimation.observations import without_each_recording
+from pipeline.estimation.generalized_least_squares import Fit, design_at
+from pipeline.estimation.observations import Observations, without_each_recording
 from pipeline.estimation.ranking import projection, without
-from pipeline.estimation.selection import GATE_BIC
+from pipeline.estimation.selection import GATE_BIC, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.design import Design, Term
-    from pipeline.estimation.generalized_least_squares import Fit
-    from pipeline.estimation.selection import Selection
     from pipeline.records import Values
 
     JSON = dict[str, Any]
-    from pipeline.estimation.observations import Observations
 
 MOST_OF = 0.5  # share of the gain that the listed seconds have together
 MOST_STRETCHES = 5

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import Start
-from pipeline.estimation.generalized_least_squares import fit_terms
+from pipeline.estimation.generalized_least_squares import Fit, fit_terms
 from pipeline.estimation.observations import through_filter
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
@@ -29,7 +29,6 @@ from pipeline.model.kinematics import table_motion
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion, Recording, SensorCalibration, Values
 

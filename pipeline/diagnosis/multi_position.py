@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis import functional_forms as forms
-from pipeline.diagnosis.findings import Findings
+from pipeline.diagnosis.findings import Case, Findings
 from pipeline.diagnosis.method_errors import given_differences
 from pipeline.diagnosis.observability import MORE, never_shown, not_observable_by_hand
 from pipeline.diagnosis.residual_dependence import GATE_P
@@ -30,10 +30,10 @@ from pipeline.diagnosis.words import listed, plain
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import Term
-from pipeline.estimation.multi_position.fit import fit
+from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
-from pipeline.estimation.multi_position.selection import FAR, posterior, select
+from pipeline.estimation.multi_position.selection import FAR, Selection, posterior, select
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue, effect, effect_from
 
@@ -42,10 +42,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.diagnosis.findings import Case
-    from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.model import Model, State
-    from pipeline.estimation.multi_position.selection import Selection
     from pipeline.records import Noise, Recording, SensorCalibration
 
 NEEDED = MORE

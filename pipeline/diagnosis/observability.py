@@ -20,7 +20,7 @@ import numpy as np
 
 from pipeline.estimation.candidates import MOUNTING, ZERO
 from pipeline.estimation.multi_position.model import refusal
-from pipeline.estimation.selection import GATE_BIC
+from pipeline.estimation.selection import GATE_BIC, Selection
 from pipeline.model.effects import catalogue, effect
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.observations import Observations
     from pipeline.estimation.ranking import Score
-    from pipeline.estimation.selection import Selection
     from pipeline.model.effects.base import Effect
 
 LEAST_SPAN_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC

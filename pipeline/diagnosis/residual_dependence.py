@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 
 from pipeline.diagnosis.functional_forms import Span, signals_of
-from pipeline.diagnosis.residual_regression import ProjectedCurves
+from pipeline.diagnosis.residual_regression import Curves, ProjectedCurves
 from pipeline.estimation.gauss_markov import selection_grid
 from pipeline.model.effects import effect
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.diagnosis.residual_regression import Curves
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion, Values
 

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.functional_forms import columns_of, signals_of
-from pipeline.estimation.design import BASE, placed
-from pipeline.estimation.gauss_markov import Products, Setting
+from pipeline.estimation.design import BASE, Term, placed
+from pipeline.estimation.gauss_markov import Blocks, Products, Setting
 from pipeline.estimation.generalized_least_squares import design_at
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.model.effects.base import Layout, truth, unit_of
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.design import Term
-    from pipeline.estimation.gauss_markov import Blocks
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.selection import Selection
     from pipeline.records import Noise, Values

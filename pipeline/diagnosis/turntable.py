@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.diagnosis.findings import Findings
+from pipeline.diagnosis.findings import Case, Findings
 from pipeline.diagnosis.formula_discovery import Discovery, dependent, discover, why_not_suggested
 from pipeline.diagnosis.influence import goodness_of_fit, influence
 from pipeline.diagnosis.method_errors import method_errors
@@ -22,12 +22,12 @@ from pipeline.diagnosis.words import FAR_OFF, plain
 from pipeline.errors import ConvergenceError
 from pipeline.estimation.candidates import free_curves, turns_of
 from pipeline.estimation.design import Start
-from pipeline.estimation.generalized_least_squares import calibration_of, fit_in_mean_frame, fit_terms
+from pipeline.estimation.generalized_least_squares import Fit, calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.posterior_turns import posterior
-from pipeline.estimation.selection import FAR_ABOVE, select
+from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.model.effects import catalogue
-from pipeline.records import Noise
+from pipeline.records import Noise, SensorCalibration
 from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.heldout import noise_floors
 from pipeline.validation.samples import samples_of_motion
@@ -35,10 +35,6 @@ from pipeline.validation.samples import samples_of_motion
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.diagnosis.findings import Case
-    from pipeline.estimation.generalized_least_squares import Fit
-    from pipeline.estimation.selection import Selection
-    from pipeline.records import SensorCalibration
 
 NEEDED = "record turns about all three axes on a table whose angle and rate are logged"
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share

@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.chip_rows import ROW_S, clear_of, columns_of, turned
+from pipeline.estimation.chip_rows import ROW_S, Chip, clear_of, columns_of, turned
 from pipeline.estimation.chips import (
     OBSERVED,
     PRIORS,
+    Estimate,
+    Found,
     axes_between,
     axes_of,
     matrix_of,
@@ -18,14 +20,11 @@ from pipeline.estimation.chips import (
 )
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.model.kinematics import turn_by_vector
-from pipeline.records import AXES, SENSOR_UNITS, coverage_factor
+from pipeline.records import AXES, SENSOR_UNITS, Values, coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.chip_rows import Chip
-    from pipeline.estimation.chips import Estimate, Found
-    from pipeline.records import Values
 
 FEWEST_ROWS = 20  # at rest and in motion, whose noise is compared
 DOUBTFUL = 0.001  # p-value of the agreement of both rotations, below which it is in doubt (Pearson's chi^2, 3 degrees)

@@ -12,18 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.gauss_markov import Blocks
+from pipeline.estimation.gauss_markov import Blocks, Prior
 from pipeline.estimation.noise import prior_of
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects.base import STANDARD_GRAVITY
 from pipeline.model.kinematics import skew
-from pipeline.records import MEDIAN_SIZE, SENSORS, noise_of_steps
+from pipeline.records import MEDIAN_SIZE, SENSORS, Mask, Recording, SensorCalibration, Values, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from pipeline.estimation.gauss_markov import Prior
-    from pipeline.records import Mask, Recording, SensorCalibration, Values
 
     Means = dict[str, Values]
 

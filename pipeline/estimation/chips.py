@@ -24,6 +24,8 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.chip_rows import (
+    Chip,
+    Means,
     blocks_of,
     clear_of,
     columns_of,
@@ -34,17 +36,14 @@ from pipeline.estimation.chip_rows import (
     turned,
 )
 from pipeline.estimation.engine import LinearMap, assess_noise, scaled_inverse
-from pipeline.estimation.gauss_markov import Prior
+from pipeline.estimation.gauss_markov import Blocks, Prior
 from pipeline.estimation.uncertainty_budget import own_and_bench
 from pipeline.model.kinematics import turn_by_vector
-from pipeline.records import AXES, SENSORS
+from pipeline.records import AXES, SENSORS, Mask, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.chip_rows import Chip, Means
-    from pipeline.estimation.gauss_markov import Blocks
-    from pipeline.records import Mask, Values
 
 # Weak priors: what a recording does not show keeps them. Sizes of a device (assumption); the group delays of an
 # MPU-6050's low-pass filters differ by up to 19 ms (its register map, register 26).

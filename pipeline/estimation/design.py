@@ -25,16 +25,14 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
-from pipeline.estimation.gauss_markov import Products
+from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.table_errors import errors_of_stops
-from pipeline.model.effects.base import Layout, truth
+from pipeline.model.effects.base import Effect, Layout, truth
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations, Part
-    from pipeline.model.effects.base import Effect
     from pipeline.records import Index, Motion, Noise, Values
 
 BASE = 12  # bias and matrix

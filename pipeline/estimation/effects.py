@@ -12,12 +12,10 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
 from pipeline.model.effects import bench_priors, effect, stated_priors
-from pipeline.records import SensorCalibration
+from pipeline.records import Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from pipeline.records import Recording
 
 
 def fit(

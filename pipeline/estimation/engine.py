@@ -30,14 +30,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.gauss_markov import GaussMarkov, Setting
-from pipeline.records import noise_of_steps
+from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Prior, Setting
+from pipeline.records import Index, Values, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from pipeline.estimation.gauss_markov import Blocks, Prior
-    from pipeline.records import Index, Values
 
 ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
 FEWEST = 2.0  # degrees of freedom: Student's t has no variance below

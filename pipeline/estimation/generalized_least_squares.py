@@ -28,7 +28,7 @@ from pipeline.estimation.engine import AVERAGED_OUT, RANK, Posterior, ResidualNo
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.noise import static_or_sheet
-from pipeline.estimation.observations import observe, weighted
+from pipeline.estimation.observations import Observations, observe, weighted
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.uncertainty_budget import (
     bench_contribution,
@@ -40,13 +40,11 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.model.effects.base import Layout, truth
 from pipeline.model.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-from pipeline.records import SensorCalibration, StageResult
+from pipeline.records import Noise, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.observations import Observations
-    from pipeline.records import Noise, Recording, Values
 
 ROUNDS = 25  # of Gauss-Newton
 SMALL_STEP = 1e-3  # of a standard uncertainty

@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.evidence import NEGLIGIBLE, Given
+from pipeline.estimation.evidence import NEGLIGIBLE, Given, Pick, Problem, Set
 from pipeline.estimation.selection import DELAYS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from pipeline.estimation.evidence import Pick, Problem, Set
     from pipeline.model.effects.base import Effect
     from pipeline.records import Values
 

@@ -16,18 +16,16 @@ from pipeline.estimation.candidates import SECOND, SECOND_SHARE, over_limits, ti
 from pipeline.estimation.design import BASE, Design, Start, Term, placed
 from pipeline.estimation.evidence import Problem, Version
 from pipeline.estimation.gauss_markov import WHITE, random_walks
-from pipeline.estimation.generalized_least_squares import design_beside, fit_terms
+from pipeline.estimation.generalized_least_squares import Fit, design_beside, fit_terms
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import EXCITED, without
-from pipeline.estimation.selection import DELAYS
+from pipeline.estimation.selection import DELAYS, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.generalized_least_squares import Fit
-    from pipeline.estimation.selection import Selection
     from pipeline.model.effects.base import Effect
 
     Values = NDArray[np.float64]

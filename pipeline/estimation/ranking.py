@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import BASE, Design, Term
-from pipeline.estimation.gauss_markov import WHITE
+from pipeline.estimation.gauss_markov import WHITE, Setting
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations
     from pipeline.records import Index, Values
 

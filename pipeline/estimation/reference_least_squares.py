@@ -36,17 +36,15 @@ from pipeline.estimation.generalized_least_squares import fit_joint, with_matrix
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import blocks_of_samples, parts_of, settled
+from pipeline.estimation.turns import Part, blocks_of_samples, parts_of, settled
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import truth
-from pipeline.records import AXES, SensorCalibration, StageResult
+from pipeline.records import AXES, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.turns import Part
-    from pipeline.records import Recording, Values
 
 NAME = "reference_least_squares"
 COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))

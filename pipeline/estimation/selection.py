@@ -26,9 +26,9 @@ import numpy as np
 
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
 from pipeline.estimation.design import Start, Term, ordinary_base, placed
-from pipeline.estimation.gauss_markov import selection_grid
+from pipeline.estimation.gauss_markov import Setting, selection_grid
 from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms
-from pipeline.estimation.observations import weighted
+from pipeline.estimation.observations import Observations, weighted
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.model.effects import effect
 
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.gauss_markov import Setting
-    from pipeline.estimation.observations import Observations
     from pipeline.records import Noise, SensorCalibration
 
     Values = NDArray[np.float64]

@@ -26,13 +26,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
-from pipeline.records import NORMAL, Contribution, SensorCalibration, StageResult
+from pipeline.records import NORMAL, Contribution, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
-    from pipeline.records import Recording, Values
 
 STAGED = {
     "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),

@@ -25,14 +25,13 @@ from pipeline.estimation.engine import LinearMap
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import ABOUT, earth_rate
-from pipeline.records import NORMAL, SENSORS, Contribution, noise_of_steps
+from pipeline.records import NORMAL, SENSORS, Contribution, Index, Motion, Values, noise_of_steps
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.gauss_markov import Blocks
-    from pipeline.records import Index, Motion, Values
 
 ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ

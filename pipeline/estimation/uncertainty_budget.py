@@ -24,10 +24,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.design import BASE, BASE_NAMES
+from pipeline.estimation.design import BASE, BASE_NAMES, Term
 from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
-from pipeline.estimation.table_errors import table_errors, type_b
-from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, FittedEffect, coverage_factor, finite
+from pipeline.estimation.table_errors import Reference, table_errors, type_b
+from pipeline.records import (
+    NORMAL,
+    RECTANGULAR,
+    SENSOR_UNITS,
+    Contribution,
+    FittedEffect,
+    Recording,
+    SensorCalibration,
+    Values,
+    coverage_factor,
+    finite,
+)
 from pipeline.signal.filters import temperature_of
 
 if TYPE_CHECKING:
@@ -35,11 +46,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from pipeline.estimation.design import Term
     from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
-    from pipeline.estimation.table_errors import Reference
-    from pipeline.records import Recording, SensorCalibration, Values
 
 BY_CHANCE = 0.1  # of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)

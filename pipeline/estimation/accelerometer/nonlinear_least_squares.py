@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.engine import LinearMap, assess_noise
+from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
 from pipeline.estimation.gauss_markov import Prior
 from pipeline.estimation.least_squares import ScaledColumns, solve_linear
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through, trials_of, without_trials
@@ -34,19 +34,16 @@ from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, prior
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.result import after_stage, curvature, fit_faces, require_faces, with_stage
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.rest_means import describe_rests, orientations_of, sound_samples
+from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples
 from pipeline.estimation.uncertainty_budget import combined, gravity_contribution, noise_contribution
 from pipeline.model.kinematics import table_motion
-from pipeline.records import Noise, SensorCalibration, coverage_factor
+from pipeline.records import Mask, Noise, Recording, SensorCalibration, Values, coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.engine import ResidualNoise
-    from pipeline.estimation.rest_means import Orientations
-    from pipeline.records import Mask, Recording, Values
 
 NAME = "nonlinear_least_squares"
 ROWS, COLUMNS = np.tril_indices(3)

@@ -27,6 +27,8 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.accelerometer.turn_extremes import (
+    Extremes,
+    Turn,
     by_turn,
     certificate_of,
     extremes_of_samples,
@@ -34,12 +36,12 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     sinusoids_of,
     turns_of,
 )
-from pipeline.estimation.engine import LinearMap, assess_noise
+from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before, two_sided
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import blocks_of_samples, parts_of
+from pipeline.estimation.turns import Sinusoid, blocks_of_samples, parts_of
 from pipeline.estimation.uncertainty_budget import (
     budgeted,
     combined,
@@ -48,16 +50,12 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.model.effects import effect
-from pipeline.records import AXES, FittedEffect, SensorCalibration
+from pipeline.records import AXES, Contribution, FittedEffect, Recording, SensorCalibration, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.accelerometer.turn_extremes import Extremes, Turn
-    from pipeline.estimation.engine import ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
-    from pipeline.estimation.turns import Sinusoid
-    from pipeline.records import Contribution, Recording, Values
 
     Quantities = dict[str, tuple[float, str]]
 

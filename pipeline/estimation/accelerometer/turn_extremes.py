@@ -21,14 +21,12 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.least_squares import certificate, certified
 from pipeline.estimation.stages import apply_step
-from pipeline.estimation.turns import filtered_alike, fit_sinusoid, wrap
-from pipeline.records import AXES
+from pipeline.estimation.turns import Part, Sinusoid, filtered_alike, fit_sinusoid, wrap
+from pipeline.records import AXES, Mask, Motion, Recording, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.turns import Part, Sinusoid
-    from pipeline.records import Mask, Motion, Recording, Values
 
 OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y, z
 

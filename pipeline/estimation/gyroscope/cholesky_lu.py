@@ -44,16 +44,14 @@ from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import of_channels
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import blocks_of_samples, parts_of
+from pipeline.estimation.turns import Part, blocks_of_samples, parts_of
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
-from pipeline.records import AXES, SensorCalibration, StageResult
+from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, StageResult, Values
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.turns import Part
-    from pipeline.records import Index, Mask, Motion, Recording, Values
 
 NAME = "cholesky_lu"
 STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative

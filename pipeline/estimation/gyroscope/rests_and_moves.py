@@ -23,12 +23,11 @@ from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import ROLE, is_multi_position
-from pipeline.records import SensorCalibration
+from pipeline.records import Recording, SensorCalibration, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Recording, Values
 
 NAME = "rests_and_moves"
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg

@@ -32,17 +32,15 @@ from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import blocks_of_samples, parts_of, steady_turns
+from pipeline.estimation.turns import Part, blocks_of_samples, parts_of, steady_turns
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
-from pipeline.records import AXES, SensorCalibration, motion_at_rest
+from pipeline.records import AXES, Mask, Motion, Recording, SensorCalibration, Values, motion_at_rest
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.gauss_markov import Blocks
-    from pipeline.estimation.turns import Part
-    from pipeline.records import Mask, Motion, Recording, Values
 
 STEP = 1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 FORGOTTEN = 1e-5  # of a change of rate, that a filter's output may still hold where a rest or a steady turn begins

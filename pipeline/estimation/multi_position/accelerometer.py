@@ -19,17 +19,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.multi_position.faces_and_turns import faces_of
-from pipeline.estimation.multi_position.model import Block, State, effect_readings, motion_of, stacked
-from pipeline.estimation.rest_means import HELD_OUT, rests_of
+from pipeline.estimation.multi_position.faces_and_turns import Faces, faces_of
+from pipeline.estimation.multi_position.model import Block, Equations, State, effect_readings, motion_of, stacked
+from pipeline.estimation.rest_means import HELD_OUT, Rests, rests_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.design import Term
-    from pipeline.estimation.multi_position.faces_and_turns import Faces
-    from pipeline.estimation.multi_position.model import Equations
-    from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
 
 ROUNDS = 12  # of effects that depend on the force

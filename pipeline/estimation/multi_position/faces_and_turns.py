@@ -25,19 +25,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.multi_position.model import Block, effect_readings, motion_of
+from pipeline.estimation.multi_position.model import Block, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import sound_span, trapezoids
-from pipeline.estimation.rest_means import ROLE
-from pipeline.records import AXES
+from pipeline.estimation.rest_means import ROLE, Rests
+from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, Values
 from pipeline.signal.segments import ACROSS, multiples
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.design import Term
-    from pipeline.estimation.multi_position.model import State
-    from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Index, Mask, Motion, Recording, SensorCalibration, Values
 
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
 DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5

@@ -37,17 +37,14 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import Posterior
-from pipeline.estimation.least_squares import gauss_newton
-from pipeline.estimation.multi_position.likelihood import NEW, project_out
-from pipeline.estimation.multi_position.model import stepped
+from pipeline.estimation.least_squares import ScaledColumns, gauss_newton
+from pipeline.estimation.multi_position.likelihood import NEW, NoiseHypothesis, project_out
+from pipeline.estimation.multi_position.model import Equations, Model, State, stepped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.least_squares import ScaledColumns
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
-    from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
-    from pipeline.estimation.multi_position.model import Equations, Model, State
     from pipeline.records import Recording, Values
 
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none

@@ -31,19 +31,16 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
-from pipeline.estimation.multi_position.faces_and_turns import require_turns, turns_of
-from pipeline.estimation.multi_position.model import Block, effect_readings, motion_of, stacked
-from pipeline.estimation.multi_position.moves import moves_of, observed_rests, tangents, to_the_end
+from pipeline.estimation.multi_position.faces_and_turns import Turns, require_turns, turns_of
+from pipeline.estimation.multi_position.model import Block, Equations, State, effect_readings, motion_of, stacked
+from pipeline.estimation.multi_position.moves import Gravity, Moves, moves_of, observed_rests, tangents, to_the_end
 from pipeline.model.kinematics import skew
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.design import Term
-    from pipeline.estimation.multi_position.faces_and_turns import Turns
     from pipeline.estimation.multi_position.fit import Fit
-    from pipeline.estimation.multi_position.model import Equations, State
-    from pipeline.estimation.multi_position.moves import Gravity, Moves
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
 

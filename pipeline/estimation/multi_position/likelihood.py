@@ -19,12 +19,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.gauss_markov import SURE, selection_grid
+from pipeline.estimation.gauss_markov import SURE, Prior, selection_grid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.gauss_markov import Prior
     from pipeline.estimation.multi_position.model import Equations
     from pipeline.records import Noise, Values
 

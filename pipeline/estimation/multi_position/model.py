@@ -32,8 +32,8 @@ import numpy as np
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.model.effects import catalogue
-from pipeline.model.effects.base import Owner
-from pipeline.records import Motion
+from pipeline.model.effects.base import Effect, Owner
+from pipeline.records import Index, Mask, Motion, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.rest_means import Rests
-    from pipeline.model.effects.base import Effect
-    from pipeline.records import Index, Mask, Values
 
     Model: TypeAlias = AccelerometerModel | GyroscopeModel
 

@@ -42,7 +42,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.multi_position.model import motion_of
-from pipeline.estimation.rest_means import ROLE, rest_means, rests_of, sound_samples
+from pipeline.estimation.rest_means import ROLE, Rests, rest_means, rests_of, sound_samples
 from pipeline.model.effects import effect
 from pipeline.model.kinematics import turn_by_vector
 from pipeline.model.measurement import compensate
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from typing import Any
 
-    from pipeline.estimation.rest_means import Rests
     from pipeline.records import Index, Mask, Recording, SensorCalibration, Values
 
 LONGEST_S = 60.0  # see ``moves_of``

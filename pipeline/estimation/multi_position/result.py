@@ -22,9 +22,9 @@ from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, trials_of
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
-from pipeline.estimation.multi_position.fit import fit, plausible, require_observable
+from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_observable
 from pipeline.estimation.multi_position.likelihood import prior_hypotheses, selection_hypotheses
-from pipeline.estimation.multi_position.model import State, parameter_places, refusal, stepped
+from pipeline.estimation.multi_position.model import Model, State, parameter_places, refusal, stepped
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of, select
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
@@ -37,14 +37,11 @@ from pipeline.estimation.uncertainty_budget import (
     scatter_contribution,
 )
 from pipeline.model.effects import effect
-from pipeline.records import NORMAL, SensorCalibration, StageResult
+from pipeline.records import NORMAL, Contribution, Noise, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.multi_position.fit import Fit
-    from pipeline.estimation.multi_position.model import Model
-    from pipeline.records import Contribution, Noise, Recording, SensorCalibration, Values
 
 STEP = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
 REMARK = {

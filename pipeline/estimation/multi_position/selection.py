@@ -24,13 +24,19 @@ from pipeline.estimation.design import Term
 from pipeline.estimation.evidence import Problem, Version
 from pipeline.estimation.gauss_markov import WALK_RATIO, WALK_SHARE, WALK_TIME
 from pipeline.estimation.multi_position.fit import Fit, fit
-from pipeline.estimation.multi_position.likelihood import NEW, project_out, selection_hypotheses
-from pipeline.estimation.multi_position.model import State, candidates_for
+from pipeline.estimation.multi_position.likelihood import (
+    NEW,
+    NoiseHypothesis,
+    ProjectedCandidates,
+    project_out,
+    selection_hypotheses,
+)
+from pipeline.estimation.multi_position.model import Equations, Model, State, candidates_for
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
 from pipeline.model.effects import catalogue, effect
-from pipeline.model.effects.base import parameter_limits
+from pipeline.model.effects.base import Effect, parameter_limits
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -38,9 +44,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, ProjectedCandidates
-    from pipeline.estimation.multi_position.model import Equations, Model
-    from pipeline.model.effects.base import Effect
     from pipeline.records import Noise, SensorCalibration
 
     Values = NDArray[np.float64]
