@@ -38,9 +38,7 @@ from pipeline.estimation.selection import GATE_BIC, Selection
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Values
+    from pipeline.records import Index, Values
 
     JSON = dict[str, Any]
 
@@ -82,7 +80,7 @@ def _gone(recording: JSON) -> bool:
     return recording["delta_bic_without"] is None or bool(recording["delta_bic_without"] < GATE_BIC)
 
 
-def _gains_of_blocks(selection: Selection, design: Design, whole: Values, term: Term, own: NDArray[np.intp]) -> Values:
+def _gains_of_blocks(selection: Selection, design: Design, whole: Values, term: Term, own: Index) -> Values:
     """Return the share of each block in what an effect gains: (m,) array. ``whole``: products of the fit's design."""
     observations, fit = selection.observations.weakened, selection.fit
     described = term.effect.parameters(observations.sensor)
@@ -118,7 +116,7 @@ def _without_each(selection: Selection) -> list[tuple[Values, float, float]]:
 def _of_recordings(
     selection: Selection,
     whole: Values,
-    own: NDArray[np.intp],
+    own: Index,
     gains: Values,
     without_each: Sequence[tuple[Values, float, float]],
 ) -> list[JSON]:
@@ -137,14 +135,14 @@ def _of_recordings(
     return sorted(found, key=lambda entry: -entry["share"])
 
 
-def _weakest(products: Values, own: NDArray[np.intp]) -> float:
+def _weakest(products: Values, own: Index) -> float:
     """Return the least information on an effect's parameters given all others, columns scaled as they are given."""
     others = np.setdiff1d(np.arange(products.shape[1] - 1), own)
     size = np.sqrt(np.maximum(np.diag(products[0])[own], 1e-300))
     return float(np.linalg.eigvalsh(without(products, others)[0][np.ix_(own, own)] / np.outer(size, size))[0])
 
 
-def _refitted(fit: Fit, own: NDArray[np.intp], least: float, rest: tuple[Values, float, float]) -> JSON:
+def _refitted(fit: Fit, own: Index, least: float, rest: tuple[Values, float, float]) -> JSON:
     """Return delta BIC of an effect without a recording, and the largest change of its parameters."""
     products, within, samples = rest
     p = products.shape[1] - 1
@@ -190,7 +188,7 @@ def _stretches(selection: Selection, gains: Values) -> list[JSON]:
     return sorted(found, key=lambda stretch: -stretch["share"])[:MOST_STRETCHES]
 
 
-def _apart(a: int, b: int, part: NDArray[np.intp]) -> bool:
+def _apart(a: int, b: int, part: Index) -> bool:
     return bool(b != a + 1 or part[a] != part[b])
 
 

@@ -40,10 +40,8 @@ from pipeline.model.effects import catalogue, effect, effect_from
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.multi_position.model import Model, State
-    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.records import Mask, Noise, Recording, SensorCalibration
 
 NEEDED = MORE
 FAR_ABOVE = 10.0  # times the noise: no unit that somebody sets down or holds rests so badly
@@ -263,7 +261,7 @@ def _folds(model: Model) -> Iterator[tuple[Model, int]]:
     """Return the models that leave out every third rest in turn, and how many each leaves out."""
     fold = np.arange(len(model.rests.time)) % FOLDS
     for k in range(FOLDS):
-        held: NDArray[np.bool_] = fold == k
+        held: Mask = fold == k
         yield model.without(held), int(held.sum())
 
 

@@ -27,14 +27,12 @@ from pipeline.model.effects import effect
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Motion, Values
+    from pipeline.records import Index, Motion, Values
 
     Block = tuple[Sequence[int], int]
     Basis = tuple[str, Curves, list[Block]]
-    Tests = tuple[list[str], Values, NDArray[np.intp], float]
+    Tests = tuple[list[str], Values, Index, float]
 
 GATE_BIC = 10.0  # "very strong" of R. E. Kass and A. E. Raftery, JASA 90 (1995), 773-795
 GATE_P = 1e-3  # probability of naming a covariate of a complete model, over all tests (Bonferroni)

@@ -32,11 +32,9 @@ from pipeline.model.formula import parse
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Noise, Values
+    from pipeline.records import Index, Noise, Values
 
     JSON = dict[str, Any]
 
@@ -274,7 +272,7 @@ def _solved(gram: Values, cross: Values) -> Values:
 class Bins:
     """Those of 40 equal bins of a covariate that hold something."""
 
-    cell: NDArray[np.intp]  # (n,), bin of each row; one beyond the last where the covariate is not known
+    cell: Index  # (n,), bin of each row; one beyond the last where the covariate is not known
     row_weight: Values  # (n,)
     weight: Values  # (b,), of the rows in a bin together
     centre: Values  # (b,), weighted mean of the covariate

@@ -29,10 +29,8 @@ from pipeline.estimation.ranking import LEFT, RIDGE, projection, without
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Motion, Values
+    from pipeline.records import Index, Mask, Motion, Values
 
     Curves = Callable[[Motion], Values]
 
@@ -78,14 +76,14 @@ class _Evidence:
         found: Values = -0.5 * self.samples * np.log(total / self.samples) - penalty
         return found
 
-    def gains(self, drops: Values, parameters: int | NDArray[np.intp]) -> Values:
+    def gains(self, drops: Values, parameters: int | Index) -> Values:
         """Return delta BIC of forms on all three axes, from their (t, 3, m) drops and numbers of parameters: (m,)."""
         rss = self.left.sum(axis=1)[:, None] - drops.sum(axis=1)
         best = self.log_likelihood(rss).max(axis=0)
         found: Values = 2.0 * (best - self.before) - parameters * float(np.log(self.samples))
         return found
 
-    def best_axes(self, drops: Values, columns: int, scanned: int | NDArray[np.intp] = 0) -> list[Gain]:
+    def best_axes(self, drops: Values, columns: int, scanned: int | Index = 0) -> list[Gain]:
         """Return what each form explains, on the axes that it improves.
 
         Their (t, 3, m) ``drops`` are those of so many columns on each axis; ``scanned`` counts parameters such as a
@@ -131,7 +129,7 @@ class ProjectedCurves(_Evidence):
         self._project(stacked, places)
         self._set(self.left, logarithms)
 
-    def _project(self, products: Values, places: Sequence[Sequence[NDArray[np.intp]]]) -> None:
+    def _project(self, products: Values, places: Sequence[Sequence[Index]]) -> None:
         """Project base and effects out of curves and residual: products inner, cross and left, by noise and axis."""
         q = len(places[0][-1])
         white = np.sqrt(np.maximum(np.einsum("ii->i", products[0]), 0.0))
@@ -178,7 +176,7 @@ class ProjectedCurves(_Evidence):
         together: Values = np.cumsum(each, axis=2)
         return together
 
-    def _each(self, index: Sequence[int]) -> tuple[Values, NDArray[np.bool_]]:
+    def _each(self, index: Sequence[int]) -> tuple[Values, Mask]:
         """Return what each curve adds to those before it, and whether it is independent of them: (t, 3, r)."""
         inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index]
         explained, independent = each_explains(inner, cross[..., None], self.error[:, :, index])
@@ -267,7 +265,7 @@ class Scan(_Evidence):
         return np.asarray(np.where(new.all(axis=2), explained[..., 0].sum(axis=2), 0.0)[1:])
 
 
-def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, NDArray[np.bool_]]:
+def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, Mask]:
     """Return what each of r curves adds to those before it, (..., r, s), and whether it is independent of them.
 
     ``inner``: (..., r, r), products of the curves. ``cross``: (..., r, s), their products with s residuals. ``error``:
@@ -286,7 +284,7 @@ def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, 
     return explained, independent
 
 
-def columns_of_fit(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[NDArray[np.intp]]]]:
+def columns_of_fit(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[Index]]]:
     """Return the columns of a selection's fit, its residual and those of curves, and where those of each axis lie."""
     design = design_at(selection.observations.weakened, selection.fit)
     motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]

@@ -29,8 +29,6 @@ from pipeline.model.effects.mounting import OWN
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.observations import Observations
     from pipeline.records import Motion, Recording, SensorCalibration, Values
 
@@ -176,7 +174,7 @@ def is_held(parameter: Mapping[str, Any]) -> bool:
     return u is not None and u < 10.0 * HELD_DEG and abs(parameter["value"]) < 0.01 * HELD_DEG
 
 
-def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, Values]:
     """Return the limits of plausibility of every effect's parameters, absolute values.
 
     ``sheet``: ``effects`` of the sensor's data sheet: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
@@ -244,18 +242,14 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
             )
 
 
-def limits_or_noise(
-    limits: NDArray[np.float64] | None, products: NDArray[np.float64], samples: float
-) -> NDArray[np.float64]:
+def limits_or_noise(limits: Values | None, products: Values, samples: float) -> Values:
     """Return the limits of an effect's parameters; where there is none, the size that adds as much as white noise."""
     power = np.maximum(np.diag(products), 1e-300)
     noise = np.sqrt(samples / power)
     return noise if limits is None else np.where(np.isfinite(limits[: len(power)]), limits[: len(power)], noise)
 
 
-def excited(
-    products: NDArray[np.float64], size: NDArray[np.float64], limit: NDArray[np.float64], least: float
-) -> NDArray[np.float64]:
+def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
     """Return the change of columns to those of parameters over their limits, in the directions that are excited.
 
     ``products``: (k, k), less the base. ``size``: (k,), norm of the columns with it. ``least``: share of it that must
@@ -268,20 +262,20 @@ def excited(
 
 def over_limits(
     places: Sequence[tuple[str, slice]],
-    products: NDArray[np.float64],
-    size: NDArray[np.float64],
-    limits: Mapping[str, NDArray[np.float64]],
+    products: Values,
+    size: Values,
+    limits: Mapping[str, Values],
     *,
     samples: float,
     least: float,
-) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+) -> tuple[Values, dict[str, Values]]:
     """Return the products of columns of parameters over their limits, (t, p + 1, p + 1), and the limits.
 
     ``places``: effect and columns, more than once for an effect of several versions. ``products``: less the base,
     readings last, the first white noise. ``limits``: by the data sheet. ``size, samples, least``: of ``excited,
     limits_or_noise``.
     """
-    found: dict[str, NDArray[np.float64]] = {}
+    found: dict[str, Values] = {}
     changed = products.copy()
     for name, own in places:
         inner = products[0, own, own]

@@ -13,20 +13,13 @@ tau on a grid. The degrees of freedom of V are those of Student's t with the kur
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
-from pipeline.records import MEDIAN_SIZE
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Places = NDArray[np.intp]
-    Values = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
+from pipeline.records import MEDIAN_SIZE, Index, Mask, Values
 
 FEWEST = 8  # siblings; docs/fleet.md has the errors and intervals in lots of 12 units
 LEVEL = 0.05  # the largest share of a lot that loses the prior by chance, which is no harm (measured: docs/fleet.md)
@@ -55,7 +48,7 @@ class LotPrior(NamedTuple):
     """
 
     predicted: Prediction
-    siblings: Places
+    siblings: Index
     deviation: Values
     probability: Values
 
@@ -78,7 +71,7 @@ class WithPrior(NamedTuple):
     share: Values
 
 
-def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tuple[Places, Places]) -> LotPrior:
+def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tuple[Index, Index]) -> LotPrior:
     """Return the prior of each unit of a lot, from siblings that are no outliers.
 
     Parameters
@@ -113,7 +106,7 @@ def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tup
     return found
 
 
-def _predicted(x: Values, v: Values, siblings: Mask, itself: Places, kind: Places) -> Prediction:
+def _predicted(x: Values, v: Values, siblings: Mask, itself: Index, kind: Index) -> Prediction:
     """Return the prediction of each unit; ``itself``: the sibling that is the unit's own device, or -1."""
     found = Prediction(*(np.empty(x.shape) for _ in range(3)))
     for each in np.unique(kind):
@@ -137,7 +130,7 @@ def _predicted(x: Values, v: Values, siblings: Mask, itself: Places, kind: Place
     return found
 
 
-def _given_tau(y: Values, v: Values, siblings: Mask, itself: Places, tau2: Values) -> tuple[Values, Values, Values]:
+def _given_tau(y: Values, v: Values, siblings: Mask, itself: Index, tau2: Values) -> tuple[Values, Values, Values]:
     """Return mean and variance of each unit's prediction for each tau, and the likelihood of tau: (n, k) arrays."""
     total = np.maximum(v + tau2, 1e-12 * tau2[-1])
     w, log = siblings[:, None] / total, np.where(siblings[:, None], np.log(total), 0.0)

@@ -31,11 +31,8 @@ from pipeline.signal.filters import apply_filter
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Mask, Motion, Noise, Recording, Values
 
-    from pipeline.records import Motion, Noise, Recording
-
-    Values = NDArray[np.float64]
 
 ROLES = ("accelerometer", "gyroscope", "static")
 BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
@@ -152,7 +149,7 @@ def _follows(before: Part | None, part: Part) -> bool:
     return before.motion.setup == part.motion.setup != "" and bool(before.motion.time[-1] < part.motion.time[0])
 
 
-def without_rows(observations: Observations, left_out: Sequence[NDArray[np.bool_]]) -> Observations:
+def without_rows(observations: Observations, left_out: Sequence[Mask]) -> Observations:
     """Return observations without the information of some rows, one array a recording; the rows stay."""
     parts = []
     for part, out in zip(observations.parts, left_out, strict=True):
@@ -314,7 +311,7 @@ def through_filter(motion: Motion, recording: Recording) -> Motion:
     )
 
 
-def _filter_settled(motion: Motion, recording: Recording) -> NDArray[np.bool_]:
+def _filter_settled(motion: Motion, recording: Recording) -> Mask:
     """Return at which samples the log says what a filtered rate is: (n,) array of bool.
 
     Where no rate is logged, that of a sample at which the log does not follow the table is wrong by up to half of the

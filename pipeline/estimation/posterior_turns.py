@@ -24,11 +24,9 @@ from pipeline.estimation.selection import DELAYS, Selection
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.model.effects.base import Effect
+    from pipeline.records import Values
 
-    Values = NDArray[np.float64]
 
 WORTH_A_FIT = 0.01  # share of the probability of sets with other effects of timing, from which on they are fitted
 MOST_FITS = 3  # of them

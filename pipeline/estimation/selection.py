@@ -35,11 +35,8 @@ from pipeline.model.effects import effect
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Noise, SensorCalibration, Values
 
-    from pipeline.records import Noise, SensorCalibration
-
-    Values = NDArray[np.float64]
 
 GATE_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
 SLOW_GATE_BIC = 16.0  # for a bias that follows time or temperature, see above

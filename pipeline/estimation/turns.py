@@ -36,11 +36,8 @@ from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Index, Mask, Motion, Recording, Values
 
-    from pipeline.records import Motion, Recording
-
-    Values = NDArray[np.float64]
 
 BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
 DISTINCT_DIRECTION_G = 0.01  # attitudes 0.6 deg apart differ
@@ -76,7 +73,7 @@ class Part:
 
     recording: Recording
     motion: Motion
-    keep: NDArray[np.bool_]  # (n,)
+    keep: Mask  # (n,)
 
     def reading(self, sensor: str) -> Values:
         """Return the readings that are used: (k, 3) array."""
@@ -116,12 +113,12 @@ def stop_and_go(motion: Motion) -> bool:
     return len(np.unique(np.round(means / DISTINCT_DIRECTION_G), axis=0)) >= 4
 
 
-def settled(part: Part) -> NDArray[np.bool_]:
+def settled(part: Part) -> Mask:
     """Return the samples of a part that an accelerometer's fit uses: its rests if it stops and goes, else all."""
     return part.keep & part.motion.still if stop_and_go(part.motion) else part.keep
 
 
-def steady_turns(part: Part, memory: float) -> NDArray[np.bool_]:
+def steady_turns(part: Part, memory: float) -> Mask:
     """Return the samples in the steady parts of a turn about one axis, less a filter's memory of what was before.
 
     A turn that is shorter than the memory (s) keeps its middle: what the filter still lacks there is a small share of
@@ -131,7 +128,7 @@ def steady_turns(part: Part, memory: float) -> NDArray[np.bool_]:
     if motion.axis is None or motion.rate is None:
         return np.zeros(len(motion.time), bool)
     rate, change = np.abs(motion.rate), np.abs(motion.angular_acceleration[:, motion.axis])
-    steady: NDArray[np.bool_] = (rate > SLOWEST_SHARE * np.max(rate)) & (change <= CHANGE_PER_SECOND * rate)
+    steady: Mask = (rate > SLOWEST_SHARE * np.max(rate)) & (change <= CHANGE_PER_SECOND * rate)
     steady &= ~motion.still
     both_ways = bool(part.recording.filter.get("zero_phase"))
     for start, stop in runs(steady):
@@ -142,7 +139,7 @@ def steady_turns(part: Part, memory: float) -> NDArray[np.bool_]:
     return steady
 
 
-def filtered_alike(part: Part) -> NDArray[np.bool_]:
+def filtered_alike(part: Part) -> Mask:
     """Return the samples of ``settled`` that a filter changes alike.
 
     Without a filter, and of rests, these are all. In a continuous turn behind a filter they are those in which the
@@ -203,7 +200,7 @@ def _factors(columns: Values, where: str) -> ScaledColumns:
     )
 
 
-def blocks_of_samples(parts: Sequence[tuple[Recording, NDArray[np.bool_]]]) -> Blocks:
+def blocks_of_samples(parts: Sequence[tuple[Recording, Mask]]) -> Blocks:
     """Cut the chosen samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
 
     ``parts``: each recording and which of its samples are used.
@@ -239,8 +236,8 @@ def _clock(recording: Recording, number: int, known: dict[str, tuple[int, float]
 class Rows:
     """Groups of a recording's samples whose means are the rows of a fit."""
 
-    kept: NDArray[np.intp]  # (k,); indices of the samples
-    first: NDArray[np.intp]  # (m,); where in ``kept`` each group starts
+    kept: Index  # (k,); indices of the samples
+    first: Index  # (m,); where in ``kept`` each group starts
     count: Values  # (m,); samples of each group
     total: int  # samples of the recording
 
@@ -302,7 +299,7 @@ class Rows:
         return self.motion(motion)
 
 
-def rows_of(motion: Motion, valid: NDArray[np.bool_], *, together: bool = True) -> Rows:
+def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> Rows:
     """Choose the samples of a fit and group those of a rest.
 
     ``valid``: (n,), samples whose readings can be used. ``together``: whether the samples of a rest are alike; after a
@@ -324,7 +321,7 @@ def rows_of(motion: Motion, valid: NDArray[np.bool_], *, together: bool = True) 
     return Rows(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(valid))
 
 
-def reference_valid(motion: Motion) -> NDArray[np.bool_]:
+def reference_valid(motion: Motion) -> Mask:
     """Return at which samples the log follows the table: (n,) array of bool.
 
     Both intervals beside a sample of a turn must be explained; with an attitude log, the rate must be the cubic through

@@ -42,11 +42,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from typing import Any
 
-    from numpy.typing import NDArray
+    from pipeline.records import Noise, SensorCalibration, Values
 
-    from pipeline.records import Noise, SensorCalibration
-
-    Values = NDArray[np.float64]
 
 ROUNDS = 3 * MOST
 POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
