@@ -17,7 +17,7 @@ known to ``e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2``; a column that leaves les
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.records import Index, Mask, Motion, Values
 
-    Curves = Callable[[Motion], Values]
+Curves: TypeAlias = "Callable[[Motion], Values]"
 
 NEW = 1e-3  # share of a column's norm that base and effects leave, below which it is theirs (EXCITED of the ranking)
 ROUNDING = float(np.finfo(np.float64).eps) / 2.0  # u

@@ -7,7 +7,7 @@ spline, and of omega omega^T. Left out are samples without a reading, and those 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from pipeline.records import MEDIAN_SIZE, SENSORS, Mask, Recording, SensorCalibr
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    Means = dict[str, Values]
+Means: TypeAlias = "dict[str, Values]"
 
 ROW_S = 0.1  # rows: short against moves by hand, of seconds; longer ones lose angular acceleration
 BLOCK_S, MOST_BLOCKS = 4.0, 300  # of the bias's wander, as in ``observations``

@@ -14,7 +14,7 @@ RSS   : ``y^T M y - y^T M Z (D^-2 + G)^-1 Z^T M y``; nu: readings less columns o
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Index, Values
 
-    Pick = tuple[int, int]  # version and scale of an effect
-    Set = frozenset[str]
+Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
+Set: TypeAlias = frozenset[str]
 
 # The prior was chosen on 738 simulated sensors: docs/blind_study.md.
 SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the data sheet's limits

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.rest_means import Rests
 
-    Model: TypeAlias = AccelerometerModel | GyroscopeModel
+Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
 
 @dataclass(frozen=True)
