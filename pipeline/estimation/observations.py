@@ -26,7 +26,7 @@ from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.encoder_rate import rate_by_angle
-from pipeline.signal.filters import apply_filter
+from pipeline.signal.filters import filtered, impulse_response
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -286,17 +286,9 @@ def through_filter(motion: Motion, recording: Recording) -> Motion:
 
     The filter is linear, so that filtered readings are the model of filtered truth; in effects that are not linear in
     the truth the order matters, but only while the filter's output changes.
-
-    ``recording``: with the filter's settings.
     """
-    signals = ("specific_force", "angular_rate"), ("specific_force_rate", "angular_acceleration")
-    found: dict[str, Any] = {}
-    for first, second in signals:
-        carrier = replace(
-            recording, accelerometer=getattr(motion, first), gyroscope=getattr(motion, second), notes=(), encodings={}
-        )
-        passed = apply_filter(carrier, recording.filter)
-        found |= {first: passed.accelerometer, second: passed.gyroscope}
+    signals = ("specific_force", "angular_rate", "specific_force_rate", "angular_acceleration")
+    found: dict[str, Any] = {name: filtered(getattr(motion, name), recording) for name in signals}
 
     def at(trajectory: Callable[..., Motion | None], **to: Any) -> Motion:  # noqa: ANN401  (an offset or a lag)
         there = trajectory(**to)
@@ -325,19 +317,7 @@ def _filter_settled(motion: Motion, recording: Recording) -> Mask:
     bend = np.zeros(len(rate))
     bend[1:-1] = np.linalg.norm(rate[2:] - 2.0 * rate[1:-1] + rate[:-2], axis=1)
     wide = np.max([bend, np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])], axis=0)
-    answer = _impulse_response(recording)
+    answer = np.abs(impulse_response(recording, 2 * min(recording.samples, LONGEST_RESPONSE) + 1))
     left = np.convolve(np.where(sure, 0.0, 0.5 * wide), answer)[len(answer) // 2 :][: len(rate)]
     forgotten = left <= max(FORGOTTEN * float(np.abs(rate).max()), FORGOTTEN_DPS)
     return np.logical_and(sure, forgotten)
-
-
-def _impulse_response(recording: Recording) -> Values:
-    """Return the size of a filter's answer to an impulse: (2 m + 1,) array, the impulse in the middle."""
-    half = min(recording.samples, LONGEST_RESPONSE)
-    impulse = np.zeros((2 * half + 1, 3))
-    impulse[half] = 1.0
-    time = np.round(np.arange(len(impulse)) * recording.interval * 1e9).astype(np.int64)
-    carrier = replace(recording, time_ns=time, accelerometer=impulse, gyroscope=None, notes=(), encodings={})
-    answer = apply_filter(carrier, recording.filter).accelerometer
-    assert answer is not None  # noqa: S101
-    return np.asarray(np.abs(answer[:, 0]), np.float64)

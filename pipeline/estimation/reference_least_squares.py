@@ -41,6 +41,7 @@ from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, no
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, Recording, SensorCalibration, StageResult, Values
+from pipeline.signal.filters import filtered
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -134,22 +135,11 @@ def _select(sensor: str, part: Part) -> Part:
 def _reference(sensor: str, part: Part) -> Values:
     """Return what an ideal sensor would read behind the recording's filter: (n, 3) array."""
     recording, motion = part.recording, part.motion
-    applied = recording.filter
-    if applied["name"] == "none":
-        return truth(sensor, motion)
-    from pipeline.signal.filters import apply_filter  # noqa: PLC0415  (only filtered recordings pay for it)
-
-    settings = {key: value for key, value in applied.items() if key not in ("delay_s", "noise_gain")}
-    ideal = replace(
-        recording, accelerometer=truth(sensor, motion), gyroscope=None, filter={"name": "none"}, encodings={}
-    )
     try:
-        filtered = apply_filter(ideal, settings).accelerometer
-        assert filtered is not None  # noqa: S101
+        return filtered(truth(sensor, motion), recording)
     except (ConfigurationError, KeyError):
-        late = motion.at_offset(offset=-applied["delay_s"]) if motion.at_offset else None
+        late = motion.at_offset(offset=-recording.filter["delay_s"]) if motion.at_offset else None
         return truth(sensor, late or motion)
-    return filtered
 
 
 def _require_observable(sensor: str, X: Values) -> float:

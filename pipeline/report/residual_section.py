@@ -15,7 +15,7 @@ cubic nonlinearity; more are gears and steps of the rate table.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +28,7 @@ from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, 
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
 from pipeline.signal.encoder_rate import rate_by_angle
+from pipeline.signal.filters import filtered
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -75,26 +76,13 @@ def residuals(sensor: str, part: JSON, recordings: list[Recording], table: JSON)
             continue
         motion = table_motion(recording, table)
         if motion is not None:
-            predicted = _filtered(recording, predicted_reading(calibration, motion))
+            predicted = filtered(predicted_reading(calibration, motion), recording)
             vague = np.zeros(3)
             by_angle = rate_by_angle(recording) if sensor == "gyroscope" else None
             if by_angle is not None and motion.axis is not None:
                 vague[motion.axis] = np.sqrt(np.mean(by_angle.noise**2))
             out.append(Residual(recording, motion, reading, predicted, vague))
     return out
-
-
-def _filtered(recording: Recording, predicted: Values) -> Values:
-    """Return a prediction behind the filter of its recording."""
-    settings = {k: v for k, v in recording.filter.items() if k not in ("delay_s", "noise_gain")}
-    if settings.get("name", "none") == "none":
-        return predicted
-    from pipeline.signal.filters import apply_filter  # noqa: PLC0415  (scipy.signal, for filtered recordings only)
-
-    ideal = replace(recording, accelerometer=predicted, gyroscope=None, filter={"name": "none"}, encodings={})
-    passed = apply_filter(ideal, settings).accelerometer
-    assert passed is not None  # noqa: S101
-    return passed
 
 
 def white_noise(residual: Residual, noise: JSON | None) -> Values:

@@ -52,6 +52,8 @@ from pipeline.errors import ConfigurationError, InputError
 from pipeline.records import Integers, Note, Recording, Values, noise_of_steps
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
 
@@ -98,21 +100,13 @@ def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
             f"recording {recording.name} has {recording.samples} samples; a filter needs at least 2",
             recording.source.get("file"),
         )
+    sections, run = _filter_of(recording, settings)
     zero_phase, interval = bool(settings["zero_phase"]), recording.interval
-    notes: tuple[Note, ...] = ()
-    if name == "rc_low_pass":
-        time_constant = _time_constant(settings, interval)
-        k = interval / (interval + time_constant)
-        sections = np.array([[k, 0.0, 0.0, 1.0, k - 1.0, 0.0]])
-        run = partial(_rc_filtered, recording.time, time_constant, zero_phase)
-    else:
-        sections, notes = _butterworth_sections(settings, interval), _timing_notes(recording)
-        run = partial(_section_filtered, sections, stretch_starts(recording), zero_phase)
     return replace(
         recording,
         accelerometer=None if recording.accelerometer is None else run(recording.accelerometer),
         gyroscope=None if recording.gyroscope is None else run(recording.gyroscope),
-        notes=recording.notes + notes,
+        notes=recording.notes + (() if name == "rc_low_pass" else _timing_notes(recording)),
         filter={
             **settings,
             "delay_s": 0.0 if zero_phase else _delay(name, settings, sections, interval),
@@ -122,16 +116,36 @@ def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
     )
 
 
+def filtered(values: Values, recording: Recording) -> Values:
+    """Return (n, k) values at the samples of a recording behind the filter that its readings went through."""
+    return values if recording.filter["name"] == "none" else _filter_of(recording, recording.filter)[1](values)
+
+
+def _filter_of(recording: Recording, settings: dict[str, Any]) -> tuple[Values, Callable[[Values], Values]]:
+    """Return the second-order sections of a filter, and the function that filters values at a recording's samples."""
+    zero_phase, interval = bool(settings["zero_phase"]), recording.interval
+    if settings["name"] == "rc_low_pass":
+        time_constant = _time_constant(settings, interval)
+        k = interval / (interval + time_constant)
+        sections = np.array([[k, 0.0, 0.0, 1.0, k - 1.0, 0.0]])
+        return sections, partial(_rc_filtered, recording.time, time_constant, zero_phase)
+    sections = _butterworth_sections(settings, interval)
+    return sections, partial(_section_filtered, sections, stretch_starts(recording), zero_phase)
+
+
+def impulse_response(recording: Recording, samples: int) -> Values:
+    """Return the answer of a recording's filter to an impulse in the middle of evenly spaced samples: (n,) array."""
+    impulse = np.zeros((samples, 1))
+    impulse[samples // 2] = 1.0
+    time_ns = np.round(np.arange(samples) * recording.interval * 1e9).astype(np.int64)
+    return filtered(impulse, Recording("impulse", "static", None, time_ns, filter=recording.filter))[:, 0]
+
+
 def filter_autocovariance(recording: Recording) -> Values:
     """Return the autocovariance of a recording's filter output for white noise of variance 1: (l,) array from lag 0."""
     if recording.filter["name"] == "none" or recording.samples < 2:
         return np.ones(1)
-    impulse = np.zeros((IMPULSE_SAMPLES, 3))
-    impulse[IMPULSE_SAMPLES // 2] = 1.0
-    time_ns = np.arange(IMPULSE_SAMPLES) * round(recording.interval * 1e9)
-    response = apply_filter(Recording("impulse", "static", None, time_ns, impulse), recording.filter).accelerometer
-    assert response is not None  # noqa: S101
-    spectrum = np.fft.rfft(response[:, 0], 2 * IMPULSE_SAMPLES)
+    spectrum = np.fft.rfft(impulse_response(recording, IMPULSE_SAMPLES), 2 * IMPULSE_SAMPLES)
     covariance: Values = np.fft.irfft(np.abs(spectrum) ** 2)[:IMPULSE_SAMPLES]
     far = np.flatnonzero(np.abs(covariance) > FORGOTTEN * covariance[0])[-1]
     return covariance[: far + 1]
