@@ -6,6 +6,11 @@ command line, and a failure record of one unit in a batch; all else that is rais
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 
 class PipelineError(Exception):
     """A user error.
@@ -97,3 +102,8 @@ class CannotCalibrateError(PipelineError):
     """The procedure or method cannot calibrate this sensor at all: it becomes ``null`` with a reason, no failure."""
 
     code = "cannot_calibrate"
+
+
+def first(names: Sequence[str], most: int, of: str = "") -> list[str]:
+    """Return the first ``most`` names or lines of a message, and in place of the others how many they are."""
+    return [*names[:most], *([f"and {len(names) - most} more {of}".rstrip()] if len(names) > most else [])]

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, first
 from pipeline.files import write_json
 
 if TYPE_CHECKING:
@@ -212,8 +212,7 @@ def difference(before: JSON, after: JSON) -> Change:
 
 
 def _named(what: str, names: Sequence[str]) -> str:
-    more = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
-    return f"{what}: {', '.join([*names[:NAMED], *more])}" if names else what
+    return f"{what}: {', '.join(first(names, NAMED))}" if names else what
 
 
 def _changed_recordings(before: JSON, after: JSON) -> list[str]:

@@ -12,11 +12,12 @@ import re
 import shlex
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pipeline.errors import first
 from pipeline.files import INSTALLED, read_json
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
 JSON = dict[str, Any]
@@ -79,13 +80,9 @@ def place(verdict: str | None) -> int:
     return [*VERDICTS, verdict].index(verdict)
 
 
-def verdict_lines(findings: Sequence[Finding]) -> list[str]:
-    """Return ``verdict_groups`` as lines."""
-    lines = []
-    for what, units in verdict_groups(findings):
-        more = f" and {len(units) - NAMED} more" if len(units) > NAMED else ""
-        lines.append(f"{what}: {', '.join(units[:NAMED])}{more}")
-    return lines
+def lines_of(groups: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """Return groups of units as lines, of a large one its first units."""
+    return [f"{what}: {', '.join(first(units, NAMED))}" for what, units in groups]
 
 
 def commands_of(
@@ -137,17 +134,20 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     calibrated = sum(row["status"] == "ok" for row in rows)
     failed = f", failed: {len(rows) - calibrated}" if calibrated < len(rows) else ""
     findings = findings_of(rows)
-    lines = [f"units calibrated: {calibrated}{failed}; look at {results}/index.html", *verdict_lines(findings)]
-    lines += _first(_not_held_out(results, [row["unit"] for row in rows]), "reasons")
+    lines = [
+        f"units calibrated: {calibrated}{failed}; look at {results}/index.html",
+        *lines_of(verdict_groups(findings)),
+    ]
+    lines += first(_not_held_out(results, [row["unit"] for row in rows]), NAMED, "reasons")
     entries = read_history(results) if of_this_run else []
     if entries:
-        lines += _first(_changes(entries), "sensors that changed")
+        lines += first(_changes(entries), NAMED, "sensors that changed")
         no_longer = [
             f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; "
             f"to have it in every run: {add_command(settings, unit, effects, folder)}"
             for (unit, run), effects in dropped(entries).items()
         ]
-        lines += _first(no_longer, "units that no longer have an effect")
+        lines += first(no_longer, NAMED, "units that no longer have an effect")
     lines += [f"{what}: {command}" for what, command in next_commands(findings, settings, folder)]
     return "\n".join(lines) + "\n"
 
@@ -161,15 +161,7 @@ def _not_held_out(results: Path, units: Sequence[str]) -> list[str]:
         for sensor in SENSORS:
             if reason := (document.get(sensor) or {}).get("reason"):
                 groups.setdefault(f"{sensor}, {reason}", []).append(unit)
-    return [
-        f"{what}: {', '.join(names[:NAMED])}{f' and {len(names) - NAMED} more' * (len(names) > NAMED)}"
-        for what, names in groups.items()
-    ]
-
-
-def _first(lines: Sequence[str], of: str) -> list[str]:
-    more = len(lines) - NAMED
-    return [*lines[:NAMED], *([f"and {more} more {of}"] * (more > 0))]
+    return lines_of(groups.items())
 
 
 def _changes(entries: Sequence[JSON]) -> list[str]:

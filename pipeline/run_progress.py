@@ -30,6 +30,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, TextIO
 
+from pipeline.errors import first
 from pipeline.results_folder import jobs_at_work, take_run
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ COST = {"ingest": 2.0, "diagnose": 4.0, "report": 2.0}  # relative to the other 
 PER_BATCH = ("collect", "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report")
 AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
 LAST_STAGE = "report"  # its units are counted as done
-NAMED_JOBS = 2
+NAMED_JOBS, NAMED = 2, 10
 INTERVAL = {True: 1.0, False: 30.0}  # s between lines, by whether it is a terminal
 CLEAR_LINE = "\r\x1b[K"
 BLOCKS = ("JOB_INFO", "JOB_STARTED", "JOB_FINISHED", "PROGRESS", "SHELLCMD", "RUN_INFO", "RESOURCES_INFO", "GROUP_INFO")
@@ -239,7 +240,10 @@ class Monitor(logging.Handler):
     def print_edited(self, edited: Sequence[str]) -> None:
         """Print which files were edited or deleted since they were made, and are made again."""
         if edited:
-            lines = ["Changed or deleted since the last run, computed again:", *_first([f"  {c}" for c in edited])]
+            lines = [
+                "Changed or deleted since the last run, computed again:",
+                *(f"  {line}" for line in first(edited, NAMED)),
+            ]
             print("\n".join(lines), file=self.stream, flush=True)
 
     def print_recovery(self) -> None:
@@ -263,7 +267,8 @@ class Monitor(logging.Handler):
         elif self.failed:
             count = f"{len(self.failed)} job{'s' * (len(self.failed) > 1)}"
             lines += [f"\n{count} failed; incomplete output is removed, all other jobs are done:"]
-            lines += _first([f"  {rule}: {_cause(log)} (all of it: {log})" for rule, log in self.failed])
+            causes = [f"{rule}: {_cause(log)} (all of it: {log})" for rule, log in self.failed]
+            lines += [f"  {line}" for line in first(causes, NAMED)]
             lines += ["Correct the cause, then run the same command again:", f"  {command}"]
         if lines:
             print("\n".join(lines), file=self.stream)
@@ -307,8 +312,3 @@ def _cause(log: Path) -> str:
     last = next((line for line in reversed(lines) if line.strip()), "")
     at = AT_UNIT.findall(last)
     return f"killed at unit {at[-1][0]}" if at else last or "killed, or could not be started"
-
-
-def _first(lines: Sequence[str]) -> list[str]:
-    more = [f"  and {len(lines) - 10} more"] * (len(lines) > 10)
-    return [*lines[:10], *more]

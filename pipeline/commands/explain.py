@@ -21,7 +21,7 @@ from pipeline.files import CONFIGS, read_json
 from pipeline.history import read_history
 from pipeline.io.yaml_file import read_yaml
 from pipeline.model.calibration_file import sentences
-from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
+from pipeline.outcome import Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
 
@@ -154,7 +154,7 @@ def _summary(found: Selection) -> list[str]:
     ]
     counts = Counter(finding.verdict.replace("_", " ") for finding in findings).most_common()
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
-    lines = [f"{len(findings)} sensors of {len(found.diagnoses)} units: {counted}", *verdict_lines(findings)]
+    lines = [f"{len(findings)} sensors of {len(found.diagnoses)} units: {counted}", *lines_of(verdict_groups(findings))]
     if found.failures:
         lines.append(f"failed: {', '.join(found.failures)}")
     continued = next_commands(findings, found.settings, found.results)[:-1]  # the last is this command

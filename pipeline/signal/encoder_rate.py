@@ -57,15 +57,12 @@ class EncoderRate:
         Standard deviation of the rate by the encoder's resolution; 0 of a fine one and at rest.
     vague : (n,) array of bool
         Where the rate is not known: a fine angle bends between two samples, a coarse one has a gap.
-    resolution : float, deg
-        Of a coarse encoder; 0 of a fine one.
     """
 
     angle: Values
     rate: Values
     noise: Values
     vague: NDArray[np.bool_]
-    resolution: float = 0.0
 
 
 def rate_by_angle(recording: Recording) -> EncoderRate | None:
@@ -144,7 +141,7 @@ def _smoothed(time: Values, angle: Values, step: float) -> EncoderRate:
         if stop - start >= MOSTLY * len(slope):
             error = max(error, _stretch(time[around][start:stop], angle[around][start:stop], step)[1])
         smooth[own], noise[own], rate[own] = found[part], error, slope[part]
-    return EncoderRate(smooth, rate, noise, vague, step)
+    return EncoderRate(smooth, rate, noise, vague)
 
 
 def _steady(rate: Values) -> tuple[int, int]:

@@ -72,8 +72,6 @@ class Creep:
         By which share the mean of the readings is too short; 0 where the rate is zero.
     squares, freedom : (3,) array, int
         Sum of squares of the readings about their parabola, and its degrees of freedom, an axis.
-    bend : float, rad
-        Largest departure of the direction from a straight line.
     """
 
     rate: Values
@@ -82,7 +80,6 @@ class Creep:
     shortening: float
     squares: Values
     freedom: int
-    bend: float
 
 
 def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
@@ -157,7 +154,7 @@ def creep_of(time: Values, force: Values, share: float = 0.0) -> Creep:
     mean = force.mean(axis=0) if n else np.zeros(3)
     length = float(np.linalg.norm(mean))
     if n < FEWEST_OF_A_SLOPE or length == 0.0 or time[-1] <= time[0]:
-        return Creep(np.zeros(3), np.zeros(3), 0.0, 0.0, np.sum((force - mean) ** 2, axis=0), max(n - 1, 0), 0.0)
+        return Creep(np.zeros(3), np.zeros(3), 0.0, 0.0, np.sum((force - mean) ** 2, axis=0), max(n - 1, 0))
     u, span = mean / length, float(time[-1] - time[0])
     basis = _parabolas(time)
     along = basis.T @ force
@@ -170,10 +167,9 @@ def creep_of(time: Values, force: Values, share: float = 0.0) -> Creep:
     slope = (line[-1] - line[0]) / span
     measured, uncertainty = np.degrees(np.cross(slope, u) / length), float(np.degrees(error / length))
     if np.linalg.norm(slope) <= SIGNIFICANT_CREEP * error:
-        return Creep(np.zeros(3), measured, uncertainty, 0.0, squares, freedom, 0.0)
-    bend = float(np.linalg.norm(path - line, axis=1).max()) / length
+        return Creep(np.zeros(3), measured, uncertainty, 0.0, squares, freedom)
     variance = float(np.mean(np.sum(path**2, axis=1))) / length**2
-    return Creep(measured, measured, uncertainty, 0.5 * variance, squares, freedom, bend)
+    return Creep(measured, measured, uncertainty, 0.5 * variance, squares, freedom)
 
 
 WINDOW_S, FEWEST = 0.2, 3  # shorter than a move; samples that have a variance
