@@ -19,15 +19,13 @@ from pipeline.files import flushed_together, read_json, write_atomically, write_
 from pipeline.history import of_units, record, unit_state
 from pipeline.pack import DOCUMENTS, PACKS, STAGES, WITH_PRIOR, Batch, Files, as_bytes, new_pack
 from pipeline.records import SENSORS
-from pipeline.report.campaign_page import render
+from pipeline.report.campaign_page import Placed, against_limits, render
 from pipeline.report.combined import combined_calibrations
 from pipeline.report.comparison_section import section, unit_figures
-from pipeline.report.fleet import fleet_statistics, unit_parameters, write_parameters
+from pipeline.report.fleet import fleet_statistics, summary_row, unit_parameters, write_parameters, write_summary
 from pipeline.report.lot import Prior, calibration_with_prior, estimates, priors_of, with_card
 from pipeline.report.pages import failure_page
 from pipeline.report.run_section import runs_data, times_of, with_history
-from pipeline.report.strips import Placed, against_limits
-from pipeline.report.summary import summary_row, write_summary
 from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
 from pipeline.stages.batch import Job, failure_of, record_output
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.rest_means import rests_by_use
 from pipeline.records import SENSORS
-from pipeline.report.certificate import certificate, certificate_page
-from pipeline.report.dcc import digital_certificate
+from pipeline.report.certificate import certificate, certificate_page, digital_certificate
 from pipeline.report.pages import failure_page
 from pipeline.report.recording_section import sensor_temperature
 from pipeline.report.unit_page import render

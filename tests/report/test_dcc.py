@@ -7,8 +7,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from pipeline.config.schema import Certificate
-from pipeline.report.certificate import certificate
-from pipeline.report.dcc import digital_certificate, dsi_unit, missing_for_dcc
+from pipeline.report.certificate import certificate, digital_certificate, dsi_unit, missing_for_dcc
 
 from .conftest import Unit, build_unit
 from .test_certificate import BUDGET, STATED, settings_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.report.strips import FARTHEST, against_limits, strips
+from pipeline.report.campaign_page import ENDS, against_limits, strips
 
 SHEET = {"accelerometer": {"bias": 0.08, "scale_factor": 0.03, "cross_axis": 0.02}}
 NAMES = ["Bias x", "Bias y", "Bias z", *(f"Scale factor error {a}" for a in "xyz")]
@@ -47,12 +47,11 @@ def drawn(svg: str) -> list[tuple[str, int, str, float]]:
 def test_each_dot_stands_at_its_share_of_the_limit_and_tells_its_value() -> None:
     rows, placed, shares = campaign(7)
     rows[2]["status"] = "failed"
-    out = strips(rows, placed)
-    assert len(out.figures) == 1  # no gyroscope
-    dots = drawn(out.figures[0].svg)
+    ((figure, texts),) = strips(rows, placed)  # no gyroscope
+    dots = drawn(figure.svg)
     assert len(dots) == 6 * 12
     assert {unit for _, unit, _, _ in dots} == {1, 2, 4, 5, 6, 7}
-    told = [text for texts in out.dots["strip-1"].values() for text in texts]
+    told = [text for of_colour in texts.values() for text in of_colour]
     for (colour, unit, name, share), text in zip(dots, told, strict=True):
         true = 100.0 * shares[unit - 1, NAMES.index(name)]
         assert share == pytest.approx(np.clip(true, -300.0, 300.0), abs=0.3)
@@ -62,16 +61,16 @@ def test_each_dot_stands_at_its_share_of_the_limit_and_tells_its_value() -> None
         limit = float(text.rpartition("±")[2])
         assert 100.0 * value / limit == pytest.approx(abs(true), rel=2e-3)
     beyond = (np.abs(np.delete(shares, 2, 0)) > 1.0).any(axis=1).sum()
-    assert f"{beyond} of 6 units are beyond the data sheet" in out.figures[0].finding
+    assert f"{beyond} of 6 units are beyond the data sheet" in figure.finding
 
 
 def test_of_many_units_the_farthest_are_drawn() -> None:
     rows, placed, shares = campaign(200)
-    dots = drawn(strips(rows, placed).figures[0].svg)
+    dots = drawn(strips(rows, placed)[0][0].svg)
     for k, name in enumerate(NAMES):
         order = np.argsort(shares[:, k]) + 1
-        assert {u for _, u, n, _ in dots if n == name} == {*order[:FARTHEST].tolist(), *order[-FARTHEST:].tolist()}
+        assert {u for _, u, n, _ in dots if n == name} == {*order[:ENDS].tolist(), *order[-ENDS:].tolist()}
 
 
 def test_two_siblings_are_not_drawn() -> None:
-    assert strips(*campaign(2)[:2]).figures == []
+    assert strips(*campaign(2)[:2]) == []
