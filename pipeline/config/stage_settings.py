@@ -59,8 +59,8 @@ LIMITS_OF_CHECKS = (
     "bias_temperature", "warm_up",
 )  # fmt: skip
 INGEST_OF_TABLE = (
-    "motion", "gravity_g", "latitude_deg", "rate_accuracy", "sense", "zero_deg", "angle_accuracy_deg",
-    "orthogonality_deg", "seat_deg",
+    "motion", "gravity_g", "latitude_deg", "azimuth_deg", "azimuth_of", "rate_accuracy", "sense", "zero_deg",
+    "angle_accuracy_deg", "orthogonality_deg", "seat_deg",
 )  # fmt: skip
 INGEST_OF_SENSOR = (
     "axis_map", "full_scale", "bias", "scale_factor", "cross_axis", *NOISE,

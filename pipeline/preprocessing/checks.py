@@ -60,25 +60,33 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     check_shared_rows(recordings)
     check_axes(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
-    return _with_gravity(check_motion(check_mounting(turns, settings), delays, settings), settings.get("table") or {})
+    return _placed(check_motion(check_mounting(turns, settings), delays, settings), settings.get("table") or {})
 
 
-def _with_gravity(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recording]:
-    """Add a note where gravity is left at 1 g and the latitude that is stated has another."""
-    latitude = table.get("latitude_deg")
-    read = [k for k, r in enumerate(recordings) if r.accelerometer is not None]
-    if latitude is None or table.get("gravity_g") != 1.0 or not read:
+def _placed(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recording]:
+    """Add notes on what latitude and azimuth mean: gravity that was left at 1 g, and where the turn axes point."""
+    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
+    if latitude is None:
         return recordings
     gravity = normal_gravity_g(float(latitude))
-    if abs(gravity - 1.0) < SAME_GRAVITY_G:
-        return recordings
+    wrong = table.get("gravity_g") == 1.0 and abs(gravity - 1.0) >= SAME_GRAVITY_G
     detail = (
         f"table.gravity_g is 1, its default; at latitude {latitude:g} deg gravity is {gravity:.5f} g at sea level, and "
         f"0.000315 g less for each km of height: set table.gravity_g={gravity:.5f}, else the scale of the "
         f"accelerometer is wrong by {abs(gravity - 1.0):.3%}"
     )
-    first = recordings[read[0]]
-    recordings[read[0]] = replace(first, notes=(*first.notes, Note("N-GRAVITY", 1, 0, 0, detail)))
+    k = next((k for k, r in enumerate(recordings) if r.accelerometer is not None), None)
+    notes = [(k, Note("N-GRAVITY", 1, 0, 0, detail))] if wrong and k is not None else []
+    if table.get("azimuth_of") == "turn_axis" and azimuth is not None:
+        turns = [(k, r) for k, r in enumerate(recordings) if r.axis and not r.up and r.role != "validation"]
+        ends = [f"body {r.axis} to {(azimuth + 90.0 * (1 - r.sense)) % 360.0:g} deg in {r.name}" for _, r in turns]
+        detail = (
+            f"Earth's rotation is in the model: by table.azimuth_deg and the sense of the encoder the shaft points "
+            f"with {', '.join(ends)}, clockwise from north; if it does not, correct table.azimuth_deg by 180 deg"
+        )
+        notes += [(turns[0][0], Note("N-AZIMUTH", len(turns), 0, 0, detail))] if turns else []
+    for k, note in notes:
+        recordings[k] = replace(recordings[k], notes=(*recordings[k].notes, note))
     return recordings
 
 

@@ -9,6 +9,7 @@ stated (the zero by more than ``procedure.mounting_tolerance_deg``), those that 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,10 +78,15 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     if _negated(found, tolerance.angle_deg) or (mapped and turned):  # an axis map that is stated may be wrong
         refused = list(departures.values())
     zeros = refined_zeros(found) if departures else {}
-    hint = _hint(refused or list(departures.values()), len(known), zeros, accelerometer, maps) if departures else ""
+    seated = table.get("seat_deg") is not None
+    hint = (
+        _hint(refused or list(departures.values()), len(known), zeros, accelerometer, maps, seated=seated)
+        if departures
+        else ""
+    )
     if refused:
         raise _refusal(refused, hint)
-    applied = zeros if table.get("seat_deg") is None else {}
+    applied = {} if seated else zeros
     used = {t.name: _as_found(t, departures.get(t.name), applied) for t in known}
     recordings = [_turned_attitude(r) if departures else r for r in recordings]
     doubts = seat_notes(list(used.values()), table, sensor) if table.get("seat_deg") is None else {}
@@ -138,12 +144,20 @@ def _hint(
     zeros: Mapping[str, float],
     accelerometer: NDArray[np.float64] | None,
     maps: Mapping[str, Sequence[str]],
+    *,
+    seated: bool,
 ) -> str:
-    """Return the settings that describe the bench as it is found, or the axis map under which it is as stated."""
+    """Return the settings that describe the bench as it is found, or the axis map under which it is as stated.
+
+    ``seated``: each turn has a mounting of its own, which contains what its zero differs from a common one.
+    """
     found = [
         d.settings | {k: f"{zeros[d.turn.name]:.2f}" for k in d.settings if k == "zero_deg" and d.turn.name in zeros}
         for d in departures
     ]
+    own = [float(f["zero_deg"]) for f in found if "zero_deg" in f]
+    if seated and len(own) == turns and max(own) - min(own) < TOLERANCE_DEG:
+        found = [f | {"zero_deg": f"{fmean(own):.1f}"} for f in found]
     alike = len(departures) == turns > 1 and all(f == found[0] for f in found)
     ways = []
     if alike and found[0] and set(found[0]) <= {"sense", "zero_deg"}:

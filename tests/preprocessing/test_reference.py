@@ -115,3 +115,13 @@ def test_gravity_that_was_left_at_1_g_is_noted_with_that_of_the_latitude() -> No
     assert stated == pytest.approx(9.81252 / 9.80665, abs=5e-5)  # PTB Braunschweig, 80 m above the sea
     here = placed | {"table": placed["table"] | {"gravity_g": stated}}
     assert not [n for r in check_recordings(list(sound()), here) for n in r.notes if n.code == "N-GRAVITY"]
+
+
+def test_the_azimuth_of_a_shaft_is_told_as_that_of_each_body_axis_on_a_left_handed_encoder() -> None:
+    turned = [
+        r if r.axis is None else replace(r, table_angle=-r.table_angle, table_rate=-r.table_rate) for r in sound()
+    ]
+    place = {"latitude_deg": 52.0, "azimuth_deg": 352.0, "azimuth_of": "turn_axis", "gravity_g": 1.0007, "sense": -1}
+    checked = check_recordings(turned, SETTINGS | {"table": SETTINGS["table"] | place})
+    (note,) = (n for r in checked for n in r.notes if n.code == "N-AZIMUTH")
+    assert "body x to 172 deg in accel_x, body y to 172 deg in accel_y" in note.detail
