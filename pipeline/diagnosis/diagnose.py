@@ -16,8 +16,9 @@ from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.findings import Case, Findings, document_of
 from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
 from pipeline.errors import ConvergenceError, NotObservableError
-from pipeline.estimation.candidates import AUTO, MOUNTING, OTHER, TILT, configured_effects
+from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
+from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.model.effects import catalogue, effect
 from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.words import next_experiment, to_distinguish
-from pipeline.estimation.candidates import OTHER
 from pipeline.estimation.design import Term, placed
+from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
 from pipeline.model.effects import effect

@@ -20,13 +20,14 @@ from pipeline.diagnosis.residual_plots import plots
 from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
 from pipeline.errors import ConvergenceError
-from pipeline.estimation.candidates import free_curves, turns_of
+from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Start
+from pipeline.estimation.free_curves import free_curves
 from pipeline.estimation.generalized_least_squares import Fit, calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.posterior_turns import posterior
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
-from pipeline.model.effects import catalogue
+from pipeline.model.effects import catalogue, effect
 from pipeline.records import Noise, SensorCalibration
 from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.heldout import noise_floors
@@ -96,7 +97,8 @@ def _described(discovery: Discovery, case: Case) -> Findings:
     at_noise = not reported.names and left[0] < CLOSE * least
     excess = left[0] if at_noise else max(left[0] - least, left[0] - left[-1])
     motions = [part.motion for part in observations.parts]
-    others = free_curves(sensor, motions) if selection.names or unknown else []
+    bent = any(effect(name).of_the_room(sensor) for name in selection.names)
+    others = free_curves(sensor, motions, bent=bent) if selection.names or unknown else []
     answers = posterior(selection, never_shown(hidden, reported.names), others)
     verdict = verdict_of_selection(
         reported.names,

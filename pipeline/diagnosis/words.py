@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.candidates import HELD, OTHER, TILT, is_held
+from pipeline.estimation.candidates import HELD, TILT, is_held
+from pipeline.estimation.free_curves import OTHER
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner, largest_by_unit, unit_of
 

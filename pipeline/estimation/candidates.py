@@ -1,16 +1,4 @@
-"""The effects that a fit can hold: which are possible, plausible and available, and where their parameters start.
-
-Physics outside the catalogue enters as free curves, so that the posterior need not call it an effect of the catalogue.
-
-    other_temperature : sum over n = 1 to 5 of c_n P_n(x), x the temperature over its span
-    other_rate        : the same of |omega|, and d_x omega_x^2 + d_y omega_y^2, which differ with the axis of the turn
-    other_input       : sum over n = 2 to 5 of c_n P_n(x), x the axis' own input over its largest value
-    other_angle       : sum over n = 1 to 8 of a_n cos(n A) + b_n sin(n A), A the table's angle
-
-with Legendre polynomials P_n and coefficients for each axis. A curve has no limit by the data sheet: its coefficients
-have the size of the noise, times the scales of ``pipeline.estimation.evidence``. That many coefficients cost evidence,
-so that a curve is more probable than an effect only where that effect leaves more than noise.
-"""
+"""The effects that a fit can hold: which are possible, plausible and available, and where their parameters start."""
 
 from __future__ import annotations
 
@@ -18,22 +6,21 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import NormalPrior, Term
+from pipeline.estimation.free_curves import BEND_SHARE, Bend
 from pipeline.model.effects import catalogue, effect, stated_priors
-from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, length, parameter_limits, truth
+from pipeline.model.effects.base import parameter_limits
 from pipeline.model.effects.mounting import OWN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.observations import Observations
+    from pipeline.model.effects.base import Effect
     from pipeline.records import Motion, Recording, SensorCalibration, Values
 
-OTHER = "other_"  # how the names of free curves begin
-DEGREE, CYCLES = 5, 8  # as in the tests that find a dependence (pipeline.diagnosis.residual_dependence)
 AUTO = "auto"  # in place of a list of effects: what the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
 HELD_DEG = 1e-4  # standard deviation of a tilt that is held at 0: a hundredth of a good encoder's accuracy
@@ -290,12 +277,15 @@ def over_limits(
 def time_constants(
     this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None, *, between: bool = True
 ) -> list[tuple[Term, float]]:
-    """Return an effect at some time constants, with log weights of their prior; the fitted one first.
+    """Return an effect at some time constants or widths, with log weights of their prior; the fitted one first.
 
     ``between``: whether there is one between each two of the effect's starts, in equal ratios.
     ``width``: standard uncertainty of the fitted value's logarithm; None: as wide as the steps between the others.
     """
     starts = this.starts(sensor)
+    if isinstance(this, Bend):
+        log_share = float(np.log(BEND_SHARE / len(this.forms)))
+        return [(Term(Bend(this.forms, k), starts[0]), log_share) for k in range(len(this.forms))]
     if not this.nonlinear or this.moves:
         return [(fitted or Term(this, np.zeros(len(starts[0]))), 0.0)]
     if between:
@@ -308,55 +298,3 @@ def time_constants(
     if width is not None:
         share = min(share, float(np.sqrt(2.0 * np.pi) * width / np.log(starts[-1][-1] / starts[0][-1])))
     return [(fitted, float(np.log(share))), *grid]
-
-
-class FreeCurve(Effect):
-    """A curve of one covariate with free coefficients."""
-
-    owner = Owner.RECORDING
-    meaning, excitation, experiment, source = "Physics outside the catalogue.", "", "", ""
-
-    def __init__(self, covariate: str, low: float, high: float) -> None:
-        self.covariate, self.name = covariate, f"{OTHER}{covariate}"
-        self.middle, self.half = 0.5 * (low + high), 0.5 * (high - low)
-        self.layout = Layout.PER_AXIS if covariate == "input" else Layout.EVERY_AXIS
-        self.count = {"input": DEGREE - 1, "angle": 2 * CYCLES, "rate": DEGREE + 2}.get(covariate, DEGREE)
-
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
-        """Return a coefficient for each curve and axis."""
-        unit = "g" if sensor == "accelerometer" else "deg/s"
-        return tuple(Parameter(f"c{k}_{axis}", unit, "coefficient") for axis in "xyz" for k in range(self.count))
-
-    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the curves; zeros in a recording without the covariate."""
-        del K, values
-        if self.covariate == "input":
-            return np.asarray(legvander(truth(sensor, motion) / self.half, DEGREE)[..., 2:])
-        known = {"temperature": motion.temperature, "angle": motion.angle, "rate": length(motion.angular_rate)}
-        covariate = known[self.covariate]
-        if covariate is None:
-            return np.zeros((len(motion.time), self.count))
-        if self.covariate == "angle":
-            turns = np.radians(covariate)[:, None] * np.arange(1, CYCLES + 1)
-            return np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
-        found = legvander((covariate - self.middle) / self.half, DEGREE)[:, 1:]
-        if self.covariate == "rate":
-            found = np.concatenate([found, (motion.angular_rate[:, :2] / self.half) ** 2], axis=1)
-        return np.asarray(found)
-
-
-def free_curves(sensor: str, motions: Sequence[Motion]) -> list[Effect]:
-    """Return the free curves of what changes in some motions."""
-    spans: dict[str, list[Values | None]] = {
-        "temperature": [m.temperature for m in motions],
-        "rate": [length(m.angular_rate) for m in motions],
-        "angle": [m.angle for m in motions],
-    }
-    found: list[Effect] = []
-    for covariate, values in spans.items():
-        known = [v for v in values if v is not None and len(v)]
-        low, high = (min(v.min() for v in known), max(v.max() for v in known)) if known else (0.0, 0.0)
-        if high > low and (covariate != "temperature" or len(known) == len(values)):
-            found.append(FreeCurve(covariate, float(low), float(high)))
-    largest = max(float(np.abs(truth(sensor, m)).max()) for m in motions)
-    return [*found, *([FreeCurve("input", -largest, largest)] if largest > 0.0 else [])]

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.evidence import NEGLIGIBLE, Given, Pick, Problem, Set
+from pipeline.estimation.free_curves import BEND
 from pipeline.estimation.selection import DELAYS
 
 if TYPE_CHECKING:
@@ -190,7 +191,7 @@ def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], name
     """Return what some searches of the same readings say together.
 
     ``searches``: None where none of the sets is possible. ``owner``: which of them a set belongs to. ``names``: effects
-    whose upper limits are asked for.
+    whose upper limits are asked for. Both forms of a free curve count as one.
     """
     pool = {
         key: (search, found)
@@ -204,9 +205,13 @@ def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], name
     weight /= weight.sum()
     order = np.argsort(-weight, kind="stable")
     keys = list(pool)
-    sets = [(tuple(sorted(keys[i])), float(weight[i])) for i in order]
+    together: dict[tuple[str, ...], float] = {}
+    for i in order:
+        stated = tuple(sorted(name.removesuffix(BEND) for name in keys[i]))
+        together[stated] = together.get(stated, 0.0) + float(weight[i])
+    sets = sorted(together.items(), key=lambda each: -each[1])
     likely = [(pool[keys[i]][0], keys[i]) for i in order[:BEAM] if weight[i] > LIKELY * weight[order[0]]]
-    return Answers(sets, _upper_limits(list(names), likely))
+    return Answers(sets, _upper_limits([name for name in names if not name.endswith(BEND)], likely))
 
 
 def _upper_limits(names: Sequence[str], likely: Sequence[tuple[Search, Set]]) -> dict[str, Values]:

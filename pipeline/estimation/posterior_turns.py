@@ -45,13 +45,14 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
     candidates |= {this.name: Term(this, np.zeros(len(this.parameters(sensor)))) for this in others}
     own, moving = frozenset(selection.names), frozenset(n for n, term in candidates.items() if term.effect.moves)
     first = Search(_problem(selection, selection.fit, candidates), seeds=[own])
-    best = first.best()
+    curves = {this.name for this in others}
+    best = first.best([key for key in first.pool if not key & curves])  # a fit holds no curves
     if best != own and best & moving == own & moving and any(candidates[n].effect.nonlinear for n in best ^ own):
         first = Search(_problem(selection, _fit(selection, best, candidates), candidates), seeds=[own, best])
     searches: list[Search | None] = [first]
     fitted = [own & moving]
     for movers in _worth_a_fit(first, moving, own & moving):
-        names = first.best([key for key in first.pool if key & moving == movers])
+        names = first.best([key for key in first.pool if key & moving == movers]) - curves
         fit = _fit(selection, names, candidates)
         fitted.append(movers)
         lag = next((t.values[0] for t in fit.terms if t.effect.name == DELAYS[1]), np.inf)

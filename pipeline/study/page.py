@@ -16,6 +16,7 @@ from pipeline.study.scores import (
     first_is_right,
     mean_excess_gone,
     named,
+    outside_answered,
     reliability,
     warned,
     wilson,
@@ -61,10 +62,21 @@ The probability of every effect in the same cases, against the share of them in 
 ![Probabilities of effects against the share of them that is there](images/{DIAGRAM})"""
 RELIABLE_HEAD = ["said, mean", "n", "true", "95 % interval"]
 MISS_TEXT = "In brackets lambda."
-SHAPE_HEAD = ["hidden", "n", "unexplained", "other warning", "silent", "nothing", "most often said", "excess gone"]
+SHAPE_HEAD = [
+    "hidden",
+    "n",
+    "unexplained",
+    "other warning",
+    "answered",
+    "silent",
+    "nothing",
+    "most often said",
+    "excess gone",
+]
 SHAPE_TEXT = """\
-Where the temperature only rises, a curve of the temperature and one of the time are the same: what is said silently is
-then a substitute, whose worth is the share of the held-out excess that it takes away (last column)."""
+Where the temperature only rises, a curve of the temperature and one of the time are the same. "Answered": no warning,
+but an answer of the answer set follows something outside the catalogue. What is said silently is a substitute, whose
+worth is the share of the held-out excess that it takes away (last column)."""
 DATA_SHEET = "Median of the size drawn; one number is for all parameters. A warm-up's time constant is 90 to 400 s."
 
 
@@ -180,10 +192,12 @@ def of_shapes(cases: Sequence[JSON]) -> Rows:
             continue
         unexplained = sum(case["verdict"] == "unexplained" for case in own)
         with_warning = sum(case["verdict"] != "unexplained" and warned(case) for case in own)
-        silent = sum(bool(case["selected"]) and not warned(case) for case in own)
+        unwarned = [outside_answered(case) for case in own if case["selected"] and not warned(case)]
+        answered, silent = sum(unwarned), len(unwarned) - sum(unwarned)
         name, count = Counter(map(_said, own)).most_common(1)[0]
         gone = "".join(f"{100 * mean.value:.0f} % (n = {mean.total})" for mean in mean_excess_gone(own))
-        counts = [len(own), unexplained, with_warning, silent, len(own) - unexplained - with_warning - silent]
+        nothing = len(own) - unexplained - with_warning - len(unwarned)
+        counts = [len(own), unexplained, with_warning, answered, silent, nothing]
         rows.append([family.replace("_", " "), *counts, f"{name} ({count})", gone])
     return rows
 

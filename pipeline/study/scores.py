@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pipeline.estimation.free_curves import OTHER
 from pipeline.report.chart import Dots, Figure, Line, Panel, chart
 
 if TYPE_CHECKING:
@@ -74,6 +75,11 @@ def not_seen(case: JSON) -> bool:
 def warned(case: JSON) -> bool:
     """Return whether there is a warning: a doubtful verdict, beyond the data sheet, or more wander than expected."""
     return bool(case["verdict"] in DOUBTFUL or not case["plausible"] or case["inflated"])
+
+
+def outside_answered(case: JSON) -> bool:
+    """Return whether one of the answers is something outside the catalogue."""
+    return any(name.startswith(OTHER) for answer in case.get("answer_set") or [] for name in answer["effects"])
 
 
 def not_silent(case: JSON) -> bool:

@@ -10,8 +10,9 @@ import pytest
 from scipy.linalg import null_space
 from scipy.special import logsumexp
 
-from pipeline.estimation.candidates import excited, free_curves
+from pipeline.estimation.candidates import excited, time_constants
 from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Problem, Version
+from pipeline.estimation.free_curves import BEND, free_curves
 from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantiles
 from pipeline.estimation.ranking import without
 from pipeline.records import Motion
@@ -160,9 +161,28 @@ def test_the_free_curve_of_the_rate_holds_lever_arms_that_differ_by_axis() -> No
     omega = np.repeat(np.eye(3), 50, axis=0) * rng.uniform(-200.0, 200.0, 150)[:, None]
     n, zero = len(omega), np.zeros((len(omega), 3))
     motion = Motion(np.arange(n) * 0.1, zero, omega, zero, zero, None, None, None, None, np.zeros(n, bool))
-    curve = next(c for c in free_curves("accelerometer", [motion]) if c.name == "other_rate")
+    curve = next(c for c in free_curves("accelerometer", [motion], bent=False) if c.name == "other_rate")
     Z = np.column_stack([np.ones(n), curve.regressors("accelerometer", motion, np.eye(3), np.zeros(0))])
     for axis, arm in enumerate(rng.standard_normal((3, 3))):  # of the proof mass of each axis
         felt = np.cross(omega, np.cross(omega, arm))[:, axis]
         taken = Z @ np.linalg.lstsq(Z, felt, rcond=None)[0]
         np.testing.assert_allclose(taken, felt, atol=1e-9 * np.abs(felt).max())
+
+
+def test_a_bend_of_the_temperature_saturates_from_either_end_on() -> None:
+    temperature = np.linspace(20.0, 30.0, 101)
+    n, zero = len(temperature), np.zeros((len(temperature), 3))
+    motion = Motion(np.arange(n) * 0.1, zero, zero, zero, zero, temperature, None, None, None, np.ones(n, bool))
+    (bend,) = (c for c in free_curves("gyroscope", [motion], bent=True) if c.name.endswith(BEND))
+    terms = [term for term, _ in time_constants(bend, "gyroscope")]
+    columns = np.concatenate([t.regressors("gyroscope", motion, np.eye(3)) for t in terms], axis=1)
+    ends = columns[[0, -1]]
+    np.testing.assert_allclose(ends.max(axis=0), 1.0)
+    assert ends.min() < 1e-4
+    assert np.all(np.abs(np.diff(columns, axis=0).sum(axis=0)) > 0.8)
+    for wanted in (np.exp((temperature - 30.0) / 2.7), np.tanh((temperature - 20.0) / 2.5)):
+        plain = np.column_stack([np.ones(n), wanted])
+        left = [
+            np.std(wanted - (A := np.column_stack([plain[:, 0], c])) @ np.linalg.lstsq(A, wanted)[0]) for c in columns.T
+        ]
+        assert min(left) < 0.03 * np.std(wanted)

@@ -17,7 +17,7 @@ from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, SIZES, Case, draw
 from pipeline.study.run import judge, read_lines, say
-from pipeline.study.scores import exact, first_is_right, not_seen
+from pipeline.study.scores import exact, first_is_right, not_seen, outside_answered
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -114,6 +114,15 @@ def test_an_effect_that_nobody_knows_of_is_not_named() -> None:
     (found,) = judge(case)
     assert "bias_drift" not in {*found["selected"], *found["not_observable"]}
     assert found["whole"]["selected"] == ["bias_drift"]
+
+
+@pytest.mark.parametrize(("family", "number"), [("shape_saturation", 6), ("single", 20)])
+def test_a_bend_of_the_temperature_is_an_answer_beside_the_warm_up_that_it_looks_like(family: str, number: int) -> None:
+    case = draw(family, number, 61)
+    found = say(recordings_of(case), case.model, case.sensor)
+    assert found["selected"] == ["warm_up"]
+    assert outside_answered(found) if case.shape else found["verdict"] == "missing_effect"
+    assert not any(":" in name for name in found["probability"])
 
 
 def test_a_study_goes_on_where_it_was_interrupted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -127,9 +127,10 @@ def test_units_in_which_every_effect_stands_out_are_counted_by_themselves() -> N
 def test_a_form_of_unknown_physics_is_unexplained_warned_of_silently_replaced_or_missed() -> None:
     held = {"before": 2.0, "after": 1.2, "floor": 1.0}
     ways = [said(verdict="unexplained"), said("a", inflated=True), said("a"), said("a"), said()]
+    ways.append(said("a") | answer(("a",), ("b", "other_temperature")))
     case = truth(key="shape_band-00000", shape="band")
     (row,) = of_shapes([case | way | {"held_out": held} for way in ways])
-    assert row == ["shape band", 5, 1, 1, 2, 1, "a (3)", "80 % (n = 5)"]
+    assert row == ["shape band", 6, 1, 1, 1, 2, 1, "a (4)", "80 % (n = 6)"]
 
 
 def test_the_page_has_the_figures_the_code_and_the_cases_that_miss() -> None:
