@@ -111,18 +111,14 @@ def _seeds(campaign: Path, count: int, processes: int, output: Path) -> None:
     from concurrent.futures import ProcessPoolExecutor  # noqa: PLC0415
     from functools import partial  # noqa: PLC0415
 
-    from pipeline.thesis.seeds import sets_of, write_rows  # noqa: PLC0415  (the page needs none of the estimators)
+    import pandas as pd  # noqa: PLC0415
+
+    from pipeline.thesis.seeds import COLUMNS, sets_of, study_of  # noqa: PLC0415  (the page needs none of the estimators)
 
     rows = []
     sets = sets_of(campaign)
     with ProcessPoolExecutor(processes) as pool:
-        for name, found in zip(sets, pool.map(partial(_study, campaign, count), sets), strict=True):
+        for name, found in zip(sets, pool.map(partial(study_of, campaign, range(count)), sets), strict=True):
             rows += found
             print(f"{name}: {len(found)} rows", file=sys.stderr, flush=True)
-    write_rows(output, rows)
-
-
-def _study(campaign: Path, count: int, name: str) -> list[dict[str, object]]:
-    from pipeline.thesis.seeds import study as rows_of  # noqa: PLC0415
-
-    return list(rows_of(campaign, [name], range(count)))
+    pd.DataFrame(rows, columns=COLUMNS).to_csv(output, index=False, float_format="%.5g", lineterminator="\n")

@@ -86,8 +86,7 @@ class EncoderTrajectory:
         """Return which inner samples a stretch ends at: there the acceleration is that before or that after."""
         jump = np.abs(self._before[1:] - self._after[:-1])
         both = self.explained[1:] & self.explained[:-1]
-        ends: NDArray[np.bool_] = both & (jump > CORNER_DPS2)
-        return ends
+        return np.asarray(both & (jump > CORNER_DPS2))
 
     def _bends(self, even: NDArray[np.bool_]) -> tuple[Values, Values, Values, NDArray[np.bool_]]:
         """Return for each interval where it bends, the acceleration before and after, and whether that holds."""
@@ -126,8 +125,7 @@ class EncoderTrajectory:
         moving = np.abs(self._mean) + np.abs(self.rate[1:]) + np.abs(self.rate[:-1]) > MOVING_DPS
         inside = np.convolve(moving, np.ones(7), "same") > 6.5
         noise = 4.0 * float(median(miss[inside])) if inside.sum() > 20 else 0.0
-        smooth: NDArray[np.bool_] = miss <= max(LOOSEST_DEG, noise)
-        return smooth
+        return np.asarray(miss <= max(LOOSEST_DEG, noise))
 
     def at(self, time: Values) -> tuple[Values, Values, Values]:
         """Return angle (deg), rate (deg/s) and acceleration (deg/s^2) at any times; (n,) arrays."""

@@ -262,8 +262,7 @@ def turn_by_vector(phi: Values) -> Values:
     s = np.where(small, 1.0, np.sin(safe) / safe)
     c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
     cross = skew(phi)
-    out: Values = np.eye(3) + s[..., None, None] * cross + c[..., None, None] * (cross @ cross)
-    return out
+    return np.asarray(np.eye(3) + s[..., None, None] * cross + c[..., None, None] * (cross @ cross))
 
 
 def skew(v: Values) -> Values:

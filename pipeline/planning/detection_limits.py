@@ -109,8 +109,7 @@ class DetectionLimits(abc.ABC):
         signal = self._signal(j, sizes)
 
         def named(share: float) -> Values:
-            together: Values = signal.found(share) * np.min(signal.ahead(share), axis=0, initial=1.0)
-            return together
+            return np.asarray(signal.found(share) * np.min(signal.ahead(share), axis=0, initial=1.0))
 
         half = _smallest(signal.found, 0.5)
         ahead = np.mean(signal.ahead(half), axis=1) if np.isfinite(half) else np.ones(len(signal.rivals))
@@ -185,14 +184,12 @@ class TurntableLimits(DetectionLimits):
         shape = (-1,) + (1,) * (added.ndim - 1)
         n = self.ranking.samples
         total = self.noise_sum.reshape(shape) + added
-        found: Values = -0.5 * n * np.log(total / n) - self.ranking.penalty.reshape(shape)
-        return found
+        return np.asarray(-0.5 * n * np.log(total / n) - self.ranking.penalty.reshape(shape))
 
     def _gain(self, signal: Values) -> Values:
         """Return g of signals, (t, ...), over a model without them."""
         without = self._log_likelihood(signal)[1:].max(axis=0)
-        found: Values = np.maximum(2.0 * (self.before - without), 0.0)
-        return found
+        return np.asarray(np.maximum(2.0 * (self.before - without), 0.0))
 
     def _signal(self, j: int, sizes: Values) -> _Signal:
         q = self._patterns(j, sizes)
@@ -221,8 +218,7 @@ class TurntableLimits(DetectionLimits):
             over = self._gain(share**2 * left_of)
             mean = over - more * (float(np.log(self.ranking.samples)) - 1.0)
             deviation = np.sqrt(4.0 * over + 2.0 * np.abs(more))
-            better: Values = np.where(deviation < TIED, tie, ndtr(mean / np.maximum(deviation, TIED)))
-            return better
+            return np.asarray(np.where(deviation < TIED, tie, ndtr(mean / np.maximum(deviation, TIED))))
 
         return _Signal(found, ahead, shares)
 
@@ -235,8 +231,7 @@ class TurntableLimits(DetectionLimits):
             signs = np.where(bits & 1, -1.0, 1.0)
         else:
             signs = np.random.default_rng(count).choice([-1.0, 1.0], (MOST_SIGNS, count))
-        found: Values = signs * sizes[:count] @ self.ranking.beside[0, block, block] @ self.ranking.blocks[j]
-        return found
+        return np.asarray(signs * sizes[:count] @ self.ranking.beside[0, block, block] @ self.ranking.blocks[j])
 
     def _explained(self, i: int, j: int, q: Values) -> Values:
         """Return what candidate i explains of the signals of candidate j: (t, s) array."""
@@ -246,8 +241,7 @@ class TurntableLimits(DetectionLimits):
             own = own + RIDGE * np.einsum("tii->ti", own)[:, :, None] * np.eye(len(at))
             self._solved[i] = np.linalg.solve(own, products[:, at, :])
         cross = products[:, at[:, None], place] @ q.T
-        found: Values = np.sum(cross * (self._solved[i][:, :, place] @ q.T), axis=1)
-        return found
+        return np.asarray(np.sum(cross * (self._solved[i][:, :, place] @ q.T), axis=1))
 
     def _passes(self, gain: Values, k: int) -> Values:
         """Return the probability that a gain passes the gate."""
@@ -255,8 +249,7 @@ class TurntableLimits(DetectionLimits):
 
         bic = GATE_BIC + k * float(np.log(self.ranking.samples))
         gate = max(bic, float(chdtri(k, GATE_P / len(self.names))))
-        found: Values = 1.0 - chndtr(gate, k, gain)
-        return found
+        return np.asarray(1.0 - chndtr(gate, k, gain))
 
 
 def noise_sums(blocks: Blocks, samples: float, settings: Sequence[Setting], true: Setting) -> Values:
@@ -310,8 +303,7 @@ class RestLimits(DetectionLimits):
         def bic(share: float, i: int) -> Values:
             rss, drop = (a + 2.0 * share * b + share**2 * c for a, b, c in (total, taken[i]))
             gain = self._scores(rss - drop).max(axis=0) - self._scores(rss).max(axis=0)
-            brought: Values = 2.0 * self.factors[i] * gain - self._parameters(i) * float(np.log(self.equations))
-            return brought
+            return np.asarray(2.0 * self.factors[i] * gain - self._parameters(i) * float(np.log(self.equations)))
 
         def found(share: float) -> Values:
             return self._passes(bic(share, j), self._parameters(j))
@@ -325,8 +317,7 @@ class RestLimits(DetectionLimits):
     def _along(self, i: int, what: Values) -> Values:
         """Return draws or signals, (t, n, s), along the directions of candidate i: (t, p, s) array."""
         projected = self.projected
-        found: Values = projected.orthonormal[i].transpose(0, 2, 1) @ (projected.raw[i].transpose(0, 2, 1) @ what)
-        return found
+        return np.asarray(projected.orthonormal[i].transpose(0, 2, 1) @ (projected.raw[i].transpose(0, 2, 1) @ what))
 
     def _squares(self, i: int, signal: Values) -> Squares:
         """Return what candidate i takes of draws and signals: squares, products and squares, each (t, s)."""

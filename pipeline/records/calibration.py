@@ -205,10 +205,6 @@ class Contribution:
         """Its share of each parameter's standard uncertainty: (p,) array."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
-    def with_freedom(self, degrees_of_freedom: NDArray[np.float64]) -> Contribution:
-        """Return the contribution with other degrees of freedom."""
-        return replace(self, degrees_of_freedom=degrees_of_freedom)
-
     def of(self, kept: slice) -> Contribution:
         """Return the contribution to some of the parameters."""
         parts = {name: values[kept] for name, values in self.parts.items()}

@@ -108,8 +108,7 @@ class Axis:
         """Return the places of values in whole drawing units; values beyond the axis stand at its end."""
         at = np.minimum(np.maximum(scaled(values, self.kind), self.low), self.high)
         slope = SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
-        units: NDArray[np.int64] = np.rint((at - self.low) * slope + SUBDIVISION * self.start).astype(np.int64)
-        return units
+        return np.asarray(np.rint((at - self.low) * slope + SUBDIVISION * self.start).astype(np.int64))
 
     def ticks(self, count: int, names: Sequence[str] = ()) -> list[Tick]:
         """Return at least two ticks as place (px) and text; ``names`` are those of the values 1, 2, ..."""

@@ -93,8 +93,7 @@ def white_noise(residual: Residual, noise: JSON | None) -> Values:
     if noise and noise.get("white"):
         gain = float(residual.recording.filter.get("noise_gain", 1.0))
         return np.asarray(np.hypot(gain * np.array(noise["white"], float), residual.reference_noise))
-    sigma: Values = MEDIAN_SIZE * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0)
-    return sigma
+    return np.asarray(MEDIAN_SIZE * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0))
 
 
 @dataclass(frozen=True)
@@ -180,8 +179,7 @@ def harmonics(residual: Residual) -> Values | None:
     mean = np.stack([np.bincount(cell, e, BINS) / count for e in residual.error.T], 1)
     amplitude = np.abs(np.fft.rfft(mean, axis=0))[: HARMONICS + 1] * (2.0 / BINS)
     amplitude[0] /= 2.0
-    restored: Values = amplitude / np.sinc(np.arange(HARMONICS + 1) / BINS)[:, None]
-    return restored
+    return np.asarray(amplitude / np.sinc(np.arange(HARMONICS + 1) / BINS)[:, None])
 
 
 def harmonic_noise(residual: Residual, white: Values, wander: Values, time: float) -> Values:
@@ -201,8 +199,7 @@ def harmonic_noise(residual: Residual, white: Values, wander: Values, time: floa
     of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(_angle_bins(motion.angle)[1], 1))) / BINS
     spread = np.sqrt(2.0 * of_white + 2.0 * spectrum / duration)
     spread[0] = np.hypot(np.sqrt(of_white), wander.max())  # a mean, not an amplitude
-    level: Values = ONE_IN_A_THOUSAND * spread
-    return level
+    return np.asarray(ONE_IN_A_THOUSAND * spread)
 
 
 def residual_figures(sensor: str, found: list[Residual], noise: JSON | None) -> list[Figure]:

@@ -159,8 +159,7 @@ def variance_of_mean(covariance: Values, count: Integers) -> Values:
     kinds, which = np.unique(count, return_inverse=True)
     lag = np.arange(len(covariance))
     weight = np.clip(1.0 - lag / kinds[:, None], 0.0, None) * np.where(lag == 0, 1.0, 2.0)
-    variance: Values = (weight @ covariance / kinds)[which]
-    return variance
+    return np.asarray((weight @ covariance / kinds)[which])
 
 
 def _rc_low_pass(time: Values, reading: Values, time_constant: float) -> Values:
@@ -342,8 +341,7 @@ def temperature_of(recording: Recording) -> NDArray[np.float64]:
     assert recording.temperature is not None  # noqa: S101
     if "temperature" not in recording.cache:
         recording.cache["temperature"] = smooth_temperature(recording.time, recording.temperature)
-    found: NDArray[np.float64] = recording.cache["temperature"]
-    return found
+    return np.asarray(recording.cache["temperature"])
 
 
 def _local_line(time: NDArray[np.float64], temperature: NDArray[np.float64], bandwidth: float) -> NDArray[np.float64]:

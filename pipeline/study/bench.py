@@ -138,8 +138,7 @@ def _autoregression(count: int, coefficient: float, rng: np.random.Generator) ->
 
     drive = np.sqrt(1.0 - coefficient**2) * rng.standard_normal((count, 3))
     drive[0] = rng.standard_normal(3)
-    found: Values = lfilter([1.0], [1.0, -coefficient], drive, axis=0)
-    return found
+    return np.asarray(lfilter([1.0], [1.0, -coefficient], drive, axis=0))
 
 
 def _one_over_f(count: int, rng: np.random.Generator) -> Values:

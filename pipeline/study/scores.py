@@ -61,11 +61,6 @@ def exact(case: JSON) -> bool:
     return not selected
 
 
-def nothing_selected(case: JSON) -> bool:
-    """Return whether nothing was selected."""
-    return not case["selected"]
-
-
 def not_seen(case: JSON) -> bool:
     """Return whether an effect that cannot be seen is listed as not observable, and was not selected."""
     name = next(iter(case["hidden"]))
@@ -193,7 +188,7 @@ def family_scores(cases: Sequence[JSON]) -> list[Score]:
     for family in sorted({c["family"] for c in cases if is_null(c)}):
         own = [c for c in cases if c["family"] == family]
         name = f"nothing hidden, {family.removeprefix('null_')}: nothing selected"
-        found += share(name, _judged(own, nothing_selected), ">= 99 %")
+        found += share(name, _judged(own, lambda case: not case["selected"]), ">= 99 %")
     return found + mean_excess_gone(in_the_catalogue(cases))
 
 

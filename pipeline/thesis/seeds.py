@@ -26,7 +26,6 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares, staged
 from pipeline.estimation.accelerometer.turn_extremes import (
@@ -176,7 +175,7 @@ class Drawn:
         chain = staged.Corrected()
         for name in staged.STAGES:
             chain = staged.follow(extremes, [name], 1.0, as_printed=as_printed, start=chain)
-            found |= {k: v for k, (v, _) in chain.values.items()}  # noqa: PD011  (no DataFrame)
+            found |= {k: v for k, (v, _) in chain.values.items()}
         row = {f"b_{a}": found[f"b_{a}"] for a in AXES}
         row |= {f"{q}_{a}": (found[f"{q}_P_{a}"] + found[f"{q}_N_{a}"]) / 2.0 for q in "OS" for a in AXES}
         row["M"] = (found["M_P_x"] + found["M_N_x"]) / 2.0  # the same on all axes
@@ -232,16 +231,17 @@ class Drawn:
             yield method, {"error": float(np.mean(np.abs(error)))}
 
 
-def study(campaign: Path, sets: Sequence[str], seeds: Sequence[int]) -> Iterator[Row]:
-    """Yield the rows of some sets of recordings of the campaign's ``simulation.yaml``."""
+def study_of(campaign: Path, seeds: Sequence[int], name: str) -> list[Row]:
+    """Return the rows of a set of recordings of the campaign's ``simulation.yaml``."""
     description = read_description(campaign / "simulation.yaml")
-    for name in sets:
-        own = Set.named(description, name)
-        held_out = Set.named(description, f"{device_of(name)}-held-out-{own.sensor}")
-        for seed in seeds:
-            recording, kept = held_out.drawn(seed)[0]
-            for cause, method, row in _rows(Drawn(own, seed, recording.select(kept))):
-                yield {"set": name, "seed": seed, "cause": CAUSES.index(cause), "method": method, **row}
+    own = Set.named(description, name)
+    held_out = Set.named(description, f"{device_of(name)}-held-out-{own.sensor}")
+    rows = []
+    for seed in seeds:
+        recording, kept = held_out.drawn(seed)[0]
+        for cause, method, row in _rows(Drawn(own, seed, recording.select(kept))):
+            rows.append({"set": name, "seed": seed, "cause": CAUSES.index(cause), "method": method, **row})
+    return rows
 
 
 def _rows(drawn: Drawn) -> Iterator[tuple[str, str, Row]]:
@@ -276,8 +276,3 @@ def sets_of(campaign: Path) -> list[str]:
     """Return the sets of recordings that calibrate a device of the thesis."""
     names = [u.unit for u in read_description(campaign / "simulation.yaml").units]
     return [n for n in names if "-held-out-" not in n and not n.startswith("gy-521")]
-
-
-def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows as CSV, with five digits."""
-    pd.DataFrame(rows, columns=COLUMNS).to_csv(path, index=False, float_format="%.5g", lineterminator="\n")

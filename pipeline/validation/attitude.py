@@ -178,8 +178,7 @@ def _tilt_between(p: Values, q: Values) -> Values:
     """Return the angle between the verticals of two attitudes, quaternions (n, 4): (n,) array, deg."""
     up, other = level_in_body(p), level_in_body(q)
     across = np.linalg.norm(np.cross(up, other), axis=1)
-    angle: Values = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", up, other)))
-    return angle
+    return np.asarray(np.degrees(np.arctan2(across, np.einsum("ij,ij->i", up, other))))
 
 
 def _with_reference(recording: Recording) -> tuple[Recording, Values]:

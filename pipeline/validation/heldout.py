@@ -231,8 +231,7 @@ def _truth(calibration: SensorCalibration, samples: Samples) -> Values:
         direction = np.where(np.isfinite(known).all(axis=1, keepdims=True), known, reading)
     size = np.linalg.norm(direction, axis=1, keepdims=True)
     unit = np.where(size > 0, direction / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
-    along: Values = samples.magnitude[:, None] * unit
-    return along
+    return np.asarray(samples.magnitude[:, None] * unit)
 
 
 def _choose(

@@ -268,5 +268,4 @@ def _near_zero(truth: Values, size: Values, S: Values) -> Values:
     spread = 1.0 + 2.0 * s[:, :, None] * l
     phi = np.exp(-np.sum(s[:, :, None] * t[:, None, :] / spread, axis=2)) / np.sqrt(np.prod(spread, axis=2))
     mean_norm = np.sum(STEP * (1.0 - phi) / np.sin(THETA) ** 2, axis=1) / (c * np.sqrt(np.pi))
-    squared: Values = 2.0 * size**2 + l.sum() - 2.0 * size * mean_norm
-    return squared
+    return np.asarray(2.0 * size**2 + l.sum() - 2.0 * size * mean_norm)

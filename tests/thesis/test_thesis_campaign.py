@@ -17,7 +17,7 @@ from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_description
 from pipeline.thesis.errata import TRUE_SCALE
 from pipeline.thesis.results import DEVICES, SILENT, read_printed
-from pipeline.thesis.seeds import FOUND, study
+from pipeline.thesis.seeds import FOUND, study_of
 from pipeline.validation.samples import samples_of_motion
 
 CAMPAIGN = Path(__file__).parents[2] / "data" / "thesis"
@@ -125,7 +125,7 @@ def test_the_printed_advantage_over_cholesky_and_lu_is_the_missing_inversion(dev
 def test_the_study_over_seeds_comes_out_as_it_is_kept(name: str) -> None:
     rows = pd.read_csv(CAMPAIGN / "seeds.csv")
     kept = rows[(rows["set"] == name) & (rows["seed"] == 7)].to_dict("records")
-    again = list(study(CAMPAIGN, [name], [7]))
+    again = study_of(CAMPAIGN, [7], name)
     assert len(kept) == len(again) > 0
     for one, other in zip(kept, again, strict=True):
         assert one["method"] == other["method"]

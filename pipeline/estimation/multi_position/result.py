@@ -176,7 +176,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     calibration = replace(calibration, effects=effects)
     sensor, size, table = calibration.sensor, len(calibration.parameter_names()), settings["table"]
     scatter = scatter_contribution(covariance, np.inf, parts, REMARK[sensor])
-    lines = [scatter.with_freedom(freedom)]
+    lines = [replace(scatter, degrees_of_freedom=freedom)]
     missing = dict(not_included or NOT_INCLUDED)
     if sensor == "accelerometer":
         gravity = gravity_contribution(sensor, calibration.matrix, table, size)

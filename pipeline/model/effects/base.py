@@ -223,8 +223,7 @@ def turning_direction(motion: Motion) -> Values:
         turning = magnitude > TURNING_DPS
         now = motion.angular_rate / np.where(turning, magnitude, 1.0)[:, None]
     last = np.maximum.accumulate(np.where(turning, np.arange(len(turning)), -1))
-    held: Values = np.where(last[:, None] >= 0, now[last], 0.0)
-    return held
+    return np.asarray(np.where(last[:, None] >= 0, now[last], 0.0))
 
 
 def per_axis(regressors: Values) -> Values:

@@ -60,10 +60,6 @@ class Term:
         """The formulas as they were written."""
         return ", ".join(formula.text for formula in self.formulas.values())
 
-    def formula_of(self, axis: str) -> Formula:
-        """Return the formula of one axis."""
-        return self.formulas[axis] if axis in self.formulas else self.formulas[""]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Declaration:

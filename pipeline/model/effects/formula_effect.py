@@ -92,7 +92,8 @@ class FormulaEffect(DeclaredEffect):
             for term in self._own if axis else self._shared:
                 factor = c_number(next(coefficients))
                 for a in axis or AXES:
-                    rows[a].append(f"{factor} * {term.formula_of(a).in_c(AXES.index(a))}")
+                    formula = term.formulas.get(a) or term.formulas[""]
+                    rows[a].append(f"{factor} * {formula.in_c(AXES.index(a))}")
         return [" + ".join(products) or "0" for products in rows.values()]
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:

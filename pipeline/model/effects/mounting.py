@@ -197,8 +197,7 @@ def errors_in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Va
     moved = [(Rotation.from_rotvec(t, degrees=True) * steps).as_rotvec(degrees=True) - t for t in theta]
     G[at] = np.concatenate([change.T for change in moved]) / STEP_DEG
     mean[:, at] = np.tile(np.eye(3), len(theta)) / len(theta)
-    found: Values = np.eye(count) - G @ np.linalg.solve(mean @ G, mean)
-    return found
+    return np.asarray(np.eye(count) - G @ np.linalg.solve(mean @ G, mean))
 
 
 class EncoderZero(_OfRecordings):
