@@ -86,22 +86,11 @@ def reference_motion(
 ) -> Motion | None:
     """Return the motion that the table's log gives for a recording, or None where it gives none.
 
-    Parameters
-    ----------
-    recording : Recording
-        With ``table_angle`` and an axis, or with ``table_attitude``. It keeps the motion, whose arrays are shared.
-    gravity_g : float, g
-        Local gravity.
-    earth_rate_level : (3,) array, deg/s, optional
-        Earth's rotation in the level frame; None leaves it out.
-    one_shaft : bool
-        Whether level x is the axis about which the encoder counts right-handed, the same in all turns
-        (``table.azimuth_of``), and not the body's axis at angle 0.
-
-    Raises
-    ------
-    InputError
-        If there are too few samples to differentiate the log.
+    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``; it keeps the motion, whose arrays are
+    shared. ``earth_rate_level``: Earth's rotation in the level frame, (3,), deg/s; None leaves it out. ``one_shaft``:
+    whether level x is the axis about which the encoder counts right-handed, the same in all turns
+    (``table.azimuth_of``), and not the body's axis at angle 0. Raises ``InputError`` if there are too few samples to
+    differentiate the log.
     """
     if recording.axis is not None and recording.table_angle is not None:
         build: Callable[..., Motion] = partial(_motion_of_turn, shaft=recording.sense if one_shaft else 0)

@@ -95,24 +95,9 @@ def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
 def solve(parts: Mapping[str, Part], readings: Truths, motion_at: Callable[[Truths, int], Motion]) -> Truths:
     """Solve the measurement equation of one or both sensors.
 
-    Parameters
-    ----------
-    parts : mapping
-        By sensor; the readings of a sensor without are the truth.
-    readings : dict
-        By sensor, (n, 3) array, g or deg/s.
-    motion_at : callable
-        Returns the motion that given truths make, in a round counted from 0.
-
-    Returns
-    -------
-    dict
-        By sensor, (n, 3) array of its truth.
-
-    Raises
-    ------
-    ConvergenceError
-        If a reading is so far out of range that the equation has no solution.
+    ``parts``: by sensor, the readings of one without are the truth; ``readings``: by sensor, (n, 3), g or deg/s, as the
+    result; ``motion_at``: returns the motion that given truths make, in a round counted from 0. Raises
+    ``ConvergenceError`` if a reading is so far out of range that the equation has no solution.
     """
     busy = {s: part for s, part in parts.items() if part.effects}
     truths = {s: linear_truth(parts[s].calibration, r) if s in parts else r for s, r in readings.items()}

@@ -92,13 +92,7 @@ def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
     and c = 0 where noise alone explains the rates: ``|w|^2 / (2 e^2)`` has mean and variance 1 then. The rate about
     gravity, which the accelerometer does not show, has the standard deviation c, too.
 
-    Returns
-    -------
-    rate : (m, 3) array, deg/s
-    error : (m,) array, deg/s
-        Standard uncertainty of each of its two components.
-    about : float, deg/s
-        c.
+    Returns the rates, (m, 3), the standard uncertainty of each of their two components, (m,), and c, all deg/s.
     """
     w, e = np.array([c.measured for c in creeps]).reshape(-1, 3), np.array([c.uncertainty for c in creeps])
     known = e > 0.0
@@ -186,16 +180,8 @@ ROUNDING = 1e-6  # relative, of a difference of decimals
 def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: float, shortest: int) -> Spans:
     """Cut stretches in which the accelerometer is quiet where the gyroscope turns.
 
-    Parameters
-    ----------
-    rate : (n, 3) array, deg/s
-        Finite in the stretches.
-    stretches : sequence of (int, int)
-        Start and stop of each, in order.
-    interval : float, s
-        Mean time between samples.
-    shortest : int
-        Samples of the shortest piece that is a rest.
+    ``rate``: (n, 3), deg/s, finite in the stretches; ``stretches``: start and stop of each, in order; ``interval``:
+    mean time between samples, s; ``shortest``: samples of the shortest piece that is a rest.
     """
     size = max(FEWEST, round(WINDOW_S / interval))
     if not stretches or min(stop - start for start, stop in stretches) < size:

@@ -38,15 +38,7 @@ JSON = dict[str, Any]
 
 
 def render(campaign: Path, folder: Path) -> str:
-    """Return ``thesis.html``.
-
-    Parameters
-    ----------
-    campaign : Path
-        With ``printed/`` and ``seeds.csv``.
-    folder : Path
-        Results of a run of it.
-    """
+    """Return ``thesis.html`` of a campaign with ``printed/`` and ``seeds.csv``, and the folder of its results."""
     printed, results = campaign / "printed", Results(folder)
     rows = pd.read_csv(campaign / "seeds.csv")
     scatter = scatters(printed, rows)

@@ -50,12 +50,9 @@ def attitude(
 ) -> dict[str, Any]:
     """Return the part ``attitude`` of ``validations/<unit>.json``, by the first held-out recording of the attitude.
 
-    Returns
-    -------
-    dict
-        ``reason`` (why there is none, else None), ``recording``, ``seconds`` (60, or the recording's length),
-        ``drift_deg`` and ``tilt_rms_deg`` (each ``before`` and ``after``) and ``curve``: ``time_s`` and, deg, the angle
-        of the gyroscope alone (``drift_before``, ``drift_after``) and the tilt of the fused attitude (``tilt_...``).
+    It has ``reason`` (why there is none, else None), ``recording``, ``seconds`` (60, or the recording's length),
+    ``drift_deg`` and ``tilt_rms_deg`` (each ``before`` and ``after``) and ``curve``: ``time_s`` and, deg, the angle of
+    the gyroscope alone (``drift_before``, ``drift_after``) and the tilt of the fused attitude (``tilt_...``).
     """
     recording = next((r for r in recordings if r.role == "validation" and r.table_attitude is not None), None)
     if recording is None:
@@ -208,15 +205,11 @@ def gravity_direction(
 ) -> dict[str, Any]:
     """Return the part ``gravity_direction`` of ``validations/<unit>.json``, with the noise of the gyroscope.
 
-    Returns
-    -------
-    dict
-        ``reason`` (why there is none, else None), ``moves`` (how many), ``mean_deg``, ``rms_deg`` and ``max_deg`` (each
-        ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean that white noise alone
-        gives), ``largest_expected_rms_deg`` (by noise and uncertainties, exceeded with a probability of 0.5 %; where
-        the fit determines the matrix) and ``creeping_rests`` (in which the unit went on turning). Where the procedure
-        states turns, ``turns``: ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``) of
-        each.
+    It has ``reason`` (why there is none, else None), ``moves`` (how many), ``mean_deg``, ``rms_deg`` and ``max_deg``
+    (each ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean that white noise alone
+    gives), ``largest_expected_rms_deg`` (by noise and uncertainties, exceeded with a probability of 0.5 %; where the
+    fit determines the matrix) and ``creeping_rests`` (in which the unit went on turning). Where the procedure states
+    turns, ``turns``: ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``) of each.
     """
     if not is_multi_position("gyroscope", recordings):
         return {"reason": "not recorded by hand"}

@@ -50,30 +50,17 @@ def validate(
 ) -> dict[str, Any]:
     """Return a sensor's part of ``validations/<unit>.json``.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        All of the unit, filtered as for the fit.
-    settings : mapping
-        Sections ``table``, ``procedure``, ``limits`` and, for the expected error, ``sensor``.
-    other : SensorCalibration, optional
-        Of the unit's other sensor. Only where no attitude is logged: effects that look at the other sensor's signal
-        then take it calibrated; without it, as it was read.
+    ``recordings``: all of the unit, filtered as for the fit; ``settings``: sections ``table``, ``procedure``,
+    ``limits`` and, for the expected error, ``sensor``; ``other``: that of the unit's other sensor. Only where no
+    attitude is logged: effects that look at the other sensor's signal then take it calibrated; without it, as it was
+    read.
 
-    Returns
-    -------
-    dict
-        ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor, vector_noise_floor,
-        steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit), ``reason`` (why),
-        ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why the
-        calibration does harm, or None), ``over_temperature`` (``residuals_over_temperature``; only where the
-        temperature was swept), ``limits`` and ``pass``. ``vector_rms_error`` is the root of the mean squared
-        length of the difference to the reference.
-
-    Raises
-    ------
-    ConfigurationError
-        If a limit's name is unknown.
+    The part has ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor,
+    vector_noise_floor, steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit),
+    ``reason`` (why), ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why
+    the calibration does harm, or None), ``over_temperature`` (``residuals_over_temperature``; only where the
+    temperature was swept), ``limits`` and ``pass``. ``vector_rms_error`` is the root of the mean squared length of the
+    difference to the reference. Raises ``ConfigurationError`` if a limit's name is unknown.
     """
     sensor = calibration.sensor
     samples, reason = _choose(sensor, recordings, noise, settings)

@@ -231,17 +231,8 @@ def effect_from(
 def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
     """Run a Python file that the user has named, and return its ``EFFECT``.
 
-    Parameters
-    ----------
-    sha256 : str, optional
-        Of the content that is expected.
-
-    Raises
-    ------
-    MissingInputError
-        If there is no such file.
-    ConfigurationError
-        If its content differs, fails, or holds no effect of the file's name.
+    ``sha256``: of the content that is expected. Raises ``MissingInputError`` if there is no such file,
+    ``ConfigurationError`` if its content differs, fails, or holds no effect of the file's name.
     """
     file = Path(path)
     if file.suffix != ".py" or not file.is_file():

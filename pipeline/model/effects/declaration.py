@@ -111,19 +111,9 @@ def read_declaration(
 ) -> Declaration:  # fmt: skip
     """Check what a file says of an effect.
 
-    Parameters
-    ----------
-    where : str
-        The file, for messages.
-    lines : callable
-        Returns the line of each key, by the keys from the top; called for a message alone.
-    built_in : bool
-        Whether the file may name a class and its ``parameters``.
-
-    Raises
-    ------
-    ConfigurationError
-        At the first thing that is wrong, with file, line, and what is expected.
+    ``where``: the file, for messages; ``lines``: returns the line of each key, by the keys from the top, for a message
+    alone; ``built_in``: whether the file may name a class and its ``parameters``. Raises ``ConfigurationError`` at the
+    first thing that is wrong, with file, line, and what is expected.
     """
     checks = {**CHECKS, **BUILT_IN_CHECKS} if built_in else CHECKS
     try:

@@ -179,14 +179,7 @@ def errors_in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Va
     exp([theta_k]x) exp([phi]x)``. With G the derivative of all parameters with respect to phi and A their mean
     rotation, the map is ``1 - G (A G)^-1 A`` (S-transformation; Baarda, Publ. Geodesy 5, 1973).
 
-    Parameters
-    ----------
-    K : (3, 3) array
-    values : (3 m,) array, deg
-        Rotations of the unit.
-    at : slice
-        Their place among the parameters; K is row by row from 3 to 12.
-    count : int
+    ``values``: (3 m,) rotations of the unit, deg, which are the parameters ``at``; K is row by row from 3 to 12.
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s that only fits of mountings pay)
 
