@@ -4,7 +4,7 @@
 #   snakemake --cores 2 --config campaign=NAME_OR_DIR            runs another campaign
 #   ... --config campaign=C 'overrides=[filter=rc_low_pass]'     Hydra overrides for every unit of the run
 #
-# ingest -> filter -> fit/{sensor}/{stage} ... -> validate, diagnose, calibration -> export -> report -> gather -> verdict
+# ingest -> filter -> fit/{sensor}/{stage} ... -> validate, diagnose, calibration -> export -> report -> summary -> gather -> verdict
 #
 # One job handles a batch of units; each writes one file, results/<campaign>/batches/<batch>/<stage>.zip.
 
@@ -18,6 +18,7 @@ if DEPLOYED:
     container: "imu-calibration.sif"
 
 
+include: "workflow/rules/prior.smk"
 include: "workflow/rules/gather.smk"
 
 
@@ -37,6 +38,7 @@ include: "workflow/rules/diagnose.smk"
 include: "workflow/rules/calibration.smk"
 include: "workflow/rules/export.smk"
 include: "workflow/rules/report.smk"
+include: "workflow/rules/summary.smk"
 include: "workflow/rules/thesis.smk"
 include: "workflow/rules/verdict.smk"
 

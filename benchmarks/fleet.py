@@ -1,16 +1,23 @@
 """What a fleet costs: ``python benchmarks/fleet.py --units 100``.
 
 A campaign of simulated units (10,000 samples each in eight recordings) goes through ``snakemake --cores 2`` with every
-stage, diagnosis and page. CPU seconds are those of Snakemake and all its jobs, user and system; the memory is that of
-the largest process. The floor is what no tool can save: one process reads the same files with pyarrow and solves one
-linear least squares problem for each sensor of each unit. CPU seconds of a shared machine vary twofold, so the floor is
-measured before, during and after the run, and so is a loop of five million additions.
+stage, diagnosis and page. Beyond ``--simulated`` units, units use recordings of others, and each goes through every
+stage. CPU seconds are those of Snakemake and all its jobs, user and system; the memory is that of the largest process.
+The floor is what no tool can save: one process reads the files of 100 units with pyarrow and solves one linear least
+squares problem for each sensor of each. CPU seconds of a shared machine vary twofold, so the floor is measured before,
+during and after the run, and so is a loop of five million additions.
+
+With ``--folder DIR`` everything stays in that folder. The same command continues a run that was interrupted, and adds
+up what all of its parts have used. 10,000 units need 9 GB.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -18,16 +25,18 @@ import tempfile
 import time
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
-PAUSE_S = 15.0  # between two measurements of the floor
+PAUSE_S = 15.0, 120.0  # between two measurements of the floor: at first, and in a long run
 ROOT = Path(__file__).resolve().parents[1]
+MEASURED = 100  # units of the floor
 FLOOR = """
 import sys, time
 from pathlib import Path
 import numpy as np
 import pyarrow.csv as csv
 start = time.process_time()
-for unit in sorted(Path(sys.argv[1]).iterdir()):
+for unit in sorted(Path(sys.argv[1]).iterdir())[:int(sys.argv[2])]:
     tables = [csv.read_csv(file) for file in sorted(unit.glob("*.csv"))]
     for sensor in ("accel_{}_g", "gyro_{}_dps"):
         y = np.concatenate([np.column_stack([t[sensor.format(a)] for a in "xyz"]) for t in tables])
@@ -36,16 +45,17 @@ for unit in sorted(Path(sys.argv[1]).iterdir()):
 print(time.process_time() - start)
 """
 
-
-# Every process of the run tells on its way out what it was, and what it has used.
+# Every process of the run tells on its way out what it was, and what it has used. The commands that start the jobs do
+# not import this. The largest memory that ``getrusage`` gives may be that of the process from which one was started.
 TELL = """
 import atexit, os, resource, sys
 def _tell():
     used = resource.getrusage(resource.RUSAGE_SELF)
     words = sys.argv
     name = words[1] if words[0].endswith("pipeline/__main__.py") else "snakemake"
+    largest = next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM"))
     with open(os.environ["FLEET_TOLD"], "a") as stream:
-        print(os.getpid(), name, used.ru_utime + used.ru_stime, used.ru_maxrss, file=stream)
+        print(os.getpid(), name, used.ru_utime + used.ru_stime, largest, file=stream)
     os._exit = leave
 def _leave(code):
     _tell()
@@ -59,73 +69,115 @@ def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=100)
+    parser.add_argument("--simulated", type=int, default=1000, help="most units with recordings of their own")
     parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--folder", type=Path, help="where everything stays, for a run that may be interrupted")
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        made = ["simulate", "fleet", "--units", str(arguments.units), "--samples", "10000", "--quiet", "--seed", "1"]
-        subprocess.run([sys.executable, "-m", "pipeline", *made], cwd=folder, check=True, stderr=subprocess.DEVNULL)
-        rows = sum(file.read_bytes().count(b"\n") - 1 for file in Path(folder, "fleet/raw").rglob("*.csv"))
-        print(f"{arguments.units} units, {rows / arguments.units:.0f} samples each", flush=True)
-        found, floors, speeds = _run(folder, arguments.cores)
-        least = statistics.median(floors)
-        print(f"load average {os.getloadavg()[0]:.1f}; five million additions: {_range(speeds)} s")
-        print(
-            f"floor: {1000 * least / arguments.units:.1f} ms a unit, median of {len(floors)} runs of {_range(floors)} s"
-        )
-        print(f"ratio to the floor: {found / least:.1f}")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = arguments.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / "fleet/ready").is_file():
+            _lay_out(folder, arguments.units, min(arguments.units, arguments.simulated))
+        _run(folder, arguments.cores)
+        _report(folder, arguments.cores)
     return 0
 
 
-def _range(seconds: list[float]) -> str:
-    return f"{min(seconds):.2f} to {max(seconds):.2f}"
+def _lay_out(folder: Path, units: int, simulated: int) -> None:
+    """Simulate some units; the others use their recordings in turn."""
+    made = ["simulate", "fleet", "--units", str(simulated), "--samples", "10000", "--quiet", "--seed", "1"]
+    subprocess.run([sys.executable, "-m", "pipeline", *made], cwd=folder, check=True, stderr=subprocess.DEVNULL)
+    header, *rows = (folder / "fleet/units.csv").read_text(encoding="utf-8").splitlines()
+    lines = [f"{header},overrides", *(f"{row}," for row in rows)]
+    for i in range(simulated, units):
+        own, _, *same = rows[i % simulated].split(",")
+        lines.append(",".join([f"V{i:05d}", f"V{i:05d}", *same, f"procedure.folder=raw/{own}"]))
+    (folder / "fleet/units.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "fleet/ready").touch()
 
 
-def _floor(folder: str) -> float:
-    done = subprocess.run(
-        [sys.executable, "-c", FLOOR, "fleet/raw"], cwd=folder, check=True, capture_output=True, text=True
-    )
-    return float(done.stdout)
+def _floor(folder: Path) -> float:
+    """Return the CPU seconds of a unit."""
+    measured = min(MEASURED, len(list((folder / "fleet/raw").iterdir())))
+    command = [sys.executable, "-c", FLOOR, "fleet/raw", str(measured)]
+    return float(subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout) / measured
 
 
-def _run(folder: str, cores: int) -> tuple[float, list[float], list[float]]:
-    """Return the CPU seconds of the run, of each floor and of each loop of additions."""
-    told = Path(folder, "told")
-    Path(folder, "sitecustomize.py").write_text(TELL, encoding="utf-8")
-    paths = [folder, *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "FLEET_TOLD": str(told)}
+def _run(folder: Path, cores: int) -> None:
+    """Run the campaign, or the rest of it, and append to ``runs`` what it has used, also where it is interrupted."""
+    (folder / "sitecustomize.py").write_text(TELL, encoding="utf-8")
+    paths = [str(folder.absolute()), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(paths),
+        "FLEET_TOLD": str((folder / "told").absolute()),
+    }
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package is not compiled at each start
     command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", str(cores)]
+    if any(folder.glob(".snakemake/locks/*")):  # of a run that was killed
+        unlock = [*command, "--unlock", "--config", "campaign=fleet"]
+        subprocess.run(unlock, cwd=folder, check=True, capture_output=True)
     floors, speeds, start = [_floor(folder)], [_speed()], time.perf_counter()
-    with Path(folder, "log").open("w", encoding="utf-8") as log:
-        run = subprocess.Popen(
-            [*command, "--config", "campaign=fleet"], cwd=folder, env=environment, stdout=log, stderr=log
-        )
-        process = 0
+    with (folder / "log").open("a", encoding="utf-8") as log:
+        command += ["--config", "campaign=fleet"]
+        run = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log, start_new_session=True)
+        process, stopped, pause = 0, False, PAUSE_S[0]
         while not process:
-            time.sleep(PAUSE_S)
-            process, failed, spent_by_run = os.wait4(run.pid, os.WNOHANG)
-            floors.append(_floor(folder))
-            speeds.append(_speed())
-    if failed:
-        raise SystemExit(Path(folder, "log").read_text(encoding="utf-8")[-4000:])
-    used, wall = spent_by_run.ru_utime + spent_by_run.ru_stime, time.perf_counter() - start
+            try:
+                end = time.perf_counter() + pause
+                while not process and time.perf_counter() < end:
+                    time.sleep(0.2)
+                    process, failed, used = os.wait4(run.pid, os.WNOHANG)
+                floors.append(_floor(folder))
+                speeds.append(_speed())
+                pause = min(2.0 * pause, PAUSE_S[1])
+            except KeyboardInterrupt:
+                stopped = True
+                run.terminate()  # jobs that run are finished
+    with (folder / "runs").open("a", encoding="utf-8") as stream:
+        cpu, wall = used.ru_utime + used.ru_stime, time.perf_counter() - start
+        print(json.dumps({"cpu": cpu, "wall": wall, "floors": floors, "speeds": speeds}), file=stream)
+    if failed or stopped:
+        raise SystemExit((folder / "log").read_text(encoding="utf-8")[-2000:] + "\nThe same command continues.")
+
+
+def _report(folder: Path, cores: int) -> None:
+    """Print what all runs of the campaign have used."""
+    runs: list[dict[str, Any]] = [json.loads(line) for line in (folder / "runs").read_text().splitlines()]
+    used, wall = sum(run["cpu"] for run in runs), sum(run["wall"] for run in runs)
+    floors, speeds = ([value for run in runs for value in run[key]] for key in ("floors", "speeds"))
+    results = folder / "results/fleet"  # beyond publish_limit, pages are in packs
+    with (results / "summary.csv").open(encoding="utf-8") as stream:
+        states = [row["status"] for row in csv.DictReader(stream)]
+    units, ok = len(states), states.count("ok")
+    files = sum(file.is_file() for file in results.rglob("*"))
+    size = sum(file.lstat().st_size for file in (results / "batches").rglob("*") if file.is_file())
     spent: dict[str, float] = defaultdict(float)
     jobs: dict[str, int] = defaultdict(int)
-    largest = 0.0
-    lines = told.read_text(encoding="utf-8").splitlines()
-    for line in dict(line.split(maxsplit=1) for line in lines).values():  # some tell twice
-        name, used_s, kilobytes = line.split()
+    memory: dict[str, float] = defaultdict(float)
+    told = (folder / "told").read_text(encoding="utf-8").splitlines()
+    for (_, name), (used_s, kilobytes) in {tuple((w := line.split())[:2]): w[2:] for line in told}.items():
         spent[name] += float(used_s)
         jobs[name] += 1
-        largest = max(largest, float(kilobytes) / 1024)
-    results = Path(folder, "results/fleet")  # beyond publish_limit, pages are in packs
-    units = len((results / "summary.csv").read_text(encoding="utf-8").splitlines()) - 1
-    files = sum(file.is_file() for file in results.rglob("*"))
+        memory[name] = max(memory[name], float(kilobytes) / 1024)
     for name, seconds in spent.items():
-        print(f"{name:12s} {jobs[name]:4d} processes {1000 * seconds / units:7.1f} ms a unit")
-    print(f"all stages, {units} units, {files} files: {1000 * used / units:.0f} ms CPU a unit, {used:.0f} s in all")
-    print(f"{wall:.0f} s on {cores} cores; {largest:.0f} MB in the largest process")
-    return used, floors, speeds
+        cost = f"{1000 * seconds / units:7.2f} ms a unit {memory[name]:5.0f} MB"
+        print(f"{name:12s} {jobs[name]:5d} processes {cost}")
+    rest = 1000 * (used - sum(spent.values())) / units
+    print(f"commands that start the jobs, and jobs that were killed: {rest:.2f} ms a unit")
+    print(f"all stages, {units} units, {ok} calibrated, in {len(runs)} runs: {1000 * used / units:.0f} ms CPU a unit")
+    print(f"{used:.0f} s CPU, {wall:.0f} s on {cores} cores; {files} files, {size / 1e9:.2f} GB of packs")
+    largest = max(memory, key=lambda name: memory[name])
+    print(f"largest process: {memory[largest]:.0f} MB ({largest})")
+    print(f"load average {os.getloadavg()[0]:.1f}; five million additions: {_range(speeds)} s")
+    least = statistics.median(floors)
+    milliseconds = _range([1000 * floor for floor in floors])
+    print(f"floor: {1000 * least:.1f} ms a unit, median of {len(floors)} measurements of {milliseconds} ms")
+    print(f"ratio to the floor: {used / units / least:.1f}")
+
+
+def _range(values: list[float]) -> str:
+    return f"{min(values):.2f} to {max(values):.2f}"
 
 
 def _speed() -> float:

@@ -109,8 +109,8 @@ def as_bytes(content: Any) -> bytes:  # noqa: ANN401
     return (content if isinstance(content, str) else json_text(content) + "\n").encode()
 
 
-PACKS, WITH_PRIOR = "packs", "combined"
-STAGES = ("calibration", "validate", "diagnose", "export", "report")
+PACKS, WITH_PRIOR = "packs", "prior"
+STAGES = ("calibration", "validate", "diagnose", "export", "report", "summary")
 FAILED = ".failed.json"
 STAGE_OF = {  # folder of the results: the stage whose packs hold its files
     "calibrations": "calibration", "validations": "validate", "diagnoses": "diagnose", "exports": "export",
@@ -125,10 +125,15 @@ class Batch:
     def __init__(self, folder: Path) -> None:
         self.packs = {stage: Pack(folder / f"{stage}.zip") for stage in STAGES}
 
+    def _of_failed(self, unit: str) -> Pack | None:
+        """Return the pack with the documents of a failed unit: of the report, or of a later stage that has failed."""
+        known = (self.packs["report"], self.packs["summary"], self.combined)
+        return next((pack for pack in known if pack and f"{unit}.calibration.json" in pack), None)
+
     def failure(self, unit: str) -> dict[str, Any] | None:
         """Return the record of the failure of a unit, None where it was calibrated."""
-        report, name = self.packs["report"], f"{unit}{FAILED}"
-        return cast("dict[str, Any]", report.json(name)) if name in report else None
+        pack = self._of_failed(unit)
+        return cast("dict[str, Any]", pack.json(f"{unit}{FAILED}")) if pack else None
 
     @cached_property
     def combined(self) -> Pack | None:
@@ -141,8 +146,8 @@ class Batch:
         folder, _, name = path.partition("/")
         if (combined := self.combined) and f"{unit}/{path}" in combined:
             return combined, f"{unit}/{path}"
-        if folder == "calibrations" and self.failure(unit):
-            return self.packs["report"], f"{unit}.calibration.json"
+        if folder in ("calibrations", "reports") and (failed := self._of_failed(unit)):
+            return failed, f"{unit}.calibration.json" if folder == "calibrations" else f"{unit}.html"
         return self.packs[STAGE_OF.get(folder, "report")], path if folder == "certificates" else name
 
     def document(self, folder: str, unit: str) -> Any:  # noqa: ANN401  (a JSON document)
@@ -153,10 +158,11 @@ class Batch:
     def files(self, unit: str) -> Iterator[tuple[str, bytes]]:
         """Yield the path and the content of each file that is published of a unit."""
         report, export, diagnose = (self.packs[stage] for stage in ("report", "export", "diagnose"))
-        yield f"reports/{unit}.html", report.read(f"{unit}.html")
-        if self.failure(unit):
-            yield f"calibrations/{unit}.json", report.read(f"{unit}.calibration.json")
+        if failed := self._of_failed(unit):
+            yield f"reports/{unit}.html", failed.read(f"{unit}.html")
+            yield f"calibrations/{unit}.json", failed.read(f"{unit}.calibration.json")
             return
+        yield f"reports/{unit}.html", report.read(f"{unit}.html")
         for folder in DOCUMENTS:
             yield f"{folder}/{unit}.json", self.packs[STAGE_OF[folder]].read(f"{unit}.json")
         for part in diagnose.json(f"{unit}.json").values():

@@ -36,8 +36,15 @@ from pipeline.results_folder import jobs_at_work, take_run
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-COST = {"ingest": 2.0, "diagnose": 4.0, "report": 2.0}  # relative to the other stages, by benchmarks/fleet.py
-PER_BATCH = ("collect", "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report")
+COST = {
+    "ingest": 2.0,
+    "diagnose": 4.0,
+    "report": 2.0,
+    "summary": 0.1,
+}  # relative to the other stages, by benchmarks/fleet.py
+PER_BATCH = (
+    "collect", "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report", "summary", "prior",
+)  # fmt: skip
 AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
 LAST_STAGE = "report"  # its units are counted as done
 NAMED_JOBS, NAMED = 2, 10

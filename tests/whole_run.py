@@ -26,32 +26,35 @@ def run_jobs(campaign: Campaign, stages: Collection[str] = tuple(batch.INPUTS)) 
     """Run the jobs of a campaign, all or those of some stages, and return the exit code of the run."""
     batches, configs = campaign.results / "batches", campaign.results / "configs"
     configs.mkdir(parents=True, exist_ok=True)
-    order = list(batch.INPUTS)
-    for name, files in settings_of_jobs(campaign).items():
-        wanted = [output for output in files if output.partition("/")[0] in stages]
-        for output in sorted(wanted, key=lambda output: order.index(output.partition("/")[0])):
-            (configs / files[output].name).write_bytes(files[output].content)
-            stage, sensor, last = [*output.split("/"), "", ""][:3]
-            folder = batches / name
-            inputs = {of: folder / f"{of}.zip" for of in batch.INPUTS[stage] if of not in batch.FITS}
-            for each in set(batch.INPUTS[stage]) & set(batch.FITS):
-                inputs[each] = folder / "fit" / each / f"{campaign.chains[name][each][-1]}.zip"
-            options = []
-            if stage == "fit":
-                chain = campaign.chains[name][sensor]
-                earlier = chain[: chain.index(last)]
-                previous = folder / "fit" / sensor / f"{earlier[-1]}.zip" if earlier else ""
-                options = ["--sensor", sensor, "--stage", last, f"--previous={previous}"]
-                options += ["--last", "yes" if last == chain[-1] else "no"]
-            target = batches / "gathered.json" if stage == "gather" else folder / f"{output}.zip"
-            given = [word for of, path in inputs.items() for word in (f"--{of}", str(path))]
-            try:
-                settings = ["--config", str(configs / files[output].name)]
-                assert batch.main(stage, [*settings, *given, *options, "--output", str(target)]) == 0
-            finally:
-                forget()  # a job is a process of its own
-                while HELD:
-                    HELD.pop().close()
+    order, settings = list(batch.INPUTS), settings_of_jobs(campaign)
+    jobs = [(output.partition("/")[0], name, output) for name, files in settings.items() for output in files]
+    for stage, name, output in sorted(jobs, key=lambda job: order.index(job[0])):
+        if stage not in stages:
+            continue
+        file, folder = settings[name][output], batches / name
+        (configs / file.name).write_bytes(file.content)
+        inputs = {of: folder / f"{of}.zip" for of in batch.INPUTS[stage] if of not in batch.FITS}
+        inputs |= {"lots": batches / "lots.zip"} if "lots" in inputs else {}
+        for each in set(batch.INPUTS[stage]) & set(batch.FITS):
+            inputs[each] = folder / "fit" / each / f"{campaign.chains[name][each][-1]}.zip"
+        options = []
+        if stage == "fit":
+            _, sensor, last = output.split("/")
+            chain = campaign.chains[name][sensor]
+            earlier = chain[: chain.index(last)]
+            previous = folder / "fit" / sensor / f"{earlier[-1]}.zip" if earlier else ""
+            options = ["--sensor", sensor, "--stage", last, f"--previous={previous}"]
+            options += ["--last", "yes" if last == chain[-1] else "no"]
+        of_all = {"gather": batches / "gathered.json", "lots": batches / "lots.zip"}
+        target = of_all.get(stage, folder / f"{output}.zip")
+        given = [word for of, path in inputs.items() for word in (f"--{of}", str(path))]
+        try:
+            config = ["--config", str(configs / file.name)]
+            assert batch.main(stage, [*config, *given, *options, "--output", str(target)]) == 0
+        finally:
+            forget()  # a job is a process of its own
+            while HELD:
+                HELD.pop().close()
     if "gather" not in stages:
         return 0
     mark, failures = campaign.results / "complete.json", batches / "gathered.json"

@@ -88,6 +88,8 @@ READS: dict[str, tuple[str, ...]] = {
         "sensor", "table", "procedure", "method", "filter", "ingest", "effects", "limits", "certificate",
         "config_sha256",
     ),
+    "summary": tuple(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("bias", "scale_factor", "cross_axis")),
+    "prior": SENSORS_AND_TABLE,
 }  # fmt: skip
 WITH_DIGEST = [stage for stage, keys in READS.items() if "config_sha256" in keys]
 
@@ -136,20 +138,44 @@ def settings_of_jobs(
 ) -> dict[str, dict[str, SettingsFile]]:
     """Return the settings of every job, by batch and by what it writes: ``fit/gyroscope/bias``.
 
-    Those of ``gather`` are of the batch ``CAMPAIGN``. ``again`` is how often an output, by its path below the results,
-    is repeated because it was edited (``pipeline.results_folder``).
+    Those of ``gather`` and ``lots`` are of the batch ``CAMPAIGN``. ``again`` is how often an output, by its path below
+    the results, is repeated because it was edited (``pipeline.results_folder``).
     """
+    configs, sections = _sections(campaign)
+    compared = sorted({unit for c in campaign.compare for g in c["groups"] for unit in g["units"]})
+    summaries = {
+        name: {
+            "row": unit.row, "overrides": unit.overrides, "config": configs[name], "compared": name in compared,
+            "lot_prior": campaign.combine == "lot",
+        }
+        for name, unit in campaign.units.items()
+    }  # fmt: skip
     found: dict[str, dict[str, SettingsFile]] = {}
     for batch, units in campaign.batches.items():
         rows = [campaign.units[unit] for unit in units]
         fits = [(s, stage) for s in BOTH for stage in campaign.chains[batch][s]]
         outputs = {f"fit/{s}/{stage}": (stage if stage == "effects" else "fit", s) for s, stage in fits}
-        outputs |= {stage: (stage, "") for stage in READS if stage not in ("fit", "effects")}
+        outputs |= {stage: (stage, "") for stage in READS if stage not in ("fit", "effects", "prior")}
+        outputs |= {"prior": ("prior", "")} if campaign.combine == "lot" else {}
         found[batch] = {
-            output: _file(output, _content(campaign, rows, *of), again(f"batches/{batch}/{output}.zip"))
+            output: _file(output, _content(campaign, rows, *of, summaries), again(f"batches/{batch}/{output}.zip"))
             for output, of in outputs.items()
         }
-    found[CAMPAIGN] = {"gather": _file("gather", _of_gather(campaign), again(""))}
+    of_gather = {
+        "campaign": campaign.name,
+        "batches": campaign.batches,
+        "order": list(campaign.units),
+        "run": campaign.run_settings(),
+        "sections": sections,
+        "compare": campaign.compare,
+        "page": campaign.page,
+        "combine": campaign.combine,
+        "publish_limit": campaign.publish_limit,
+        "truths": {unit: str(campaign.truth(unit)) for unit in compared},
+    }
+    found[CAMPAIGN] = {"gather": _file("gather", of_gather, again(""))}
+    if campaign.combine == "lot":
+        found[CAMPAIGN]["lots"] = _file("lots", {"batches": campaign.batches}, again("batches/lots.zip"))
     return found
 
 
@@ -158,7 +184,9 @@ def _file(output: str, content: dict[str, Any], again: int) -> SettingsFile:
     return SettingsFile(f"{output.replace('/', '-')}-{hashlib.sha256(text).hexdigest()[:16]}.json", text)
 
 
-def _content(campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: str) -> dict[str, Any]:
+def _content(
+    campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: str, summaries: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return the settings of some units that a stage, of a fit of a sensor, reads."""
     digests = [{"config_sha256": r.config_sha256} if stage in WITH_DIGEST else {} for r in rows]
     settings = {r.name: select_settings(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
@@ -166,6 +194,8 @@ def _content(campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: st
         for row in rows:
             own = {c: row.row[c] for c in ("serial", "lot", "date") if row.row.get(c)}
             settings[row.name] |= {"row": own, "run": campaign.run_settings(row.name)}
+    if stage == "summary":
+        settings = {row.name: settings[row.name] | summaries[row.name] for row in rows}
     if stage == "calibration" and campaign.boards:
         for row in rows:
             board = row.row.get("board", "")
@@ -215,34 +245,6 @@ def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], d
     return shared, own
 
 
-def _of_gather(campaign: Campaign) -> dict[str, Any]:
-    exported = campaign.combine == "lot"  # gather writes the exports with the prior
-    configs, sections = _sections(campaign)
-    settings = {
-        name: {"config": configs[name]}
-        | (select_settings(unit.config, "export") if exported else {"sensor": _limits(unit.config["sensor"])})
-        for name, unit in campaign.units.items()
-    }
-    common, own = in_common(settings)
-    compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
-    return {
-        "campaign": campaign.name,
-        "batches": campaign.batches,
-        "rows": [unit.row for unit in campaign.units.values()],
-        "overrides": {name: unit.overrides for name, unit in campaign.units.items() if unit.overrides},
-        "run": campaign.run_settings(),
-        "sections": sections,
-        "compare": campaign.compare,
-        "page": campaign.page,
-        "combine": campaign.combine,
-        "publish_limit": campaign.publish_limit,
-        "truths": {u: str(campaign.truth(u)) for u in sorted(compared)},
-        "common": common,
-        "units": own,
-        **(effects_for("export", "", [unit.config for unit in campaign.units.values()]) if exported else {}),
-    }
-
-
 def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, Any]]:
     """Return the digest of each section of each unit's configuration, and the section behind each digest."""
     known: dict[int, str] = {}  # units share the sections that no override of theirs changes
@@ -259,12 +261,6 @@ def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, 
                 values.setdefault(known[id(content)], own)
             found[name][section] = known[id(content)]
     return found, values
-
-
-def _limits(sensor: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the limits of bias and matrix in a data sheet."""
-    limited = ("bias", "scale_factor", "cross_axis")
-    return {name: {key: sensor[name].get(key) for key in limited} for name in BOTH if sensor.get(name)}
 
 
 def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)

@@ -119,7 +119,7 @@ def effects_for(stage: str, sensor: str, configs: Iterable[Mapping[str, Any]]) -
     """
     units = list(configs)
     section = next((c["user_effects"] for c in units if "user_effects" in c), None)
-    if section is None or stage not in ("effects", "validate", "diagnose", "export", "report"):
+    if section is None or stage not in ("effects", "validate", "diagnose", "export", "report", "prior"):
         return {}
     if stage not in ("diagnose", "report"):
         wanted: set[str] = set()

@@ -7,7 +7,6 @@ error of a scale factor, or what one axis reads of another.
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -17,20 +16,19 @@ import pandas as pd
 from pipeline.outcome import VERDICTS, findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart
-from pipeline.report.fleet import COLUMNS
+from pipeline.report.fleet import Table
 from pipeline.report.held_out_section import FAR
-from pipeline.report.numbers import number, percent, plain, unit_text
+from pipeline.report.numbers import number, percent, plain
 from pipeline.report.pages import script_data, template
-from pipeline.report.parameters import parameter_rows
+from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from numpy.typing import NDArray
 
 
 JSON = dict[str, Any]
-Placed = dict[str, tuple[float, float, str]]  # row of the plot: value, limit, unit
 Told = tuple[Figure, dict[str, list[str]]]  # a chart of units, and the text of each dot by its colour
 FIRST = 100  # rows that a browser shows at once; it shows the others when asked
 NAMED = 3  # units that the finding of a chart names
@@ -50,7 +48,7 @@ def render(
     *,
     twins: Sequence[Sequence[str]] = (),
     statistics: JSON | None = None,
-    placed: Mapping[str, Mapping[str, Placed]] | None = None,
+    placed: Table | None = None,
     history: JSON | None = None,
     settings: JSON | None = None,
     published: Collection[str] | None = None,
@@ -60,7 +58,7 @@ def render(
     ``rows``: one a unit, as of ``summary_row``, in the order of ``units.csv``; ``failures``: ``unit, stage, code,
     message, file`` of each failed unit; ``comparisons``: as of ``comparison_section.section``; ``page``: name of a
     further page; ``twins``: files of several units with the same content under different names; ``statistics``: as of
-    ``fleet_statistics``; ``placed``: unit to its parameters, as of ``against_limits``; ``history``: as of
+    ``fleet_statistics``; ``placed``: of ``against_limits`` of all units; ``history``: as of
     ``runs_data``; ``settings``: of the run, for the commands to continue with; ``published``: units that have a page
     of their own where pages are published on request only, None: all.
     """
@@ -69,7 +67,7 @@ def render(
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     fleet = [told for sensor in SENSORS for told in _fleet_figure(sensor, frame)]
-    plots = strips(rows, placed or {})
+    plots = strips(rows, placed or Table.of({row["unit"]: {} for row in rows}, 2))
     text: str = template("campaign.html").render(
         campaign=campaign,
         published=published,
@@ -225,48 +223,41 @@ ROW, LEFT = 17, 130  # px
 SPREAD, HALF = 0.6, 0.42  # of a row: over which the units stand in their order, and half of its bar's height
 
 
-def against_limits(calibration: JSON, sheet: JSON) -> dict[str, Placed]:
-    """Return for each sensor the parameters that its data sheet limits; ``sheet`` is the section ``sensor``."""
-    found = {}
-    for sensor in SENSORS:
-        rows = parameter_rows(calibration[sensor], sheet.get(sensor) or {}) if calibration.get(sensor) else []
-        limited = ((r["name"], r["p"], r["limit"]) for r in rows if r["limit"])
-        found[sensor] = {
-            sys.intern(name): (p.value, limit, sys.intern(unit_text(p.unit))) for name, p, limit in limited
-        }
-    return found
-
-
-def strips(rows: Sequence[JSON], placed: Mapping[str, Mapping[str, Placed]]) -> list[Told]:
+def strips(rows: Sequence[JSON], placed: Table) -> list[Told]:
     """Return the strip plots of a campaign, each with the text of its dots.
 
-    ``rows``: one a unit, as of ``summary_row``, in the order of the page; ``placed``: unit to its parameters, as of
-    ``against_limits``.
+    ``rows``: one a unit, as of ``summary_row``, in the order of the page; ``placed``: of ``against_limits``, value and
+    limit of the parameters of each unit.
     """
     siblings: dict[tuple[str, str], list[int]] = {}
     for i, row in enumerate(rows):
-        if row["status"] == "ok" and row["unit"] in placed:
+        if row["status"] == "ok":
             siblings.setdefault((row.get("sensor") or "", row.get("method") or ""), []).append(i)
     out: list[Told] = []
+    units = [row["unit"] for row in rows]
     for (model, method), members in siblings.items():
+        values, limits = placed.some([units[i] for i in members])
         for sensor in SENSORS:
-            known = [(i, placed[rows[i]["unit"]][sensor]) for i in members if placed[rows[i]["unit"]].get(sensor)]
-            if len(known) >= FEWEST_SIBLINGS:
+            own = [name for name in values if name.startswith(sensor)]
+            known = values[own].notna().any(axis="columns").to_numpy(bool)
+            if known.sum() >= FEWEST_SIBLINGS:
                 title = f"{sensor.capitalize()}, {model}, {plain(method)}"
-                out.append(_strip(f"strip-{len(out) + 1}", title, [r["unit"] for r in rows], known))
+                shown = Table([values.loc[known, own], limits.loc[known, own]], placed.units)
+                out.append(_strip(f"strip-{len(out) + 1}", title, units, np.array(members)[known], shown))
     return out
 
 
-def _strip(name: str, title: str, units: list[str], known: list[tuple[int, Placed]]) -> Told:
+def _strip(name: str, title: str, units: list[str], numbers: NDArray[np.intp], placed: Table) -> Told:
     """Return the plot of some siblings and the text of each dot."""
-    labels = list(dict.fromkeys(label for _, of in known for label in of))
-    share = np.array([[of[k][0] / of[k][1] if k in of else np.nan for k in labels] for _, of in known])
-    numbers = np.array([i for i, _ in known])
+    value, limit = (frame.to_numpy(float) for frame in placed.frames)
+    labels = [column.partition(" ")[2] for column in placed.frames[0]]
+    measures = [placed.units[column] for column in placed.frames[0]]
+    share = value / limit
     at = len(labels) - np.arange(len(labels), dtype=float)  # the first row on top
-    down = SPREAD * (0.5 - (np.arange(len(known)) + 0.5) / len(known))
+    down = SPREAD * (0.5 - (np.arange(len(numbers)) + 0.5) / len(numbers))
     drawn = np.isfinite(share)
     layers = [_bar(np.array([-1.0, 1.0]), 0.4, at[0] + 0.6, 4)]
-    if many := len(known) > MOST:
+    if many := len(numbers) > MOST:
         rank = np.argsort(np.argsort(share, axis=0), axis=0)
         drawn &= (rank < ENDS) | (rank >= drawn.sum(axis=0) - ENDS)
         ends = np.nanquantile(share, [0.05, 0.95], axis=0).T
@@ -279,11 +270,13 @@ def _strip(name: str, title: str, units: list[str], known: list[tuple[int, Place
             x = 100.0 * np.clip(share[i, j], -EDGE, EDGE)
             dots.append(Dots(x, at[j] + down[i], colour, units=tuple((numbers[i] + 1).tolist())))
             legend.append((f"c{colour}", words))
-            values[f"c{colour}"] = [_told(labels[b], known[a][1]) for a, b in zip(i, j, strict=True)]
+            values[f"c{colour}"] = [
+                _told(labels[b], value[a, b], limit[a, b], measures[b]) for a, b in zip(i, j, strict=True)
+            ]
     worst, column = np.unravel_index(np.nanargmax(np.abs(share)), share.shape)
     farthest = f"{units[numbers[worst]]}, {labels[column].lower()} ({percent(float(abs(share[worst, column])))})"
     count = int(beyond.any(axis=1).sum())
-    said = f"{count} of {len(known)} units are beyond" if count else f"all {len(known)} units are within"
+    said = f"{count} of {len(numbers)} units are beyond" if count else f"all {len(numbers)} units are within"
     caption = "Each unit a dot, as a share of its data sheet's limit; shaded: within the limit."
     if many:
         caption += f" Grey bars: 5 to 95 % of the units; dots: the {ENDS} smallest and largest."
@@ -301,7 +294,6 @@ def _bar(ends: NDArray[np.float64], low: float, high: float, colour: int) -> Lay
     return Area(low, high, colour, 100.0 * np.clip(ends, -EDGE, EDGE))
 
 
-def _told(label: str, of: Placed) -> str:
+def _told(label: str, value: float, limit: float, unit: str) -> str:
     """Return the text of a dot: value, and its share of the limit."""
-    value, limit, unit = of[label]
     return f"{label}: {number(value, 4)} {unit}".rstrip() + f", {percent(value / limit)} of ±{number(limit)}"

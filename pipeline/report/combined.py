@@ -32,7 +32,7 @@ from pipeline.io.files import wrong_name
 from pipeline.records import NORMAL, SENSORS, Contribution, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -45,20 +45,20 @@ SAME = ("sensor", "method", "table")  # what the calibrations of one estimate ha
 
 
 def combined_calibrations(
-    rows: Sequence[Mapping[str, Any]], calibrations: Mapping[str, JSON]
+    rows: Sequence[Mapping[str, Any]], read: Callable[[str], JSON]
 ) -> tuple[dict[str, JSON], list[JSON]]:
     """Return a calibration for each serial with several calibrations, and what was combined or why it was not.
 
-    ``rows``: ``unit`` and ``serial`` of each unit. ``calibrations``: unit to ``calibrations/<unit>.json``.
+    ``rows``: ``unit``, ``serial`` and ``status`` of each unit. ``read`` returns ``calibrations/<unit>.json`` of a unit.
     """
     devices: dict[str, list[str]] = {}
     for row in rows:
-        if row.get("serial") and calibrations[row["unit"]]["status"] == "ok":
+        if row.get("serial") and row["status"] == "ok":
             devices.setdefault(str(row["serial"]), []).append(row["unit"])
     found, told = {}, []
     for serial, units in devices.items():
         if len(units) > 1:
-            documents = [calibrations[unit] for unit in units]
+            documents = [read(unit) for unit in units]
             reason = f"the serial {wrong}" if (wrong := wrong_name(serial)) else _refused(documents)
             told.append({"serial": serial, "units": units, "refused": reason})
             if not reason:

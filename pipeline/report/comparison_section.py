@@ -43,18 +43,16 @@ FIGURES = (
 )  # fmt: skip
 
 
-def unit_figures(
-    calibration: JSON, validation: JSON | None, diagnosis: JSON | None, truth: JSON | None = None
-) -> list[JSON]:
+def unit_figures(calibration: JSON, validation: JSON, diagnosis: JSON | None) -> list[JSON]:
     """Return what is compared of a unit, a dict for each calibrated sensor; None becomes missing.
 
-    ``unit, sensor``; rms errors ``before``, ``after`` and ``truth`` (against ``truth/<unit>.json`` of simulated
-    recordings) with the standard uncertainty ``u_<name>`` (g or deg/s); ``noise_floor``; ``table_time``, the length of
-    the recordings of the fit (s); ``verdict``; ``parameters``: name to Parameter.
+    ``unit, sensor``; rms errors ``before`` and ``after`` with the standard uncertainty ``u_<name>`` (g or deg/s);
+    ``truth`` is that of ``against_truth``; ``noise_floor``; ``reference_rms``; ``table_time``, the length of the
+    recordings of the fit (s); ``verdict``; ``parameters``: name to Parameter.
     """
     rows = []
     for sensor in SENSORS:
-        part, held_out = calibration.get(sensor), (validation or {}).get(sensor)
+        part, held_out = calibration.get(sensor), validation.get(sensor)
         if part and held_out:
             before, after = (step.get("rms_error") for step in first_and_last_step(held_out))
             inputs = [i for i in calibration.get("inputs") or [] if i.get("role") in (sensor, "rests")]
@@ -65,9 +63,10 @@ def unit_figures(
                 "u_before": _noise_of_error(before, held_out),
                 "after": after,
                 "u_after": _noise_of_error(after, held_out),
-                "truth": _against_truth(part, held_out, (truth or {}).get(sensor)),
+                "truth": None,
                 "u_truth": None,
                 "noise_floor": held_out.get("noise_floor"),
+                "reference_rms": held_out.get("reference_rms"),
                 "table_time": sum(i.get("duration_s") or 0.0 for i in inputs) or None,
                 "verdict": ((diagnosis or {}).get(sensor) or {}).get("verdict") or "",
                 "parameters": {p.words: p for p in fitted_parameters(part)},
@@ -84,14 +83,15 @@ def _noise_of_error(error: float | None, held_out: JSON) -> float | None:
     return math.sqrt(noise * (2.0 * error**2 - noise) / (2.0 * samples)) / error
 
 
-def _against_truth(part: JSON, held_out: JSON, truth: JSON | None) -> float | None:
-    size = held_out.get("reference_rms")
-    if truth is None or size is None:
+def against_truth(figures: JSON, truth: JSON) -> float | None:
+    """Return the rms error against the truth of simulated recordings, ``truth/<unit>.json`` of the sensor."""
+    if figures["reference_rms"] is None:
         return None
-    matrix = np.array(part["matrix"], float)
+    values = np.array([p.value for p in figures["parameters"].values()][:12])
+    matrix = values[3:].reshape(3, 3)
     left = matrix @ np.linalg.inv(np.array(truth["matrix"], float)) - np.eye(3)
-    bias = matrix @ (np.array(truth["bias"], float) - np.array(part["bias"], float))
-    return float(np.sqrt(size**2 * np.sum(left**2) / 3.0 + np.sum(bias**2)))
+    bias = matrix @ (np.array(truth["bias"], float) - values[:3])
+    return float(np.sqrt(figures["reference_rms"] ** 2 * np.sum(left**2) / 3.0 + np.sum(bias**2)))
 
 
 def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:

@@ -1,8 +1,5 @@
 """The tables of a campaign: its summary, a row a unit, and statistics over its units.
 
-Columns of the summary: those of every campaign in the order of ``COLUMNS``, then the user's own columns of
-``units.csv``. A column of the user's whose name is taken gets ``sheet_`` before it.
-
 Units of one sensor model that were calibrated by one method are compared with each other. For each parameter
 
     z = (value - median) / (1.4826 median(|value - median|))
@@ -29,9 +26,7 @@ from __future__ import annotations
 
 import io
 import math
-import sys
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -40,8 +35,7 @@ import pyarrow.parquet as pq
 
 from pipeline.files import write_atomically
 from pipeline.records import MEDIAN_SIZE, SENSORS
-from pipeline.report.held_out_section import first_and_last_step, passes
-from pipeline.report.parameters import Parameter, fitted_parameters
+from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -51,44 +45,55 @@ JSON = dict[str, Any]
 FEWEST = 20  # units, below which a median absolute deviation says little: its own spread is 17 % of it there
 FAR = 6.0  # robust standard deviations: of 10,000 units with 24 parameters, noise alone puts none there
 LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
-MOST_PAIRED = 2000  # units that the slope is taken from: it needs all pairs of them
+MOST_PAIRED = 1000  # units that the slope is taken from: it needs all pairs of them, 50 MB
 DAYS_OF_A_YEAR = 365.25
 SIBLINGS = ["sensor", "method"]
 
 
-def unit_parameters(calibration: JSON) -> dict[str, Parameter]:
-    """Return every fitted parameter of a unit: ``<sensor>_bias_x``, ``<sensor>_<effect>_<symbol>``.
+class Table(NamedTuple):
+    """Figures of parameters: frames of a row a unit and a column a parameter, and the unit of measurement of each."""
 
-    Units of a fleet share the texts.
-    """
-    return {
-        sys.intern(f"{sensor}_{p.name.replace('.', '_')}"): p._replace(name=sys.intern(p.name), unit=sys.intern(p.unit))
-        for sensor in SENSORS
-        if calibration.get(sensor)
-        for p in fitted_parameters(calibration[sensor])
-    }
+    frames: list[pd.DataFrame]
+    units: dict[str, str]
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, Mapping[str, Sequence[Any]]], figures: int) -> Table:
+        """Return the parameters of some units: by name their figures, and their unit of measurement."""
+        units = {name: p[-1] for own in parameters.values() for name, p in own.items()}
+        absent = (None,) * figures
+        table = [[own.get(name, absent) for name in units] for own in parameters.values()]
+        values = ([[p[i] for p in row] for row in table] for i in range(figures))
+        return cls([pd.DataFrame(v, list(parameters), list(units), float) for v in values], units)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Table]) -> Table:
+        """Return the parameters of all parts."""
+        units = {name: unit for part in parts for name, unit in part.units.items()}
+        return cls([pd.concat(frames) for frames in zip(*(part.frames for part in parts), strict=True)], units)
+
+    def some(self, units: Sequence[str]) -> list[pd.DataFrame]:
+        """Return the figures of some units: parameters by sensor, in the order in which the units first have them."""
+        first = self.frames[0].loc[units].dropna(axis="columns", how="all")
+        known, names = first.notna().to_numpy(), first.columns
+        order = np.lexsort((known.argmax(axis=0), [name.startswith("gyroscope") for name in names]))
+        return [frame.loc[units, names[order]] for frame in self.frames]
 
 
-def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Parameter]]) -> JSON:
+def fleet_statistics(rows: Sequence[JSON], fitted: Table) -> JSON:
     """Return the statistics of a fleet, ``fleet.json``: a list of dicts for each statistic, and ``missing``.
 
-    ``rows``: one a unit, as of ``summary_row``; ``fitted``: unit to its parameters, none of those that failed.
+    ``rows``: one a unit, as of ``summary_row``; ``fitted``: of ``unit_parameters``, none of units that failed.
     """
     sheet = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).set_index("unit").replace("", None)
     out: JSON = {key: [] for key in (*STATISTICS, "repeatability")}
-    fitted_units = [unit for unit in sheet.index if fitted.get(unit)]
-    for (model, method), siblings in sheet.loc[fitted_units].groupby(SIBLINGS, sort=False):
-        own = [fitted[unit] for unit in siblings.index]
-        units = {name: p.unit for parameters in own for name, p in parameters.items()}
-        values, *stated = (
-            pd.DataFrame([{n: read(p) for n, p in each.items()} for each in own], siblings.index, list(units), float)
-            for read in (attrgetter("value"), attrgetter("standard_uncertainty"), attrgetter("expanded_uncertainty"))
-        )
+    known = fitted.frames[0].loc[sheet.index].notna().any(axis="columns").to_numpy(bool)
+    for (model, method), siblings in sheet[known].groupby(SIBLINGS, sort=False):
+        values, *stated = fitted.some(list(siblings.index))
         statistics = {key: statistic(values, siblings) for key, statistic in STATISTICS.items()}
         statistics["repeatability"] = _repeatability(values, siblings, *stated)
         for key, results in statistics.items():
             for name, found in results:
-                about = {"sensor": model, "method": method, "parameter": name, "unit": units[name]}
+                about = {"sensor": model, "method": method, "parameter": name, "unit": fitted.units[name]}
                 out[key].append(about | found)
     out["far"].sort(key=lambda f: -abs(f["z"]))
     out["missing"] = _missing_effects(rows)
@@ -221,7 +226,7 @@ def _missing_effects(rows: Sequence[JSON]) -> list[str]:
     return sentences
 
 
-def write_parameters(path: Path, rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Parameter]]) -> None:
+def write_parameters(path: Path, rows: Sequence[JSON], fitted: Table) -> None:
     """Write ``parameters.parquet``: a row a unit with everything of ``summary.csv`` and every fitted parameter.
 
     Columns of a parameter: ``<name>`` and ``<name>_expanded_uncertainty``, with the unit in the column's metadata.
@@ -231,66 +236,18 @@ def write_parameters(path: Path, rows: Sequence[JSON], fitted: Mapping[str, Mapp
         values = pa.array([row.get(column) for row in rows])
         arrays.append(values if values.type != pa.null() else values.cast(pa.string()))
         fields.append(pa.field(column, arrays[-1].type))
-    units = {name: p.unit for each in fitted.values() for name, p in each.items()}
-    for name, unit in units.items():
-        found = [fitted.get(row["unit"], {}).get(name) for row in rows]
-        for suffix, of in (("", "value"), ("_expanded_uncertainty", "expanded_uncertainty")):
-            arrays.append(pa.array([getattr(p, of) if p else None for p in found], pa.float64()))
-            fields.append(pa.field(name + suffix, pa.float64(), metadata={"unit": unit}))
+    value, _, expanded = fitted.some([row["unit"] for row in rows])
+    for name in value:
+        for suffix, frame in (("", value), ("_expanded_uncertainty", expanded)):
+            arrays.append(pa.array(frame[name], pa.float64(), from_pandas=True))
+            fields.append(pa.field(name + suffix, pa.float64(), metadata={"unit": fitted.units[name]}))
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), buffer, compression="zstd")
     write_atomically(path, buffer.getvalue())
 
 
-UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
-SENSOR_COLUMNS = (
-    "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
-    "answers",
-)  # fmt: skip
-IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
-COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE)
-SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
-
-
-def summary_row(
-    unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, sheet_row: dict[str, str]
-) -> JSON:
-    """Return a unit's row: a dict from column to value, None where there is none.
-
-    ``calibration, validation, diagnosis``: as in their files; ``sheet_row``: the unit's row of ``units.csv``.
-    """
-    error = calibration.get("error") or {}
-    file = f"{error['file']}: " if error.get("file") else ""
-    row: JSON = dict.fromkeys(COLUMNS) | {
-        "unit": unit,
-        **{key: sheet_row.get(key) or None for key in ("serial", "lot", "date")},
-        "status": calibration.get("status"),
-        "error": f"{file}{error['message']}" if error.get("message") else None,
-        "sensor": calibration.get("sensor"),
-        "method": calibration.get("method"),
-        "pass": passes(calibration, validation),
-    }
-    for sensor in SENSORS:
-        held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
-        raw, final = first_and_last_step(held_out)
-        selected = found.get("selected") if found.get("verdict") == "missing_effect" else None
-        errors = [step.get(error) for error in ("rms_error", "mean_abs_error") for step in (raw, final)]
-        texts = [found.get("verdict"), ";".join(selected or []) or None, found.get("reason") or None]
-        texts.append(len(found.get("answer_set") or []) or None)
-        values = [*errors, held_out.get("noise_floor"), *texts]
-        row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
-        implausible = (calibration.get(sensor) or {}).get("implausible") or []
-        row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
-    for key, value in sheet_row.items():
-        if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
-            row[f"sheet_{key}" if key in COLUMNS else key] = value
-    return row
-
-
 def write_summary(path: Path, rows: list[JSON]) -> None:
     """Write ``summary.csv`` from rows of ``summary_row``; own columns may differ from unit to unit."""
-    import pandas as pd  # noqa: PLC0415  (0.4 s, and summary_row is used without it)
-
     columns = list(dict.fromkeys([*COLUMNS, *(key for row in rows for key in row)]))
     frame = pd.DataFrame([{key: _cell(value) for key, value in row.items()} for row in rows], columns=columns)
     write_atomically(path, frame.to_csv(index=False, lineterminator="\n"))

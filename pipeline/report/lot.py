@@ -8,6 +8,7 @@ the recording, the mounting and the table have no prior. The estimate is that of
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -37,6 +38,7 @@ LINE = "prior of the lot"
 LACK_OF_FIT = "lack of fit"  # a table's errors are part of it: no estimate shows whether siblings share it
 SHARED = f"{BENCH}, and {LACK_OF_FIT}"
 NONE = np.empty(0)
+MOST_FREEDOM = 1e12  # in place of infinitely many degrees of freedom, for which JSON has no number
 DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: the uncertainty does not hold the error
 
 
@@ -57,6 +59,17 @@ class Estimate(NamedTuple):
     names: list[str]
     known: Mask  # the sensor's own parameters, of a stated uncertainty
 
+    def to_json(self) -> JSON:
+        """Return the estimate for a file."""
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in self._asdict().items()}
+
+    @classmethod
+    def from_json(cls, data: JSON) -> Estimate:
+        """Return the estimate that ``to_json`` gave; units of a fleet share its texts."""
+        texts = {k: sys.intern(data[k]) for k in ("sensor", "lot", "comparable")}
+        arrays = {k: np.array(data[k]) for k in ("values", "own", "freedom", "shared", "kind", "known")}
+        return cls(**{**data, **texts, **arrays, "names": list(map(sys.intern, data["names"]))})
+
 
 class Prior(NamedTuple):
     """The prior of a sensor of a unit, or why it has none."""
@@ -70,6 +83,17 @@ class Prior(NamedTuple):
     predicted: Prediction = Prediction(NONE, NONE, NONE)
     known: Mask = NONE.astype(bool)
     shared: Values = NONE  # mean standard uncertainty of the siblings by what they may share
+
+    def to_json(self) -> JSON:
+        """Return the prior for a file."""
+        arrays = {k: getattr(self, k).tolist() for k in ("known", "shared")}
+        return self._asdict() | arrays | {"predicted": [v.tolist() for v in self.predicted]}
+
+    @classmethod
+    def from_json(cls, data: JSON) -> Prior:
+        """Return the prior that ``to_json`` gave."""
+        known, predicted = np.array(data["known"], bool), Prediction(*map(np.array, data["predicted"]))
+        return cls(**{**data, "known": known, "predicted": predicted, "shared": np.array(data["shared"])})
 
 
 def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> list[Estimate]:
@@ -98,7 +122,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
                 refused=refused,
                 values=x,
                 own=own,
-                freedom=freedom,
+                freedom=np.minimum(freedom, MOST_FREEDOM),
                 shared=np.sqrt(np.diag(shared)),
                 kind=kinds_of(fit),
                 names=fit.parameter_names(),
@@ -225,5 +249,5 @@ def with_card(page: str, calibration: JSON, document: JSON | None, priors: Mappi
         both = [{p.name: p for p in fitted_parameters(of[sensor])} for of in (calibration, found)]
         shown = (added.get(key, []) for key in ("parameters", "mean", "standard_deviation", "share"))
         rows[sensor] = [(*(of[name] for of in both), *rest) for name, *rest in zip(*shown, strict=True)]
-    section = template("lot.html").render(unit=calibration["unit"], document=document, priors=priors, rows=rows)
+    section = template("lot.html").render(calibration=calibration, document=document, priors=priors, rows=rows)
     return page.replace(MARK, section + MARK, 1)

@@ -12,6 +12,9 @@ MODULES = {
     "calibration": "calibration",
     "export": "export",
     "report": "report",
+    "summary": "summary",
+    "lots": "prior",
+    "prior": "prior",
     "gather": "gather",
     "verdict": "batch",
 }

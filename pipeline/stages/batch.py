@@ -36,6 +36,9 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "calibration": ("ingest", *FITS, "validate"),
     "export": ("calibration", "validate", "diagnose"),
     "report": ("ingest", "filter", "calibration", "validate", "diagnose", "export"),
+    "summary": ("calibration", "validate", "diagnose", "report"),
+    "lots": (),
+    "prior": ("ingest", "filter", "calibration", "validate", "diagnose", "report", "lots"),
     "gather": (),
 }
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last")}
@@ -136,6 +139,9 @@ def record_output(job: Job, output: Path, names: Sequence[str] = ("",)) -> None:
 def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
     """Return the record of a unit's failure; an exception that is no user error is a bug, its traceback is printed."""
     code, message, file = "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)", None
+    if isinstance(error, DamagedFileError):
+        with suppress(OSError), Path(str(error.file)).open("ab") as stream:
+            stream.write(b"\0")  # another size: the next run sees that the file is not as it was written
     if isinstance(error, PipelineError):
         code, message, file = error.code, error.message, error.file
     elif isinstance(error, OSError) and error.filename is not None:
@@ -156,9 +162,6 @@ def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any])
     except Exception as error:
         if isinstance(error, OSError) and error.filename is None:
             raise  # a full disk concerns the run, not the unit
-        if isinstance(error, DamagedFileError):
-            with suppress(OSError), Path(str(error.file)).open("ab") as stream:
-                stream.write(b"\0")  # another size: the next run sees that the file is not as it was written
         stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
         failure = failure_of(error, unit, stage)
         print(f"{stage}: {unit} FAILED: {failure['message']}", file=sys.stderr, flush=True)

@@ -1,55 +1,38 @@
 """Stage gather: every unit's files under their stable paths, the summary and the page of the campaign.
 
-The whole set is made in a folder of its own and replaces the published one when it is complete, so that the published
-files are always those of one run.
+It joins the files that the stage ``summary`` has written, one a batch, and reads no other document of a unit. The whole
+set is made in a folder of its own and replaces the published one when it is complete, so that the published files are
+always those of one run.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-from contextlib import suppress
-from dataclasses import dataclass, field
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import DamagedFileError, PipelineError
-from pipeline.exports import exports
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
-from pipeline.history import of_units, record, unit_state
-from pipeline.pack import DOCUMENTS, PACKS, STAGES, WITH_PRIOR, Batch, Files, as_bytes, new_pack
-from pipeline.records import SENSORS
-from pipeline.report.campaign_page import Placed, against_limits, render
-from pipeline.report.combined import combined_calibrations
-from pipeline.report.comparison_section import section, unit_figures
-from pipeline.report.fleet import fleet_statistics, summary_row, unit_parameters, write_parameters, write_summary
-from pipeline.report.lot import Prior, calibration_with_prior, estimates, priors_of, with_card
-from pipeline.report.pages import failure_page
+from pipeline.history import of_units, record
+from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes
+from pipeline.report.campaign_page import render
+from pipeline.report.comparison_section import against_truth, section
+from pipeline.report.fleet import Table, fleet_statistics, write_parameters, write_summary
+from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
 from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
-from pipeline.stages.batch import Job, failure_of, record_output
+from pipeline.stages.batch import failure_of, record_output
+from pipeline.stages.summary import failed_files, failed_summary
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from pipeline.report.parameters import Parameter
+    from pipeline.stages.batch import Job
 
 JSON = dict[str, Any]
+FIGURES = {"parameters": 3, "placed": 2}  # of a unit in its summary, and how many figures each parameter has
 NEW = ".new"  # folder of the new set, below the results
-
-
-@dataclass
-class Gathered:
-    """What one unit adds to the files about all units."""
-
-    row: JSON
-    failure: JSON | None = None
-    state: JSON = field(default_factory=dict)
-    inputs: list[tuple[str, str]] = field(default_factory=list)  # file and SHA-256
-    calibration: JSON | None = None  # where a joint estimate is asked for
-    fitted: dict[str, Parameter] = field(default_factory=dict)
-    placed: dict[str, Placed] = field(default_factory=dict)
-    figures: list[JSON] = field(default_factory=list)
 
 
 def gather_batch(job: Job) -> None:
@@ -57,148 +40,112 @@ def gather_batch(job: Job) -> None:
 
     The output, the list of failures, is written last.
     """
-    results = job.results
+    results, run = job.results, job.run
     finish_publishing(results)
     new = results / NEW
     shutil.rmtree(new, ignore_errors=True)
     for name in PUBLISHED:
         if "." not in name:
             (new / name).mkdir(parents=True)
-    packed = len(job.run["rows"]) > job.run["publish_limit"]
+    packed = len(run["order"]) > run["publish_limit"]
     known = (results / "calibrations").glob("*.json") if any((results / PACKS).glob("*")) else ()
     asked = {file.stem for file in known}  # by ``unpack``
+    found: dict[str, JSON] = {}
+    parts: dict[str, list[Table]] = {key: [] for key in FIGURES}
     with flushed_together(results):
-        rows = {row["unit"]: row for row in job.run["rows"]}
-        gathered = {}
-        told = _with_lots(job, rows)
-        for name, units in job.run["batches"].items():
+        for name, units in run["batches"].items():
             folder = job.output.parent / name
+            if run["combine"] != "lot":
+                (folder / f"{WITH_PRIOR}.zip").unlink(missing_ok=True)
             batch = Batch(folder)
             for unit in units:
-                gathered[unit] = _gather_unit(job, batch, rows[unit], new, publish=not packed or unit in asked)
-            for stage in (*STAGES, *([WITH_PRIOR] if told else [])) if packed else ():
+                found[unit] = _gather_unit(batch, unit, new, publish=not packed or unit in asked)
+            for key, figures in FIGURES.items():
+                parts[key].append(Table.of({unit: found[unit].pop(key) for unit in units}, figures))
+            for stage in (*STAGES, *([WITH_PRIOR] if batch.combined else [])) if packed else ():
                 _link(folder / f"{stage}.zip", new / PACKS / name / f"{stage}.zip")
-        units = {unit: gathered[unit] for unit in rows}
-        _write_campaign(job, units, new, told, packed=packed)
+        units = {unit: found[unit] for unit in run["order"]}
+        tables = {key: Table.joined(of_batches) for key, of_batches in parts.items()}
+        _write_campaign(job, units, tables, new, packed=packed)
     publish_all(new, results)
     record_output(job, results, PUBLISHED)
-    write_json(job.output, [u.failure for u in units.values() if u.failure])
+    write_json(job.output, [u["failure"] for u in units.values() if u["failure"]])
 
 
-def _with_lots(job: Job, rows: Mapping[str, dict[str, str]]) -> list[JSON]:
-    """Write what the priors of the lots change, ``combined.zip`` of each batch; return what ``fleet.json`` tells."""
-    if job.run["combine"] != "lot":
-        for name in job.run["batches"]:
-            (job.output.parent / name / f"{WITH_PRIOR}.zip").unlink(missing_ok=True)
-        return []
-    batches = {name: Batch(job.output.parent / name) for name in job.run["batches"]}
-    found = []
-    for name, units in job.run["batches"].items():
-        for unit in units:
-            with suppress(DamagedFileError):  # the unit fails where its files are published
-                if not batches[name].failure(unit):
-                    documents = (batches[name].document(of, unit) for of in ("calibrations", "diagnoses"))
-                    found += estimates(rows[unit], *documents)
-    priors, told = priors_of(found)
-    for name, units in job.run["batches"].items():
-        with new_pack(job.output.parent / name / f"{WITH_PRIOR}.zip") as add:
-            for unit in units:
-                if own := {s: priors[unit, s] for s in SENSORS if (unit, s) in priors}:
-                    files = _files_with_prior(job, batches[name], unit, own)
-                    add({f"{unit}/{path}": as_bytes(content) for path, content in files.items()})
-    return told
-
-
-def _files_with_prior(job: Job, batch: Batch, unit: str, priors: Mapping[str, Prior]) -> Files:
-    """Return the files of a unit that its priors add or change."""
-    calibration, validation, diagnosis = (batch.document(folder, unit) for folder in DOCUMENTS)
-    document = calibration_with_prior(calibration, priors)
-    page = batch.packs["report"].read(f"{unit}.html").decode()
-    files: Files = {f"reports/{unit}.html": with_card(page, calibration, document, priors)}
-    if document:
-        files[f"combined/{unit}.json"] = document
-        written = exports(document, job.units[unit], validation, diagnosis)
-        files |= {f"exports/{unit}/{file}": text for file, text in written.items()}
-    return files
-
-
-def _gather_unit(job: Job, batch: Batch, row: dict[str, str], new: Path, *, publish: bool) -> Gathered:
-    """Publish the files of one unit; one whose files cannot be gathered has failed."""
+def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
+    """Publish the files of a unit and return its summary; one whose files cannot be gathered has failed."""
+    found: JSON = {}
     try:
-        found = _read_unit(job, batch, row)
-        files = dict(batch.files(row["unit"])) if publish else {}
+        found = _shared(batch.packs["summary"].json(f"{unit}.json"))
+        failure = batch.failure(unit)
+        files = dict(batch.files(unit)) if publish else {}
     except Exception as error:  # noqa: BLE001  (one unit never stops the campaign)
-        return _failed_unit(job, batch, row, error, new)
+        failure = failure_of(error, unit, "gather")
+        document, page = failed_files(batch.packs["calibration"], unit, failure).values()
+        files = {f"calibrations/{unit}.json": as_bytes(document), f"reports/{unit}.html": as_bytes(page)}
+    if failure and failure != found.get("failure"):  # it fails after its summary was made
+        document = failed_files(batch.packs["calibration"], unit, failure)[f"{unit}.calibration.json"]
+        found = failed_summary(found, failure, document)
     for name, content in files.items():
         write_atomically(new / name, content)
     return found
 
 
-def _read_unit(job: Job, batch: Batch, row: dict[str, str]) -> Gathered:
-    """Return what a unit adds to the campaign."""
-    unit, failure = row["unit"], batch.failure(row["unit"])
-    calibration = batch.document("calibrations", unit)
-    validation, diagnosis = (None if failure else batch.document(name, unit) for name in ("validations", "diagnoses"))
-    found = _gathered(job, row, failure, (calibration, validation, diagnosis))
-    if any(unit in g["units"] for c in job.run["compare"] for g in c["groups"]):
-        truth = Path(job.run["truths"][unit])  # behind the recordings, where they were simulated
-        known = read_json(truth) if truth.is_file() else None
-        found.figures = unit_figures(calibration, validation, diagnosis, known)
-    found.fitted = unit_parameters(calibration)
-    found.placed = against_limits(calibration, job.units[unit]["sensor"])
+def _shared(value: Any) -> Any:  # noqa: ANN401  (a JSON value)
+    """Return a value whose texts are stored once, however many units have them."""
+    if isinstance(value, str):
+        return sys.intern(value)
+    if isinstance(value, list):
+        return [_shared(v) for v in value]
+    return {sys.intern(k): _shared(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+
+def _figures(job: Job, units: Mapping[str, JSON]) -> list[JSON]:
+    """Return what is compared of the units, also against the truth of simulated recordings."""
+    found = []
+    for unit, path in job.run["truths"].items():
+        truth = read_json(Path(path)) if Path(path).is_file() else {}
+        for figures in units[unit].get("figures", []):
+            figures["parameters"] = {words: Parameter(*p) for words, p in figures["parameters"].items()}
+            if figures["sensor"] in truth:
+                figures["truth"] = against_truth(figures, truth[figures["sensor"]])
+            found.append(figures)
     return found
 
 
-def _gathered(
-    job: Job,
-    row: dict[str, str],
-    failure: JSON | None,
-    documents: tuple[JSON, JSON | None, JSON | None],
-) -> Gathered:
-    unit, (calibration, validation, diagnosis) = row["unit"], documents
-    return Gathered(
-        summary_row(unit, calibration, validation, diagnosis, row),
-        failure,
-        unit_state(calibration, validation, diagnosis, job.run["overrides"].get(unit, {}), job.units[unit]["config"]),
-        [(file["file"], file["sha256"]) for file in calibration.get("inputs") or []],
-        calibration if job.run["combine"] == "serial" else None,
-    )
+def _statistics(job: Job, units: Mapping[str, JSON], fitted: Table, new: Path) -> JSON:
+    """Return the statistics of the fleet; write the joint estimates."""
+    rows = [u["row"] for u in units.values()]
+    statistics = fleet_statistics(rows, fitted)
+    if job.run["combine"] == "lot":
+        from pipeline.stages.prior import TOLD  # noqa: PLC0415  (only where a lot is the prior)
 
+        statistics["combined"] = Pack(job.output.parent / "lots.zip").json(TOLD)
+    if job.run["combine"] == "serial":
+        from pipeline.report.combined import combined_calibrations  # noqa: PLC0415  (only for joint estimates)
 
-def _failed_unit(job: Job, batch: Batch, row: dict[str, str], error: Exception, new: Path) -> Gathered:
-    """Return a unit that fails here, its page and its document written."""
-    unit = row["unit"]
-    failure = failure_of(error, unit, "gather")
-    keys = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
-    try:
-        known = batch.packs["calibration"].json(f"{unit}.json")
-    except PipelineError:
-        known = {}
-    calibration = {key: known.get(key) for key in keys} | {"unit": unit, "status": "failed", "error": failure}
-    calibration |= {"inputs": known.get("inputs") or [], "accelerometer": None, "gyroscope": None}
-    write_json(new / "calibrations" / f"{unit}.json", calibration)
-    write_atomically(new / "reports" / f"{unit}.html", failure_page(unit, failure))
-    return _gathered(job, row, failure, (calibration, None, None))
-
-
-def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path, lots: list[JSON], *, packed: bool) -> None:
-    """Write the files about all units; ``lots``: what ``fleet.json`` tells of their priors."""
-    run, rows = job.run, [u.row for u in units.values()]
-    fitted = {name: u.fitted for name, u in units.items()}
-    failures, statistics = [u.failure for u in units.values() if u.failure], fleet_statistics(rows, fitted)
-    if lots:
-        statistics["combined"] = lots
-    if run["combine"] == "serial":
-        joint, told = combined_calibrations(rows, {name: u.calibration for name, u in units.items() if u.calibration})
-        statistics["combined"] = told
+        batch_of = {unit: name for name, own in job.run["batches"].items() for unit in own}
+        joint, statistics["combined"] = combined_calibrations(
+            rows, lambda unit: Batch(job.output.parent / batch_of[unit]).document("calibrations", unit)
+        )
         for serial, document in joint.items():
             write_json(new / "combined" / f"{serial}.json", document)
+    return statistics
+
+
+def _write_campaign(
+    job: Job, units: Mapping[str, JSON], tables: Mapping[str, Table], new: Path, *, packed: bool
+) -> None:
+    """Write the files about all units."""
+    fitted = tables["parameters"]
+    run, rows = job.run, [u["row"] for u in units.values()]
+    failures, statistics = [u["failure"] for u in units.values() if u["failure"]], _statistics(job, units, fitted, new)
     write_summary(new / "summary.csv", rows)
     write_json(new / "failures.json", failures)
     write_parameters(new / "parameters.parquet", rows, fitted)
     write_json(new / "fleet.json", statistics)
-    figures = [figure for u in units.values() for figure in u.figures]
-    entries = record(job.results, {name: u.state for name, u in units.items()}, run["run"], run["sections"])
+    figures = _figures(job, units) if run["compare"] else []
+    entries = record(job.results, {name: u["state"] for name, u in units.items()}, run["run"], run["sections"])
     publish_histories(new, entries, units)
     page = render(
         run["campaign"],
@@ -206,9 +153,9 @@ def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path, lots: li
         failures,
         [section(c, figures, f"comparison-{i}") for i, c in enumerate(run["compare"], 1)],
         run["page"],
-        twins=same_files({name: u.inputs for name, u in units.items()}),
+        twins=same_files({name: u["state"]["recordings"] for name, u in units.items()}),
         statistics=statistics,
-        placed={name: u.placed for name, u in units.items()},
+        placed=tables["placed"],
         history=runs_data(entries, run["run"]),
         settings=run["run"],
         published={page.stem for page in (new / "reports").glob("*.html")} if packed else None,
@@ -226,16 +173,16 @@ def publish_histories(new: Path, entries: Sequence[JSON], units: Iterable[str]) 
             write_atomically(page, with_history(page.read_text(encoding="utf-8"), history, times))
 
 
-def same_files(inputs: Mapping[str, Sequence[tuple[str, str]]]) -> list[list[str]]:
+def same_files(recordings: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
     """Return the files of several units with the same content under different names.
 
-    ``inputs``: unit to its files, each with its SHA-256. One file that several units are calibrated from is not
+    ``recordings``: unit to its files, each with a digest. One file that several units are calibrated from is not
     reported.
     """
     first: dict[str, tuple[str, str]] = {}
     same: dict[str, dict[str, str]] = {}
-    for unit, files in inputs.items():
-        for file, digest in files:
+    for unit, files in recordings.items():
+        for file, digest in files.items():
             known, owner = first.setdefault(digest, (file, unit))
             if known != file:
                 same.setdefault(digest, {known: owner}).setdefault(file, unit)

@@ -9,7 +9,10 @@ from pipeline.validation.attitude import attitude, gravity_direction
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from pipeline.pack import Files
+    from pipeline.records import Noise, Recording, SensorCalibration
     from pipeline.stages.batch import Job
 
 
@@ -18,12 +21,23 @@ def validate_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     recordings = recordings_of(job.inputs, unit)
     fits = load_fits(job.inputs, unit)
     noises = require_noises(job.inputs["filter"], unit, recordings, settings["sensor"], fits)
-    document: dict[str, Any] = {"schema_version": 1, "unit": unit}
-    for sensor, calibration in fits.items():
-        other = next(fit for s, fit in fits.items() if s != sensor)
-        document[sensor] = calibration and validate(calibration, recordings, noises[sensor], settings, other=other)
+    document: dict[str, Any] = {"schema_version": 1, "unit": unit} | held_out(fits, recordings, noises, settings)
     document["attitude"] = attitude(fits["accelerometer"], fits["gyroscope"], recordings)
     document["gravity_direction"] = gravity_direction(
         **fits, recordings=recordings, noise=noises.get("gyroscope"), settings=settings
     )
     return {f"{unit}.json": document}
+
+
+def held_out(
+    fits: Mapping[str, SensorCalibration | None],
+    recordings: Sequence[Recording],
+    noises: Mapping[str, Noise],
+    settings: dict[str, Any],
+) -> dict[str, Any]:
+    """Return the part of each sensor in ``validations/<unit>.json``, None where it has no fit."""
+    found = {}
+    for sensor, fit in fits.items():
+        other = next(f for s, f in fits.items() if s != sensor)
+        found[sensor] = fit and validate(fit, recordings, noises[sensor], settings, other=other)
+    return found

@@ -62,11 +62,12 @@ def of(batch: str, *stages: str) -> set[str]:
 def test_a_setting_of_a_unit_concerns_the_jobs_of_its_batch_that_read_it(
     bench: Path, unit: str, override: str, expected: set[str]
 ) -> None:
-    assert changed(bench, unit_overrides={unit: [override]}) == expected | {"campaign/gather"}
+    batch = REFERENCE if unit.startswith("A") else STAGED
+    assert changed(bench, unit_overrides={unit: [override]}) == expected | {f"{batch}/summary", "campaign/gather"}
 
 
 def test_a_setting_of_the_run_concerns_every_batch(bench: Path) -> None:
-    stages = ("validate", "calibration", "report")
+    stages = ("validate", "calibration", "report", "summary")
     assert changed(bench, overrides="limits.gyroscope.bias=20") == of(REFERENCE, *stages) | of(STAGED, *stages) | {
         "campaign/gather"
     }

@@ -136,9 +136,9 @@ def test_offset_and_drift_of_a_tables_own_clock_are_found_within_their_uncertain
 
 
 def test_the_same_recording_in_two_units_is_noted_on_the_page_of_the_campaign() -> None:
-    inputs = {unit: [(f"raw/{unit}/log.csv", "s")] for unit in ("U1", "U2")}
-    inputs["U3"] = [("raw/U1/log.csv", "s"), ("raw/U3/a.csv", "t")]
-    twins = same_files(inputs)
+    recordings = {unit: {f"raw/{unit}/log.csv": "s"} for unit in ("U1", "U2")}
+    recordings["U3"] = {"raw/U1/log.csv": "s", "raw/U3/a.csv": "t"}
+    twins = same_files(recordings)
     assert twins == [["U1: raw/U1/log.csv", "U2: raw/U2/log.csv"]]
     page = render("campaign", [], [], twins=twins)
     assert "U1: raw/U1/log.csv, U2: raw/U2/log.csv" in page

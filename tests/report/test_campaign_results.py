@@ -16,7 +16,8 @@ import pipeline
 from pipeline.errors import InputError, MissingInputError
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.records import Recording
-from pipeline.report.fleet import summary_row, write_summary
+from pipeline.report.fleet import write_summary
+from pipeline.report.summary import summary_row
 
 from .conftest import Unit, build_unit
 

@@ -32,8 +32,8 @@ def document(unit: str, values: np.ndarray, own_u: float = OWN_U, **changes: Any
 
 
 def joint(documents: list[dict[str, Any]]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    rows = [{"unit": d["unit"], "serial": "S1"} for d in documents]
-    return combined_calibrations(rows, {d["unit"]: d for d in documents})
+    rows = [{"unit": d["unit"], "serial": "S1", "status": d["status"]} for d in documents]
+    return combined_calibrations(rows, {d["unit"]: d for d in documents}.__getitem__)
 
 
 def test_repeatability_solves_the_equation_of_paule_and_mandel() -> None:

@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 from scipy import stats
 
-from pipeline.report.fleet import _missing_effects, fleet_statistics, unit_parameters, write_parameters
-from pipeline.report.parameters import Parameter
+from pipeline.report.fleet import Table, _missing_effects, fleet_statistics, write_parameters
+from pipeline.report.summary import unit_parameters
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,10 +30,9 @@ def fleet(values: NDArray[np.float64], model: str = "mpu6050", lots: int = 5) ->
         for i in range(len(values))
     ]  # fmt: skip
     found = {
-        row["unit"]: {"gyroscope_bias_x": Parameter("bias_x", float(v), "deg/s", 0.1)}
-        for row, v in zip(rows, values, strict=True)
+        row["unit"]: {"gyroscope_bias_x": (float(v), 0.05, 0.1, "deg/s")} for row, v in zip(rows, values, strict=True)
     }
-    return rows, found
+    return rows, Table.of(found, 3)
 
 
 def test_a_unit_far_from_its_siblings_is_named_and_no_other() -> None:
@@ -54,7 +53,8 @@ def test_units_of_another_model_are_no_siblings() -> None:
     one, two = fleet(rng.normal(0.0, 1.0, 30)), fleet(rng.normal(100.0, 1.0, 30), "stim300")
     for row in two[0]:
         row["unit"] = "V" + row["unit"]
-    told = fleet_statistics([*one[0], *two[0]], one[1] | {"V" + k: v for k, v in two[1].items()})
+    second = Table([frame.rename(index=lambda unit: "V" + unit) for frame in two[1].frames], two[1].units)
+    told = fleet_statistics([*one[0], *two[0]], Table.joined([one[1], second]))
     assert told["far"] == []
     assert [d["sensor"] for d in told["distributions"]] == ["mpu6050", "stim300"]
 
@@ -69,9 +69,11 @@ def test_few_fleets_in_which_nothing_is_wrong_are_said_to_have_something() -> No
 def test_a_fleet_without_serials_lots_and_dates_has_distributions_only() -> None:
     rows, found = fleet(np.random.default_rng(8).normal(0.0, 1.0, 25))
     rows = [row | {"serial": None, "lot": None, "date": ""} for row in rows]
-    told = fleet_statistics([*rows, {"unit": "failed", "sensor": "mpu6050", "method": None}], found)
+    failed = Table.of({"failed": {}}, 3)
+    row = {"unit": "failed", "sensor": "mpu6050", "method": None}
+    told = fleet_statistics([*rows, row], Table.joined([failed, found]))
     assert [key for key, value in told.items() if value] == ["distributions"]
-    assert fleet_statistics([], {})["distributions"] == []
+    assert fleet_statistics([row], failed)["distributions"] == []
 
 
 def test_a_parameter_that_no_unit_fits_is_in_the_distributions_only() -> None:
@@ -113,7 +115,6 @@ def test_calibrations_of_a_device_are_compared_with_their_stated_uncertainty(sca
     rows, found = fleet(values)
     for i, row in enumerate(rows):
         row["serial"] = f"S{i // 3}"
-    found = {u: {n: p._replace(coverage_factor=2.0) for n, p in own.items()} for u, own in found.items()}
     (told,) = fleet_statistics(rows, found)["repeatability"]
     groups = values.reshape(100, 3)
     squares = np.sum((groups - groups.mean(axis=1, keepdims=True)) ** 2) / 0.05**2  # u is 0.1 / 2
@@ -145,7 +146,7 @@ def test_the_table_holds_every_parameter_with_its_uncertainty_and_unit(tmp_path:
     p = {"b_x": {"value": 0.5, "unit": "g/degC", "expanded_uncertainty": 0.05}}
     document = {"accelerometer": fit | {"effects": [{"name": "bias_temperature", "parameters": p}]}, "gyroscope": None}
     rows = [{"unit": "U1", "lot": None, "pass": True, "accelerometer_error_after": 0.5}, {"unit": "U2"}]
-    write_parameters(tmp_path / "p.parquet", rows, {"U1": unit_parameters(document), "U2": {}})
+    write_parameters(tmp_path / "p.parquet", rows, Table.of({"U1": unit_parameters(document), "U2": {}}, 3))
     table = pq.read_table(tmp_path / "p.parquet")
     first, second = table.to_pylist()
     assert first["accelerometer_bias_y"] == 2.0

@@ -14,7 +14,8 @@ import pytest
 
 from pipeline.report import campaign_page
 from pipeline.report.chart import Figure, Panel, Samples, chart
-from pipeline.report.fleet import COLUMNS, summary_row, write_summary
+from pipeline.report.fleet import write_summary
+from pipeline.report.summary import COLUMNS, summary_row
 from pipeline.report.unit_page import render
 
 from .conftest import Unit, build_unit

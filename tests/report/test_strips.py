@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.report.campaign_page import ENDS, against_limits, strips
+from pipeline.report.campaign_page import ENDS, strips
+from pipeline.report.fleet import Table
+from pipeline.report.summary import against_limits
 
 SHEET = {"accelerometer": {"bias": 0.08, "scale_factor": 0.03, "cross_axis": 0.02}}
 NAMES = ["Bias x", "Bias y", "Bias z", *(f"Scale factor error {a}" for a in "xyz")]
 NAMES += [f"{a} reads of {b}" for a in "xyz" for b in "xyz" if a != b]
 
 
-def campaign(count: int) -> tuple[list[dict[str, Any]], dict[str, Any], np.ndarray]:
+def campaign(count: int) -> tuple[list[dict[str, Any]], Table, np.ndarray]:
     """Return units with random biases and sensitivities, and the shares of the limits that follow."""
     rng = np.random.default_rng(3)
     rows, placed, shares = [], {}, []
@@ -26,7 +28,7 @@ def campaign(count: int) -> tuple[list[dict[str, Any]], dict[str, Any], np.ndarr
         placed[f"U{i}"] = against_limits({"accelerometer": part, "gyroscope": None}, SHEET)
         beside = K[~np.eye(3, dtype=bool)]
         shares.append([*bias / 0.08, *(np.diag(K) - 1.0) / 0.03, *beside / 0.02])
-    return rows, placed, np.array(shares)
+    return rows, Table.of(placed, 2), np.array(shares)
 
 
 def drawn(svg: str) -> list[tuple[str, int, str, float]]:

@@ -20,10 +20,11 @@ from pipeline.commands import add, apply, explain, unpack
 from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.campaign import Campaign
 from pipeline.errors import ConfigurationError, DamagedFileError, InputError
+from pipeline.pack import Batch
 from pipeline.results_folder import HELD
 from pipeline.stages import batch, gather, report
 
-STAGES = ("ingest", "filter", "fit", "calibration", "validate", "diagnose", "export", "report", "gather")
+STAGES = ("ingest", "filter", "fit", "calibration", "validate", "diagnose", "export", "report", "summary", "gather")
 FOLDERS = ("calibrations", "validations", "diagnoses", "reports", "certificates", "exports")
 
 
@@ -36,7 +37,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         shutil.copytree(simulated, directory / "raw" / name)
     (directory / "units.csv").write_text("unit\n" + "\n".join(names) + "\n")
     campaign = load_campaign({"campaign": str(directory), "results": str(directory.parent / "results")})
-    files_of, read_unit, render = batch._files_of, gather._read_unit, report.render
+    files_of, failure, render = batch._files_of, Batch.failure, report.render
 
     def faulty(module: Any, job: batch.Job, unit: str, settings: dict[str, Any]) -> Any:
         real = getattr(module, f"{job.stage}_unit")
@@ -49,10 +50,10 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
             module = SimpleNamespace(**vars(module) | {f"{job.stage}_unit": fails})
         return files_of(module, job, unit, settings)
 
-    def faulty_gather(job: batch.Job, folder: Any, row: dict[str, str]) -> gather.Gathered:
-        if row["unit"] == "at_gather":
+    def faulty_gather(packs: Batch, unit: str) -> Any:
+        if unit == "at_gather":
             raise RuntimeError("fault at at_gather")
-        return read_unit(job, folder, row)
+        return failure(packs, unit)
 
     def faulty_render(document: dict[str, Any], *rest: Any, **more: Any) -> str:
         if document["unit"] == "at_report" and document["status"] == "failed":
@@ -61,7 +62,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, "_files_of", faulty)
-        patch.setattr(gather, "_read_unit", faulty_gather)
+        patch.setattr(Batch, "failure", faulty_gather)
         patch.setattr(report, "render", faulty_render)
         assert run_jobs(campaign) == 1
     return campaign, campaign.results

@@ -4,6 +4,8 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 from whole_run import run_campaign
 
@@ -43,6 +45,14 @@ def test_a_campaign_with_the_prior_of_its_lot(tmp_path: Path, capsys: pytest.Cap
     plain, prior = (pipeline.load_calibration(results / of / "A001.json") for of in ("calibrations", "combined"))
     errors = [abs(c.accelerometer.bias - 0.01).mean() for c in (plain, prior)]
     assert errors[1] < errors[0]  # nine equal units: 30 % of the error is left where mean and spread are known
+    held_out = pd.read_csv(directory / "raw" / "A001" / "validation.csv")
+    readings = held_out[[f"accel_{axis}_g" for axis in "xyz"]].to_numpy()
+    document = json.loads((results / "combined" / "A001.json").read_text())
+    told_errors = document["lot_prior"]["accelerometer"]["held_out_rms_error"]
+    for calibration, name in ((plain, "without"), (prior, "with")):
+        size = np.linalg.norm(calibration.apply(accelerometer=readings).accelerometer, axis=1)
+        assert told_errors[name] == pytest.approx(np.sqrt(np.mean((size - 1.0) ** 2)), rel=1e-3)
+    assert "g without the prior" in (results / "reports" / "A001.html").read_text()
     exported = (results / "exports" / "A001" / "kalibr.yaml").read_text()
     assert "With the prior of mpu6050, lot 7, accelerometer: 8 siblings" in exported
     assert "With the prior of 8 siblings" not in (results / "exports" / "B" / "kalibr.yaml").read_text()

@@ -156,7 +156,7 @@ def test_an_unchanged_second_run_does_nothing(bench: Bench) -> None:
 
 
 def after(batch: str) -> set[str]:
-    return {f"{stage}/{batch}" for stage in ("validate", "diagnose", "calibration", "export", "report")}
+    return {f"{stage}/{batch}" for stage in ("validate", "diagnose", "calibration", "export", "report", "summary")}
 
 
 def test_changing_settings_reruns_the_stages_that_read_them(bench: Bench) -> None:

@@ -82,7 +82,7 @@ def test_the_demo_without_a_shared_disk_has_the_bytes_of_a_local_run(tmp_path: P
         )
         assert done.returncode == 1, done.stdout + done.stderr
         assert "2 units failed" in done.stderr
-    assert len(list(nodes.iterdir())) == 23  # every job but collect, gather and verdict
+    assert len(list(nodes.iterdir())) == 25  # every job but collect, gather and verdict
     local, apart = (published(clone / name / "demo") for name in ("local", "apart"))
     assert len(local) > 250
     assert apart == local

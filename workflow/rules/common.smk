@@ -75,6 +75,7 @@ else:
         "directory": without_braces(CAMPAIGN.directory),
         "simulation": CAMPAIGN.simulation and without_braces(CAMPAIGN.simulation),
         "page": CAMPAIGN.page,
+        "combine": CAMPAIGN.combine,
         "chains": CAMPAIGN.chains,
         "apart": bool(workflow.storage_settings.default_storage_provider),
         "settings": {

@@ -6,6 +6,7 @@ rule gather:
     input:
         settings=lambda wildcards: local(settings_file("campaign", "gather")),
         packs=[of_batches(stage) for stage in PUBLISHED_STAGES],
+        priors=[LOTS, *of_batches("prior")] if PLAN["combine"] == "lot" else [],
     output:
         f"{RESULTS}/batches/gathered.json",
     log:

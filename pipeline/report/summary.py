@@ -1,0 +1,91 @@
+"""What a unit adds to the tables of the campaign: its row, and its parameters.
+
+Columns: those of every campaign in the order of ``COLUMNS``, then the user's own columns of ``units.csv``. A column of
+the user's whose name is taken gets ``sheet_`` before it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipeline.records import SENSORS
+from pipeline.report.held_out_section import first_and_last_step, passes
+from pipeline.report.numbers import unit_text
+from pipeline.report.parameters import fitted_parameters, parameter_rows
+
+JSON = dict[str, Any]
+UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
+SENSOR_COLUMNS = (
+    "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
+    "answers",
+)  # fmt: skip
+IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
+COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE)
+SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
+
+
+def summary_row(
+    unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, sheet_row: dict[str, str]
+) -> JSON:
+    """Return a unit's row: a dict from column to value, None where there is none.
+
+    ``calibration, validation, diagnosis``: as in their files; ``sheet_row``: the unit's row of ``units.csv``.
+    """
+    error = calibration.get("error") or {}
+    file = f"{error['file']}: " if error.get("file") else ""
+    row: JSON = dict.fromkeys(COLUMNS) | {
+        "unit": unit,
+        **{key: sheet_row.get(key) or None for key in ("serial", "lot", "date")},
+        "status": calibration.get("status"),
+        "error": f"{file}{error['message']}" if error.get("message") else None,
+        "sensor": calibration.get("sensor"),
+        "method": calibration.get("method"),
+        "pass": passes(calibration, validation),
+    }
+    for sensor in SENSORS:
+        held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
+        raw, final = first_and_last_step(held_out)
+        selected = found.get("selected") if found.get("verdict") == "missing_effect" else None
+        errors = [step.get(error) for error in ("rms_error", "mean_abs_error") for step in (raw, final)]
+        texts = [found.get("verdict"), ";".join(selected or []) or None, found.get("reason") or None]
+        texts.append(len(found.get("answer_set") or []) or None)
+        values = [*errors, held_out.get("noise_floor"), *texts]
+        row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
+        implausible = (calibration.get(sensor) or {}).get("implausible") or []
+        row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
+    for key, value in sheet_row.items():
+        if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
+            row[f"sheet_{key}" if key in COLUMNS else key] = value
+    return row
+
+
+def sheet_columns(row: JSON) -> dict[str, str]:
+    """Return what ``summary_row`` took from ``units.csv``."""
+    return {k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in COLUMNS)}
+
+
+def unit_parameters(calibration: JSON) -> dict[str, tuple[float | str | None, ...]]:
+    """Return every fitted parameter of a unit: ``<sensor>_bias_x``, ``<sensor>_<effect>_<symbol>``.
+
+    Value, standard uncertainty, expanded uncertainty, unit; an uncertainty is None where the method states none.
+    """
+    return {
+        f"{sensor}_{p.name.replace('.', '_')}": (p.value, p.standard_uncertainty, p.expanded_uncertainty, p.unit)
+        for sensor in SENSORS
+        if calibration.get(sensor)
+        for p in fitted_parameters(calibration[sensor])
+    }
+
+
+def against_limits(calibration: JSON, sheet: JSON) -> dict[str, tuple[float, float, str]]:
+    """Return value, limit and unit of the parameters that the data sheet limits: ``<sensor> Bias x``.
+
+    ``sheet`` is the section ``sensor`` of the configuration.
+    """
+    return {
+        f"{sensor} {row['name']}": (row["p"].value, row["limit"], unit_text(row["p"].unit))
+        for sensor in SENSORS
+        if calibration.get(sensor)
+        for row in parameter_rows(calibration[sensor], sheet.get(sensor) or {})
+        if row["limit"]
+    }

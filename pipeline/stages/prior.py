@@ -1,0 +1,77 @@
+"""Stages lots and prior (``combine=lot``): the priors of all units, and the files of a unit that its prior changes."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import DamagedFileError
+from pipeline.exports import exports
+from pipeline.pack import DOCUMENTS, STAGE_OF, Pack, as_bytes, new_pack
+from pipeline.records import SENSORS, SensorCalibration
+from pipeline.report.lot import Estimate, Prior, calibration_with_prior, priors_of, with_card
+from pipeline.stages.batch import record_output
+from pipeline.stages.summary import failed_files
+from pipeline.stages.unit_files import recordings_of, require_noises
+from pipeline.stages.validate import held_out
+
+if TYPE_CHECKING:
+    from pipeline.pack import Files
+    from pipeline.stages.batch import Job
+
+TOLD = "told.json"  # what ``fleet.json`` tells of the lots
+
+
+def lots_batch(job: Job) -> None:
+    """Write the priors of the units of each batch, from the estimates in the files of the stage summary."""
+    batches, found = job.run["batches"], []
+    for name, units in batches.items():
+        summaries = Pack(job.output.parent / name / "summary.zip")
+        for unit in units:
+            with suppress(DamagedFileError):  # ``gather`` finds that the unit has failed
+                found += [Estimate.from_json(e) for e in summaries.json(f"{unit}.json").get("estimates", ())]
+    priors, told = priors_of(found)
+    with new_pack(job.output) as add:
+        add({TOLD: as_bytes(told)})
+        for name, units in batches.items():
+            own = {u: {s: priors[u, s].to_json() for s in SENSORS if (u, s) in priors} for u in units}
+            add({f"{name}.json": as_bytes(own)})
+    record_output(job, job.output)
+
+
+@lru_cache(maxsize=1)
+def _of_batch(lots: Pack, batch: str) -> Any:  # noqa: ANN401  (a JSON document)
+    return lots.json(f"{batch}.json")
+
+
+def prior_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
+    """Return the files that the priors of a unit add or change, by their paths below the results."""
+    given = _of_batch(job.inputs["lots"], job.output.parent.name)[unit]
+    if not given:
+        return {}
+    priors = {sensor: Prior.from_json(prior) for sensor, prior in given.items()}
+    calibration, validation, diagnosis = (job.inputs[STAGE_OF[of]].json(f"{unit}.json") for of in DOCUMENTS)
+    document = calibration_with_prior(calibration, priors)
+    files: Files = {}
+    if document:
+        fits = {s: SensorCalibration.from_json(s, document[s]) if document[s] else None for s in SENSORS}
+        recordings = recordings_of(job.inputs, unit)
+        noises = require_noises(job.inputs["filter"], unit, recordings, settings["sensor"], fits)
+        after = held_out(fits, recordings, noises, settings)
+        for sensor in [s for s in priors if not priors[s].refused]:
+            errors = {"without": validation[sensor], "with": after[sensor]}
+            rms = {name: part["steps"][-1]["rms_error"] if part["held_out"] else None for name, part in errors.items()}
+            document["lot_prior"][sensor]["held_out_rms_error"] = rms
+        files[f"combined/{unit}.json"] = document
+        written = exports(document, settings, validation, diagnosis)
+        files |= {f"exports/{unit}/{file}": text for file, text in written.items()}
+    page = job.inputs["report"].read(f"{unit}.html").decode()
+    files[f"reports/{unit}.html"] = with_card(page, calibration, document, priors)
+    return {f"{unit}/{path}": content for path, content in files.items()}
+
+
+def prior_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:  # noqa: ARG001
+    """Return the document and the page of a unit that fails here."""
+    earlier = f"{unit}.calibration.json" in job.inputs["report"]
+    return {} if earlier else failed_files(job.inputs["calibration"], unit, failure)

@@ -1,0 +1,86 @@
+"""Stage summary: what each unit of a batch adds to the files about all units.
+
+``gather`` joins these files of the batches, and reads no calibration, validation or diagnosis.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import PipelineError
+from pipeline.history import unit_state
+from pipeline.report.pages import failure_page
+from pipeline.report.summary import against_limits, sheet_columns, summary_row, unit_parameters
+
+if TYPE_CHECKING:
+    from pipeline.pack import Files, Pack
+    from pipeline.stages.batch import Job
+
+JSON = dict[str, Any]
+KEPT = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
+
+
+def summary_unit(job: Job, unit: str, settings: JSON) -> Files:
+    """Return what a calibrated unit adds to the campaign."""
+    documents = [job.inputs[stage].json(f"{unit}.json") for stage in ("calibration", "validate", "diagnose")]
+    calibration, _, diagnosis = documents
+    found = summary(settings, None, *documents)
+    if settings["compared"]:
+        from pipeline.report.comparison_section import unit_figures  # noqa: PLC0415  (pandas, where units are compared)
+
+        found["figures"] = unit_figures(*documents)
+    if settings["lot_prior"]:
+        from pipeline.report.lot import estimates  # noqa: PLC0415  (only where a lot is the prior)
+
+        found["estimates"] = [e.to_json() for e in estimates(settings["row"], calibration, diagnosis)]
+    return {f"{unit}.json": found}
+
+
+def summary_failed(job: Job, unit: str, settings: JSON, failure: JSON) -> Files:
+    """Return what a failed unit adds to the campaign; of one that fails here also its document and its page."""
+    name, report, files = f"{unit}.calibration.json", job.inputs["report"], {}
+    try:
+        calibration = report.json(name)
+    except PipelineError:
+        files = failed_files(job.inputs["calibration"], unit, failure)
+        calibration = files[name]
+    return {f"{unit}.json": summary(settings, failure, calibration), **files}
+
+
+def summary(
+    settings: JSON,
+    failure: JSON | None,
+    calibration: JSON,
+    validation: JSON | None = None,
+    diagnosis: JSON | None = None,
+) -> JSON:
+    """Return the part of a summary that failed units have too.
+
+    ``settings``: ``row`` of ``units.csv``, ``overrides`` and ``config``, the digest of each section.
+    """
+    documents = calibration, validation, diagnosis
+    return {
+        "row": summary_row(calibration["unit"], *documents, settings["row"]),
+        "failure": failure,
+        "state": unit_state(*documents, settings["overrides"], settings["config"]),
+        "parameters": unit_parameters(calibration),
+        "placed": against_limits(calibration, settings.get("sensor", {})),
+    }
+
+
+def failed_files(calibrations: Pack, unit: str, failure: JSON) -> Files:
+    """Return the calibration document and the page of a unit that fails after its report."""
+    try:
+        known = calibrations.json(f"{unit}.json")
+    except PipelineError:
+        known = {}
+    document = {key: known.get(key) for key in KEPT} | {"unit": unit, "status": "failed", "error": failure}
+    document |= {"inputs": known.get("inputs") or [], "accelerometer": None, "gyroscope": None}
+    return {f"{unit}.calibration.json": document, f"{unit}.html": failure_page(unit, failure)}
+
+
+def failed_summary(found: JSON, failure: JSON, document: JSON) -> JSON:
+    """Return the summary of a unit that fails after it was made."""
+    state = found.get("state", {})
+    settings = {"row": sheet_columns(found.get("row", {})), **{k: state.get(k, {}) for k in ("overrides", "config")}}
+    return summary(settings, failure, document)
