@@ -8,6 +8,8 @@ where
                      the ratio of measured times to ``COST`` of the other stages
     jobs at a time : seconds that jobs have worked / seconds since the first was started
 
+but not less than a running job needs for its other units, each as long as those so far.
+
 A job handles a batch of units and writes to its log which one it is at: ``stage: unit (3 of 50)``.
 
 The line stands in place of Snakemake's blocks for each job (``--printshellcmds`` and ``--verbose`` keep those, and
@@ -135,7 +137,8 @@ class Progress:
             left += max(units, 0.0) * mean.get(rule, scale * COST.get(rule, 1.0))
         worked = self.lost + sum(job.seconds for job in self.done) + sum(time.time() - job.since for job in jobs)
         jobs_at_a_time = worked / max(time.monotonic() - self.started, 1e-3)
-        return left / max(jobs_at_a_time, 1.0)
+        begun = [(job.units - number + 0.5) * (time.time() - job.since) / number for job, _, number in at]
+        return max(left / max(jobs_at_a_time, 1.0), *begun, 0.0)
 
     def _mean_batch(self) -> float:
         return sum(self.batches.values()) / max(len(self.batches), 1)

@@ -98,3 +98,16 @@ def test_a_command_tells_the_time_left_on_a_terminal_and_each_half_minute_elsewh
     countdown(20, "20 of 40 cases")
     assert stream.getvalue() == "50 % | 20 of 40 cases | about 45 s left\n"  # 43 s since it began, to 5 s
     assert countdown.left(40) == ""
+
+
+def test_a_job_that_takes_longer_than_earlier_ones_lengthens_the_time_left(tmp_path: Path) -> None:
+    progress = Progress({"a": 3})
+    progress.wanted = {"fit": 4}
+    for number in (1, 2):
+        progress.start(number, "fit", {"batch": "a"}, tmp_path / "none")
+        progress.finish(number)
+    (tmp_path / "log").write_text("fit: U1 (1 of 3)\n")
+    progress.start(3, "fit", {"batch": "a"}, tmp_path / "log")
+    progress.running[3].since -= 300.0  # 300 s at the first unit, and two and a half are to come
+    (tmp_path / "log").touch()
+    assert progress.text().endswith("about 12 min left")

@@ -52,7 +52,13 @@ if (contents) {
   addEventListener("scroll", () => requestAnimationFrame(follow), { passive: true });
   follow();
 }
-if (matchMedia("(max-width: 700px)").matches) for (const part of document.querySelectorAll("details.fold")) part.open = false;
+// On a phone, long parts are closed; a link into one opens it, and all are printed.
+const folds = [...document.querySelectorAll("details.fold")];
+if (matchMedia("(max-width: 700px)").matches) for (const part of folds) part.open = false;
+const unfold = () => { const part = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)))?.closest("details.fold"); if (part) part.open = true; };
+addEventListener("hashchange", unfold);
+addEventListener("beforeprint", () => folds.forEach((part) => part.open = true));
+unfold();
 // On a phone, a table that is too wide shows each row as a block (page.css). The names of the columns are rules of a style sheet, as
 // the rows of a list change.
 const narrow = matchMedia("(max-width: 700px)"), names_ = document.createElement("style");
