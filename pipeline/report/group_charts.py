@@ -77,12 +77,16 @@ def bars(
     bottom = top + ROW * len(rows)
     ticks = axis.ticks(5)
     out = [f'<path class="grid" d="{"".join(f"M{at:.1f} {top}V{bottom}" for at, _ in ticks)}"/>']
-    out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows) if row.value is not None]
+    drawn = [(top + ROW * i, row) for i, row in enumerate(rows) if row.value is not None]
+    out += [_row(row, axis, at) for at, row in drawn]
     for words, value in levels.items():
         at, said = axis.pixels(value), f"{words} {number(value)}"
         half = LETTER / 2 * len(said)
-        out.append(f'<path class="level" d="M{at:.1f} {top}V{bottom}"/>')
+        beside = "".join(f"M{at:.1f} {place + 13}v14" for place, _ in drawn)  # labels are not crossed
+        out.append(f'<path class="level" d="M{at:.1f} {top}v2{beside}"/>')
         out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, said, "m"))
+    ends = [(max(axis.pixels(0.0), axis.pixels(row.value)) + 4, at, row) for at, row in drawn if row.interval is None]
+    out += [text(end, at + 24, number(row.value), "value") for end, at, row in ends]
     out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows) if row.value is None]
     for k, members in enumerate(brackets):
         at, heights = stop + RIGHT - 12 + BRACKET * k, {top + ROW * row + 20: said for row, said in members.items()}
@@ -117,7 +121,7 @@ def _row(row: Point, axis: Axis, top: int) -> str:
     if row.interval is None:
         zero = axis.pixels(0.0)  # the start of a logarithmic axis
         out += f'<path class="bar c{row.colour}" d="M{zero:.1f} {top + 15}H{end:.1f}v10H{zero:.1f}z"/>'
-        return out + text(max(zero, end) + 4, top + 24, number(row.value))
+        return out
     middle, (low, high) = top + 21, row.interval
     out += f"<g><title>{escape(f'{said} ({number(low)} to {number(high)})')}</title>"
     if len(row.units) > 1:
