@@ -137,8 +137,8 @@ class Progress:
             left += max(units, 0.0) * mean.get(rule, scale * COST.get(rule, 1.0))
         worked = self.lost + sum(job.seconds for job in self.done) + sum(time.time() - job.since for job in jobs)
         jobs_at_a_time = worked / max(time.monotonic() - self.started, 1e-3)
-        begun = [(job.units - number + 0.5) * (time.time() - job.since) / number for job, _, number in at]
-        return max(left / max(jobs_at_a_time, 1.0), *begun, 0.0)
+        at_least = [(job.units - number + 0.5) * (time.time() - job.since) / number for job, _, number in at]
+        return max([left / max(jobs_at_a_time, 1.0), *at_least])
 
     def _mean_batch(self) -> float:
         return sum(self.batches.values()) / max(len(self.batches), 1)

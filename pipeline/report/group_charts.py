@@ -85,8 +85,9 @@ def bars(
         beside = "".join(f"M{at:.1f} {place + 13}v14" for place, _ in drawn)  # labels are not crossed
         out.append(f'<path class="level" d="M{at:.1f} {top}v2{beside}"/>')
         out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, said, "m"))
-    ends = [(max(axis.pixels(0.0), axis.pixels(row.value)) + 4, at, row) for at, row in drawn if row.interval is None]
-    out += [text(end, at + 24, number(row.value), "value") for end, at, row in ends]
+    for at, row in drawn:
+        if row.value is not None and row.interval is None:
+            out.append(text(max(axis.pixels(0.0), axis.pixels(row.value)) + 4, at + 24, number(row.value), "value"))
     out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows) if row.value is None]
     for k, members in enumerate(brackets):
         at, heights = stop + RIGHT - 12 + BRACKET * k, {top + ROW * row + 20: said for row, said in members.items()}
