@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
+
+    from pipeline.records.recording import Values
 
 SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 NORMAL, RECTANGULAR = "normal", "rectangular"
@@ -20,26 +22,15 @@ NORMAL, RECTANGULAR = "normal", "rectangular"
 
 @dataclass(frozen=True)
 class StageResult:
-    """One stage of a fit.
-
-    Attributes
-    ----------
-    parameters : dict
-        Name to ``{"value", "unit", "standard_uncertainty"}``; the uncertainty may be None.
-    residual_rms : float or None
-        Of the fit's own error measure after this stage, unit of the sensor.
-    correction : dict or None
-        How readings are corrected up to and including this stage, where matrix and bias alone do not say it; the
-        method's module in ``pipeline.estimation`` defines its keys.
-    details : dict
-        Values for the report (condition number, samples used, iterations ...).
-    """
+    """One stage of a fit."""
 
     name: str
-    parameters: dict[str, Any]
-    residual_rms: float | None = None
+    parameters: dict[str, Any]  # name to {"value", "unit", "standard_uncertainty"}; the uncertainty may be None
+    residual_rms: float | None = None  # of the fit's own error measure after this stage, unit of the sensor
+    # How readings are corrected up to and including this stage, where matrix and bias alone do not say it; the method's
+    # module in pipeline.estimation defines its keys.
     correction: dict[str, Any] | None = None
-    details: dict[str, Any] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)  # for the report: condition number, samples used, iterations
 
 
 @dataclass(frozen=True)
@@ -55,7 +46,7 @@ class FittedEffect:
     definition: dict[str, Any] | None = None
 
     @property
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> Values:
         """Values of the parameters, in their order."""
         return np.array([p["value"] for p in self.parameters.values()])
 
@@ -64,34 +55,22 @@ class FittedEffect:
 class SensorCalibration:
     """Calibration of one sensor after a stage.
 
-    Attributes
-    ----------
-    bias : (3,) array, g or deg/s
-    matrix : (3, 3) array, dimensionless
-    covariance : (12, 12) array or None
-        Of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then each effect's parameters (then larger than 12). It
-        includes every line of the uncertainty budget.
-    degrees_of_freedom : float
-        The smallest of the parameters.
-    freedom : (p,) array or None
-        Effective degrees of freedom of each parameter; None: ``degrees_of_freedom`` for all.
-    budget : dict or None
-        As published; see ``pipeline.estimation.uncertainty_budget``.
-    convergence : dict or None
-        Evidence that the estimate is a minimum: ``cosine``, the largest between the residual and a column of the
-        Jacobian; ``condition`` and ``rank`` of its scaled columns; ``parameters``, their number.
+    ``convergence`` is the evidence that the estimate is a minimum: ``cosine``, the largest between the residual and a
+    column of the Jacobian; ``condition`` and ``rank`` of its scaled columns; ``parameters``, their number.
     """
 
     sensor: str
-    bias: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    bias: Values = field(default_factory=lambda: np.zeros(3))  # (3,), g or deg/s
+    matrix: Values = field(default_factory=lambda: np.eye(3))  # (3, 3), dimensionless
     stages: tuple[StageResult, ...] = ()
     effects: tuple[FittedEffect, ...] = ()
-    covariance: NDArray[np.float64] | None = None
-    degrees_of_freedom: float = float("inf")
+    # (p, p), of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then of each effect's parameters; with every line of
+    # the uncertainty budget.
+    covariance: Values | None = None
+    degrees_of_freedom: float = float("inf")  # the smallest of the parameters
     converged: bool = True
-    freedom: NDArray[np.float64] | None = None
-    budget: dict[str, Any] | None = None
+    freedom: Values | None = None  # (p,), effective degrees of freedom; None: ``degrees_of_freedom`` for all
+    budget: dict[str, Any] | None = None  # as published; see pipeline.estimation.uncertainty_budget
     convergence: dict[str, Any] | None = None
 
     def parameter_names(self) -> list[str]:
@@ -99,7 +78,7 @@ class SensorCalibration:
         names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
         return names + [f"{e.name}.{p}" for e in self.effects for p in e.parameters]
 
-    def effective_freedom(self) -> NDArray[np.float64]:
+    def effective_freedom(self) -> Values:
         """Return the effective degrees of freedom of each parameter: (p,) array."""
         if self.freedom is not None:
             return self.freedom
@@ -151,12 +130,12 @@ class SensorCalibration:
         )
 
 
-def _shaped(values: NDArray[np.float64]) -> dict[str, Any]:
+def _shaped(values: Values) -> dict[str, Any]:
     """Return the values of bias and matrix in the shapes of these."""
     return {"bias": values[:3].tolist(), "matrix": values[3:12].reshape(3, 3).tolist()}
 
 
-def coverage_factor(degrees_of_freedom: ArrayLike, probability: float = 0.95) -> NDArray[np.float64]:
+def coverage_factor(degrees_of_freedom: ArrayLike, probability: float = 0.95) -> Values:
     """Return the two-sided coverage factor k of Student's t, of the shape of its argument.
 
     k solves ``P(|t_nu| <= k) = probability`` (JCGM 100:2008, annex G); for infinite ``nu`` it is the normal quantile.
@@ -165,43 +144,27 @@ def coverage_factor(degrees_of_freedom: ArrayLike, probability: float = 0.95) ->
 
     nu, upper = np.asarray(degrees_of_freedom, float), 0.5 + probability / 2.0
     known = np.isfinite(nu)
-    factors: NDArray[np.float64] = np.where(known, stdtrit(np.where(known, nu, 1.0), upper), ndtri(upper))[()]
+    factors: Values = np.where(known, stdtrit(np.where(known, nu, 1.0), upper), ndtri(upper))[()]
     return factors
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """One line of an uncertainty budget: the share of one source (JCGM 100:2008, 8 and annex H).
-
-    Attributes
-    ----------
-    kind : str
-        ``A`` (from the scatter of these recordings) or ``B`` (from any other knowledge).
-    distribution : str
-        Assumed distribution of the input.
-    covariance : (p, p) array
-        Of the parameters, from this source only; ``degrees_of_freedom`` is (p,).
-    input_uncertainty : float or None
-        Standard uncertainty of the input; None where the source is not a single quantity.
-    independent : int
-        How many independent quantities of this uncertainty the input stands for (stops of a table, axes).
-    parts : dict of str to (p,) array
-        Standard uncertainties that the contribution consists of, where they are known separately.
-    """
+    """One line of an uncertainty budget: the share of one source (JCGM 100:2008, 8 and annex H)."""
 
     source: str
-    kind: str
-    distribution: str
-    covariance: NDArray[np.float64]
-    degrees_of_freedom: NDArray[np.float64]
-    input_uncertainty: float | None = None
+    kind: str  # A (from the scatter of these recordings) or B (from any other knowledge)
+    distribution: str  # assumed, of the input
+    covariance: Values  # (p, p), of the parameters, from this source only
+    degrees_of_freedom: Values  # (p,)
+    input_uncertainty: float | None = None  # standard uncertainty; None where the source is not a single quantity
     input_unit: str = ""
-    independent: int = 1
-    parts: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    independent: int = 1  # quantities of this uncertainty that the input stands for (stops of a table, axes)
+    parts: dict[str, Values] = field(default_factory=dict)  # (p,), standard uncertainties it consists of, where known
     remark: str = ""
 
     @property
-    def standard_uncertainty(self) -> NDArray[np.float64]:
+    def standard_uncertainty(self) -> Values:
         """Its share of each parameter's standard uncertainty: (p,) array."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
@@ -211,7 +174,7 @@ class Contribution:
         freedom = self.degrees_of_freedom[kept]
         return replace(self, covariance=self.covariance[kept, kept], degrees_of_freedom=freedom, parts=parts)
 
-    def placed(self, place: NDArray[np.float64]) -> Contribution:
+    def placed(self, place: Values) -> Contribution:
         """Return the contribution to q parameters that include these p: ``place`` is (q, p), zeros and ones."""
         parts = {name: place @ values for name, values in self.parts.items()}
         freedom = np.full(len(place), np.inf)
@@ -236,6 +199,6 @@ class Contribution:
         }
 
 
-def finite(values: NDArray[np.float64]) -> list[float | None]:
+def finite(values: Values) -> list[float | None]:
     """Return a list for JSON, with None for infinite values."""
     return [float(v) if np.isfinite(v) else None for v in values]

@@ -91,61 +91,33 @@ class Encoding:
 class Recording:
     """The samples of one recording.
 
-    Attributes
-    ----------
-    name : str
-        Name in the procedure, for example ``accel_x``.
-    role : str
-        ``accelerometer`` or ``gyroscope`` (turns for that sensor), ``rests`` (rests and moves without a table),
-        ``validation`` (held out from every fit) or ``static`` (pins the noise model).
-    axis : str or None
-        Body axis that the table turns about (``x``, ``y``, ``z``), None where there is no single axis.
-    time_ns : (n,) array of int64, ns since power-on
-    accelerometer, gyroscope : (n, 3) arrays, g and deg/s, or None
-    temperature, table_angle, table_rate : (n,) arrays, degC, deg, deg/s, or None
-        Angle and rate are about the turn axis, the angle not wrapped; in held-out motion the magnitude of the rate.
-    table_attitude : (n, 4) array, or None
-        Unit quaternion (w, x, y, z), body to level with z up.
-    flags : (n,) array of uint16, or None
-        Bit 0: a gap before this sample. Bit 1: clipped. Bit 2: stuck. Bit 3: repaired.
-    source : dict
-        ``file``, ``sha256``, ``rows`` of the input.
-    filter : dict
-        Name and settings of the filter that was applied; ``delay_s`` of its output (0 where it is zero-phase), and
-        ``noise_gain``, the factor on the standard deviation of white noise.
-    encodings : dict of str to Encoding
-        Columns that came as integers.
-    setup : str
-        Which of several tables, mountings or sessions it was made in; empty where there is one alone.
-    up : str
-        ``+x``, ``-z`` ..: the body axis that points up throughout a turn about a vertical axis; empty elsewhere, where
-        the table's angle says which one does.
-    sense : int
-        1 or -1: the table's log counted right-handed about the body axis, or about its opposite. Angle and rate are
-        about the body axis.
-    clock_shared : bool
-        Whether the time between this recording and the unit's others is known (their times do not overlap).
+    ``role``: ``accelerometer`` or ``gyroscope`` (turns for that sensor), ``rests`` (rests and moves without a table),
+    ``validation`` (held out from every fit) or ``static`` (pins the noise model). ``filter``: name and settings of the
+    filter that was applied; ``delay_s`` of its output (0 where it is zero-phase), and ``noise_gain``, the factor on the
+    standard deviation of white noise.
     """
 
-    name: str
+    name: str  # in the procedure, for example accel_x
     role: str
-    axis: str | None
-    time_ns: NDArray[np.int64]
-    accelerometer: Values | None = None
-    gyroscope: Values | None = None
-    temperature: Values | None = None
-    table_angle: Values | None = None
-    table_rate: Values | None = None
-    table_attitude: Values | None = None
-    flags: NDArray[np.uint16] | None = None
-    source: dict[str, Any] = field(default_factory=dict)
+    axis: str | None  # body axis that the table turns about (x, y, z), None where there is no single axis
+    time_ns: Integers  # (n,), ns since power-on
+    accelerometer: Values | None = None  # (n, 3), g
+    gyroscope: Values | None = None  # (n, 3), deg/s
+    temperature: Values | None = None  # (n,), degC
+    table_angle: Values | None = None  # (n,), deg about the turn axis, not wrapped
+    table_rate: Values | None = None  # (n,), deg/s about the turn axis; in held-out motion its magnitude
+    table_attitude: Values | None = None  # (n, 4), unit quaternion (w, x, y, z), body to level with z up
+    flags: NDArray[np.uint16] | None = None  # (n,), bit 0: a gap before this sample, 1: clipped, 2: stuck, 3: repaired
+    source: dict[str, Any] = field(default_factory=dict)  # file, sha256, rows of the input
     notes: tuple[Note, ...] = ()
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
-    encodings: dict[str, Encoding] = field(default_factory=dict)
-    clock_shared: bool = True
-    setup: str = ""
+    encodings: dict[str, Encoding] = field(default_factory=dict)  # of the columns that came as integers
+    clock_shared: bool = True  # whether the time between this recording and the unit's others is known
+    setup: str = ""  # which of several tables, mountings or sessions it was made in; empty where there is one alone
+    # Body axis (+x, -z ..) that points up throughout a turn about a vertical axis; empty elsewhere: the table's angle
+    # says which one does.
     up: str = ""
-    sense: int = 1
+    sense: int = 1  # 1 or -1: the table's log counted right-handed about the body axis, or about its opposite
 
     @cached_property
     def time(self) -> Values:
@@ -236,50 +208,30 @@ def median(values: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
 class Motion:
     """The true motion, from a table's log (without noise) or from calibrated signals, in the body frame.
 
-    Attributes
-    ----------
-    time : (n,) array, s since power-on
-    specific_force, angular_rate, angular_acceleration : (n, 3) arrays, g, deg/s, deg/s^2
-    specific_force_rate : (n, 3) array, g/s
-        Time derivative of ``specific_force`` as the body sees it (for gravity alone ``-omega x f``, omega in rad/s).
-    temperature : (n,) array, degC, or None
-        Smoothed over 30 s: sensor noise in a regressor would bias what is fitted to it.
-    angle, rate, axis : (n,) arrays, deg and deg/s, and index of the turn axis, or None
-    still : (n,) array of bool
-        Samples at which the body rests and has settled.
-    at_offset : callable or None
-        ``at_offset(offset=tau)`` is the motion at ``time + tau`` (tau a float or (n,) array, s), from the same
-        interpolated trajectory; None where the trajectory is not known between the samples.
-    at_lag : callable or None
-        ``at_lag(lag=tau, offset=0.0)`` is what a first-order lag of time constant tau, s, leaves of that motion.
-    level : (n, 3, 3) array, or None
-        Rows: the level frame's axes x, y, z in the body frame; None where no reference gives the heading.
-    direction : (n, 3) array, or None
-        Unit vector of the turn that goes on or, at rest, of the last one; zeros before the first. None: not computed
-        yet (``pipeline.model.effects.base.turning_direction``).
-    reference_valid : (n,) array of bool, or None
-        Samples around which the table's log is dense enough to interpolate the trajectory.
-    recording, setup : str
-        Name of the recording; its table, mounting or session; empty where there is one alone.
+    ``at_offset(offset=tau)`` is the motion at ``time + tau`` (tau a float or (n,) array, s), from the same interpolated
+    trajectory, and ``at_lag(lag=tau, offset=0.0)`` what a first-order lag of time constant tau, s, leaves of that; None
+    where the trajectory is not known between the samples.
     """
 
-    time: NDArray[np.float64]
-    specific_force: NDArray[np.float64]
-    angular_rate: NDArray[np.float64]
-    angular_acceleration: NDArray[np.float64]
-    specific_force_rate: NDArray[np.float64]
-    temperature: NDArray[np.float64] | None
-    angle: NDArray[np.float64] | None
-    rate: NDArray[np.float64] | None
-    axis: int | None
-    still: NDArray[np.bool_]
+    time: Values  # (n,), s since power-on
+    specific_force: Values  # (n, 3), g
+    angular_rate: Values  # (n, 3), deg/s
+    angular_acceleration: Values  # (n, 3), deg/s^2
+    specific_force_rate: Values  # (n, 3), g/s, as the body sees it: for gravity alone -omega x f, omega in rad/s
+    temperature: Values | None  # (n,), degC, smoothed over 30 s: sensor noise in a regressor would bias what is fitted
+    angle: Values | None  # (n,), deg
+    rate: Values | None  # (n,), deg/s
+    axis: int | None  # of the turn
+    still: Mask  # (n,), samples at which the body rests and has settled
     at_offset: Callable[..., Motion | None] | None = None
     at_lag: Callable[..., Motion | None] | None = None
-    level: NDArray[np.float64] | None = None
-    direction: NDArray[np.float64] | None = None
-    reference_valid: NDArray[np.bool_] | None = None
+    level: Values | None = None  # (n, 3, 3), rows: the level frame's axes in the body frame; None: heading not known
+    # (n, 3), unit vector of the turn that goes on or, at rest, of the last one; zeros before the first. None: not
+    # computed yet (pipeline.model.effects.base.turning_direction).
+    direction: Values | None = None
+    reference_valid: Mask | None = None  # (n,), around which the table's log is dense enough to be interpolated
     recording: str = ""
-    setup: str = ""
+    setup: str = ""  # table, mounting or session of the recording; empty where there is one alone
 
     def select(self, index: NDArray[Any]) -> Motion:
         """Return the motion at some samples (a mask or integers), without the trajectory between samples."""

@@ -47,22 +47,12 @@ GAP = 1.5  # sampling intervals, above which the angle in between is not known
 
 @dataclass(frozen=True)
 class EncoderRate:
-    """Angle and rate of a table by the log of its angle.
+    """Angle and rate of a table by the log of its angle: (n,) arrays."""
 
-    Attributes
-    ----------
-    angle, rate : (n,) arrays, deg, deg/s
-        The angle is smoothed where the encoder is coarse.
-    noise : (n,) array, deg/s
-        Standard deviation of the rate by the encoder's resolution; 0 of a fine one and at rest.
-    vague : (n,) array of bool
-        Where the rate is not known: a fine angle bends between two samples, a coarse one has a gap.
-    """
-
-    angle: Values
-    rate: Values
-    noise: Values
-    vague: NDArray[np.bool_]
+    angle: Values  # deg, smoothed where the encoder is coarse
+    rate: Values  # deg/s
+    noise: Values  # deg/s, standard deviation of the rate by the encoder's resolution; 0 of a fine one and at rest
+    vague: NDArray[np.bool_]  # where the rate is not known: at a bend of a fine angle, at a gap of a coarse one
 
 
 def rate_by_angle(recording: Recording) -> EncoderRate | None:

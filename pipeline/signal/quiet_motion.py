@@ -60,26 +60,14 @@ FEWEST_OF_A_SLOPE = 8  # samples from which a slope has five degrees of freedom
 
 @dataclass(frozen=True)
 class Creep:
-    """The tilt within one rest.
+    """The tilt within one rest."""
 
-    Attributes
-    ----------
-    rate : (3,) array, deg/s
-        omega across gravity, in the axes of the readings; zero where it is not significant.
-    measured : (3,) array, deg/s
-        The same, also where it may be noise; ``uncertainty`` is the standard one of each of its two components.
-    shortening : float
-        By which share the mean of the readings is too short; 0 where the rate is zero.
-    squares, freedom : (3,) array, int
-        Sum of squares of the readings about their parabola, and its degrees of freedom, an axis.
-    """
-
-    rate: Values
-    measured: Values
-    uncertainty: float
-    shortening: float
-    squares: Values
-    freedom: int
+    rate: Values  # (3,), deg/s, omega across gravity, in the axes of the readings; zero where it is not significant
+    measured: Values  # (3,), deg/s, the same, also where it may be noise
+    uncertainty: float  # deg/s, the standard one of each of its two components
+    shortening: float  # share by which the mean of the readings is too short; 0 where the rate is zero
+    squares: Values  # (3,), sum of squares of the readings about their parabola
+    freedom: int  # degrees of freedom of the squares, an axis
 
 
 def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:

@@ -46,28 +46,14 @@ OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "la
 
 @dataclass(frozen=True)
 class Job:
-    """A stage on a batch.
-
-    Attributes
-    ----------
-    units : dict of str to dict
-        Unit to its settings.
-    run : dict
-        Settings that are not a unit's, and the options of the command line.
-    inputs : dict of str to Pack
-        Stage to the files that it wrote.
-    output : Path
-        File to write.
-    results : Path
-        Of the campaign.
-    """
+    """A stage on a batch."""
 
     stage: str
-    units: dict[str, dict[str, Any]]
-    run: dict[str, Any]
-    inputs: dict[str, Pack]
-    output: Path
-    results: Path
+    units: dict[str, dict[str, Any]]  # unit to its settings
+    run: dict[str, Any]  # settings that are not a unit's, and the options of the command line
+    inputs: dict[str, Pack]  # stage to the files that it wrote
+    output: Path  # file to write
+    results: Path  # of the campaign
 
 
 def main(stage: str, argv: Sequence[str]) -> int:
