@@ -14,6 +14,7 @@ RSS   : ``y^T M y - y^T M Z (D^-2 + G)^-1 Z^T M y``; nu: readings less columns o
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -30,6 +31,7 @@ Set: TypeAlias = frozenset[str]
 SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the data sheet's limits
 SCALE_PRIOR = np.log([0.2375, 0.2375, 0.2375, 0.2375, 0.03, 0.02])
 NEGLIGIBLE = 1e-4  # weight of a hypothesis or of a part of a mixture that is left out
+READINGS, ZEROS = -2, -1  # columns of the padded products
 WIDE = 8  # columns of an effect from which on LAPACK's factorisation costs less than an elimination of all side by side
 RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
 
@@ -54,6 +56,11 @@ class Problem:
     limits: Mapping[str, Values]  # (k,), of the parameters of each effect; the unit of its columns
     excluded: Mapping[str, Set] = field(default_factory=dict)  # effects that are never in a set with this one
 
+    @cached_property
+    def padded(self) -> Values:
+        """The products with a further column of zeros, the last, which fills up sets of fewer columns."""
+        return np.pad(self.products, ((0, 0), (0, 1), (0, 1)))
+
     def rss(self, squares: Values) -> Values:
         """Return -nu/2 log RSS of sums of squares."""
         return np.asarray(-0.5 * self.free * np.log(np.maximum(squares + self.within, 1e-300)))
@@ -64,47 +71,57 @@ class Problem:
 
 
 class Given:
-    """A problem beside a set of effects at chosen versions and scales."""
+    """A problem beside s sets of effects, each at chosen versions and scales."""
 
-    def __init__(self, problem: Problem, picks: Mapping[str, Pick]) -> None:
-        self.problem, self.level = problem, problem.prior
-        self.squares, self._half = problem.products[:, -1, -1], None  # of the readings; what the set takes
-        if picks:
-            held = [problem.versions[name][v].columns for name, (v, _) in picks.items()]
-            at = np.concatenate(held)
-            scale = np.repeat([SCALES[s] for _, s in picks.values()], [len(c) for c in held])
-            L = np.linalg.cholesky(problem.products[:, at[:, None], at] + np.diag(scale**-2.0))
-            self._half = np.linalg.inv(L) @ problem.products[:, at]
-            self.squares = self.squares - np.sum(self._half[:, :, -1] ** 2, axis=1)
-            logarithm = 2.0 * np.sum(np.log(np.einsum("tkk->tk", L)), axis=1) + 2.0 * float(np.sum(np.log(scale)))
-            chosen = sum(float(SCALE_PRIOR[s] + problem.versions[n][v].log_weight) for n, (v, s) in picks.items())
-            self.level = problem.prior - 0.5 * logarithm + chosen
+    def __init__(self, problem: Problem, sets: Sequence[Mapping[str, Pick]]) -> None:
+        self.problem, products = problem, problem.padded
+        held = [[problem.versions[name][v].columns for name, (v, _) in picks.items()] for picks in sets]
+        shape = len(sets), max(sum(map(len, columns)) for columns in held)
+        at, scale = np.full(shape, ZEROS), np.ones(shape)
+        for row, (picks, columns) in enumerate(zip(sets, held, strict=True)):
+            if columns:
+                own = slice(sum(map(len, columns)))
+                at[row, own] = np.concatenate(columns)
+                scale[row, own] = np.repeat([SCALES[s] for _, s in picks.values()], [len(c) for c in columns])
+        L = np.linalg.cholesky(
+            products[:, at[:, :, None], at[:, None, :]] + scale[:, :, None] ** -2.0 * np.eye(shape[1])
+        )
+        self._half = np.linalg.inv(L) @ products[:, at]  # what the sets take
+        self.squares = problem.products[:, None, -1, -1] - np.sum(self._half[..., READINGS] ** 2, axis=2)
+        logarithm = 2.0 * np.sum(np.log(np.einsum("tskk->tsk", L)), axis=2) + 2.0 * np.sum(np.log(scale), axis=1)
+        chosen = [sum(SCALE_PRIOR[s] + problem.versions[n][v].log_weight for n, (v, s) in p.items()) for p in sets]
+        self.level = problem.prior[:, None] - 0.5 * logarithm + np.array(chosen)
 
     def alone(self) -> Values:
-        """Return log E of the set under each hypothesis: (t,) array."""
+        """Return log E of the sets under each hypothesis: (t, s) array."""
         return self.level + self.problem.rss(self.squares)
 
-    def conditionals(self, names: Sequence[str]) -> dict[str, Values]:
-        """Return log E with each of some further effects, without prior odds: its (versions, scales) array."""
-        found: dict[str, Values] = {}
+    def conditionals(self, names: Sequence[str]) -> list[dict[str, Values]]:
+        """Return log E of each set with each of some effects, without prior odds: its (versions, scales) array."""
+        found: list[dict[str, Values]] = [{} for _ in self.level.T]
         for block in self.blocks(names):
-            each = np.logaddexp.reduce(block.score, axis=1).T
-            found |= zip(block.names, np.split(each, block.starts[1:]), strict=True)
+            each = np.logaddexp.reduce(block.score, axis=1).transpose(1, 2, 0)
+            for of_set, own in zip(found, each, strict=True):
+                of_set |= zip(block.names, np.split(own, block.starts[1:]), strict=True)
         return found
 
     def mixtures(self, names: Sequence[str]) -> dict[str, tuple[Values, Values, Values]]:
-        """Return log weight, (m,), mean and standard deviation, (m, k), of effects' parameters over their limits."""
+        """Return log weight, (m,), mean and standard deviation, (m, k), of effects' parameters over their limits.
+
+        They are those beside the first set.
+        """
         found = {}
         for block in self.blocks(names):
-            ends = [*block.starts[1:], block.score.shape[2]]
-            top = np.maximum.reduceat(np.max(block.score, axis=(0, 1)), block.starts)
+            score, inner, cross, squares = block.score[:, :, 0], block.inner[:, 0], block.cross[:, 0], block.squares
+            ends = [*block.starts[1:], score.shape[2]]
+            top = np.maximum.reduceat(np.max(score, axis=(0, 1)), block.starts)
             owner = np.repeat(np.arange(len(ends)), np.diff([*block.starts, ends[-1]]))
-            kept = block.score > top[owner] + np.log(NEGLIGIBLE)
+            kept = score > top[owner] + np.log(NEGLIGIBLE)
             s, t, m = np.nonzero(kept)
-            k = block.inner.shape[-1]
-            inverse = np.linalg.inv(block.inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(k))
-            mean, weight = (inverse @ block.cross[t, m, :, None])[..., 0], block.score[kept]
-            spread = np.einsum("nkk->nk", inverse) * (block.squares[kept] / self.problem.free)[:, None]
+            k = inner.shape[-1]
+            inverse = np.linalg.inv(inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(k))
+            mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
+            spread = np.einsum("nkk->nk", inverse) * (squares[:, :, 0][kept] / self.problem.free)[:, None]
             deviation = np.sqrt(np.maximum(spread, 0.0))
             for place, name in enumerate(block.names):
                 own = owner[m] == place
@@ -116,19 +133,18 @@ class Given:
         sizes: dict[int, list[str]] = {}
         for name in names:
             sizes.setdefault(len(self.problem.versions[name][0].columns), []).append(name)
-        out, products = [], self.problem.products
+        out, products = [], self.problem.padded
         for alike in sizes.values():
             each = [self.problem.versions[name] for name in alike]
             at = np.array([version.columns for versions in each for version in versions])
-            inner, cross = products[:, at[:, :, None], at[:, None, :]], products[:, at, -1]
-            if self._half is not None:
-                half = self._half[:, :, at].transpose(0, 2, 3, 1)
-                inner = inner - half @ half.transpose(0, 1, 3, 2)
-                cross = cross - (half @ self._half[:, None, :, -1:])[..., 0]
-            gain, log_det = _explained(inner, cross, self.squares)
-            squares = self.squares[:, None] - gain
-            weight = SCALE_PRIOR[:, None, None] + [version.log_weight for versions in each for version in versions]
-            score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, None] + weight
+            half = self._half[..., at].transpose(0, 1, 3, 4, 2)
+            inner = products[:, None, at[:, :, None], at[:, None, :]] - half @ half.swapaxes(3, 4)
+            cross = products[:, None, at, READINGS] - (half @ self._half[:, :, None, :, READINGS, None])[..., 0]
+            flat = inner.reshape(-1, *inner.shape[2:]), cross.reshape(-1, *cross.shape[2:]), self.squares.ravel()
+            gain, log_det = (found.reshape(-1, *inner.shape[:3]) for found in _explained(*flat))
+            squares = self.squares[:, :, None] - gain
+            weight = SCALE_PRIOR[:, None, None, None] + [v.log_weight for versions in each for v in versions]
+            score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, :, None] + weight
             starts = np.cumsum([0, *(len(versions) for versions in each[:-1])])
             out.append(Block(alike, starts, inner, cross, score, squares + self.problem.within))
         return out
@@ -136,14 +152,14 @@ class Given:
 
 @dataclass(frozen=True)
 class Block:
-    """Effects with as many columns beside a set, their m versions one after the other."""
+    """Effects with as many columns beside s sets, their m versions one after the other."""
 
     names: list[str]
     starts: Index  # of each effect's versions
-    inner: Values  # (t, m, k, k), products of columns
-    cross: Values  # (t, m, k), with the readings
-    score: Values  # (scales, t, m), log E
-    squares: Values  # (scales, t, m), sum of squares that is left
+    inner: Values  # (t, s, m, k, k), products of columns
+    cross: Values  # (t, s, m, k), with the readings
+    score: Values  # (scales, t, s, m), log E
+    squares: Values  # (scales, t, s, m), sum of squares that is left
 
 
 def _explained(inner: Values, cross: Values, squares: Values) -> tuple[Values, Values]:

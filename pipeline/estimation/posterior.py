@@ -94,16 +94,16 @@ class Search:
 
     def given(self, names: Set, but: Set = frozenset()) -> Given:
         """Return the problem beside a set, less some of its members."""
-        return Given(self.problem, {n: pick for n, pick in self.pool[names].picks.items() if n not in but})
+        return Given(self.problem, [{n: pick for n, pick in self.pool[names].picks.items() if n not in but}])
 
     def _prune(self, seeds: Sequence[Set]) -> None:
         """Leave out hypotheses that have no weight beside any of some sets."""
         kept = np.zeros(len(self.problem.prior), bool)
         for names in seeds:
-            found = Given(self.problem, dict.fromkeys(sorted(names), FIRST))
+            found = Given(self.problem, [dict.fromkeys(sorted(names), FIRST)])
             blocks = found.blocks(self._allowed(names))
-            best = [np.maximum.reduceat(np.max(b.score, axis=0), b.starts, axis=1) for b in blocks]
-            each = np.concatenate([found.alone()[:, None], *best], axis=1)
+            best = [np.maximum.reduceat(np.max(b.score[:, :, 0], axis=0), b.starts, axis=1) for b in blocks]
+            each = np.concatenate([found.alone(), *best], axis=1)
             kept |= np.any(each > each.max(axis=0) + np.log(NEGLIGIBLE), axis=1)
         self.problem = self.problem.under(kept)
 
@@ -114,8 +114,7 @@ class Search:
     def _beam(self) -> None:
         level = [self.required]
         while level:
-            children = dict.fromkeys(child for names in level for child in self._extend(names))
-            level = self._near(sorted(children, key=lambda names: -self.pool[names].score)[:BEAM], FAR)
+            level = self._near(sorted(self._extend(level), key=lambda names: -self.pool[names].score)[:BEAM], FAR)
             for names in level:
                 self._finish(names)
             level = self._near(level, NEAR)
@@ -129,12 +128,11 @@ class Search:
         """Replace each member of the best set by every other effect."""
         for _ in range(ROUNDS):
             best = self.best()
-            for name in sorted(best - self.required):  # the order of a set differs from process to process
-                self._extend(best - {name})
+            self._extend([best - {name} for name in sorted(best - self.required)])  # in the same order in each process
             for names in self._best(BEAM, NEAR):
                 self._finish(names)
             if self.best() == best:
-                self._extend(best)
+                self._extend([best])
                 return
 
     def _best(self, most: int, within: float) -> list[Set]:
@@ -142,23 +140,25 @@ class Search:
         near = [names for names, found in self.pool.items() if found.score > top - within]
         return sorted(near, key=lambda names: -self.pool[names].score)[:most]
 
-    def _extend(self, names: Set) -> list[Set]:
-        """Add every allowed effect to a set; return the new sets."""
-        if len(names) >= MOST + len(self.required):
-            return []
-        if names not in self._extended:
-            self._extended.add(names)
+    def _extend(self, level: Sequence[Set]) -> list[Set]:
+        """Add every allowed effect to some sets; return the new sets."""
+        level = [names for names in level if len(names) < MOST + len(self.required)]
+        new = [names for names in level if names not in self._extended]
+        self._extended.update(new)
+        for names in new:
             self._finish(names)
-            own = self.pool[names]
-            for name, found in self.given(names).conditionals(self._allowed(names)).items():
+        parents = [self.pool[names] for names in new]
+        beside = Given(self.problem, [own.picks for own in parents]).conditionals([*self.problem.versions]) if new else []
+        for names, own, conditionals in zip(new, parents, beside, strict=True):
+            for name in self._allowed(names):
+                found, child = conditionals[name], names | {name}
                 total = float(np.logaddexp.reduce(found, axis=None))
-                child = names | {name}
                 score, held = total + own.spread + ODDS * len(child), self.pool.get(child)
                 if held is None or (not held.final and held.score < score):
                     best, at = _largest(found)
                     spread = total - best if len(child) == 1 else 0.0
                     self.pool[child] = Found(score, {**own.picks, name: at}, spread, final=len(child) == 1)
-        return [names | {name} for name in self._allowed(names)]
+        return list(dict.fromkeys(names | {name} for names in level for name in self._allowed(names)))
 
     def _finish(self, names: Set) -> None:
         """Find the best versions and scales of a set, and average over all."""
@@ -171,13 +171,13 @@ class Search:
             before, spread = dict(picks), 0.0
             for name in picks:
                 others = {n: pick for n, pick in picks.items() if n != name}
-                each = Given(self.problem, others).conditionals([name])[name]
+                each = Given(self.problem, [others]).conditionals([name])[0][name]
                 score, picks[name] = _largest(each)
                 spread += float(np.logaddexp.reduce(each, axis=None)) - score
             if picks == before:
                 break
         if not picks:
-            score = float(np.logaddexp.reduce(Given(self.problem, {}).alone()))
+            score = float(np.logaddexp.reduce(Given(self.problem, [{}]).alone(), axis=None))
         self.pool[names] = Found(score + spread + ODDS * len(names), picks, spread, final=True)
 
 
