@@ -224,8 +224,8 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
     known = np.flatnonzero(np.isfinite(layer.x) & np.isfinite(layer.y))
     if isinstance(layer, Line):
         breaks = np.flatnonzero(np.diff(known) > 1) + 1
-        ends = (np.split(axis.units(v[known]), breaks) for axis, v in ((x, layer.x), (y, layer.y)))
-        path = "".join(_line(*piece) for piece in zip(*ends, strict=True))
+        ends = np.array([x.units(layer.x[known]), y.units(layer.y[known])])
+        path = "".join(_line(*piece) for piece in (np.split(ends, breaks, axis=1) if breaks.size else [ends]))
         return f'<path class="line c{layer.colour} {layer.style}" d="{path}"/>'
     at, path, room = x.units(layer.x[known]), "", LARGE_DOTS
     if layer.low is not None and layer.high is not None:
@@ -278,17 +278,17 @@ def _line(x: NDArray[np.int64], y: NDArray[np.int64]) -> str:
         return _dots(x, y)
     if len(x) == 2:  # most are rests, which are many
         return f"M{x[0]} {y[0]}l{x[1] - x[0]} {y[1] - y[0]}"
-    return f"M{x[0]} {y[0]}l{_path(' %d %d', np.diff(x), np.diff(y))[1:]}"
+    return f"M{x[0]} {y[0]}l{_path(' %d %d', x[1:] - x[:-1], y[1:] - y[:-1])[1:]}"
 
 
 def _dots(x: NDArray[np.int64], y: NDArray[np.int64]) -> str:
     """Return a path of dots: lines of length zero, which round line ends make visible."""
-    return f"M{x[0]} {y[0]}h0{_path('m%d %dh0', np.diff(x), np.diff(y))}" if len(x) else ""
+    return f"M{x[0]} {y[0]}h0{_path('m%d %dh0', x[1:] - x[:-1], y[1:] - y[:-1])}" if len(x) else ""
 
 
 def _path(form: str, *columns: NDArray[np.int64]) -> str:
     """Return the form once for each row of the columns."""
-    return form * len(columns[0]) % tuple(np.stack(columns, 1).ravel().tolist())
+    return form * len(columns[0]) % tuple(np.array(columns).T.ravel().tolist())
 
 
 def _names(points: Sequence[tuple[float, float, str]], x: Axis, y: Axis) -> str:

@@ -141,15 +141,21 @@ def _drift(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, 
 
 
 def _lots(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
-    """Find the parameters that differ between lots."""
+    """Find the parameters that differ between lots, by the test of Kruskal and Wallis (JASA 47, 1952, 583-621).
+
+    Its statistic, with the correction for ties, is ``(n - 1)`` times the share of the variance of all n ranks that the
+    mean ranks of the lots have.
+    """
+    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only lots need)
+
     for name in values.columns[values.count() >= FEWEST]:
         lots = {lot: v.dropna() for lot, v in values[name].groupby(siblings["lot"])}
         lots = {lot: v for lot, v in lots.items() if len(v) >= 3}
         if len(lots) < 2 or np.ptp(values[name].dropna()) == 0.0:
             continue
-        from scipy import stats  # noqa: PLC0415  (as above)
-
-        p = float(stats.kruskal(*lots.values()).pvalue)
+        ranks = pd.concat(lots).rank()
+        share = ranks.groupby(level=0).transform("mean").var() / ranks.var()
+        p = float(chdtrc(len(lots) - 1, (len(ranks) - 1) * share))
         if p * len(values.columns) < LEVEL:
             medians, middle = {lot: float(v.median()) for lot, v in lots.items()}, float(values[name].median())
             lot = max(medians, key=lambda lot: abs(medians[lot] - middle))
