@@ -139,12 +139,12 @@ class ProjectedCurves(_Evidence):
             known = np.concatenate([model[:-1], *explained])
             k, index = len(known), np.concatenate([known, own, model[-1:]])
             among = products[:, index[:, None], index]
-            taken = projection(among, np.arange(k))[:, :, k:]
-            rest = without(among, np.arange(k))[:, k:, k:]
+            taken = projection(among, np.arange(k))
+            rest = without(among, np.arange(k), taken)[:, k:, k:]
             inner.append(rest[:, :q, :q])
             cross.append(rest[:, :q, q])
             left.append(rest[:, q, q])
-            error.append(unit * (white[own] + white[known] @ np.abs(taken[:, :, :q])))
+            error.append(unit * (white[own] + white[known] @ np.abs(taken[:, :, k : k + q])))
         over = self.scale[None, :] ** -2
         self.white: Values = np.mean([axis[0] for axis in inner], axis=0)
         self.inner: Values = np.stack(inner, axis=1)[1:] * over[:, :, None, None]

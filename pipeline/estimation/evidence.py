@@ -94,15 +94,15 @@ class Given:
 
     def alone(self) -> Values:
         """Return log E of the sets under each hypothesis: (t, s) array."""
-        return self.level + self.problem.rss(self.squares)
+        return np.asarray(self.level + self.problem.rss(self.squares))
 
     def conditionals(self, names: Sequence[str]) -> list[dict[str, Values]]:
         """Return log E of each set with each of some effects, without prior odds: its (versions, scales) array."""
         found: list[dict[str, Values]] = [{} for _ in self.level.T]
         for block in self.blocks(names):
             each = np.logaddexp.reduce(block.score, axis=1).transpose(1, 2, 0)
-            for of_set, own in zip(found, each, strict=True):
-                of_set |= zip(block.names, np.split(own, block.starts[1:]), strict=True)
+            for k, own in enumerate(each):
+                found[k] |= zip(block.names, np.split(own, block.starts[1:]), strict=True)
         return found
 
     def mixtures(self, names: Sequence[str]) -> dict[str, tuple[Values, Values, Values]]:

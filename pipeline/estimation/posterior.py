@@ -147,11 +147,11 @@ class Search:
         self._extended.update(new)
         for names in new:
             self._finish(names)
-        parents = [self.pool[names] for names in new]
-        beside = Given(self.problem, [own.picks for own in parents]).conditionals([*self.problem.versions]) if new else []
-        for names, own, conditionals in zip(new, parents, beside, strict=True):
+        given = Given(self.problem, [self.pool[names].picks for names in new]) if new else None
+        for names, found_of in zip(new, given.conditionals([*self.problem.versions]) if given else [], strict=True):
+            own = self.pool[names]
             for name in self._allowed(names):
-                found, child = conditionals[name], names | {name}
+                found, child = found_of[name], names | {name}
                 total = float(np.logaddexp.reduce(found, axis=None))
                 score, held = total + own.spread + ODDS * len(child), self.pool.get(child)
                 if held is None or (not held.final and held.score < score):

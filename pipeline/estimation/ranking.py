@@ -252,16 +252,17 @@ class Ranking:
         return float(np.sum(limits[:count] ** 2 * np.diag(self.beside[setting, block, block])))
 
 
-def without(products: Values, index: Index) -> Values:
+def without(products: Values, index: Index, taken: Values | None = None) -> Values:
     """Return products of columns after some of them are projected out of all: (t, p, p) array.
 
     Zeros in theirs, and in those of columns of which only rounding is left; the last column, the readings, is kept.
 
-    ``products``: (t, p, p). ``index``: (q,).
+    ``products``: (t, p, p). ``index``: (q,). ``taken``: their ``projection``, where it is known.
     """
     if len(index) == 0:
         return products
-    rest = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
+    taken = projection(products, index) if taken is None else taken
+    rest = products - products[:, index, :].transpose(0, 2, 1) @ taken
     new = np.einsum("tpp->tp", rest) > LEFT * np.einsum("tpp->tp", products)
     new[:, -1] = True
     rest *= new[:, :, None]

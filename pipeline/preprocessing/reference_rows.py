@@ -52,6 +52,12 @@ class Comparison:
         for channel in channels:
             finite = np.isfinite(channel.low)
             self.known &= finite if channel.of_intervals else finite[1:] & finite[:-1]
+        # size and starts, and the sums of each channel
+        self.stretches: list[tuple[int, Index, dict[str, tuple[Values, Values, Values, Values]]]] = []
+        n = len(self.dt)
+        for size in sorted({SHORT, max(n // LONG, SHORT)}):
+            starts = np.arange(0, max(n - size // 2, 1), size)
+            self.stretches.append((size, starts, {c.name: self._sums(c, starts) for c in channels}))
 
     def find(self, claim: Channel) -> tuple[bool, Note] | None:
         """Return where a channel contradicts all others, and whether no effect of the catalogue explains it."""
@@ -110,13 +116,12 @@ class Comparison:
 
     def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Note | None:
         limits, n = self.limits, len(self.dt)
-        for size in sorted({SHORT, max(n // LONG, SHORT)}):
-            starts = np.arange(0, max(n - size // 2, 1), size)
-            turned, total, bends, _ = self._sums(claim, starts)
+        for size, starts, known in self.stretches:
+            turned, total, bends, _ = known[claim.name]
             length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
             excess, sums = [], []
             for other in others:
-                seen, seen_total, seen_bends, swing = self._sums(other, starts)
+                seen, seen_total, seen_bends, swing = known[other.name]
                 most = np.maximum(total, seen_total)
                 allowed = limits.rate * most + BENDS * np.sqrt(bends + seen_bends) + RESOLVED_DEG
                 if claim.of_intervals or other.of_intervals:
