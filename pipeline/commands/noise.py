@@ -14,7 +14,7 @@ from pipeline.exports import Subject, export, formats
 from pipeline.files import json_text, write_atomically
 from pipeline.records import AXES, SENSORS
 from pipeline.report.noise_section import remarks, term_rows
-from pipeline.report.numbers import MINUS, number
+from pipeline.report.numbers import MINUS, aligned, number
 
 if TYPE_CHECKING:
     import argparse
@@ -77,7 +77,5 @@ def _told(sensor: str, noise: JSON) -> str:
     if noise["source"]:
         lines[0] += f": {noise['samples']} samples, {number(noise['length_s'])} s without a gap"
     rows = [["", *AXES, "unit"], *([r["name"], *r["axes"], r["unit"]] for r in term_rows(noise))]
-    if len(rows) > 1:
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-        lines += ["  " + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines += aligned(rows) if len(rows) > 1 else []
     return "\n".join([*lines, *(f"  {line}" for line in remarks(noise))])

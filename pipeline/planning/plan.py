@@ -30,6 +30,7 @@ from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
 from pipeline.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
 from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
+from pipeline.report.numbers import aligned
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, course_of, read_config
 
@@ -228,10 +229,10 @@ def _of_sensor(sensor: str, part: Mapping[str, Any]) -> list[str]:
     lines = [f"{sensor} (noise {noise['white']:.2g} {unit} a sample, bias wander {noise['wander']:.2g} {unit})"]
     head = ["effect", "smallest size", "of limit", "similar signal", "note"]
     if part["effects"]:
-        lines += _aligned([head, *(_row(entry) for entry in part["effects"])])
+        lines += aligned([head, *(_row(entry) for entry in part["effects"])])
     if part["not_observable"]:
         lines.append("  not observable:")
-        lines += _aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
+        lines += aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
     return lines
 
 
@@ -297,12 +298,4 @@ def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
             )
         both = name in a and name in b
         rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
-    return [*reasons, *(_aligned(rows) if len(rows) > 1 else [])]
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows as lines whose columns begin at the same place."""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    return [
-        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
+    return [*reasons, *(aligned(rows) if len(rows) > 1 else [])]

@@ -72,25 +72,13 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
 def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
     """Filter the accelerometer and gyroscope readings of a recording; everything else stays as it is.
 
-    Parameters
-    ----------
-    recording : Recording
-    settings : dict
-        ``name`` (``none``, ``rc_low_pass``, ``low_pass``, ``high_pass``, ``band_pass``, ``band_stop``), ``cutoff_hz``,
-        ``time_constant_s``, ``low_hz``, ``high_hz``, ``order``, ``zero_phase``.
+    ``settings``: ``name`` (``none``, ``rc_low_pass``, ``low_pass``, ``high_pass``, ``band_pass``, ``band_stop``),
+    ``cutoff_hz``, ``time_constant_s``, ``low_hz``, ``high_hz``, ``order``, ``zero_phase``. The result's ``filter``
+    holds them, ``delay_s`` (at 0 Hz; of a band-pass at the middle of its band; 0 for a high-pass, which does not delay
+    what is far above its cutoff) and ``noise_gain``.
 
-    Returns
-    -------
-    Recording
-        With ``filter`` holding the settings, ``delay_s`` (at 0 Hz; of a band-pass at the middle of its band; 0 for a
-        high-pass, which does not delay what is far above its cutoff) and ``noise_gain``.
-
-    Raises
-    ------
-    ConfigurationError
-        If a setting is missing or a cutoff is not below half the sampling rate.
-    InputError
-        If the recording is too short to have a sampling interval.
+    Raises ``ConfigurationError`` if a setting is missing or a cutoff is not below half the sampling rate,
+    ``InputError`` if the recording is too short to have a sampling interval.
     """
     name = settings["name"]
     if name == "none":

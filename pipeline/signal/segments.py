@@ -88,19 +88,9 @@ def cut(
 ) -> list[Recording]:
     """Return the segments of one long recording as recordings of their own.
 
-    Parameters
-    ----------
-    recording : Recording
-    windows : sequence of mapping, optional
-        ``role``, ``axis``, ``start_s`` and ``stop_s`` (in the recording's own time, from its first sample), in place of
-        what is found here.
-    found : bool
-        Whether the windows were found in the recording.
-
-    Raises
-    ------
-    InputError
-        If nothing is found, or a window holds no samples.
+    ``windows``: ``role``, ``axis``, ``start_s`` and ``stop_s`` (in the recording's own time, from its first sample), in
+    place of what is found here; ``found``: whether they were found in the recording. Raises ``InputError`` if nothing
+    is found, or a window holds no samples.
     """
     segments = _find_segments(recording) if windows is None else [_of_window(recording, w) for w in windows]
     out: list[Recording] = []
