@@ -23,6 +23,7 @@ import numpy as np
 from pipeline.io.quality_flags import BY_CHANCE
 from pipeline.model.kinematics import normal_gravity_g
 from pipeline.preprocessing.at_rest import check_axes, check_static
+from pipeline.preprocessing.coarse_temperature import refined
 from pipeline.preprocessing.evidence import place, refusal
 from pipeline.preprocessing.mounting import check_mounting
 from pipeline.preprocessing.reference import check_motion, check_turns
@@ -60,7 +61,8 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     check_shared_rows(recordings)
     check_axes(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
-    return _placed(check_motion(check_mounting(turns, settings), delays, settings), settings.get("table") or {})
+    checked = refined(check_motion(check_mounting(turns, settings), delays, settings))
+    return _placed(checked, settings.get("table") or {})
 
 
 def _placed(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recording]:

@@ -29,6 +29,7 @@ from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import fit_stage
 from pipeline.model.effects import leaving_out
+from pipeline.preprocessing.coarse_temperature import refined
 from pipeline.records import SENSORS, Recording, SensorCalibration
 from pipeline.study.bench import at_detection, recordings_of, signals_left
 from pipeline.study.cases import REFERENCE, Case, draw
@@ -110,7 +111,7 @@ def read_lines(path: Path) -> list[JSON]:
 
 def judge(case: Case) -> list[JSON]:
     """Return what is said of a case: one entry, or one for each sensor where nothing is hidden."""
-    recordings = recordings_of(case)
+    recordings = refined(recordings_of(case))
     out = []
     for sensor in SENSORS if case.kind == "null" else (case.sensor,):
         began = time.process_time()
