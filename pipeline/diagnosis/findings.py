@@ -116,7 +116,7 @@ def document_of(found: Findings, case: Case) -> dict[str, Any]:
         "unexplained": found.unknown,
         "suggested_effect": None,
         "next_experiment": next_experiment(verdict, ranking, found),
-        "override": _override(found.sensor, [*listed, *found.selected]) if found.selected else "",
+        "override": f"effects.{found.sensor}=[{','.join([*listed, *found.selected])}]" if found.selected else "",
         "configured": case.configured,
         "wander": _wander(found),
         "method_errors": [],
@@ -144,10 +144,6 @@ def _how_sure(found: Findings) -> dict[str, Any]:
         "upper_limit": limits,
         "to_distinguish": to_distinguish(sets, found.sensor, on_table=found.on_table),
     }
-
-
-def _override(sensor: str, names: Sequence[str]) -> str:
-    return f"effects.{sensor}=[{','.join(names)}]"
 
 
 def _entry(found: Findings, name: str) -> dict[str, Any]:

@@ -21,7 +21,6 @@ Application, 1997, section 4.2).
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,15 +68,10 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
                 "effect": name,
                 "recordings": recordings,
                 "seconds": _stretches(selection, gains),
-                "depends_on": [r["recording"] for r in recordings if _gone(r)],
+                "depends_on": [r["recording"] for r in recordings if (r["delta_bic_without"] or 0.0) < GATE_BIC],
             }
         )
     return found
-
-
-def _gone(recording: JSON) -> bool:
-    """Return whether the evidence is gone without a recording."""
-    return recording["delta_bic_without"] is None or bool(recording["delta_bic_without"] < GATE_BIC)
 
 
 def _gains_of_blocks(selection: Selection, design: Design, whole: Values, term: Term, own: Index) -> Values:
@@ -174,7 +168,7 @@ def _stretches(selection: Selection, gains: Values) -> list[JSON]:
     ends = np.cumsum([len(part.weight) for part in observations.parts])
     first, last = observations.blocks.first, np.append(observations.blocks.first[1:], len(time)) - 1
     part = np.searchsorted(ends, first, side="right")
-    breaks = [0, *(k for k in range(1, len(chosen)) if _apart(chosen[k - 1], chosen[k], part)), len(chosen)]
+    breaks = np.flatnonzero((np.diff(chosen) != 1) | (np.diff(part[chosen]) != 0)) + 1
     found = [
         {
             "recording": observations.parts[part[run[0]]].name,
@@ -182,14 +176,9 @@ def _stretches(selection: Selection, gains: Values) -> list[JSON]:
             "to_s": float(time[last[run[-1]]]),
             "share": float(gains[run].sum()),
         }
-        for a, b in pairwise(breaks)
-        if len(run := chosen[a:b])
+        for run in np.split(chosen, breaks)
     ]
     return sorted(found, key=lambda stretch: -stretch["share"])[:MOST_STRETCHES]
-
-
-def _apart(a: int, b: int, part: Index) -> bool:
-    return bool(b != a + 1 or part[a] != part[b])
 
 
 SIMULATIONS = 199  # the share is known to 3.5 % (standard error) at worst

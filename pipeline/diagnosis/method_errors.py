@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.design import Start
 from pipeline.estimation.generalized_least_squares import Fit, fit_terms
 from pipeline.estimation.observations import through_filter
 from pipeline.model.effects import effect_of
@@ -232,8 +231,7 @@ def _difference_of(calibration: SensorCalibration, selection: Selection, setting
     known = {term.effect.name for term in free.terms}
     more = [t for t in selection.fit.terms if t.effect.name in names and t.effect.name not in known]
     if more:
-        start = Start(free.bias, free.K, selection.start.scale)
-        free = fit_terms(selection.observations, [*free.terms, *more], start, selection.settings)
+        free = fit_terms(selection.observations, [*free.terms, *more], free, selection.settings)
     M = calibration.matrix
     own = _own_covariance(calibration, settings)
     of_free, of_method = np.zeros((12, 12)), np.zeros((12, 12))

@@ -33,7 +33,7 @@ from pipeline.estimation.design import Term
 from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
-from pipeline.estimation.multi_position.selection import FAR, Selection, posterior, select
+from pipeline.estimation.multi_position.selection import FAR, Selection, posterior
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue, effect, effect_from
 
@@ -64,7 +64,7 @@ def findings(case: Case) -> Findings:
     """
     model, calibration = _model_of_all_rests(case), case.calibration
     given = calibration, case.configured, case.noise, case.sheet
-    selection = select(model, *given)
+    selection = Selection(model, *given)
     expected = _without_creep(case.noise, case.sheet)
     hidden, unknown = not_observable_by_hand(selection, case.configured), dependences(selection)
     chi = [_chi(selection, fit, expected) for fit in selection.fits]
@@ -125,7 +125,7 @@ def findings(case: Case) -> Findings:
             "method_errors": given_differences(
                 calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
             ),
-            "cross_validation": _nested(selection, lambda part: select(part, *given)),
+            "cross_validation": _nested(selection, lambda part: Selection(part, *given)),
         },
     )
 

@@ -21,7 +21,6 @@ from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
 from pipeline.errors import ConvergenceError
 from pipeline.estimation.candidates import turns_of
-from pipeline.estimation.design import Start
 from pipeline.estimation.free_curves import free_curves
 from pipeline.estimation.generalized_least_squares import Fit, calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
@@ -181,8 +180,7 @@ def _fits(selection: Selection) -> list[Fit]:
     fitted = {term.effect.name: term for term in selection.fit.terms}
     for count in range(1, len(selection.names)):
         terms = [*selection.base.terms, *(fitted[name] for name in selection.names[:count])]
-        start = Start(selection.fit.bias, selection.fit.K, selection.start.scale)
-        fits.append(fit_terms(selection.observations, terms, start, selection.settings))
+        fits.append(fit_terms(selection.observations, terms, selection.fit, selection.settings))
     return [*fits, selection.fit] if selection.names else fits
 
 

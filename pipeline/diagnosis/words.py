@@ -300,18 +300,13 @@ def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: F
     entries = {entry["effect"]: entry for entry in ranking}
 
     def alike(name: str) -> list[str]:
-        return [a["effect"] for a in entries[name]["look_alikes"] if not _contains(a["effect"], name)]
+        others = [a["effect"] for a in entries[name]["look_alikes"]]
+        return [n for n in others if name not in getattr(catalogue().get(n), "contains", ())]
 
     name = next((n for n in found.selected if alike(n)), found.selected[0])
     experiment = _experiment(name, on_table=found.on_table)
     others = listed([plain(other) for other in alike(name)[:2]], "or")
     return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
-
-
-def _contains(other: str, name: str) -> bool:
-    """Return whether an effect is another one with more parameters: there is nothing to distinguish."""
-    known = catalogue().get(other)
-    return known is not None and name in known.contains
 
 
 def of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:

@@ -112,7 +112,7 @@ def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
 
 @dataclass(frozen=True)
 class Start:
-    """The base by ordinary least squares."""
+    """The base from which a fit starts: by ordinary least squares, or of another fit."""
 
     bias: Values  # (3,)
     K: Values  # (3, 3)

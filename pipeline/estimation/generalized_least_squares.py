@@ -54,11 +54,9 @@ LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(Start):
     """Base and effects that explain the readings best."""
 
-    bias: Values  # (3,)
-    K: Values  # (3, 3)
     terms: tuple[Term, ...]  # the effects at their values
     # (12 + p, 12 + p); of bias, K (row by row) and the effects' parameters, as the noise settings of the fit weight it
     covariance: Values
@@ -71,7 +69,6 @@ class Fit:
     condition: float  # of the scaled products of columns
     cosine: float  # largest between what is left of the readings and a column, both whitened
     rank: int  # parameters, or combinations of them, that the readings determine
-    scale: Values  # (3,); white noise of each axis, for the weights between the axes
 
 
 def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
@@ -103,6 +100,7 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     return Fit(
         bias,
         K,
+        start.scale,
         tuple(terms),
         covariance,
         solved.log_likelihood,
@@ -114,7 +112,6 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         solved.condition,
         solved.left if linear else solved.cosine,
         solved.rank,
-        start.scale,
     )
 
 

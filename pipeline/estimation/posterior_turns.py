@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, over_limits, time_constants
-from pipeline.estimation.design import BASE, Design, Start, Term, placed
+from pipeline.estimation.design import BASE, Design, Term, placed
 from pipeline.estimation.evidence import Problem, Version
 from pipeline.estimation.gauss_markov import WHITE, random_walks
 from pipeline.estimation.generalized_least_squares import Fit, design_beside, fit_terms
@@ -89,8 +89,7 @@ def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, 
         if name == DELAYS[1]:
             values = np.maximum(values, term.effect.starts(selection.observations.sensor)[0])
         terms.append(fitted.get(name) or replace(term, values=values))
-    start = Start(selection.fit.bias, selection.fit.K, selection.start.scale)
-    return fit_terms(selection.observations, terms, start, selection.settings)
+    return fit_terms(selection.observations, terms, selection.fit, selection.settings)
 
 
 def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:

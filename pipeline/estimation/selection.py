@@ -270,8 +270,7 @@ class Selection:
         if tuple(self.names) in self.fits:
             self.fit = self.fits[tuple(self.names)]
             return
-        start = Start(self.fit.bias, self.fit.K, self.start.scale)
-        self.fit = fit_terms(self.observations, [*self.base.terms, *self._terms()], start, self.settings)
+        self.fit = fit_terms(self.observations, [*self.base.terms, *self._terms()], self.fit, self.settings)
         self.fits[tuple(self.names)] = self.fit
 
     def _terms(self) -> list[Term]:
@@ -364,8 +363,7 @@ class Selection:
         terms = self._terms()
         value = np.maximum(-terms[place].values, effect(other).starts(self.observations.sensor)[0])
         terms[place] = Term(effect(other), value)
-        start = Start(self.fit.bias, self.fit.K, self.start.scale)
-        fit = fit_terms(self.observations, [*self.base.terms, *terms], start, self.settings)
+        fit = fit_terms(self.observations, [*self.base.terms, *terms], self.fit, self.settings)
         gain = 2.0 * (fit.log_likelihood - self.fit.log_likelihood)
         if gain <= (CLEARLY if other == DELAYS[1] else 0.0):
             return False

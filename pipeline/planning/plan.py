@@ -118,7 +118,7 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Select
     if sensor == "gyroscope":
         start, other = SensorCalibration(sensor), start
     model = require_model(simulated.recordings, start, simulated.noise[sensor], settings, other)
-    return by_hand.select(model, start, [], simulated.noise[sensor], simulated.sheets[sensor])
+    return by_hand.Selection(model, start, [], simulated.noise[sensor], simulated.sheets[sensor])
 
 
 def _entry(sensor: str, found: Detection, *, limited: bool) -> Document:

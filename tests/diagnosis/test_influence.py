@@ -11,7 +11,6 @@ import yaml
 from bench_session import STOP_AND_GO, Session, record
 
 from pipeline.diagnosis.influence import goodness_of_fit, influence
-from pipeline.estimation.design import Start
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
@@ -53,9 +52,8 @@ def test_an_effect_in_every_recording_depends_on_none_and_its_gain_is_that_of_th
     left = next(e for e in found["recordings"] if e["recording"] == "gyro_x")
     kept = tuple(p for p in selection.observations.parts if p.name != "gyro_x")
     rest = replace(selection.observations, parts=kept)  # an independent fit of the other recordings
-    start = Start(selection.fit.bias, selection.fit.K, selection.start.scale)
     settings = [selection.fit.setting]
-    fits = [fit_terms(rest, terms, start, settings) for terms in ([], selection.fit.terms)]
+    fits = [fit_terms(rest, terms, selection.fit, settings) for terms in ([], selection.fit.terms)]
     gain = 2.0 * (fits[1].log_likelihood - fits[0].log_likelihood)
     assert left["delta_bic_without"] == pytest.approx(gain - 9 * np.log(3.0 * rest.samples), rel=0.02)
     change = np.abs(fits[1].terms[0].values - selection.fit.terms[0].values)

@@ -28,7 +28,7 @@ from scipy import stats
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.result import model_of
-from pipeline.estimation.multi_position.selection import select
+from pipeline.estimation.multi_position.selection import Selection
 from pipeline.estimation.noise import estimate_noise
 from pipeline.io.read import read_recordings
 from pipeline.simulation.description import read_config
@@ -148,7 +148,7 @@ def named(which: str, seed: int, rest_s: float | None = None) -> bool:
     calibration = FITS[sensor].fit([drawn.recording], None, settings)
     model = model_of([drawn.recording], calibration, noise, settings)
     assert model is not None
-    return effect in select(model, calibration, [], noise, settings["sensor"][sensor]).names
+    return effect in Selection(model, calibration, [], noise, settings["sensor"][sensor]).names
 
 
 @pytest.mark.study

@@ -25,7 +25,7 @@ from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, f
 from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_observable
 from pipeline.estimation.multi_position.likelihood import prior_hypotheses, selection_hypotheses
 from pipeline.estimation.multi_position.model import Model, State, parameter_places, refusal, stepped
-from pipeline.estimation.multi_position.selection import fit_configured, limits_of, select
+from pipeline.estimation.multi_position.selection import Selection, fit_configured, limits_of
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.table_errors import type_b
@@ -88,7 +88,7 @@ def fit_effects_by_rests(
     model = model_of(recordings, before, noise, settings)
     if model is None:
         return before
-    names = select(model, before, [], noise, sheet).names if wanted == AUTO else list(wanted)
+    names = Selection(model, before, [], noise, sheet).names if wanted == AUTO else list(wanted)
     if not names:
         return before
     for name in names:

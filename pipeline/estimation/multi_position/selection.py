@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from typing import Any
 
-    from pipeline.records import Noise, SensorCalibration, Values
+    from pipeline.records import Mask, Noise, SensorCalibration, Values
 
 
 ROUNDS = 3 * MOST
@@ -60,19 +60,6 @@ class Scored:
     shown: dict[str, Values]  # orthonormal directions of each under the model's best hypothesis
     spare: dict[str, float]  # the factor on its gain; 0 where too few equations are left to judge it
     signal: dict[str, Values]  # its fitted, whitened signal there
-
-
-def select(
-    model: Model, start: SensorCalibration, configured: Sequence[str], noise: Noise | None, sheet: Mapping[str, Any]
-) -> Selection:
-    """Select effects.
-
-    ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sheet``: the sensor's
-    section of the configuration.
-    """
-    found = Selection(model, start, configured, noise, sheet)
-    found.run()
-    return found
 
 
 def fit_configured(
@@ -99,14 +86,10 @@ def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, Values]:
 class Selection:
     """What was selected, and how every candidate did: ``first`` and ``last`` before and after the search.
 
-    ``names``: in order. ``steps``: score of each when it was accepted. ``fits``: of base and configured effects, then
-    with each further selected one. ``own``: scores given all selected effects but one.
+    ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sheet``: the sensor's
+    section of the configuration. ``names``: in order. ``steps``: score of each when it was accepted. ``fits``: of base
+    and configured effects, then with each further selected one. ``own``: scores given all selected effects but one.
     """
-
-    first: Scored
-    last: Scored
-    own: dict[str, Scored]
-    fits: list[Fit]
 
     def __init__(
         self,
@@ -127,9 +110,6 @@ class Selection:
         self.steps: dict[str, Score] = {}
         self.fit = self.base
         self.known: dict[tuple[tuple[str, ...], tuple[str, ...]], Scored] = {}
-
-    def run(self) -> None:
-        """Search."""
         self.first = self.last = self._scored([])
         for _ in range(ROUNDS):
             best = self._best(self.last) if len(self.names) < MOST else None
@@ -178,7 +158,7 @@ class Selection:
         terms = []
         for this in self.candidates:
             if this.name in fitted and this.name not in names:
-                terms.append(Term(this, _silent(this, self.model.sensor, fitted[this.name])))
+                terms.append(Term(this, np.where(_nonlinear(this, self.model.sensor), fitted[this.name], 0.0)))
             elif this.name not in names:
                 terms += [Term(this, values) for values in this.starts(self.model.sensor)]
         equations = self.model.equations(replace(self.fit.state, terms=tuple(kept)), terms)
@@ -294,10 +274,9 @@ class Selection:
         return [*fits, self.fit] if self.names else fits
 
 
-def _silent(this: Effect, sensor: str, values: Values) -> Values:
-    """Return parameters at which an effect adds nothing, its nonlinear ones as they are."""
-    nonlinear = [p.name in this.nonlinear for p in this.parameters(sensor)]
-    return np.where(nonlinear, values, 0.0)
+def _nonlinear(this: Effect, sensor: str) -> Mask:
+    """Return which parameters of an effect are not linear: (p,) array."""
+    return np.array([p.name in this.nonlinear for p in this.parameters(sensor)])
 
 
 def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect] = ()) -> Answers:
@@ -324,8 +303,7 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     base = np.concatenate([equations.base, *equations.effects[:held]], axis=1)
     columns = []
     for (_, term, _), Z in zip(listed, equations.candidates, strict=True):
-        linear = [p.name not in term.effect.nonlinear for p in term.effect.parameters(model.sensor)]
-        columns.append(Z[:, linear])
+        columns.append(Z[:, ~_nonlinear(term.effect, model.sensor)])
     readings = equations.residual + sum(
         Z @ fitted[name].values[: Z.shape[1]]
         for (name, term, _), Z in zip(listed, columns, strict=True)
