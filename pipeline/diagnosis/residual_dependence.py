@@ -22,6 +22,7 @@ from numpy.polynomial.chebyshev import chebvander
 from pipeline.diagnosis.functional_forms import Span, signals_of
 from pipeline.diagnosis.residual_regression import Curves, ProjectedCurves
 from pipeline.estimation.gauss_markov import selection_grid
+from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     Basis = tuple[str, Curves, list[Block]]
     Tests = tuple[list[str], Values, Index, float]
 
-GATE_BIC = 10.0  # "very strong" of R. E. Kass and A. E. Raftery, JASA 90 (1995), 773-795
 GATE_P = 1e-3  # probability of naming a covariate of a complete model, over all tests (Bonferroni)
 DEGREE = 5  # up to four turning points over the span; faster changes are steps
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue

@@ -112,11 +112,12 @@ def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
 
 @dataclass(frozen=True)
 class Start:
-    """The base from which a fit starts: by ordinary least squares, or of another fit."""
+    """Where a fit starts: the base by ordinary least squares, or another fit."""
 
     bias: Values  # (3,)
     K: Values  # (3, 3)
     scale: Values  # (3,); white noise of each axis, for the weights between the axes
+    terms: tuple[Term, ...] = ()  # the effects at their values
 
 
 def ordinary_base(observations: Observations, noise: Noise | None) -> Start:

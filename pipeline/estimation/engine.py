@@ -143,9 +143,13 @@ def scaled_inverse(matrix: Values) -> Values:
 
 def draw_normal(rng: np.random.Generator, covariance: Values, count: int) -> Values:
     """Return (count, p) normal errors, also of a singular covariance."""
+    return rng.standard_normal((count, len(covariance))) @ root_of(covariance).T
+
+
+def root_of(covariance: Values) -> Values:
+    """Return A with ``A A^T`` a covariance that may be singular: (p, p) array."""
     values, vectors = np.linalg.eigh(covariance)
-    root: Values = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return rng.standard_normal((count, len(values))) @ root.T
+    return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None)))
 
 
 def _within(weight: Values, sigma: Values, probability: float) -> Values:

@@ -31,7 +31,6 @@ from pipeline.estimation.noise import static_or_sheet
 from pipeline.estimation.observations import Observations, observe, weighted
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.uncertainty_budget import (
-    bench_contribution,
     budgeted,
     combined,
     effect_parameters,
@@ -40,7 +39,7 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.model.effects.base import Layout, truth
 from pipeline.model.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-from pipeline.records import Noise, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import NORMAL, Contribution, Noise, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -53,11 +52,10 @@ TIMES = (30.0, 100.0, 300.0, 1000.0)  # s, correlation times of that grid
 LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 3e-4 new
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Fit(Start):
     """Base and effects that explain the readings best."""
 
-    terms: tuple[Term, ...]  # the effects at their values
     # (12 + p, 12 + p); of bias, K (row by row) and the effects' parameters, as the noise settings of the fit weight it
     covariance: Values
     log_likelihood: float  # under the best noise setting, up to a constant of the readings
@@ -77,70 +75,71 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     ``terms``: effects and where their nonlinear parameters start. ``settings``: noises over which the likelihood is
     maximised.
     """
-    terms = [replace(term, values=np.array(term.values, float), full=True) for term in terms]
-    bias, K = start.bias.copy(), start.K.copy()
     linear = not any(term.effect.nonlinear or term.effect.layout == Layout.SHARED for term in terms)
-    rounds, converged = 0, False
-    solved = _solve(_at(observations, terms, bias, K, start.scale), observations, settings)
+    rounds, converged, state = 0, False, _with_all_columns(start, terms)
+    solved = _solve(design_at(observations, state), observations, settings)
     while rounds < ROUNDS and not converged:
         rounds += 1
-        bias, K = bias + solved.step[:3], K + solved.step[3:BASE].reshape(3, 3)
-        terms, taken = stepped(terms, solved.step[BASE:])
+        moved, taken = stepped(state.terms, solved.step[BASE:])
         taken = np.concatenate([solved.step[:BASE], taken])
+        K = state.K + taken[3:BASE].reshape(3, 3)
+        state = replace(state, bias=state.bias + taken[:3], K=K, terms=tuple(moved))
         small = np.maximum(
             SMALL_STEP * np.sqrt(np.diag(solved.best_covariance)), np.where(np.arange(len(taken)) < BASE, 1e-12, 0.0)
         )
         converged = linear or bool(np.all(np.abs(taken) <= small))
         if not linear:
-            solved = _solve(_at(observations, terms, bias, K, start.scale), observations, settings)
-    residual, _ = _residual(observations, terms, bias, K)
+            solved = _solve(design_at(observations, state), observations, settings)
+    residual, _ = _residual(observations, state)
     noise = observations.weakened
     squares = np.sum(noise.weight[:, None] * residual**2) + np.sum(noise.scatter)
     covariance, freedom = solved.posterior.averaged()
     return Fit(
-        bias,
-        K,
-        start.scale,
-        tuple(terms),
-        covariance,
-        solved.log_likelihood,
-        solved.setting,
-        float(freedom.min()),
-        float(np.sqrt(squares / (3.0 * noise.samples))),
-        rounds,
-        converged,
-        solved.condition,
-        solved.left if linear else solved.cosine,
-        solved.rank,
+        state.bias,
+        state.K,
+        state.scale,
+        state.terms,
+        covariance=covariance,
+        log_likelihood=solved.log_likelihood,
+        setting=solved.setting,
+        degrees_of_freedom=float(freedom.min()),
+        residual_rms=float(np.sqrt(squares / (3.0 * noise.samples))),
+        rounds=rounds,
+        converged=converged,
+        condition=solved.condition,
+        cosine=solved.left if linear else solved.cosine,
+        rank=solved.rank,
     )
 
 
-def _at(observations: Observations, terms: Sequence[Term], bias: Values, K: Values, scale: Values) -> Design:
-    """Return the derivative of the model at some parameters, and its residual, as products."""
-    residual, base = _residual(observations, terms, bias, K)
-    return Design(observations, terms, K, scale, target=residual, base=base)
+def _with_all_columns(start: Start, terms: Sequence[Term]) -> Start:
+    """Return a base with effects of which all parameters are fitted."""
+    full = (replace(term, values=np.array(term.values, float), full=True) for term in terms)
+    return Start(start.bias, start.K, start.scale, tuple(full))
 
 
-def design_at(observations: Observations, fit: Fit) -> Design:
-    """Return the derivative of a fitted model, and its residual in place of the readings."""
-    return _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
+def design_at(observations: Observations, at: Start) -> Design:
+    """Return the derivative of a model at some parameters, and its residual in place of the readings."""
+    residual, base = _residual(observations, at)
+    scale = np.maximum(at.scale, 1e-300)
+    return Design(observations, at.terms, at.K, scale, target=residual, base=base)
 
 
 def design_beside(observations: Observations, fit: Fit, terms: Sequence[Term]) -> Design:
     """Return columns of further terms at a fit, its residual in place of the readings, and the base taken out."""
-    residual, base = _residual(observations, fit.terms, fit.bias, fit.K)
+    residual, base = _residual(observations, fit)
     return Design(observations, terms, fit.K, fit.scale, target=residual, base=base, project=True)
 
 
-def _residual(observations: Observations, terms: Sequence[Term], bias: Values, K: Values) -> tuple[Values, Values]:
+def _residual(observations: Observations, at: Start) -> tuple[Values, Values]:
     """Return the readings less the model, and what K acts on: the truth and the effects that the axes share."""
-    sensor = observations.sensor
+    sensor, K = observations.sensor, at.K
     predicted, base = [], []
     for part in observations.parts:
-        *motions, everything = motions_of(part, terms)
+        *motions, everything = motions_of(part, at.terms)
         u = truth(sensor, everything)
-        reading = bias + u @ K.T
-        for term, motion in zip(terms, motions, strict=True):
+        reading = at.bias + u @ K.T
+        for term, motion in zip(at.terms, motions, strict=True):
             if term.effect.moves:
                 continue
             z = term.effect.reading(sensor, motion, K, term.values)
@@ -238,19 +237,18 @@ def fit_best(
     if len(combinations) > 1:
         scores = []
         for terms in combinations:
-            full = [replace(t, values=np.array(t.values, float), full=True) for t in terms]
-            design = _at(observations, full, start.bias, start.K, start.scale)
+            design = design_at(observations, _with_all_columns(start, terms))
             scores.append(_solve(design, observations, settings).log_likelihood)
         chosen = combinations[int(np.argmax(scores))]
     return fit_terms(observations, chosen, start, settings)
 
 
-def require_observable(observations: Observations, fit: Fit, scale: Values) -> None:
+def require_observable(observations: Observations, fit: Fit) -> None:
     """Refuse a fit that the recordings do not determine.
 
     Raises ``NotObservableError`` naming the parameters.
     """
-    design = _at(observations, fit.terms, fit.bias, fit.K, scale)
+    design = design_at(observations, fit)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
     free = np.ones(len(names), bool)  # a prior determines the others
     for at, term in zip(design.slices, fit.terms, strict=True):
@@ -300,7 +298,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     require_available(observations, effects)
     grid = selection_grid(noise, RATIOS, TIMES)
     fit = fit_best(observations, combinations, base, grid)
-    require_observable(observations, fit, base.scale)
+    require_observable(observations, fit)
     return calibration_of(sensor, fit, observations, start, settings, noise)
 
 
@@ -361,7 +359,8 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     lines = [noise_contribution(errors, whole, prior)]
     for name, prior_part in design.prior_covariances(fit.setting).items():
         remark = HELD if name == TILT and not observations.levelling_deg else ""
-        lines.append(bench_contribution(name, change @ prior_part @ change.T, remark))
+        own, never = change @ prior_part @ change.T, np.full(len(change), np.inf)
+        lines.append(Contribution(name.replace("_", " "), "B", NORMAL, own, never, remark=remark))
     return budgeted(found, reference, errors, lines, settings, results, names)
 
 

@@ -89,10 +89,12 @@ class Observations:
     @cached_property
     def weakened(self) -> Observations:
         """The same, with weights that allow for the errors of the angle, for sums in which these are noise."""
-        parts = self.parts
-        if self.angle_deg > 0.0:
-            parts = tuple(_without_stops(part, _lost_at_stops(part, self)) for part in parts)
-        return replace(self, parts=parts, angle_deg=0.0)
+        parts = []
+        for part in self.parts if self.angle_deg > 0.0 else ():
+            weight, rests = part.weight / (1.0 + _lost_at_stops(part, self)), part.motion.still
+            share = float(weight[rests].sum() / part.weight[rests].sum()) if rests.any() else 1.0
+            parts.append(replace(part, weight=weight, scatter=share * part.scatter))
+        return replace(self, parts=tuple(parts) or self.parts, angle_deg=0.0)
 
     @cached_property
     def scatter(self) -> Values:
@@ -171,21 +173,16 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
 
     Errors of the angle are left aside where noise hides them.
     """
-    parts = []
+    parts, white = [], 0.0 if noise is None else float(np.mean(noise.white))
     for part in observations.parts:
         share = information(noise, part.interval)
         fewer = part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter)
-        parts.append(fewer if noise is None else _behind_encoder(fewer, float(np.mean(noise.white))))
-    found = replace(observations, parts=tuple(parts), white=0.0 if noise is None else float(np.mean(noise.white)))
+        if part.rounding is not None and white > 0.0:  # the noise r of the rate: 1 / (1 + r^2 / s^2) as much
+            fewer = replace(fewer, weight=fewer.weight / (1.0 + part.rounding / white**2))  # the scatter is of rests
+        parts.append(fewer)
+    found = replace(observations, parts=tuple(parts), white=white)
     lost = [_lost_at_stops(part, found).max(initial=0.0) for part in parts]
     return found if max(lost, default=0.0) > HIDDEN_ANGLE else replace(found, angle_deg=0.0)
-
-
-def _behind_encoder(part: Part, white: float) -> Part:
-    """Return a part whose rows weigh ``1 / (1 + r^2 / s^2)`` as much: r is the noise of the rate, s of a sample."""
-    if part.rounding is None or white <= 0.0:
-        return part
-    return replace(part, weight=part.weight / (1.0 + part.rounding / white**2))  # the scatter is that of rests
 
 
 def _lost_at_stops(part: Part, observations: Observations) -> Values:
@@ -201,12 +198,6 @@ def _lost_at_stops(part: Part, observations: Observations) -> Values:
     group = 2 * stop + np.any(after != 0.0, axis=1)
     squares = (angle / white) ** 2 * np.sum(before**2 + after**2, axis=1)
     return np.asarray(np.bincount(group, part.weight * squares, 2 * stops)[group], np.float64)
-
-
-def _without_stops(part: Part, lost: Values) -> Part:
-    weight, rests = part.weight / (1.0 + lost), part.motion.still
-    share = float(weight[rests].sum() / part.weight[rests].sum()) if rests.any() else 1.0
-    return replace(part, weight=weight, scatter=share * part.scatter)
 
 
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:

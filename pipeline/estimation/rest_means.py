@@ -96,18 +96,13 @@ def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, An
             "recording": recording.name,
             "time_s": float(recording.time[rest.start]),
             "duration_s": float(recording.time[rest.stop - 1] - recording.time[rest.start]),
-            "creep_dps": _creep_rate(recording, rest),
+            "creep_dps": 0.0  # where it does not stand out of the noise
+            if recording.accelerometer is None
+            else float(np.linalg.norm(creep_in(recording, rest.start, rest.stop).rate)),
             "reason": rest.reason,
         }
         for recording, rest in pairs
     ]
-
-
-def _creep_rate(recording: Recording, rest: Rest) -> float:
-    """Return the rate at which the unit tilts in a rest, deg/s; 0 where it does not stand out of the noise."""
-    if recording.accelerometer is None:
-        return 0.0
-    return float(np.linalg.norm(creep_in(recording, rest.start, rest.stop).rate))
 
 
 def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer") -> tuple[Values, Integers]:

@@ -95,12 +95,6 @@ def scatter_contribution(
     return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
 
 
-def bench_contribution(name: str, covariance: Values, remark: str = "") -> Contribution:
-    """Return what the prior of an effect of the bench contributes."""
-    source = name.replace("_", " ")
-    return Contribution(source, "B", NORMAL, covariance, np.full(len(covariance), np.inf), remark=remark)
-
-
 def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
     """Return what rounding to whole counts contributes, or why it has no line of its own.
 

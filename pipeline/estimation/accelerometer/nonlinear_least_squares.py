@@ -32,7 +32,14 @@ from pipeline.estimation.multi_position.fit import Fit
 from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, prior_hypotheses
 from pipeline.estimation.multi_position.model import State
-from pipeline.estimation.multi_position.result import after_stage, curvature, fit_faces, require_faces, with_stage
+from pipeline.estimation.multi_position.result import (
+    NOT_INCLUDED,
+    after_stage,
+    curvature,
+    fit_faces,
+    require_faces,
+    with_stage,
+)
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.table_errors import Reference, disturbance
@@ -63,11 +70,9 @@ SMALLEST_OUTLIER_G = 1e-6  # rests of a noise-free recording are no outliers
 FEWEST_TO_JUDGE = 18  # rests, two a parameter
 OUTLIER_SHARE = 0.2  # of the rests: where more are off, none can be called wrong
 MOST_ROWS = 600  # of which a covariance is drawn
-NOT_INCLUDED = {
+OF_LENGTH = {
+    **NOT_INCLUDED,
     "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
-    "quantisation": "contained in the noise of the readings, as the rests scatter",
-    "temperature": "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is "
-    "stated",
     "time base": "no time enters the length of gravity",
 }
 
@@ -163,7 +168,7 @@ def _fit_triangular(
         correction,
         parameters=parameters,
         parts=parts,
-        not_included=NOT_INCLUDED,
+        not_included=OF_LENGTH,
     )
 
 
@@ -321,7 +326,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     parameters = _parameters(solved, scatter.covariance)
     calibration = with_stage(before, NAME, details, solved.model, solved.fit, correction, parameters)
     gravity = gravity_contribution("accelerometer", calibration.matrix, settings["table"], 12)
-    missing = NOT_INCLUDED if gravity else {"local gravity": "table.gravity_accuracy_g is not stated", **NOT_INCLUDED}
+    missing = OF_LENGTH if gravity else {"local gravity": "table.gravity_accuracy_g is not stated", **OF_LENGTH}
     lines = [gravity] if gravity else []
     complete, trials = combined(calibration, [scatter, *lines], missing), trials_of(settings)
     if not trials:

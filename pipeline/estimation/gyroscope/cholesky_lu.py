@@ -99,10 +99,12 @@ def fit(
     noise = assess_noise(residuals, design, blocks, prior, disturbance(reference, residuals, blocks))
     scatter = noise_contribution(noise, fit, prior)
     matrix = _matrix(A, as_printed=as_printed)
+    after = (turns.reading - previous.bias) @ matrix.T
+    error = np.linalg.norm(after, axis=1) - np.linalg.norm(turns.rate, axis=1)
     result = StageResult(
         name=NAME,
         parameters=stage_parameters(_values(factors), (scatter.covariance + given)[12:, 12:]),
-        residual_rms=_residual_rms(turns, previous.bias, matrix),
+        residual_rms=float(np.sqrt(np.mean(error**2))),
         correction={"steps": [{"subtract": previous.bias.tolist()}, {"matrix": matrix.tolist()}]},
         details={
             "turns": len(U),
@@ -184,12 +186,6 @@ def _values(factors: _Factors) -> dict[str, tuple[float, str]]:
     values = {f"S_{axis}": (float(s), "1") for axis, s in zip(AXES, factors.S, strict=True)}
     values |= {f"T_{AXES[i]}{AXES[j]}": (float(factors.T[i, j]), "1") for i, j in below}
     return values | {f"M_{AXES[i]}{AXES[j]}": (float(factors.M[i, j]), "1") for i in range(3) for j in range(3)}
-
-
-def _residual_rms(turns: Turns, bias: Values, matrix: Values) -> float:
-    rate = (turns.reading - bias) @ matrix.T
-    error = np.linalg.norm(rate, axis=1) - np.linalg.norm(turns.rate, axis=1)
-    return float(np.sqrt(np.mean(error**2)))
 
 
 def _angle_errors(Y: Values, U: Values, matrix: Values) -> list[list[float | None]]:

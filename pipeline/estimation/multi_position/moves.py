@@ -41,6 +41,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.engine import root_of
 from pipeline.estimation.multi_position.model import motion_of
 from pipeline.estimation.rest_means import ROLE, Rests, rest_means, rests_of, sound_samples
 from pipeline.model.effects import effect
@@ -286,7 +287,8 @@ def gravity_of(
     recordings: Sequence[Recording], rests: Rests, accelerometer: SensorCalibration, moved: Values | None = None
 ) -> Gravity:
     """Return gravity at the rests of the accelerometer; ``moved`` as of ``observed_rests``."""
-    root, moved = _root(accelerometer), np.zeros(12) if moved is None else moved
+    covariance = np.zeros((12, 12)) if accelerometer.covariance is None else accelerometer.covariance[:12, :12]
+    root, moved = root_of(covariance), np.zeros(12) if moved is None else moved
     accelerometer = replace(
         accelerometer, bias=accelerometer.bias + moved[:3], matrix=accelerometer.matrix + moved[3:].reshape(3, 3)
     )
@@ -333,11 +335,3 @@ def _near(recordings: Sequence[Recording], rests: Rests, *, at_start: bool) -> t
         reading[own[known]] = means[known]
         share[own[known]] = variance_of_mean(filter_autocovariance(recording), counts[known])
     return reading, share
-
-
-def _root(accelerometer: SensorCalibration) -> Values:
-    """Return the root of the covariance of bias and matrix; zeros where there is none."""
-    if accelerometer.covariance is None:
-        return np.zeros((12, 12))
-    values, vectors = np.linalg.eigh(accelerometer.covariance[:12, :12])
-    return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None)))

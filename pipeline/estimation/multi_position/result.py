@@ -30,6 +30,7 @@ from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.table_errors import type_b
 from pipeline.estimation.uncertainty_budget import (
+    TEMPERATURE,
     base_parameters,
     combined,
     effect_parameters,
@@ -51,8 +52,7 @@ REMARK = {
 NOT_INCLUDED = {
     "table angle, rate and orthogonality, levelling": "there is no table",
     "quantisation": "contained in the noise of the readings, as the rests scatter",
-    "temperature": "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is "
-    "stated",
+    "temperature": TEMPERATURE,
 }
 NAME = "faces"
 
