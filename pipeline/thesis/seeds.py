@@ -166,15 +166,12 @@ class Drawn:
     def staged_accelerometer(self, *, as_printed: bool, judge: bool = True) -> Row:
         """Return what the stages find, and the error that they leave."""
         turns = self._seen(as_printed=as_printed)
-        extremes = (
-            extremes_of_samples(turns)
-            if as_printed
-            else extremes_of_sinusoids([[s.coefficients for s in fits] for fits in sinusoids_of(turns)])
-        )
+        fitted = [[s.coefficients for s in fits] for fits in ([] if as_printed else sinusoids_of(turns))]
+        extremes = extremes_of_samples(turns, 1.0) if as_printed else extremes_of_sinusoids(fitted, 1.0)
         found: dict[str, float] = {}
         chain = staged.Corrected()
         for name in staged.STAGES:
-            chain = staged.follow(extremes, [name], 1.0, as_printed=as_printed, start=chain)
+            chain = staged.follow(extremes, [name], chain)
             found |= {k: v for k, (v, _) in chain.values.items()}
         row = {f"b_{a}": found[f"b_{a}"] for a in AXES}
         row |= {f"{q}_{a}": (found[f"{q}_P_{a}"] + found[f"{q}_N_{a}"]) / 2.0 for q in "OS" for a in AXES}
@@ -213,9 +210,7 @@ class Drawn:
         parts = parts_of(turns, "gyroscope", table, "the study")
         samples = gyroscope.samples_of(parts, turns)
         theta = gyroscope.weights_of(samples.rate, as_printed=False) @ samples.reading
-        chain = gyroscope.follow(
-            gyroscope.Response(theta[0], theta[1:], samples.speed), list(gyroscope.STAGES), as_printed=False
-        )
+        chain = gyroscope.follow(gyroscope.Response(theta[0], theta[1:], samples.speed), list(gyroscope.STAGES))
         integrated = turns_of(parts)
         U, Y = integrated.integral(integrated.rate), integrated.integral(integrated.reading - theta[0])
         forward = np.linalg.lstsq(U, Y, rcond=None)[0].T

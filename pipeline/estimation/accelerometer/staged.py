@@ -93,7 +93,7 @@ def _angles(names: tuple[str, ...], sides: Mapping[str, Values]) -> Quantities:
 GREEK = ("alpha", "beta", "gamma")
 
 
-def orthogonality(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> Outcome:
+def orthogonality(extremes: Extremes) -> Outcome:
     """Return the factors of orthogonality (3.15-3.29).
 
     In turns about x, y, z the upper extremes of the two other axes should be 90 deg apart; their excesses are
@@ -109,21 +109,20 @@ def orthogonality(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> 
     being the reference and every printed O_x = 1, and the side is chosen by the sign of the reading with its bias. A
     filter delays both extremes of a pair by the same angle while the table turns evenly, so the excesses do not change.
     """
-    del gravity_g
 
     def factors(excess_deg: Values) -> Values:
         a, b, c = np.cos(np.radians(excess_deg))
-        return np.array([b * c, a * c, a * b] if as_printed else [1.0, c, a * b])
+        return np.array([b * c, a * c, a * b] if extremes.as_printed else [1.0, c, a * b])
 
     positive, negative = factors(extremes.excess_high), factors(extremes.excess_low)
-    switch_at = np.zeros(3) if as_printed else extremes.a_zero
+    switch_at = np.zeros(3) if extremes.as_printed else extremes.a_zero
     values = _per_axis("O_P", positive, "1") | _per_axis("O_N", negative, "1")
     values |= _angles(GREEK, {"P": extremes.excess_high, "N": extremes.excess_low})
     mean = (positive + negative) / 2.0
     return Outcome([two_sided(positive, negative, switch_at)], values, mean, mean)
 
 
-def misalignment(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> Outcome:
+def misalignment(extremes: Extremes) -> Outcome:
     """Return the factors of misalignment (3.30-3.37).
 
     While the table turns about an axis, that axis should stay level. Its reading gives the angle
@@ -135,7 +134,6 @@ def misalignment(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> O
     (a_max - a_min) / 2, the same on both sides: M_P = M_N. As printed a_height is the mean of the axis's readings, bias
     included, over a_max for M_P and over |a_min| for M_N, and the side is chosen by the sign of the reading.
     """
-    del gravity_g
 
     def angles(largest: Values) -> Values:
         ratio = extremes.height / largest
@@ -147,7 +145,7 @@ def misalignment(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> O
                 )
         return np.asarray(np.arcsin(ratio))
 
-    if as_printed:
+    if extremes.as_printed:
         sides = {"P": angles(extremes.a_max), "N": angles(np.abs(extremes.a_min))}
     else:
         sides = dict.fromkeys("PN", angles((extremes.a_max - extremes.a_min) / 2.0))
@@ -155,18 +153,17 @@ def misalignment(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> O
     values = _per_axis("M_P", positive, "1") | _per_axis("M_N", negative, "1")
     values |= _angles(GREEK, {side: np.degrees(angle) for side, angle in sides.items()})
     mean = (positive + negative) / 2.0
-    switch_at = np.zeros(3) if as_printed else extremes.a_zero
+    switch_at = np.zeros(3) if extremes.as_printed else extremes.a_zero
     return Outcome([two_sided(positive, negative, switch_at)], values, mean, mean)
 
 
-def bias(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> Outcome:
+def bias(extremes: Extremes) -> Outcome:
     """Return the bias (3.38-3.39): ``a_bi = a_mis - b``, b = a_zero, the mean reading of each axis where level."""
-    del gravity_g, as_printed
     b = extremes.a_zero
     return Outcome([{"subtract": b.tolist()}], _per_axis("b", b, "g"), subtracted=b)
 
 
-def scale_factor(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> Outcome:
+def scale_factor(extremes: Extremes) -> Outcome:
     """Return a scale factor for each side (3.40-3.43).
 
         S_P = G / (a_max - a_zero),   S_N = G / |a_min - a_zero|,   a_sc = a_bi S
@@ -174,15 +171,15 @@ def scale_factor(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> O
     As printed it is ``G / a_max - a_zero``, and a_zero is subtracted once more in (3.42) and (3.43), without effect
     after the bias stage, where a_zero is about zero.
     """
-    a_max, a_min, a_zero = extremes.a_max, extremes.a_min, extremes.a_zero
-    if as_printed:
-        positive, negative = gravity_g / a_max - a_zero, gravity_g / np.abs(a_min) - a_zero
+    G, a_max, a_min, a_zero = extremes.gravity_g, extremes.a_max, extremes.a_min, extremes.a_zero
+    if extremes.as_printed:
+        positive, negative = G / a_max - a_zero, G / np.abs(a_min) - a_zero
         steps = [{"subtract": a_zero.tolist()}, two_sided(positive, negative, np.zeros(3))]
     else:
-        positive, negative = gravity_g / (a_max - a_zero), gravity_g / np.abs(a_min - a_zero)
+        positive, negative = G / (a_max - a_zero), G / np.abs(a_min - a_zero)
         steps = [two_sided(positive, negative, a_zero)]
     values = _per_axis("S_P", positive, "1") | _per_axis("S_N", negative, "1")
-    return Outcome(steps, values, positive, negative, a_zero if as_printed else np.zeros(3))
+    return Outcome(steps, values, positive, negative, a_zero if extremes.as_printed else np.zeros(3))
 
 
 STAGES = {f.__name__: f for f in (orthogonality, misalignment, bias, scale_factor)}
@@ -225,20 +222,18 @@ class Corrected:
         )
 
 
-def follow(
-    extremes: Extremes, names: Sequence[str], gravity_g: float, *, as_printed: bool, start: Corrected | None = None
-) -> Corrected:
+def follow(extremes: Extremes, names: Sequence[str], start: Corrected | None = None) -> Corrected:
     """Run stages one after the other, each on the output of the one before.
 
     ``start``: output of the stage before the first.
     """
     found = start or Corrected()
     for step in found.steps:
-        extremes = extremes.corrected(step, as_printed=as_printed)
+        extremes = extremes.corrected(step)
     for name in names:
-        own = STAGES[name](extremes, gravity_g, as_printed=as_printed)
+        own = STAGES[name](extremes)
         for step in own.steps:
-            extremes = extremes.corrected(step, as_printed=as_printed)
+            extremes = extremes.corrected(step)
         positive, negative = found.positive * own.positive, found.negative * own.negative
         found = Corrected(
             found.steps + own.steps, found.bias + own.subtracted * found.k, positive, negative, own.values
@@ -266,17 +261,15 @@ def fit(
     theta = np.concatenate([s.coefficients for channel in range(3) for s in (turn[channel] for turn in sinusoids)])
 
     def chain(values: Values) -> Corrected:
-        extremes = extremes_of_sinusoids(by_turn(sinusoids, values))
-        return follow(extremes, [*before, name], gravity_g, as_printed=as_printed)
+        return follow(extremes_of_sinusoids(by_turn(sinusoids, values), gravity_g), [*before, name])
 
-    extremes = extremes_of_samples(turns) if as_printed else extremes_of_sinusoids(by_turn(sinusoids, theta))
-    found = follow(extremes, [name], gravity_g, as_printed=as_printed, start=Corrected.of(previous))
+    by_sinusoids = extremes_of_sinusoids(by_turn(sinusoids, theta), gravity_g)
+    extremes = extremes_of_samples(turns, gravity_g) if as_printed else by_sinusoids
+    found = follow(extremes, [name], Corrected.of(previous))
     map_ = _linear_map(sinusoids, theta, chain)
     noise = _noise(turns, map_, prior, settings["table"])
     if as_printed:
-        scatter = _resampled(
-            turns, sinusoids, noise, lambda e: follow(e, [*before, name], gravity_g, as_printed=True).vector()
-        )
+        scatter = _resampled(turns, sinusoids, noise, gravity_g, [*before, name])
     else:
         scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, np.concatenate([turn.reading for turn in turns]))
@@ -349,9 +342,10 @@ def _resampled(
     turns: Sequence[Turn],
     sinusoids: Sequence[Sequence[Sinusoid]],
     noise: ResidualNoise,
-    vector: Callable[[Extremes], Values],
+    gravity_g: float,
+    names: Sequence[str],
 ) -> Contribution:
-    """Return the scatter of a function of the extremes over synthetic turns."""
+    """Return the scatter of what some stages find over synthetic turns."""
     pairs = list(zip(turns, sinusoids, strict=True))
     means = [turn.reading - np.column_stack([s.residuals for s in fits]) for turn, fits in pairs]
     cuts = np.cumsum([len(turn.angle) for turn in turns])[:-1]
@@ -361,5 +355,5 @@ def _resampled(
             replace(turn, reading=mean + new)
             for turn, mean, new in zip(turns, means, np.split(noisy, cuts), strict=True)
         ]
-        vectors.append(vector(extremes_of_samples(synthetic)))
+        vectors.append(follow(extremes_of_samples(synthetic, gravity_g), names).vector())
     return scatter_contribution(np.cov(np.array(vectors).T), REPLICATES - 1.0)

@@ -46,6 +46,8 @@ class Extremes:
     # (3,), g; what each axis reads while the table turns about it: by default the amplitude of its swing, as printed
     # its mean
     height: Values
+    gravity_g: float
+    as_printed: bool  # whether they are single samples, and the equations those that are printed
 
     @property
     def a_max(self) -> Values:
@@ -72,14 +74,14 @@ class Extremes:
         """alpha_N, beta_N, gamma_N: the same of the lower extremes."""
         return wrap(self.angle_low[:, 0] - self.angle_low[:, 1] - 90.0)
 
-    def corrected(self, step: Mapping[str, Any], *, as_printed: bool) -> Self:
+    def corrected(self, step: Mapping[str, Any]) -> Self:
         """Return the extremes of readings after a step of a correction."""
 
         def apply(values: Values) -> Values:
             return apply_step(step, values.T).T
 
         height = self.height
-        if as_printed:
+        if self.as_printed:
             height = apply(height[:, None])[:, 0]
         elif "two_sided" in step:
             sides = step["two_sided"]
@@ -138,7 +140,7 @@ def sinusoids_of(turns: Sequence[Turn]) -> list[list[Sinusoid]]:
     ]
 
 
-def extremes_of_sinusoids(coefficients: Sequence[Sequence[Values]]) -> Extremes:
+def extremes_of_sinusoids(coefficients: Sequence[Sequence[Values]], gravity_g: float) -> Extremes:
     """Return the extremes of fitted sinusoids.
 
     ``coefficients``: ``Sinusoid.coefficients``.
@@ -155,10 +157,10 @@ def extremes_of_sinusoids(coefficients: Sequence[Sequence[Values]]) -> Extremes:
             angle[axis, pose] = np.degrees(np.arctan2(sine, cosine))
             high[channel, pose], low[channel, pose] = zero + asymmetry + amplitude, zero + asymmetry - amplitude
             level[channel, pose] = zero
-    return Extremes(angle, angle + 180.0, high, low, level, height)
+    return Extremes(angle, angle + 180.0, high, low, level, height, gravity_g, as_printed=False)
 
 
-def extremes_of_samples(turns: Sequence[Turn]) -> Extremes:
+def extremes_of_samples(turns: Sequence[Turn], gravity_g: float) -> Extremes:
     """Return the extremes as the largest and smallest samples of the turns, the readings of each pose from one sample.
 
     An axis is level in two poses of either turn in which it goes up and down and in all four of its own turn.
@@ -177,7 +179,7 @@ def extremes_of_samples(turns: Sequence[Turn]) -> Extremes:
             level[channel, 2 * pose : 2 * pose + 2] = turn.reading[[top[other], bottom[other]], channel]
         level[axis, 4:] = turn.reading[np.concatenate([top, bottom]), axis]
         height[axis] = turn.reading[:, axis].mean()
-    return Extremes(angle_high, angle_low, high, low, level, height)
+    return Extremes(angle_high, angle_low, high, low, level, height, gravity_g, as_printed=True)
 
 
 def by_turn(sinusoids: Sequence[Sequence[Sinusoid]], values: Values) -> list[list[Values]]:

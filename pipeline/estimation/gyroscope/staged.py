@@ -21,7 +21,7 @@ these recordings the bias is that of the static recording. As printed, row i is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,18 +55,17 @@ class Outcome:
     values: dict[str, tuple[float, str]]
 
 
-def bias(response: Response, *, as_printed: bool) -> Outcome:
+def bias(response: Response) -> Outcome:
     """Return the bias (3.47-3.48): ``g_bi = g_r - b``, b the mean of the readings at rest.
 
     The rests are those of the recordings made for the gyroscope, by the table's log, as in the thesis; the static
     recording, perhaps far away in time and temperature, stands in only where these hold no rest.
     """
-    del as_printed
     values = {f"b_{axis}": (float(b), "deg/s") for axis, b in zip(AXES, response.rest, strict=True)}
     return Outcome({"subtract": response.rest.tolist()}, values)
 
 
-def orthogonality_and_misalignment(response: Response, *, as_printed: bool) -> Outcome:
+def orthogonality_and_misalignment(response: Response) -> Outcome:
     """Return the matrix of orthogonality and misalignment (3.49-3.51).
 
         S M = diag(I),   M = S^-1 diag(I),   g_mis = g_bi M
@@ -79,12 +78,12 @@ def orthogonality_and_misalignment(response: Response, *, as_printed: bool) -> O
     response.require_turns()
     rate = np.diag(response.rate)
     S = rate @ response.slope
-    M = np.linalg.solve(S.T, rate).T if as_printed else np.linalg.solve(S, rate)
+    M = np.linalg.solve(S.T, rate).T if response.as_printed else np.linalg.solve(S, rate)
     values = {f"M_{i + 1}{j + 1}": (float(M[i, j]), "1") for i in range(3) for j in range(3)}
     return Outcome({"matrix": M.T.tolist()}, values)
 
 
-def scale_factor(response: Response, *, as_printed: bool) -> Outcome:
+def scale_factor(response: Response) -> Outcome:
     """Return the scale factors (3.52-3.53): ``S_i = I_i / (g_max - g_min)``, ``g_sc = g_mis S``.
 
     g_max is the reading of axis i while the table turns about it at the rate I_i, and g_min its reading at rest. The
@@ -94,7 +93,7 @@ def scale_factor(response: Response, *, as_printed: bool) -> Outcome:
     response.require_turns()
     g_min = response.rest
     g_max = g_min + response.rate * np.diag(response.slope)
-    scale = response.rate / g_max - g_min if as_printed else response.rate / (g_max - g_min)
+    scale = response.rate / g_max - g_min if response.as_printed else response.rate / (g_max - g_min)
     values = {f"S_{axis}": (float(s), "1") for axis, s in zip(AXES, scale, strict=True)}
     return Outcome({"matrix": np.diag(scale).tolist()}, values)
 
@@ -126,9 +125,7 @@ class Corrected:
         return np.concatenate([offset, matrix.ravel(), [value for value, _ in self.values.values()]])
 
 
-def follow(
-    response: Response, names: Sequence[str], *, as_printed: bool, start: Sequence[Mapping[str, Any]] = ()
-) -> Corrected:
+def follow(response: Response, names: Sequence[str], start: Sequence[Mapping[str, Any]] = ()) -> Corrected:
     """Run stages one after the other, each on the output of the one before.
 
     ``start``: the correction by the stages before the first.
@@ -137,7 +134,7 @@ def follow(
     for step in start:
         response = response.corrected(step)
     for name in names:
-        own = STAGES[name](response, as_printed=as_printed)
+        own = STAGES[name](response)
         response = response.corrected(own.step)
         found = Corrected([*found.steps, own.step], own.values)
     return found
@@ -164,14 +161,14 @@ def fit(
 
     def response(values: Values) -> Response:
         b, slope = values.reshape(3, 4)[:, 0], values.reshape(3, 4)[:, 1:].T
-        return Response(b, slope, samples.speed)
+        return Response(b, slope, samples.speed, as_printed)
 
     def chain(values: Values) -> Values:
-        return follow(response(values), [*before, name], as_printed=as_printed).vector()
+        return follow(response(values), [*before, name]).vector()
 
     at = theta.T.ravel()
     correction = (previous.stages[-1].correction or {}) if previous and previous.stages else {}
-    found = follow(response(at), [name], as_printed=as_printed, start=correction.get("steps", []))
+    found = follow(response(at), [name], correction.get("steps", []))
     x, y, z = np.split(derivative(chain, at, np.full(12, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
     reference = Reference("gyroscope", samples.motions, map_, theta[1:].T, settings["table"])
@@ -214,13 +211,14 @@ class Response:
     rest: Values  # (3,), deg/s; mean reading at rest
     slope: Values  # (3, 3); row i: reading of x, y, z per deg/s about axis i
     rate: Values  # (3,), deg/s; I: mean magnitude of the rate about each axis; 0 where none was recorded
+    as_printed: bool = False  # whether the equations are those that are printed
 
     def corrected(self, step: Mapping[str, Any]) -> Response:
         """Return the response of readings after a step of a correction."""
         if "subtract" in step:
-            return Response(self.rest - np.asarray(step["subtract"]), self.slope, self.rate)
+            return replace(self, rest=self.rest - np.asarray(step["subtract"]))
         matrix = np.asarray(step["matrix"])
-        return Response(matrix @ self.rest, self.slope @ matrix.T, self.rate)
+        return replace(self, rest=matrix @ self.rest, slope=self.slope @ matrix.T)
 
     def require_turns(self) -> None:
         """Raise ``NotObservableError`` where there is no turn about one of the axes."""
