@@ -163,11 +163,8 @@ class Form:
         known = {"speed": "rate"}
         order = ["angle", "temperature", "time", "rate"]
         named = [known.get(name, name) for name in signals]
-        return next((name for name in order if name in named), "specific_force" if self._of_force(signals) else "rate")
-
-    @staticmethod
-    def _of_force(signals: Sequence[str]) -> bool:
-        return any(name.startswith("f") for name in signals) or "u" in signals
+        of_force = any(name.startswith("f") or name == "u" for name in signals)
+        return next((name for name in order if name in named), "specific_force" if of_force else "rate")
 
     @property
     def scanned(self) -> int:

@@ -233,8 +233,11 @@ def _how_sure(part: Mapping[str, Any]) -> list[str]:
     if part.get("to_distinguish"):
         lines.append(f"These recordings cannot distinguish them; this one would: {part['to_distinguish']}.")
     if part.get("upper_limit"):
-        each = "; ".join(f"{plain(name)} {_limit(limits)}" for name, limits in part["upper_limit"].items())
-        lines.append(f"Upper limits (95 %), were the effect there: {each}.")
+        each = []
+        for name, limits in part["upper_limit"].items():
+            sizes = [f"{v:.2g}{'' if unit == '1' else ' ' + unit}" for unit, v in largest_by_unit(limits).items()]
+            each.append(f"{plain(name)} {', '.join(sizes)}")
+        lines.append(f"Upper limits (95 %), were the effect there: {'; '.join(each)}.")
     return lines
 
 
@@ -245,11 +248,6 @@ def _answer(effects: Sequence[str]) -> str:
         for name in effects
     ]
     return " + ".join(names) or "nothing"
-
-
-def _limit(limits: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the upper limits of an effect's parameters, the largest of each unit: ``0.0031 deg/s/g``."""
-    return ", ".join(f"{v:.2g}{'' if unit == '1' else ' ' + unit}" for unit, v in largest_by_unit(limits).items())
 
 
 def to_distinguish(sets: Sequence[Mapping[str, Any]], sensor: str, *, on_table: bool) -> str:

@@ -207,7 +207,9 @@ def _errors(  # noqa: PLR0917  (what acts on the fits)
         covariance, freedom = assess_noise(fit.residual, design, blocks, prior).posterior(fit.map).averaged()
         none = np.zeros((3, len(k)))
         source = f"noise of the {fit.sensor}s"
-        rougher = np.where(_by_motion(fit)[k], max(_rms(fit.residual[moving]) / fit.scale, 1.0), 1.0)
+        # what motion alone determines: its noise may be larger than that at rest
+        by_motion = (np.array(fit.names)[k] != "rotation") | (fit.sensor == "gyroscope")
+        rougher = np.where(by_motion, max(_rms(fit.residual[moving]) / fit.scale, 1.0), 1.0)
         noise = covariance[np.ix_(k, k)] * np.outer(rougher, rougher)
         found.append(Error(source, "A", float(freedom[k].min()), noise, put, none))
         weak = np.array([PRIORS[fit.names[i]] ** -2 for i in k])
@@ -242,12 +244,6 @@ def _errors(  # noqa: PLR0917  (what acts on the fits)
                 of_axes = np.stack([_axes_change(chips, R, E, who) for E in shears], axis=1)
             found.append(Error(source, kind, nu, own_covariance, of_fits, of_axes))
     return found
-
-
-def _by_motion(fit: Fit) -> Mask:
-    """Return which parameters are determined by motion alone, whose noise may be larger than that at rest."""
-    names = np.array(fit.names)
-    return np.asarray((names != "bias") & ((names != "rotation") | (fit.sensor == "gyroscope")))
 
 
 def _rms(values: Values) -> float:

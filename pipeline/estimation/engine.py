@@ -116,7 +116,9 @@ class Posterior:
         variances = np.clip(np.diagonal(self.covariances, axis1=1, axis2=2)[:, known], 0.0, None)
         sigma = np.sqrt(variances / average[known])
         inner, outer = (_within(self.weight, sigma, level) for level in (ONE_SIGMA, COVERED))
-        size[known], inverse[known] = _student(inner, outer)
+        inverses, ratio, quantile = _quantiles()
+        inverse[known] = np.interp(outer / inner, ratio, inverses)
+        size[known] = outer / np.interp(inverse[known], inverses, quantile)
         freedom = np.where(known, 1.0 / np.maximum(1.0 / self.spare + inverse, 1e-300), np.inf)
         return mean * np.outer(size, size), freedom
 
@@ -170,13 +172,6 @@ def _within(weight: Values, sigma: Values, probability: float) -> Values:
         if np.all(np.abs(step) <= SMALL_STEP * x):
             break
     return x
-
-
-def _student(inner: Values, outer: Values) -> tuple[Values, Values]:
-    """Return scale and inverse degrees of freedom of Student's t of the same ``inner`` and ``outer``: (p,) arrays."""
-    inverse, ratio, quantile = _quantiles()
-    found = np.interp(outer / inner, ratio, inverse)
-    return outer / np.interp(found, inverse, quantile), found
 
 
 @cache

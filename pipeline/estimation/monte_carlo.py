@@ -142,11 +142,6 @@ def beside_trials(
     return replace(calibration, budget=budget)
 
 
-def without_trials(calibration: SensorCalibration, reason: str) -> SensorCalibration:
-    """Return a calibration whose budget says why it holds no Monte Carlo run."""
-    return replace(calibration, budget={**(calibration.budget or {}), KEY: {"trials": 0, "reason": reason}})
-
-
 def _compared(calibration: SensorCalibration, drawn: Values) -> dict[str, Any]:
     effects = [value for effect in calibration.effects for value in effect.values]
     estimate = np.concatenate([calibration.bias, calibration.matrix.ravel(), effects])

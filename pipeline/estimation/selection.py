@@ -7,13 +7,13 @@ In each round every candidate competes at its own best noise setting. The best o
 where p is that of the likelihood ratio and m the number of candidates (Bonferroni). A bias that follows time or
 temperature needs 16: wander of another kind than the model's looks like it. Beside what is selected, whose
 equations are of first order, it must bring 1/5000 of what that has brought, or 30. Where the residual stays above
-twice the noise, an effect must also explain 5 % of the excess: a model that misses something large is mended a little
-by anything small.
-After an effect of timing or with
-a time constant the model is fitted anew and all columns are rebuilt there. Selected effects whose own delta BIC has
-become negative are dropped, and one that a rival replaces with delta BIC > 10 is exchanged. If nothing passes although
-the wander seems three times that of a static recording or of the data sheet, two effects may hide each other: then all
-pairs are tried once.
+twice the noise, an effect must also explain 5 % of the excess: where a model lacks something large, anything small
+improves it a little.
+
+After an effect of timing or with a time constant, the model is fitted anew and all columns are rebuilt there. Selected
+effects whose own delta BIC has become negative are dropped. One that a rival replaces with delta BIC > 10 is exchanged.
+If nothing passes although the wander seems three times that of a static recording or of the data sheet, two effects may
+hide each other: then all pairs are tried once.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pipeline.estimation.ranking import Ranking, Score
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.records import Noise, SensorCalibration, Values
 
@@ -76,17 +76,11 @@ def select(
     observations = weighted(observations, noise)
     start, settings = ordinary_base(observations, noise), selection_grid(noise)
     base = fit_best(observations, starts_of(configured, observations, known, accelerometer), start, settings)
-    candidates = {
-        e.name: Term(
-            e,
-            np.zeros(len(e.parameters(observations.sensor))),
-            prior=prior_of(e, observations, accelerometer, configured),
-        )
-        for e in candidates_for(observations, configured)
-    }
-    ranking = Ranking(
-        observations, *_columns(base, base, candidates.values(), observations.sensor), base.K, start.scale, settings
-    )
+    candidates = {}
+    for this in candidates_for(observations, configured):
+        prior = prior_of(this, observations, accelerometer, configured)
+        candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
+    ranking = _ranking(observations, base, base, candidates, settings)
     limits = limits_of(observations.sensor, sheet)
     found = Selection(observations, noise, sheet, start, settings, limits, candidates, base, base, ranking, ranking)
     if search:
@@ -94,18 +88,21 @@ def select(
     return found
 
 
-def _columns(fit: Fit, base: Fit, candidates: Iterable[Term], sensor: str) -> tuple[list[Term], list[Term]]:
-    """Return configured effects and candidates as columns: at fitted values, others at each of their starts."""
+def _ranking(
+    observations: Observations, base: Fit, fit: Fit, candidates: Mapping[str, Term], settings: Sequence[Setting]
+) -> Ranking:
+    """Return the linear problem at a fit: fitted effects at their values, others at each of their starts."""
     fitted = {term.effect.name: replace(term, full=False) for term in fit.terms}
     found: list[Term] = []
-    for term in candidates:
-        if term.effect.name in fitted:
-            found.append(fitted[term.effect.name])
+    for name, term in candidates.items():
+        if name in fitted:
+            found.append(fitted[name])
         elif term.effect.moves:
             found.append(term)
         else:
-            found += [Term(term.effect, values) for values in term.effect.starts(sensor)]
-    return [replace(fitted[term.effect.name], full=True) for term in base.terms], found
+            found += [Term(term.effect, values) for values in term.effect.starts(observations.sensor)]
+    configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
+    return Ranking(observations, configured, found, fit.K, fit.scale, settings)
 
 
 @dataclass
@@ -153,23 +150,16 @@ class Selection:
                 if not self._exchange():
                     return
                 continue
-            if not self.names:
-                self.alone[best.name] = best
             self.names.append(best.name)
             self.steps[best.name] = best
             K = self.fit.K
             self._fit_selected()
             moved = effect(best.name).nonlinear or effect(best.name).moves or np.abs(self.fit.K - K).max() > ANOTHER_K
             if moved:  # the candidates' columns depend on what has changed
-                self._rebuild()
+                self._refit()
             self._drop()
             self._drop_refuted()
             self._merge()
-
-    def _rebuild(self) -> None:
-        """Build the candidates' columns at the fit."""
-        terms = _columns(self.fit, self.base, self.candidates.values(), self.observations.sensor)
-        self.ranking = Ranking(self.observations, *terms, self.fit.K, self.start.scale, self.settings)
 
     def _selected(self, names: Sequence[str]) -> list[int]:
         return [self.ranking.indices(name)[0] for name in names]
@@ -193,9 +183,10 @@ class Selection:
     def _refined(self, score: Score) -> Score:
         """Return the score of a nonlinear candidate at its own optimum."""
         this = effect(score.name)
-        start = np.maximum(score.values, this.starts(self.observations.sensor)[0]) if this.name == DELAYS[1] else None
-        term = Term(this, score.values if start is None else start)
-        terms = [*self.base.terms, *self._terms(), term]
+        values = score.values
+        if this.name == DELAYS[1]:
+            values = np.maximum(values, this.starts(self.observations.sensor)[0])
+        terms = [*self.base.terms, *self._terms(), Term(this, values)]
         fit = fit_terms(self.observations, terms, self.start, self.settings)
         self.fits[*self.names, score.name] = fit
         before, _ = self.ranking.of_model(self._selected(self.names))
@@ -231,9 +222,8 @@ class Selection:
 
         ``beside`` holds the indices of candidates that the score was made with, beside what is selected.
         """
-        if score.name in DELAYS and any(name in DELAYS for name in self.names):
-            return False
-        if self._overlaps(score.name, self.names):
+        second_delay = score.name in DELAYS and any(name in DELAYS for name in self.names)
+        if second_delay or self._overlaps(score.name, self.names):
             return False
         real = score.name != DELAYS[1] or score.values[0] > 0
         significant = score.delta_bic > self._gate(score.name) and score.p_value * len(self.candidates) < GATE_P
@@ -258,20 +248,19 @@ class Selection:
         floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
         residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
         drop = score.drop / self.ranking.samples
-        left = residual - drop
-        return bool(left < FAR_ABOVE**2 * floor or drop > WORTH_NAMING * (residual - floor))
+        return bool(residual - drop < FAR_ABOVE**2 * floor or drop > WORTH_NAMING * (residual - floor))
 
     def _refit(self) -> None:
         """Fit configured and selected effects together and rebuild the candidates there."""
         self._fit_selected()
-        self._rebuild()
+        self.ranking = _ranking(self.observations, self.base, self.fit, self.candidates, self.settings)
 
     def _fit_selected(self) -> None:
-        if tuple(self.names) in self.fits:
-            self.fit = self.fits[tuple(self.names)]
-            return
-        self.fit = fit_terms(self.observations, [*self.base.terms, *self._terms()], self.fit, self.settings)
-        self.fits[tuple(self.names)] = self.fit
+        key = tuple(self.names)
+        if key not in self.fits:
+            terms = [*self.base.terms, *self._terms()]
+            self.fits[key] = fit_terms(self.observations, terms, self.fit, self.settings)
+        self.fit = self.fits[key]
 
     def _terms(self) -> list[Term]:
         """Return the selected effects at their fitted values, or at those of the step that accepted them."""
@@ -286,9 +275,7 @@ class Selection:
         self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in gone))
 
     def _drop(self) -> None:
-        for name in list(self.names):
-            if effect(name).moves:
-                continue
+        for name in [n for n in self.names if not effect(n).moves]:
             own = self._beside([n for n in self.names if n != name]).get(name)
             if own is None or own.delta_bic < 0.0:
                 self._forget([name])
@@ -336,9 +323,7 @@ class Selection:
 
     def _exchange(self) -> bool:
         """Replace a selected effect by one that explains clearly more in its place."""
-        for name in self.names:
-            if effect(name).moves:
-                continue
+        for name in [n for n in self.names if not effect(n).moves]:
             others = [n for n in self.names if n != name]
             scores = self._beside(others)
             own = scores.pop(name).delta_bic if name in scores else float("-inf")
@@ -386,10 +371,9 @@ class Selection:
         """Return whether the residual's wander is far above that of a static recording or of the data sheet."""
         _, at = self.ranking.of_model([])
         white = float(np.sqrt(np.mean(self.start.scale**2)))
+        expected = float(self.sheet.get("bias_wander") or 0.0)
         if self.noise is not None and self.noise.source == "static":
             expected = float(np.sqrt(np.mean(self.noise.wander**2)))
-        else:
-            expected = float(self.sheet.get("bias_wander") or 0.0)
         return expected > 0 and self.ranking.settings[at].ratio * white > INFLATED * expected
 
     def _pairs(self) -> None:

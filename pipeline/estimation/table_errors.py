@@ -85,7 +85,9 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
         if reference.sensor not in sensors:
             continue
         u = reference.table.get(key)
-        fitted = [name for name in replaced_by if _everywhere(name, estimated, reference.motions)]
+        setups = {motion.setup for motion in reference.motions}
+        each = [n for n in replaced_by if all(f"{n}@{setup}" in estimated for setup in setups)]
+        fitted = [name for name in replaced_by if name in estimated or name in each]
         reason = f"estimated by {fitted[0]}" if fitted else _without(source, key, reference.table)
         if reason:
             missing[source] = reason
@@ -125,11 +127,6 @@ def _largest(reference: Reference) -> float:
             size = max(size, slope * float(table.get("angle_accuracy_deg") or 0.0))
             size = max(size, float(np.abs(motion.rate).max()) * float(table.get("rate_accuracy") or 0.0))
     return size
-
-
-def _everywhere(name: str, estimated: Sequence[str], motions: Sequence[Motion]) -> bool:
-    """Return whether an effect is estimated, for all recordings or in each of their setups."""
-    return name in estimated or all(f"{name}@{motion.setup}" in estimated for motion in motions)
 
 
 def _without(source: str, key: str, table: Mapping[str, Any]) -> str:

@@ -26,7 +26,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
 from pipeline.estimation.gauss_markov import Prior
 from pipeline.estimation.least_squares import ScaledColumns, solve_linear
-from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through, trials_of, without_trials
+from pipeline.estimation.monte_carlo import KEY, beside_trials, quadratic_results, through, trials_of
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.fit import Fit
 from pipeline.estimation.multi_position.fit import fit as fit_model
@@ -333,7 +333,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         return complete
     if len(count) > MOST_ROWS:
         reason = f"{len(count)} readings of a continuous turn are too many equations to draw; it is made for rests"
-        return without_trials(complete, reason)
+        return replace(complete, budget={**(complete.budget or {}), KEY: {"trials": 0, "reason": reason}})
     steps = quadratic_results(
         solved.columns * (solved.deviation / solved.fit.error)[:, None],
         curvature(solved.model, solved.fit, place.shape[1]),

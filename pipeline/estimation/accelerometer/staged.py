@@ -282,13 +282,14 @@ def fit(
         noise,
         scatter.degrees_of_freedom,
     )
-    last = name == "scale_factor"
+    last, named = name == "scale_factor", effect(ASYMMETRY).parameters("accelerometer")
+    asymmetry = {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(named, found.c, strict=True)}
     calibration = SensorCalibration(
         sensor="accelerometer",
         bias=found.bias,
         matrix=np.diag(1.0 / found.k),
         stages=(*(previous.stages if previous else ()), result),
-        effects=(_asymmetry(found),) if last else (),
+        effects=(FittedEffect(ASYMMETRY, asymmetry),) if last else (),
         convergence=certificate_of(sinusoids),
     )
     kept = slice(0, 15 if last else 12)
@@ -301,12 +302,6 @@ def fit(
         return np.array([chain(theta + e).vector()[kept] for e in errors])
 
     return budgeted(calibration, reference, noise, [scatter.of(kept)], settings, results)
-
-
-def _asymmetry(found: Corrected) -> FittedEffect:
-    names = effect(ASYMMETRY).parameters("accelerometer")
-    described = {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(names, found.c, strict=True)}
-    return FittedEffect(ASYMMETRY, described)
 
 
 def _noise(turns: Sequence[Turn], map_: LinearMap, prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
