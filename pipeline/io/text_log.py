@@ -303,7 +303,9 @@ class _Blocks:
         except UnicodeDecodeError as error:
             place = f"{self.path}:{self.line + data.count(NEWLINE, 0, error.start)}"
             byte = f"byte {self.offset + error.start} (0x{data[error.start]:02x})"
-            raise IngestError(f"{byte} is not UTF-8; save the file as UTF-8", place, code="not_utf8") from error
+            raise IngestError(
+                f"{byte} is not UTF-8; save the file as UTF-8 (iconv -f LATIN1 -t UTF-8)", place, code="not_utf8"
+            ) from error
 
     def _refuse_broken_line(self, data: bytes) -> None:
         r"""Refuse a carriage return inside a line: ``0\r.025`` was one number, and ``0`` is another.

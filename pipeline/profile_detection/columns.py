@@ -37,9 +37,13 @@ SENSOR_WORDS = {
     "gyroscope": {"g", "gy", "gyr", "gyro", "gyroscope", "w", "omega", "rotation", "rot", "angular"},
 }
 NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
-TIME_FIRST = {"t", "ts", "sec", "secs", "ms", "us", "ns", "tow", "utc", "epoch", "elapsed", "date"}
+TIME_FIRST = {
+    "t", "ts", "sec", "secs", "ms", "us", "ns", "msec", "usec", "nsec", "tow", "utc", "epoch", "elapsed", "date",
+    "uhrzeit",
+}  # fmt: skip
 TIME_WORDS = {
-    "time", "timestamp", "stamp", "datetime", "millis", "micros", "seconds", "ticks", "zeit", "tiempo", "temps",
+    "time", "timestamp", "stamp", "datetime", "millis", "micros", "nanos", "seconds", "milliseconds", "microseconds",
+    "nanoseconds", "ticks", "zeit", "tiempo", "temps",
 }  # fmt: skip
 TABLE_WORDS = {"table", "turntable", "encoder", "enc", "shaft"}
 TEMPERATURE_WORDS = {"temp", "temperature", "tmp"}
@@ -52,7 +56,8 @@ SQUARED = (["s"], ["ms"], ["mps"])  # before a 2 that is a power, not an axis
 UNIT_ENDINGS = (
     ("m/s^2", ("m s 2", "mps 2", "ms 2")), ("deg/s", ("dps", "deg s", "degps")),
     ("rad/s", ("rad s", "rads", "radps", "rad")), ("degC", ("degc", "deg c", "c")), ("mg", ("mg",)), ("g", ("g",)),
-    ("s", ("s", "sec")), ("ms", ("ms", "millis")), ("us", ("us", "micros")), ("ns", ("ns",)), ("deg", ("deg",)),
+    ("s", ("s", "sec", "seconds")), ("ms", ("ms", "millis", "msec", "milliseconds")),
+    ("us", ("us", "micros", "usec", "microseconds")), ("ns", ("ns", "nanos", "nsec", "nanoseconds")), ("deg", ("deg",)),
 )  # fmt: skip
 LINES_TRIED = 400  # with each separator
 MOST_ROWS = 200_000  # read as numbers; bounds the cost
@@ -195,7 +200,8 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
     counters = [i for i, v in numbers.items() if len(v) > 2 and bool(np.mean(np.diff(v) == 1.0) > COUNTING)]
     of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
     named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
-    unnamed = [] if found.layout.header else [i for i in rising if i not in counters]
+    unnamed = [i for i in rising if i not in counters and (not found.layout.header or i in of_sensor)]
+    unnamed = unnamed if not found.layout.header or len(unnamed) == 1 else []
     candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
     steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)

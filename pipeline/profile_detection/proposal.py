@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.io.gravity_rotation import interval_of, moves_of
+from pipeline.io.ingest_settings import AUTO
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
 from pipeline.profile_detection.columns import (
     TEMPERATURE_RANGE,
@@ -31,6 +32,7 @@ from pipeline.profile_detection.unit_guesses import (
     OF_SENSOR,
     UNKNOWN,
     Guess,
+    counts_a_turn,
     counts_of_sensor,
     force_unit,
     other_range,
@@ -146,12 +148,32 @@ def _belong_together(one: Columns, two: Columns) -> bool:
 
 
 def _alike(one: Proposal, two: Proposal) -> bool:
-    return [s.names for s in one.layouts] == [s.names for s in two.layouts] and one.csv == two.csv and not one.parts
+    """Return whether one profile reads both: the same names, or others only for channels that a file may lack."""
+    if one.parts or two.parts:
+        return False
+    if [s.names for s in one.layouts] == [s.names for s in two.layouts] and one.csv == two.csv:
+        return True
+    if one.csv.get("header") is not True or _without_delimiter(one) != _without_delimiter(two):
+        return False
+    first, second = one.columns[0], two.columns[0]
+    shared = first.keys() & second.keys()
+    other = [entry for c, entry in {**first, **second}.items() if c not in shared]
+    return all(first[c]["column"] == second[c]["column"] for c in shared) and all(e.get("optional") for e in other)
+
+
+def _without_delimiter(proposal: Proposal) -> dict[str, Any]:
+    return {key: value for key, value in proposal.csv.items() if key != "delimiter"}
 
 
 def _fill_in(proposal: Proposal, other: Proposal) -> None:
-    """Take from another file of the same layout what this one could not tell."""
+    """Take from another file of the same layout what this one could not tell, or does not hold."""
     proposal.files += other.files
+    if proposal.csv.get("delimiter") != other.csv.get("delimiter"):
+        proposal.csv["delimiter"] = AUTO
+        proposal.evidence["delimiter"] = "the files differ: by the header of each"
+    for channel in other.columns[0].keys() - proposal.columns[0].keys():
+        proposal.columns[0][channel] = other.columns[0][channel]
+        proposal.evidence[channel] = f"{other.evidence.get(channel, '')} ({Path(other.files[0]).name})"
     for channel, entry in proposal.columns[0].items():
         better = other.columns[0].get(channel, entry)
         if UNKNOWN in entry.values() and UNKNOWN not in better.values():
@@ -292,7 +314,10 @@ def _by_table(columns: Columns, rate: Values, time_s: Values | None) -> Guess | 
     multiplier, divisor = UNITS[channel][stated or {"table_rate": "deg/s", "table_angle": "deg"}[channel]]
     if CENTIDEGREES in words_of(columns.layout.names[index]):
         divisor *= 100
-    values = columns.layout.numbers[index] * multiplier / divisor
+    values = columns.layout.numbers[index]
+    if channel == "table_angle" and stated is None and (turn := counts_a_turn(values)):
+        divisor *= turn / 360.0
+    values = values * multiplier / divisor
     if channel == "table_angle":
         if time_s is None:
             return None
@@ -331,6 +356,10 @@ def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str)
         entries[channel] = {"column": layout.key(index), "unit": stated or usual, "optional": True}
         span = f"{values.min():.6g} to {values.max():.6g}"
         proposal.evidence[channel] = f"{why}: {span}" if stated else f"{span}, so {usual}"
+        turn = counts_a_turn(values) if channel == "table_angle" and stated is None else None
+        if turn:
+            entries[channel] |= {"unit": COUNTS, "counts_per_unit": float(f"{turn / 360.0:.12g}")}
+            proposal.evidence[channel] = f"{span}, and starts again after {turn} counts: {turn} / 360 counts a degree"
         if channel == "table_angle" and CENTIDEGREES in words_of(layout.names[index]):
             entries[channel] |= {"unit": COUNTS, "counts_per_unit": 100.0}
             proposal.evidence[channel] = f"the name says hundredths of a degree: {span}"

@@ -29,8 +29,14 @@ CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and 
 FOLLOWED = 0.3  # share of the rates' rms that the table's rate leaves at most: axes lean, and rates are noisy
 CLOSE_BY_TURNS = 0.2  # those of both sensors, in few moves
 USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits
-# 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch).
-USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2)
+# 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
+USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
+# Counts a turn of encoders: 8 to 20 bits, and usual numbers of lines, once, twice and four times.
+ENCODERS = (
+    *(2**bits for bits in range(8, 21)),
+    *(k * n for n in (500, 600, 900, 1000, 1250, 2500, 9000) for k in (1, 2, 4)),
+)
+CLOSE_TURN = 0.01  # half of the least distance of two of them, but 4000 and 4096
 OFFSETS = (0.0, 32768.0, 8192.0, 2048.0)  # middle of 16, 14 and 12 bits without a sign
 SCALES = np.geomspace(1.0, 1000.0, 481)  # counts per deg/s that are tried, 1.4 % apart
 ASSUMED_HZ = 100.0  # where the time is not known
@@ -39,6 +45,7 @@ TOO_FAST_FOR_RADIANS = 40.0  # rad/s, 2300 deg/s: beyond the range of usual sens
 BURSTS = 0.1  # mean over median interval, from which both are told
 RATES_HZ = (5.0, 20_000.0)  # sampling rates of inertial sensors
 SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
+FLATTEST = 0.1  # smallest over largest extent of rests in a plane: axes lean and scale by some percent
 FEWEST_RESTS_FOR_A_SPHERE = 9  # twice the four unknowns, and one
 
 
@@ -94,7 +101,11 @@ def force_unit(force: Values, interval_s: float) -> Guess:
     at_rest = np.concatenate([force[a:b] for a, b in rests]) if rests else force
     size = float(np.median(np.linalg.norm(at_rest, axis=1)))  # of samples: a slow turn may pass for a rest
     where = f"|a| is {size:.4g} at rest" if rests else f"|a| is {size:.4g} on the whole"
-    centre, radius = sphere(means) if len(rests) >= FEWEST_RESTS_FOR_A_SPHERE else (np.zeros(3), size)
+    centre, radius = np.zeros(3), size
+    if len(rests) >= FEWEST_RESTS_FOR_A_SPHERE:
+        spread = np.linalg.svd(means - means.mean(axis=0), compute_uv=False)
+        if spread[2] > FLATTEST * spread[0]:  # rests of turns about one axis lie in a plane, on many spheres
+            centre, radius = sphere(means)
     if whole(force):
         guess = _counts_per_g(len(rests), centre, radius, size, where)
     else:
@@ -229,6 +240,17 @@ def counts_of_sensor(guess: Guess, name: str, sensor: dict[str, Any]) -> Guess:
         f"sensor.{name}.range must be the range that the logger sets"
     )
     return Guess({**guess.entry, "counts_per_unit": figure}, text)
+
+
+def counts_a_turn(values: Values) -> int | None:
+    """Return the counts a turn of an encoder that starts again at each turn; None where it shows no such count."""
+    steps = np.abs(np.diff(values))
+    wraps = np.flatnonzero(steps[1:-1] > np.ptp(values) / 2.0) + 1
+    if not wraps.size or not whole(values):
+        return None
+    turn = float(np.median(steps[wraps] + (steps[wraps - 1] + steps[wraps + 1]) / 2.0))
+    usual = min((n for n in ENCODERS if n > np.ptp(values)), key=lambda n: abs(np.log(n / turn)), default=0)
+    return usual if usual and abs(turn / usual - 1.0) < CLOSE_TURN else None
 
 
 def temperature_counts(span: str, sensor: str) -> Guess:

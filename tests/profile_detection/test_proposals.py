@@ -297,3 +297,28 @@ def test_the_rate_of_the_table_in_the_same_rows_tells_the_unit_of_the_gyroscope(
     (proposal,) = propose([find_layout(f"t,table_rate_dps,gx,gy,gz\n{rows}".encode(), "log.csv")])
     assert {k: proposal.columns[0]["gyro_y"].get(k) for k in entry} == entry, proposal.evidence
     assert "a deg/s of the table's rate in the same rows" in proposal.evidence["gyroscope"]
+
+
+@pytest.mark.parametrize("turn", [4096, 4000])
+def test_an_encoder_that_starts_again_and_turns_about_one_axis_are_read_in_one_profile(
+    tmp_path: Path, turn: int
+) -> None:
+    time = np.arange(2000) * 0.04
+    rate = np.where((time % 5.0 > 1.0) & (time % 5.0 < 3.0), 15.0, 0.0)  # deg/s, with rests; counted left-handed
+    angle = np.cumsum(rate) * 0.04
+    force = np.column_stack([np.full(2000, 0.03), np.sin(np.radians(angle)), np.cos(np.radians(angle)) + 0.05])
+    rates = np.column_stack([rate + 1.2, np.full(2000, -0.8), np.full(2000, 0.5)])
+    counts = np.mod(np.rint(700 - angle / 360 * turn), turn)
+    columns = np.column_stack([3e6 + time * 1e6, counts, np.rint(rates * 1000), np.rint(force * 16384)]).astype(int)
+    names = ["usec", "enc", "gx", "gy", "gz", "ax", "ay", "az"]
+    for name, kept, separator in (("turn", names, "\t"), ("flight", [n for n in names if n != "enc"], ";")):
+        lines = [kept, *([str(row[names.index(n)]) for n in kept] for row in columns)]
+        (tmp_path / f"{name}.txt").write_text("\n".join(map(separator.join, lines)) + "\n")
+    for order in (("turn", "flight"), ("flight", "turn")):
+        proposal = proposed(*(tmp_path / f"{name}.txt" for name in order))
+        found = proposal.columns[0]
+        assert proposal.csv["delimiter"] == "auto"
+        assert found["time"]["unit"] == "us"
+        assert found["accel_x"] == {"column": "ax", "unit": "counts", "counts_per_unit": 16384.0}
+        assert found["table_angle"]["counts_per_unit"] == pytest.approx(turn / 360)
+        assert found["gyro_z"]["counts_per_unit"] == 1000.0
