@@ -72,7 +72,7 @@ class Disk:
         return self.place
 
     def start(self, place: str, *config: str, fault: str = "", cwd: str = ".") -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "snakemake", "--cores", "2", "-s", str(ROOT / "Snakefile"), "--config"]
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", "-p", "-s", str(ROOT / "Snakefile"), "--config"]
         command += [
             f"campaign={self.directory / 'pair'}",
             f"overrides=[batch_size=1, method.gyroscope=null, certificate.place={place}]",
@@ -237,7 +237,7 @@ def test_results_that_cannot_be_written_are_refused_before_any_job(disk: Disk) -
     results = f"results={disk.directory / 'results'}"
     disk.remount("ro")
     try:
-        command = [sys.executable, "-m", "snakemake", "--cores", "2", "-s", str(ROOT / "Snakefile")]
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", "-p", "-s", str(ROOT / "Snakefile")]
         command += ["--forcerun", "gather", "--config", f"campaign={disk.directory / 'pair'}", results]
         done = subprocess.run(command, cwd=disk.directory.parent, capture_output=True, text=True, check=False)
     finally:
