@@ -79,11 +79,9 @@ def write_mcap(path: Path, samples: int) -> None:
     """Write what a recorder writes: quantised readings in zstd chunks, and a temperature ten times a second."""
     from mcap.writer import Writer  # noqa: PLC0415
 
-    from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, _Message, imu_table  # noqa: PLC0415
+    from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, as_messages, imu_table  # noqa: PLC0415
 
     generator = np.random.default_rng(1)
-    warm = _Message("imu")
-    warm.doubles(2)
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1 << 20)
         writer.start(profile="ros2")
@@ -96,7 +94,7 @@ def write_mcap(path: Path, samples: int) -> None:
             stamps = 1_700_000_000_000_000_000 + 1_000_000 * np.arange(start, start + n)
             force = np.rint(generator.normal(0, 5000, (n, 3))) / 16384
             rate = np.rint(generator.normal(0, 5000, (n, 3))) / 131
-            warmth = warm.fill(stamps, np.column_stack([25 + 1e-9 * (stamps - stamps[0]), np.zeros(n)]))
+            warmth = as_messages(stamps, "imu", np.column_stack([25 + 1e-9 * (stamps - stamps[0]), np.zeros(n)]))
             messages = imu_table(stamps, {"accelerometer": force, "gyroscope": rate})
             for i, (stamp, row) in enumerate(zip(stamps.tolist(), messages, strict=True)):
                 writer.add_message(imu, stamp, row.tobytes(), stamp)

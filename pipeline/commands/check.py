@@ -21,8 +21,7 @@ from pipeline.io.files import SUFFIXES, recording_files
 from pipeline.model.data_sheet import settings_of_ranges
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.proposal import as_yaml, propose
-from pipeline.profile_detection.recording_facts import as_text, facts
-from pipeline.profile_detection.topics import topic_lines, topics_of
+from pipeline.profile_detection.recording_facts import as_text, facts, topic_lines, topics_of
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.run_progress import Countdown
 

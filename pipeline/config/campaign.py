@@ -10,15 +10,17 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import ValidationError
+
 from pipeline.config.comparisons import resolve_comparisons
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, load_layers, read_sheet
-from pipeline.config.options import Problem, default_of_run, nearest, parse
-from pipeline.config.schema import OF_BENCH
+from pipeline.config.options import RUN_SETTINGS, Problem, mapping_of, nearest, parse
+from pipeline.config.schema import OF_BENCH, RunSettings
 from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import GIVEN, PYTHON
 from pipeline.errors import ConfigurationError
-from pipeline.files import SHIPPED
+from pipeline.files import CONFIGS, SHIPPED
 from pipeline.history import SENSORS
 
 if TYPE_CHECKING:
@@ -147,16 +149,17 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
             for line in str(problem).splitlines():
                 problems.setdefault(line, []).append(name)
     if problems:
-        raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
-    batches, chains = cut_batches(units, _count("batch_size", layers.of_run, 1, "auto or "))
+        lines = [f"  unit {_few(names)}: {text}" for text, names in problems.items()]
+        raise ConfigurationError("the configuration is refused:\n" + "\n".join(lines), str(directory / "units.csv"))
+    of_run = run_settings(layers.of_run)
+    batches, chains = cut_batches(units, None if of_run.batch_size == "auto" else of_run.batch_size)
     _check_boards(boards_of(units), batches, str(directory / "units.csv"))
     results = Path(str(settings.get("results", "results"))) / directory.name
     compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
-    page, simulation = layers.campaign.page, layers.simulation
-    combine, limit = _combine(layers.of_run), _count("publish_limit", layers.of_run, 0)
     return Campaign(
-        directory.name, directory, results, units, batches, chains, compare, simulation, settings, page, combine, limit
-    )
+        directory.name, directory, results, units, batches, chains, compare, layers.simulation, settings,
+        layers.campaign.page, of_run.combine, of_run.publish_limit,
+    )  # fmt: skip
 
 
 def read_layers(directory: Path, settings: Mapping[str, Any]) -> tuple[Composer, Layers]:
@@ -176,33 +179,18 @@ def find_campaign(name: str) -> Path:
     )
 
 
-def _of_run(name: str, overrides: Sequence[str]) -> Any:  # noqa: ANN401  (a setting's type is its own)
-    value = default_of_run(name)
-    for text in overrides:
-        try:
-            key, given = parse(text)
-        except Problem as problem:
-            raise ConfigurationError(str(problem)) from problem
-        value = given if key == name else value
-    return value
-
-
-def _combine(overrides: Sequence[str]) -> str | None:
-    """Return by which column of the sheet calibrations are combined; None: not at all."""
-    combine = _of_run("combine", overrides)
-    if combine not in (None, "serial", "lot"):
-        raise ConfigurationError(f"combine={combine}: serial, lot or null is expected")
-    return combine if combine is None else str(combine)
-
-
-def _count(name: str, overrides: Sequence[str], least: int, words: str = "") -> Any:  # noqa: ANN401
-    """Return a whole number among the settings of the run, None for ``auto``."""
-    count = _of_run(name, overrides)
-    if words and count == "auto":
-        return None
-    if not isinstance(count, int) or isinstance(count, bool) or count < least:
-        raise ConfigurationError(f"{name}={count}: {words}a whole number from {least} on is expected")
-    return count
+def run_settings(overrides: Sequence[str]) -> RunSettings:
+    """Return the settings of the run that its overrides, weakest first, give; ``ConfigurationError``: one is wrong."""
+    settings = {name: value for name, value in mapping_of(CONFIGS / "config.yaml").items() if name in RUN_SETTINGS}
+    try:
+        settings |= dict(map(parse, overrides))
+        return RunSettings.model_validate(settings)
+    except Problem as problem:
+        raise ConfigurationError(str(problem)) from problem
+    except ValidationError as error:
+        name = str(error.errors()[0]["loc"][0])
+        expected = RunSettings.model_fields[name].description
+        raise ConfigurationError(f"{name}={settings[name]}: {expected} is expected") from None
 
 
 def cut_batches(
@@ -257,17 +245,13 @@ def _check_boards(boards: Mapping[str, Sequence[str]], batches: Mapping[str, Seq
     batch_of = {unit: batch for batch, units in batches.items() for unit in units}
     split = [b for b, chips in boards.items() if len({batch_of[chip] for chip in chips}) > 1] if boards else []
     if split:
-        more = f" and {len(split) - 5} more" * (len(split) > 5)
         raise ConfigurationError(
-            f"column board: the chips of {', '.join(split[:5])}{more} are estimated together; expected consecutive "
-            "rows with the same method",
+            f"column board: the chips of {_few(split)} are estimated together; expected consecutive rows with the same "
+            "method",
             sheet,
         )
 
 
-def _one_message(problems: Mapping[str, list[str]]) -> str:
-    lines = []
-    for text, names in problems.items():
-        more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-        lines.append(f"  unit {', '.join(names[:5])}{more}: {text}")
-    return "the configuration is refused:\n" + "\n".join(lines)
+def _few(names: Sequence[str]) -> str:
+    """Return up to five names, and how many more there are."""
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -44,6 +44,7 @@ from pipeline.config.user_effects import (
 )
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
+from pipeline.history import SENSORS
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.model.data_sheet import completed, range_settings, without_overridden
 
@@ -202,11 +203,8 @@ class Composer:
             except (HydraException, OmegaConfBaseException) as error:
                 cause = f" ({error.__cause__})" if error.__cause__ else ""
                 raise Problem(f"{str(error).splitlines()[0]}{cause}") from error
-            base = OmegaConf.to_container(composed, resolve=False)
-            assert isinstance(base, dict)  # noqa: S101
-            plain: dict[str, Any] = {str(k): v for k, v in base.items()}
-            for run_setting in RUN_SETTINGS:
-                plain.pop(run_setting)
+            base: Any = OmegaConf.to_container(composed, resolve=False)
+            plain: dict[str, Any] = {str(k): v for k, v in base.items() if k not in RUN_SETTINGS}
             for group in GROUPS:
                 option = groups.get(group) or default_option(group)
                 plain[group] = {"name": option, **plain[group]}
@@ -216,15 +214,11 @@ class Composer:
 
     def _with_stages(self, method: dict[str, Any]) -> dict[str, Any]:
         """Return a method with the stages of the method chosen for each sensor."""
-        stages: dict[str, list[str]] = {}
-        sensors = ("accelerometer", "gyroscope")
-        if all(method[sensor] is None for sensor in sensors):
+        stages = {sensor: [NOT_WANTED] for sensor in SENSORS if method[sensor] is None}
+        if len(stages) == len(SENSORS):
             raise Problem("method.accelerometer and method.gyroscope are both null: nothing is left to calibrate")
-        for sensor in sensors:
+        for sensor in (s for s in SENSORS if s not in stages):
             name = method[sensor]
-            if name is None:
-                stages[sensor] = [NOT_WANTED]
-                continue
             if name not in self.options["method"]:
                 raise Problem(f"method.{sensor}={name}: no such method{nearest(name, self.options['method'])}")
             own = method["stages"] if name == method["name"] else self._read("method", name)["stages"]
@@ -250,14 +244,6 @@ class Composer:
         if sensor not in applies:
             raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
 
-    def _check_contained(self, sensor: str, name: str, names: list[str]) -> None:
-        own = self.user_effects.effects.get(name)
-        known = own is None and name in self.effects
-        contains = own.contains if own else read_option("effect", name, ()).get("contains", []) if known else []
-        within = [other for other in names if other in contains]
-        if within:
-            raise Problem(f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them")
-
     def _check_meaning(self, config: dict[str, Any]) -> None:
         stated = {key for key in OF_BENCH if config["table"].get(key)}
         of_bench = [name for name in self.effects if stated and read_option("effect", name, ()).get("prior") in stated]
@@ -265,7 +251,10 @@ class Composer:
             for name in [] if names == "auto" else names:
                 self._check_effect(sensor, name, config["procedure"])
             for name in [] if names == "auto" else [*of_bench, *names]:
-                self._check_contained(sensor, name, names)
+                own = self.user_effects.effects.get(name)
+                contains = own.contains if own else read_option("effect", name, ()).get("contains", [])
+                if within := [other for other in names if other in contains]:
+                    raise Problem(f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them")
         ingest = repr((config["ingest"], config["procedure"]))
         if ingest not in self._valid_ingest:
             try:
@@ -282,7 +271,7 @@ class Composer:
 
 def _without_need(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str, Any]:
     """Return the procedure, with recordings for a sensor that is not calibrated made optional."""
-    unused = {sensor for sensor in ("accelerometer", "gyroscope") if method[sensor] is None}
+    unused = {sensor for sensor in SENSORS if method[sensor] is None}
     entries = procedure["recordings"].items()
     recordings = {name: {**e, "optional": True} if e["role"] in unused else e for name, e in entries}
     return {**procedure, "recordings": recordings} if unused else procedure

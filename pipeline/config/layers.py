@@ -272,8 +272,8 @@ def load_layers(directory: Path, settings: Mapping[str, Any], sheet: Sheet, sens
         raise ConfigurationError(problem, str(simulation))
     campaign = file.model_copy(update={"overrides": units})
     per_unit = _unit_overrides(settings.get("unit_overrides", {}), sheet.rows)
-    devices = _read_devices(directory, sheet)
-    return Layers(sheet, campaign, [*in_file, *on_command_line], devices, command, per_unit, simulation)
+    of_run = [*in_file, *on_command_line]
+    return Layers(sheet, campaign, of_run, _read_devices(directory, sheet), command, per_unit, simulation)
 
 
 def as_list(value: Any, where: str, what: str = LIST) -> list[str]:  # noqa: ANN401  (the user's)
@@ -353,15 +353,12 @@ def _check_models_and_lots(campaign: CampaignFile, sheet: Sheet, sensors: set[st
             run, _ = _split(overrides)
             if run:
                 raise ConfigurationError(f"{key}, {name}: {run[0]} is a setting of the run, not of units", file)
-            if key == "models" and any(_parsed_key(o) == "sensor" for o in overrides):
+            try:
+                another = key == "models" and any(parse(o)[0] == "sensor" for o in overrides)
+            except Problem as problem:
+                raise ConfigurationError(str(problem)) from problem
+            if another:
                 raise ConfigurationError(f"models, {name}: the overrides of a model cannot choose another", file)
-
-
-def _parsed_key(text: str) -> str:
-    try:
-        return parse(text)[0]
-    except Problem as problem:
-        raise ConfigurationError(str(problem)) from problem
 
 
 def _unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:  # noqa: ANN401

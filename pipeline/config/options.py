@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 
+from pipeline.config.schema import RunSettings
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
 from pipeline.io.yaml_file import read_yaml
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
-RUN_SETTINGS = ("batch_size", "combine", "publish_limit")
+RUN_SETTINGS = tuple(RunSettings.model_fields)
 LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
@@ -73,9 +74,7 @@ def _parse_with_hydra(text: str) -> tuple[str, Any]:
     return override.key_or_group, override.value()
 
 
-@cache
-def _hydras_parser() -> OverridesParser:
-    return OverridesParser.create()
+_hydras_parser = cache(OverridesParser.create)
 
 
 @cache
@@ -104,11 +103,6 @@ def default_option(group: str) -> str:
         if not isinstance(entry, str) and group in entry:
             return str(entry[group])
     raise KeyError(group)
-
-
-def default_of_run(name: str) -> Any:  # noqa: ANN401  (a setting's type is its own)
-    """Return the default of a setting of the run."""
-    return mapping_of(CONFIGS / "config.yaml")[name]
 
 
 def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN401  (any YAML value)

@@ -337,6 +337,14 @@ class Unit(Section):
     certificate: Certificate
 
 
+class RunSettings(Section):
+    """Settings of a run, of ``campaign.yaml`` or the command line. A description says what is expected."""
+
+    batch_size: Literal["auto"] | Annotated[int, Field(ge=1)] = Field(description="auto or a whole number from 1 on")
+    combine: Literal["serial", "lot"] | None = Field(description="serial, lot or null")
+    publish_limit: int = Field(ge=0, description="a whole number from 0 on")
+
+
 SECTIONS: dict[str, type[BaseModel]] = {
     name: field.annotation
     for name, field in Unit.model_fields.items()

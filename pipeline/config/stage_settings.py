@@ -103,8 +103,9 @@ def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> 
     """Return the settings of a unit that a stage reads: a key of ``READS``, or a stage of the fit of a sensor."""
     out: dict[str, Any] = {}
     paths = _paths(stage, sensor)
-    if stage == "effects" and sensor == "gyroscope" and _mountings(config):
-        paths = paths + _paths(stage, "accelerometer")  # gravity determines the mountings
+    mounted = config["table"].get("seat_deg") is not None or "mounting" in (config["effects"]["gyroscope"] or ())
+    if stage == "effects" and sensor == "gyroscope" and mounted:  # with a mounting of the unit in each recording,
+        paths = paths + _paths(stage, "accelerometer")  # which gravity determines
     for *branch, leaf in paths:
         source: Any = config
         target = out
@@ -114,11 +115,6 @@ def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> 
         if leaf in source or (branch[-1:] != ["effects"] and leaf != "given"):  # a data sheet limits some effects
             target[leaf] = source[leaf]
     return out
-
-
-def _mountings(config: Mapping[str, Any]) -> bool:
-    """Return whether the gyroscope is fitted together with a mounting of the unit in each recording."""
-    return config["table"].get("seat_deg") is not None or "mounting" in (config["effects"]["gyroscope"] or ())
 
 
 @cache

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -71,14 +72,8 @@ def read_any(file: Path, name: str | None = None, counts: Mapping[str, float | N
     """Read a calibration in any format; where a format has a file for each sensor, from either of them.
 
     ``name``: of the format, or its beginning (``format_of``), found from the file's name and content where not given;
-    ``counts``: sensor to its counts per g or deg/s, for formats in counts.
-
-    Raises
-    ------
-    ConfigurationError
-        If no format, or several, have this name.
-    InputError
-        If the format is not known, or the file does not hold what the format needs.
+    ``counts``: sensor to its counts per g or deg/s, for formats in counts. ``ConfigurationError``: no format, or
+    several, have this name; ``InputError``: the file does not hold what the format needs.
     """
     stated = None if name is None else format_of(name)
     if not is_published(file):
@@ -88,8 +83,10 @@ def read_any(file: Path, name: str | None = None, counts: Mapping[str, float | N
     if name == CALIBRATION:
         document = read_calibration(file)
         own = {s: c for s in SENSORS if (c := sensor_of(document, s, file)) is not None}
-        known = {s: c if _uncertain(c) else replace(c, covariance=None) for s, c in own.items()}
-        return FoundCalibration(name, str(document["unit"]), known, document=document)
+        for sensor, c in own.items():  # a published one holds zeros where no uncertainty is known
+            if c.covariance is None or not np.any(np.diag(c.covariance) > 0.0):
+                own[sensor] = replace(c, covariance=None)
+        return FoundCalibration(name, str(document["unit"]), own, document=document)
     declared = formats()[name][0]
     if not declared.reads:
         raise InputError(f"the format {name} holds no calibration that can be read: {declared.equation}", str(file))
@@ -142,40 +139,25 @@ def format_of(given: str) -> str:
                              f"{', '.join(found or known)}; choose one (convert --from, --to)")  # fmt: skip
 
 
-def _uncertain(calibration: SensorCalibration) -> bool:
-    """Return whether a calibration states uncertainties: a published one holds zeros where none is known."""
-    return calibration.covariance is not None and bool(np.any(np.diag(calibration.covariance) > 0.0))
-
-
 def _recognised(file: Path, text: str) -> str:
     """Return the name of the only format whose keys a file has."""
     known = {name: declared for name, (declared, _) in formats().items()}
     if file.name in known:
         return file.name
-    found = [name for name, declared in known.items() if declared.reads and _fits(file, text, declared)]
-    if _is_calibration(text):
-        found = [CALIBRATION]
+    found = []
+    for name, declared in known.items():
+        with suppress(ValueError, YAMLError):
+            if declared.reads and _sensors_in(file, declared, text_kinds.parsed(declared.reads["text"], text)):
+                found.append(name)
+    with suppress(ValueError):
+        document = json.loads(text)
+        if isinstance(document, dict) and {"schema_version", "status", *SENSORS} <= set(document):
+            found = [CALIBRATION]
     if len(found) == 1:
         return found[0]
     listed = ", ".join(found or [CALIBRATION, *(n for n, d in known.items() if d.reads)])
     reason = "the file fits several formats" if found else "the file has the keys of no format"
     raise InputError(f"{reason}: {listed}; name it (convert --from, method.format)", str(file))
-
-
-def _is_calibration(text: str) -> bool:
-    try:
-        document = json.loads(text)
-    except ValueError:
-        return False
-    return isinstance(document, dict) and {"schema_version", "status", *SENSORS} <= set(document)
-
-
-def _fits(file: Path, text: str, declared: Format) -> bool:
-    try:
-        content = text_kinds.parsed(declared.reads["text"], text)
-    except (ValueError, YAMLError):
-        return False
-    return bool(_sensors_in(file, declared, content))
 
 
 def _sensors_in(file: Path, declared: Format, content: text_kinds.Node) -> dict[str, dict[str, str]]:
@@ -250,10 +232,9 @@ def _calibration(
         most = float(np.abs(held["left_out"]).max())
         notes += [f"{sensor}: cross-axis terms change by up to {most:.2g} per degC, which is not read"] * (most > SAME)
     effects = _thermal(sensor, polynomial, notes)
-    if "g_sensitivity" in held and np.any(held["g_sensitivity"]):
-        effects.append(_fitted("g_sensitivity", sensor, held["g_sensitivity"].ravel() / raw))
-    if "scale_factor_temperature" in held and np.any(held["scale_factor_temperature"]):
-        effects.append(_fitted("scale_factor_temperature", sensor, held["scale_factor_temperature"].ravel()))
+    for name, unit in (("g_sensitivity", raw), ("scale_factor_temperature", 1.0)):
+        if np.any(values_of := held.get(name, np.zeros(1))):
+            effects.append(_fitted(name, sensor, values_of.ravel() / unit))
     covariance = None
     if "bias_deviation" in held and np.any(held["bias_deviation"]):
         size = 12 + sum(len(e.parameters) for e in effects)

@@ -108,11 +108,11 @@ def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, An
     out["walk_origin"] = converted or "for the bias wander of the sensor's configuration"
     if not axes:
         return out
-    whites = [w for terms in axes if (w := _white(terms)) is not None]
+    of_axes, walks = zip(*map(_white_and_walk, axes), strict=True)
+    whites = [w for w in of_axes if w is not None]
     if whites:
         out["white"], *out["white_interval"] = _rms(whites)
         out["white_origin"] = f"measured at rest ({found['source']}), root mean square of the axes"
-    walks = [_walk(terms) for terms in axes]
     seen = [w for w in walks if w is not None]
     limits = [t["random_walk"].get("upper_limit") for t, w in zip(axes, walks, strict=True) if w is None]
     lesser = [least for limit in limits if (least := min((v for v in (limit, walk) if v), default=None)) is not None]
@@ -134,33 +134,20 @@ def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, An
     return out
 
 
-def _white(terms: JSON) -> Values | None:
-    """Return the white noise of an axis and the ends of its interval, (3,); None where none was seen."""
+def _white_and_walk(terms: JSON) -> list[Values | None]:
+    """Return white noise and walk of an axis with the ends of their intervals, (3,); None where no term was seen."""
+
+    def seen(*parts: JSON) -> list[Values]:
+        return [np.array([p["value"], *p["interval"]], float) for p in parts if p["value"] is not None]
+
     processes = [(part, part["correlation_time_s"]["value"]) for part in terms["gauss_markov"]]
-    fast = [np.sqrt(2.0 * time) * _ends(part) for part, time in processes if time < FAST_S]
-    return _root_sum_square([*_seen(terms["white"]), *fast])
-
-
-def _walk(terms: JSON) -> Values | None:
-    """Return the walk of an axis and the ends of its interval, (3,); None where no slow term was seen."""
-    processes = [(part, part["correlation_time_s"]["value"]) for part in terms["gauss_markov"]]
-    slow = [np.sqrt(2.0 / time) * _ends(part) for part, time in processes if time >= FAST_S]
-    white = _white(terms)
-    flicker = [] if white is None else [np.sqrt(3.0) * FLAT / white[0] * b**2 for b in _seen(terms["bias_instability"])]
-    return _root_sum_square([*_seen(terms["random_walk"]), *slow, *flicker])
-
-
-def _ends(term: JSON) -> Values:
-    """Return a term and the ends of its interval: (3,)."""
-    return np.array([term["value"], *term["interval"]], float)
-
-
-def _seen(term: JSON) -> list[Values]:
-    return [] if term["value"] is None else [_ends(term)]
-
-
-def _root_sum_square(parts: list[Values]) -> Values | None:
-    return np.sqrt(np.sum(np.square(parts), axis=0)) if parts else None
+    fast = [np.sqrt(2.0 * time) * value for part, time in processes if time < FAST_S for value in seen(part)]
+    slow = [np.sqrt(2.0 / time) * value for part, time in processes if time >= FAST_S for value in seen(part)]
+    white, walk = [*seen(terms["white"]), *fast], [*seen(terms["random_walk"]), *slow]
+    if white:
+        density = np.sqrt(np.sum(np.square(white), axis=0))[0]
+        walk += [np.sqrt(3.0) * FLAT / density * b**2 for b in seen(terms["bias_instability"])]
+    return [np.sqrt(np.sum(np.square(parts), axis=0)) if parts else None for parts in (white, walk)]
 
 
 def _rms(values: Sequence[Any]) -> Any:  # noqa: ANN401  (numbers, or lists of them)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -118,11 +119,6 @@ def parsed(kind: str, text: str) -> Node:
     return Node(only)
 
 
-def _yaml(text: str) -> Any:  # noqa: ANN401
-    """Return YAML; OpenCV writes ``%YAML:1.0``, which YAML itself does not know."""
-    return yaml.safe_load(text.removeprefix("%YAML:1.0"))
-
-
 def _parameters(text: str) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for line in text.splitlines():
@@ -138,26 +134,18 @@ def _parameters(text: str) -> dict[str, Any]:
 
 def _c_arrays(text: str) -> dict[str, Any]:
     bare = re.sub(r"//[^\n]*|/\*.*?\*/", "", text, flags=re.DOTALL)
-    found = {}
-    for name, body in ARRAY.findall(bare):
-        numbers = [float(x) for x in re.findall(rf"(?<![\w.]){NUMBER}", body)]
-        if numbers:
-            found[name] = numbers
-    return found
+    found = {name: [float(x) for x in re.findall(rf"(?<![\w.]){NUMBER}", body)] for name, body in ARRAY.findall(bare)}
+    return {name: numbers for name, numbers in found.items() if numbers}
 
 
 def _numbers(text: str) -> dict[str, Any]:
-    found: list[float] = []
-    for word in text.split():
-        if not re.fullmatch(NUMBER, word):
-            break
-        found.append(float(word))
+    found = [float(word) for word in takewhile(re.compile(NUMBER).fullmatch, text.split())]
     return {"numbers": found} if len(found) == 21 else {}
 
 
 PARSERS: dict[str, Callable[[str], Any]] = {
     "json": json.loads,
-    "yaml": _yaml,
+    "yaml": lambda text: yaml.safe_load(text.removeprefix("%YAML:1.0")),  # as OpenCV writes, which YAML does not know
     "parameters": _parameters,
     "c": _c_arrays,
     "xml": lambda text: {name: float(value) for name, value in DEFINE.findall(text)},

@@ -41,9 +41,8 @@ DESCRIPTOR = re.compile(r"-|/dev/stdout|(?:/dev/fd|/proc/self/fd)/(\d+)")  # fil
 KINDS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
 
 
-def _canonical() -> dict[str, Any]:
-    used = ("time", "temperature", *ACCELEROMETER, *GYROSCOPE)
-    return {"csv": {"columns": {c: {"column": CANONICAL[c], "unit": next(iter(UNITS[c]))} for c in used}}}
+USED = ("time", "temperature", *ACCELEROMETER, *GYROSCOPE)
+CANONICAL_CSV = {"csv": {"columns": {c: {"column": CANONICAL[c], "unit": next(iter(UNITS[c]))} for c in USED}}}
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class LogProfile:
     its reading axes points along; straight where it is not named.
     """
 
-    ingest: Mapping[str, Any] = field(default_factory=_canonical)
+    ingest: Mapping[str, Any] = field(default_factory=lambda: CANONICAL_CSV)
     axis_maps: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @classmethod

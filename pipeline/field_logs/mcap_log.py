@@ -19,9 +19,9 @@ from mcap.records import Channel, Metadata, Schema
 from pipeline.errors import IngestError, InputError
 from pipeline.field_logs.compensate import Block
 from pipeline.io.ingest_settings import mcap_format
-from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
 from pipeline.io.mcap_copy import McapCopy
 from pipeline.io.mcap_reader import McapReader
+from pipeline.io.message_decoder import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, new_imu, replaced
 from pipeline.io.units import SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.log_motion import ExponentialRegression

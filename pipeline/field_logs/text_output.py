@@ -77,11 +77,15 @@ class CsvLog:
             for body, lines in log:
                 if rows == 0:
                     self._begin(log.head)
-                cells = self._cells(body, lines)
+                try:
+                    table = self.layout.parse(body, dict.fromkeys(range(len(self.layout.names)), pa.string()))
+                    cells = [column.combine_chunks() for column in table.columns]
+                    signals = self._signals(cells, rows)
+                except pa.ArrowInvalid as error:
+                    raise self._refusal(body, lines, str(error)) from None
                 if rows == 0:
                     readings = [cells[i] for s in SENSORS for i in self.places.get(s, [])]
                     checks.check_decimals(readings, self.settings.decimal)
-                signals = self._signals(cells, body, lines, rows)
                 yield Block(signals, f"{self.source}:{lines[0]}", "", raw.tell(), (cells, b'"' in body))
                 rows += len(lines)
             if rows == 0:
@@ -93,7 +97,8 @@ class CsvLog:
         columns, quoted = block.content
         for sensor, values in readings.items():
             for k, i in enumerate(self.places[sensor]):
-                text = _digits(values[:, k], self.settings.decimal)
+                text = pc.cast(to_arrow(np.round(values[:, k], DECIMALS) + 0.0), pa.string())
+                text = pc.replace_substring(text, ".", self.settings.decimal) if self.settings.decimal != "." else text
                 missing = ~np.isfinite(values[:, k])
                 if missing.any():
                     written = pa.array(~np.isfinite(block.signals[sensor][:, k]))
@@ -116,7 +121,11 @@ class CsvLog:
             (self.columns[c], i) for s, where in self.places.items() for c, i in zip(SIGNALS[s], where, strict=True)
         ]
         self.layout = Layout(str(self.source), head.names, places, head.delimiter, self.settings.decimal)
-        self.out.write(head.text(self._new_names(head.names)).encode())
+        new = list(head.names)
+        for sensor in (s for s in SENSORS if s in self.places):
+            for channel, i in zip(TRIADS[sensor], self.places[sensor], strict=True):
+                new[i] = CANONICAL[channel]
+        self.out.write(head.text(new).encode())
 
     def _find(self, names: list[str], where: str) -> None:
         for signal, channels in SIGNALS.items():
@@ -139,20 +148,6 @@ class CsvLog:
             got = f"{', '.join(names)[:200]}{other_separator(names)}"
             raise InputError(f"no column of a sensor; expected {expected}, got {got}; {told}", where)
 
-    def _new_names(self, names: list[str]) -> list[str]:
-        new = list(names)
-        for sensor in (s for s in SENSORS if s in self.places):
-            for channel, i in zip(TRIADS[sensor], self.places[sensor], strict=True):
-                new[i] = CANONICAL[channel]
-        return new
-
-    def _cells(self, body: bytes, lines: Integers) -> list[pa.Array]:
-        try:
-            table = self.layout.parse(body, dict.fromkeys(range(len(self.layout.names)), pa.string()))
-        except pa.ArrowInvalid as error:
-            raise self._refusal(body, lines, str(error)) from None
-        return [column.combine_chunks() for column in table.columns]
-
     def _refusal(self, body: bytes, lines: Integers, otherwise: str) -> InputError:
         """Return the error that names the first line of a block with a cell that is no number."""
         for fault in find_faults(self.layout, body, lines, None):
@@ -170,14 +165,11 @@ class CsvLog:
             found = pc.cast(pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text), pa.float64())
         return to_numpy(pc.fill_null(found, np.nan) if found.null_count else found)
 
-    def _signals(self, cells: list[pa.Array], body: bytes, lines: Integers, rows: int) -> dict[str, Any]:
-        """Return the signals of a block in g, deg/s, degC and s, the readings in body axes."""
+    def _signals(self, cells: list[pa.Array], rows: int) -> dict[str, Any]:
+        """Return the signals of a block, after so many rows, in g, deg/s, degC and s, the readings in body axes."""
         out: dict[str, Any] = {}
         for signal, where in self.places.items():
-            try:
-                numbers = np.column_stack([self._numbers(cells[i]) for i in where])
-            except pa.ArrowInvalid as error:
-                raise self._refusal(body, lines, str(error)) from None
+            numbers = np.column_stack([self._numbers(cells[i]) for i in where])
             for k, channel in enumerate(SIGNALS[signal]):
                 column = self.columns[channel]
                 if channel != "time" or column.unit == COUNTS:
@@ -186,7 +178,7 @@ class CsvLog:
                     numbers[:, k] /= SECOND_NS / UNITS["time"][column.unit][0]
             out[signal] = self.profile.to_body(signal, numbers) if signal in SENSORS else numbers[:, 0]
         if self.settings.rate_hz is not None:
-            out["time"] = np.arange(rows, rows + len(lines)) / self.settings.rate_hz
+            out["time"] = np.arange(rows, rows + len(cells[0])) / self.settings.rate_hz
         if "time" in out:
             if rows == 0 and out["time"][0] > SINCE_1970_NS / SECOND_NS:
                 self.origin = float(out["time"][0])
@@ -242,11 +234,6 @@ def _index(column: Column, names: list[str]) -> int | None:
     if isinstance(column.column, int):
         return column.column if column.column < len(names) else None
     return names.index(column.column) if column.column in names else None
-
-
-def _digits(values: Values, decimal: str) -> pa.Array:
-    text = pc.cast(to_arrow(np.round(values, DECIMALS) + 0.0), pa.string())
-    return text if decimal == "." else pc.replace_substring(text, ".", decimal)
 
 
 def _lines_of(columns: list[pa.Array], delimiter: str, *, quoted: bool) -> memoryview:

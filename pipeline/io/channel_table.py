@@ -18,7 +18,7 @@ from pipeline.io.units import COUNTS, TRIADS, to_house_unit
 from pipeline.records import AXES, Encoding, Note
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -32,29 +32,40 @@ STRAIGHT = ("+x", "+y", "+z")
 class ChannelTable:
     """The samples of one file.
 
-    ``values`` are in house units, by channel (``pipeline.io.units.CHANNELS``). ``line_of`` maps a row, counted from 0,
-    to the line of the file, counted from 1; 0 where a format has no lines. ``flags``: what the reader itself marks.
+    ``values`` are in house units, by channel (``pipeline.io.units.CHANNELS``). ``lines``: the line of each row, counted
+    from 1; None where a format has no lines. ``flags``: what the reader itself marks.
     """
 
     path: str
     time_ns: Integers
     values: dict[str, Values]
     source: dict[str, Any]
-    line_of: Callable[[int], int]
+    lines: Integers | None = None
     encodings: dict[str, Encoding] = field(default_factory=dict)
     notes: tuple[Note, ...] = ()
     flags: NDArray[np.uint16] | None = None
 
     def place(self, row: int) -> str:
         """Return ``path:line`` of a row, or the path where there are no lines."""
-        line = self.line_of(row)
-        return f"{self.path}:{line}" if line else self.path
+        return self.path if self.lines is None else f"{self.path}:{self.lines[row]}"
 
     def note(self, code: str, rows: Index, detail: str) -> Note:
         """Return a note on some rows, with their first and last line and time."""
         first, last = int(rows[0]), int(rows[-1])
         start, end = float(self.time_ns[first]) / 1e9, float(self.time_ns[last]) / 1e9
-        return Note(code, int(rows.size), self.line_of(first), self.line_of(last), detail, start, end)
+        lines = (0, 0) if self.lines is None else (int(self.lines[first]), int(self.lines[last]))
+        return Note(code, int(rows.size), *lines, detail, start, end)
+
+    def select(self, rows: Index | slice, *notes: Note) -> ChannelTable:
+        """Return some rows, in their order, with further notes."""
+        return replace(
+            self,
+            time_ns=self.time_ns[rows],
+            values={channel: values[rows] for channel, values in self.values.items()},
+            lines=None if self.lines is None else self.lines[rows],
+            notes=(*self.notes, *notes),
+            flags=None if self.flags is None else self.flags[rows],
+        )
 
 
 def in_house_unit(source: ChannelSource, numbers: Values) -> Values:

@@ -24,7 +24,7 @@ from pipeline.io.units import TRIADS
 from pipeline.records import Note
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from pipeline.records import Index, Values
 
@@ -40,11 +40,12 @@ def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) ->
 
     ``program`` has rests ``{rest_s}``, turns ``{turn_deg, rate_dps, acceleration_dps2}`` and ``{repeat, steps}``.
     """
-    knots = knots_of(program)
-    fit = fit_clocks(table, _as_log(table, knots))
+    pause = {"rest_s": BEFORE_S}
+    commanded = Program([pause, *_flat(program), pause])
+    fit = fit_clocks(table, _as_log(table, commanded))
     t = seconds_of(table)
-    placed = _place(table, knots, t, fit.table_time(t))
-    angle, rate = at(knots, placed.tau(t))
+    placed = _place(table, commanded, t, fit.table_time(t))
+    angle, rate, *_ = commanded.at(placed.tau(t))
     shifts = placed.shifts
     begun, farthest = round(placed.begun, 3) + 0.0, float(np.abs(shifts).max())
     detail = (
@@ -58,58 +59,67 @@ def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) ->
     return replace(table, values=values, notes=(*table.notes, note))
 
 
-def knots_of(program: Sequence[Mapping[str, Any]]) -> Values:
-    """Return time (s), angle (deg), rate (deg/s) and acceleration (deg/s^2) at the knots of a program: (m, 4) array."""
-    time, angle = BEFORE_S, 0.0
-    rows = [(0.0, 0.0, 0.0, 0.0)]
-    for step in _flat(program):
-        if "rest_s" in step:
-            time += float(step["rest_s"])
-            continue
-        turn, acceleration = float(step["turn_deg"]), float(step["acceleration_dps2"])
-        sign = float(np.sign(turn))
-        top = min(float(step["rate_dps"]), float(np.sqrt(abs(turn) * acceleration)))
-        ramp, hold = top / acceleration, abs(turn) / top - top / acceleration
-        half = sign * 0.5 * top * ramp
-        rows += [
-            (time, angle, 0.0, sign * acceleration),
-            (time + ramp, angle + half, sign * top, 0.0),
-            (time + ramp + hold, angle + turn - half, sign * top, -sign * acceleration),
-            (time + 2 * ramp + hold, angle + turn, 0.0, 0.0),
-        ]
-        time, angle = time + 2 * ramp + hold, angle + turn
-    rows.append((time + BEFORE_S, angle, 0.0, 0.0))
-    return np.array(rows)
+class Program:
+    """One axis of a table over time, by its steps: rests and turns with trapezoidal rate; it rests before and after.
+
+        A(t) = A_k + W_k s + a_k s^2 / 2,   dA/dt = W_k + a_k s,   s = t - t_k
+
+    A turn by the angle D at the rate r with acceleration a ramps for r/a, holds r and ramps down; where |D| < r^2/a it
+    never reaches r, and the ramps meet in the middle.
+
+    Attributes
+    ----------
+    steps : list of dict
+        ``{rest_s}`` and ``{turn_deg, rate_dps, acceleration_dps2}``.
+    knots : (1 + 4 n, 4) array
+        Time t_k (s), angle A_k (deg), rate W_k (deg/s) and acceleration a_k (deg/s^2); four rows for each of n moves.
+    stops : (n + 1,) array, deg
+        Angles before each move and after the last.
+    duration : float, s
+    """
+
+    def __init__(self, steps: Iterable[Mapping[str, Any]]) -> None:
+        self.steps = list(steps)
+        time, angle, rows = 0.0, 0.0, [(0.0, 0.0, 0.0, 0.0)]
+        for step in self.steps:
+            turn = float(step.get("turn_deg", 0.0))
+            time += float(step.get("rest_s", 0.0))
+            if turn == 0.0:
+                continue
+            acceleration, sign = float(step["acceleration_dps2"]), float(np.sign(turn))
+            top = min(float(step["rate_dps"]), float(np.sqrt(abs(turn) * acceleration)))
+            ramp, hold = top / acceleration, abs(turn) / top - top / acceleration
+            half = sign * 0.5 * top * ramp
+            rows += [
+                (time, angle, 0.0, sign * acceleration),
+                (time + ramp, angle + half, sign * top, 0.0),
+                (time + ramp + hold, angle + turn - half, sign * top, -sign * acceleration),
+                (time + 2 * ramp + hold, angle + turn, 0.0, 0.0),
+            ]
+            time, angle = time + 2 * ramp + hold, angle + turn
+        self.knots, self.duration = np.array(rows), time
+        self.stops: Values = self.knots[::4, 1]
+
+    def at(self, time: Values) -> tuple[Values, Values, Values, Index]:
+        """Return angle, rate, acceleration and number of the move, at rest of the last one (-1: none yet), (n,)."""
+        k = np.clip(np.searchsorted(self.knots[:, 0], time, side="right") - 1, 0, None)
+        s = np.clip(time - self.knots[k, 0], 0.0, None)
+        _, angle, rate, acceleration = self.knots[k].T
+        return angle + (rate + 0.5 * acceleration * s) * s, rate + acceleration * s, acceleration, (k - 1) // 4
 
 
 def _flat(program: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+    """Yield the steps of a program, repeated ones as often as they are made."""
     for step in program:
-        if "repeat" in step:
-            for _ in range(int(step["repeat"])):
-                yield from _flat(step["steps"])
-        else:
-            yield step
+        for _ in range(int(step.get("repeat", 1))):
+            yield from _flat(step["steps"]) if "repeat" in step else [step]
 
 
-def at(knots: Values, time: Values) -> tuple[Values, Values]:
-    """Return the commanded angle (deg) and rate (deg/s) at any times; it rests before and after."""
-    k = np.clip(np.searchsorted(knots[:, 0], time, side="right") - 1, 0, len(knots) - 1)
-    s = np.maximum(time - knots[k, 0], 0.0)
-    rate: Values = knots[k, 2] + knots[k, 3] * s
-    return knots[k, 1] + (knots[k, 2] + 0.5 * knots[k, 3] * s) * s, rate
-
-
-def moves_of(knots: Values) -> list[tuple[float, float]]:
-    """Return begin and end of each move, s of the program."""
-    starts = [i for i in range(len(knots)) if knots[i, 2] == 0 and knots[i, 3] != 0]
-    return [(float(knots[i, 0]), float(knots[i + 3, 0])) for i in starts]
-
-
-def _as_log(table: ChannelTable, knots: Values) -> ChannelTable:
-    own = np.arange(0.0, knots[-1, 0], STEP_S)
-    angle, rate = at(knots, own)
+def _as_log(table: ChannelTable, program: Program) -> ChannelTable:
+    own = np.arange(0.0, program.duration, STEP_S)
+    angle, rate, *_ = program.at(own)
     values = {"table_angle": angle, "table_rate": rate}
-    return ChannelTable(table.path, np.rint(own * 1e9).astype(np.int64), values, table.source, table.line_of)
+    return ChannelTable(table.path, np.rint(own * 1e9).astype(np.int64), values, table.source)
 
 
 @dataclass(frozen=True)
@@ -137,9 +147,9 @@ class _Placed:
         return np.clip(tau, self.low[j], self.high[j])
 
 
-def _place(table: ChannelTable, knots: Values, t: Values, tau: Values) -> _Placed:
+def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> _Placed:
     """Place each move by the readings of the gyroscope about it."""
-    begin, end = np.array(moves_of(knots)).T
+    begin, end = program.knots[1::4, 0], program.knots[4::4, 0]
     gaps = begin[1:] - end[:-1]
     middle, n = (begin + end) / 2, len(begin)
     near = np.searchsorted(end[:-1] + gaps / 2, tau)
@@ -149,9 +159,9 @@ def _place(table: ChannelTable, knots: Values, t: Values, tau: Values) -> _Place
     reach = np.minimum(reach, end - begin + 1.0)
     for _ in range(ROUNDS):
         now = placed.tau(t)
-        commanded = at(knots, now)[1]
+        commanded = program.at(now)[1]
         sensed = _about_the_moves(table, commanded)
-        slope = (at(knots, now + STEP_S)[1] - at(knots, now - STEP_S)[1]) / (2 * STEP_S)
+        slope = (program.at(now + STEP_S)[1] - program.at(now - STEP_S)[1]) / (2 * STEP_S)
         off = slope * (sensed - commanded)
         info = np.bincount(near, slope**2, n)
         change = np.divide(np.bincount(near, off, n), info, out=np.zeros(n), where=info > 0)

@@ -51,33 +51,31 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
     number, searched for a header that was not expected there.
     """
     twice = sorted({n for n in names if n and names.count(n) > 1})
+    others = [f"column name {', '.join(twice)} stands more than once in the header"] if twice else []
     found: list[tuple[Column, int]] = []
     lacking: list[Column] = []
-    contradictions = []
     for column in settings.columns:
-        wanted = column.column
-        index = wanted if isinstance(wanted, int) else names.index(wanted) if wanted in names else len(names)
+        name = column.column
+        index = name if isinstance(name, int) else names.index(name) if name in names else len(names)
         if index < len(names):
-            contradictions += _contradiction(column, names[index])
+            others += _contradiction(column, names[index])
             found.append((column, index))
         elif not column.optional:
             lacking.append(column)
     absent = _channels_of_absent_sensor(lacking, found, len(names))
     missing = [str(column.column) for column in lacking if column.channel not in absent]
-    others = contradictions
-    if twice:
-        others = [f"column name {', '.join(twice)} stands more than once in the header", *others]
     if missing:
         numbers = bool(settings.header) and all(
             NUMBER.fullmatch(n) for name in names for n in re.split(r"[;\t| ]+", name)
         )
-        message = "; ".join([_missing_message(missing, names), *others])
+        near = {m: difflib.get_close_matches(m, names, 1) for m in missing}
+        wanted = ", ".join(f"{m} (nearest: {n[0]})" if n else m for m, n in near.items())
+        others = [f"column {wanted} missing; found {', '.join(names)[:300]}{other_separator(names)}", *others]
         hint = "" if twice else _what_to_do(missing, names, settings, below, numbers=numbers)
         code = "duplicate_column" if twice else "no_header" if numbers else "missing_column"
-        raise IngestError(message, where, code=code, hint=hint)
+        raise IngestError("; ".join(others), where, code=code, hint=hint)
     if others:
-        code = "duplicate_column" if twice else "unit_contradiction"
-        raise IngestError("; ".join(others), where, code=code)
+        raise IngestError("; ".join(others), where, code="duplicate_column" if twice else "unit_contradiction")
     return found
 
 
@@ -109,12 +107,6 @@ def _contradiction(column: Column, name: str) -> list[str]:
         return []
     where = f"ingest.csv.columns.{column.channel}.unit"
     return [f"the header says that {name!r} is in {stated}, {where} says {column.unit}; one of them is wrong"]
-
-
-def _missing_message(missing: list[str], names: list[str]) -> str:
-    near = {m: difflib.get_close_matches(m, names, 1) for m in missing}
-    hints = [f"{m} (nearest: {n[0]})" if n else m for m, n in near.items()]
-    return f"column {', '.join(hints)} missing; found {', '.join(names)[:300]}{other_separator(names)}"
 
 
 def other_separator(names: list[str]) -> str:
@@ -176,8 +168,9 @@ class Layout:
     def numbers(self, body: bytes, rows: int) -> dict[int, Values] | None:
         """Return the columns in use as numbers, by index; None where a cell is not a finite number."""
         wanted = sorted({index for _, index in self.columns})
-        if b"\0" in body or (b'"' in body and self._quoted_numbers(body)):
-            return None
+        quoted = (line.decode("utf-8", "replace") for line in body.split(b"\n") if b'"' in line) if b'"' in body else ()
+        if b"\0" in body or any(set(wanted) & set(_quoted(line, self.delimiter)) for line in quoted):
+            return None  # a comma in a number in quotes may separate thousands
         try:
             table = self.parse(body, dict.fromkeys(wanted, pa.float64()))
         except pa.ArrowInvalid:
@@ -186,12 +179,6 @@ class Layout:
         found = dict(zip(wanted, values, strict=True))
         valid = table.num_rows == rows and all(bool(np.isfinite(v).all()) for v in values)
         return found if valid else None
-
-    def _quoted_numbers(self, body: bytes) -> bool:
-        """Return whether a number stands in quotes, where a comma in it may separate thousands."""
-        wanted = {index for _, index in self.columns}
-        lines = (line.decode("utf-8", "replace") for line in body.split(b"\n") if b'"' in line)
-        return any(wanted & set(_quoted(line, self.delimiter)) for line in lines)
 
 
 @dataclass(frozen=True)

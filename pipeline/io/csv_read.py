@@ -2,8 +2,9 @@
 
     value = (count - offset) / counts_per_unit
 
-Files of one recording that were logged at the same times are joined row by row; the log of a table with a clock of its
-own is aligned with the sensor's (``pipeline.io.encoder_log``).
+The rows are read in blocks of whole lines. Lines that are no rows of numbers are refused by their number, or dropped
+with a note where the profile allows it. Files of one recording that were logged at the same times are joined row by
+row; the log of a table with a clock of its own is aligned with the sensor's (``pipeline.io.encoder_log``).
 
 Gyroflow's ``.gcsv`` states scales, orientation and column names itself (versions 1.0 to 1.3;
 docs.gyroflow.xyz/app/technical-details/gcsv-format):
@@ -23,16 +24,28 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable, in_house_unit, to_body_axes
-from pipeline.io.csv_rows import read_rows
-from pipeline.io.csv_times import in_order, times_of
+from pipeline.io.csv_layout import Fault, Layout, column_notes, find_columns, find_faults, refusal
+from pipeline.io.csv_times import (
+    EXACT_BELOW_S,
+    LONGEST_S,
+    exact_times,
+    in_order,
+    over_budget,
+    rows_of_session,
+    seconds_per_unit,
+    time_column,
+    times_of,
+    whole_times,
+)
 from pipeline.io.files import refuse_foreign, unchanged
-from pipeline.io.ingest_settings import Checks, Column, CsvFormat
+from pipeline.io.ingest_settings import AUTO, DROP, GAP, Checks, Column, CsvFormat
+from pipeline.io.text_log import TextLog
 from pipeline.io.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TRIADS, UNITS
 from pipeline.records import Encoding, Note
 
@@ -40,11 +53,17 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
+    from pipeline.records import Integers, Values
 
 TABLE_TIME = "table_time"
 FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
 LONGEST_HEADER = 1 << 16  # bytes that are searched for the line of names
 LAST_VERSION = "1.3"
+LINES_BELOW, SEARCHED_BELOW = 60, 10_000  # lines, bytes after a header without the columns, searched for another
+LINES, EXACT = -1, -2  # in place of a column's index: numbers of the lines, times in ns
+MOST_REFUSED = 10_000  # bad lines after which the rest of the file is not searched for more
 
 
 def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks | None = None) -> ChannelTable:
@@ -62,19 +81,28 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
 
 
 def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
-    """Return the channels of one file."""
-    rows = read_rows(path, settings, checks)
-    refused = rows.refused
+    """Return the channels of one file; an ``IngestError`` names the line."""
+    with unchanged(path), path.open("rb") as stream:
+        log = TextLog(stream, str(path), settings)
+        reader = _RowReader(log)
+        for body, lines in log:
+            reader.add(body, lines)
+        rows = reader.rows(checks)
     try:
-        rows, time_ns = in_order(rows, times_of(rows, settings), settings, checks)
+        table = in_order(_converted(log, rows, times_of(rows, settings)), rows, settings, checks)
     except IngestError as error:
-        raise also(refused, error) if refused else error from None
-    if refused:
-        raise refused
-    notes = rows.notes
-    if settings.rate_hz is not None:
-        detail = f"no time column: rows counted at {settings.rate_hz:g} Hz"
-        notes = (*notes, Note("N-SYNTHTIME", len(time_ns), 0, 0, detail))
+        raise also(rows.refused, error) if rows.refused else error from None
+    if rows.refused:
+        raise rows.refused
+    table.source["rows"] = len(table.time_ns)
+    if settings.rate_hz is None:
+        return table
+    detail = f"no time column: rows counted at {settings.rate_hz:g} Hz"
+    return replace(table, notes=(*table.notes, Note("N-SYNTHTIME", len(table.time_ns), 0, 0, detail)))
+
+
+def _converted(log: TextLog, rows: Rows, time_ns: Integers) -> ChannelTable:
+    """Return the rows of a log with their numbers in the units of the package."""
     values, encodings = {}, {}
     for column, index in rows.layout.columns:
         if column.channel != "time":
@@ -82,17 +110,8 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
             values[column.channel] = in_house_unit(column, numbers)
             if column.unit == COUNTS and bool(np.all(numbers == np.rint(numbers))):
                 encodings[column.channel] = Encoding(1.0 / column.counts_per_unit, column.offset)
-    lines = rows.lines
-    return ChannelTable(
-        path=rows.layout.path,
-        time_ns=time_ns,
-        values=values,
-        source={"file": rows.layout.path, "sha256": rows.sha256, "rows": len(lines)},
-        line_of=lambda row: int(lines[row]) if row < len(lines) else 0,
-        encodings=encodings,
-        notes=notes,
-        flags=rows.flags,
-    )
+    source = {"file": log.path, "sha256": log.sha256}
+    return ChannelTable(log.path, time_ns, values, source, rows.lines, encodings, rows.notes)
 
 
 def also(first: IngestError, second: IngestError) -> IngestError:
@@ -102,6 +121,163 @@ def also(first: IngestError, second: IngestError) -> IngestError:
     both = IngestError(f"{first.message}. Also {place}{second.message}", first.file, code=first.code)
     both.sessions = second.sessions
     return both
+
+
+class Rows(NamedTuple):
+    """The rows of a text log as numbers.
+
+    ``numbers``: the columns in use, by index. ``lines``: the line of each row, counted from 1. ``exact_ns``: times from
+    their decimal digits, where doubles are too coarse. ``repaired``: rows that were dropped, which count against
+    ``repaired_rows``. ``restarts``: rows before which the header was repeated. ``refused``: the refusal of lines that
+    are no rows, which is raised once the times are read, to name their faults as well.
+    """
+
+    layout: Layout
+    numbers: dict[int, Values]
+    lines: Integers
+    exact_ns: Integers | None
+    notes: tuple[Note, ...]
+    repaired: int
+    restarts: list[int]
+    refused: IngestError | None = None
+
+
+class _RowReader:
+    """Numbers of a text log, gathered block by block."""
+
+    def __init__(self, log: TextLog) -> None:
+        self.log, self.path, self.settings = log, log.path, log.settings
+        self.allowed = {"not_finite"} if self.settings.nan == GAP else set()
+        if self.settings.bad_rows == DROP:
+            self.allowed |= {"bad_row", "nul", "not_a_number", "decimal_comma"}
+        if self.settings.session is not None:
+            self.allowed.add("restarted")
+        self.layout: Layout | None = None
+        self.notes: list[Note] = []
+        self.row_count = 0  # bad ones as well
+        self.blocks: list[dict[int, NDArray[Any]]] = []  # columns of the valid rows
+        self.faults: list[Fault] = []
+        self.refused: list[Fault] = []
+        self.last_row: tuple[int, str] | None = None
+
+    def add(self, body: bytes, lines: Integers) -> None:
+        """Add a block of rows with these numbers of lines."""
+        layout = self.layout = self.layout or self._find_layout(body, lines)
+        numbers = layout.numbers(body, len(lines))
+        self.row_count += len(lines)
+        if numbers is None:
+            body, lines, numbers = self._valid_rows(layout, body, lines)
+        else:
+            self.last_row = int(lines[-1]), body[body.rfind(b"\n", 0, -1) + 1 : -1].decode("utf-8", "replace")
+        if numbers:
+            self.blocks.append(numbers | {LINES: lines} | self._exact_times(layout, body, numbers))
+
+    def rows(self, checks: Checks) -> Rows:
+        """Return all rows, without those that may be dropped."""
+        if self.layout is None:
+            raise self.log.no_rows()
+        columns = {
+            k: np.concatenate([b.pop(k) for b in self.blocks]) for k in list(self.blocks[0] if self.blocks else ())
+        }
+        parted = [f.line for f in self.faults if f.parted_before]
+        if parted and columns:
+            keep = ~np.isin(columns[LINES], parted)
+            columns = {k: values[keep] for k, values in columns.items()}
+        if not columns or not columns[LINES].size:
+            raise refusal(self.layout, self.faults)
+        lines, exact_ns = columns.pop(LINES), columns.pop(EXACT, None)
+        restarts = np.searchsorted(lines, [f.line for f in self.faults if f.kind == "restarted"])
+        rows = Rows(self.layout, columns, lines, exact_ns, (), 0, restarts.tolist())
+        if self.faults and self.settings.session is not None:
+            part = lines[rows_of_session(rows, times_of(rows, self.settings), self.settings)]
+            within = range(int(part[0]), int(part[-1]) + 1)
+            self.faults, self.refused = (
+                [f for f in found if f.line in within] for found in (self.faults, self.refused)
+            )
+        notes, repaired, refused = self._drop_faults(self.layout, checks, int(lines[-1]))
+        return rows._replace(notes=(*self.log.notes, *self.notes, *notes), repaired=repaired, refused=refused)
+
+    def _find_layout(self, body: bytes, lines: Integers) -> Layout:
+        """Return which column holds which channel."""
+        head, settings = self.log.head, self.settings
+        assert head is not None  # noqa: S101  (rows follow it)
+        text = body[:SEARCHED_BELOW].decode("utf-8", "replace").split("\n")[:LINES_BELOW]
+        below = dict(zip(lines.tolist(), text, strict=False))
+        columns = find_columns(head.names, settings, f"{self.path}:{head.line}", below)
+        if settings.delimiter == AUTO:
+            self.notes.append(Note("N-DELIM", 1, 0, 0, f"the separator is {head.delimiter!r}, by the header"))
+        self.notes += column_notes(head.names, columns, head.line if settings.header is True else 0)
+        return Layout(self.path, head.names, columns, head.delimiter, settings.decimal)
+
+    def _valid_rows(self, layout: Layout, body: bytes, lines: Integers) -> tuple[bytes, Integers, dict[int, Values]]:
+        """Return the valid rows of a block, and keep the faults of the others."""
+        found = []
+        for fault in find_faults(layout, body, lines, self.last_row):
+            found.append(fault)
+            self.refused += [fault] if fault.kind not in self.allowed else []
+            if len(self.refused) > MOST_REFUSED:
+                raise refusal(layout, self.refused, more=True)
+        self.faults += found
+        bad = np.isin(lines, [f.line for f in found if not f.parted_before])
+        parts = body.split(b"\n")
+        self.last_row = None if bad[-1] else (int(lines[-1]), parts[-2].decode("utf-8", "replace"))
+        body = b"".join(part + b"\n" for part, other in zip(parts, bad.tolist(), strict=False) if not other)
+        lines = lines[~bad]
+        numbers = layout.numbers(body, len(lines)) if len(lines) else {}
+        if not bad.any() or numbers is None:
+            place = f"{self.path}:{lines[0]}"
+            raise IngestError("cannot be read as numbers: its rows cannot be told apart", place, code="not_a_number")
+        return body, lines, numbers
+
+    def _exact_times(self, layout: Layout, body: bytes, numbers: dict[int, Values]) -> dict[int, Integers]:
+        """Return the times from their digits, from the first that a double does not hold to half a nanosecond."""
+        if self.settings.rate_hz is not None or self.settings.tick_ns is not None:
+            return {}
+        column, index = time_column(layout)
+        largest = float(np.abs(numbers[index]).max()) * seconds_per_unit(column.unit)
+        if not (self.blocks and EXACT in self.blocks[0]):
+            if largest < EXACT_BELOW_S:
+                return {}
+            for block in self.blocks:
+                block[EXACT] = whole_times(block[index], column.unit)
+        out_of_range = largest >= LONGEST_S  # refused later
+        return {EXACT: np.zeros(len(numbers[index]), np.int64) if out_of_range else exact_times(layout, body)}
+
+    def _drop_faults(self, layout: Layout, checks: Checks, last: int) -> tuple[list[Note], int, IngestError | None]:
+        """Return notes on the lines that are dropped, how many count against the limit of repairs, and a refusal."""
+        if not self.faults:
+            return [], 0, None
+        final = self.faults[-1]
+        end = max(final.line, last)
+        cut = {final.line} if final.short and final.line == end else set()
+        tail = [f for f in self.faults if f.line in cut or f.parted_before in cut]
+        others = [f for f in self.faults if f not in tail and f.kind != "restarted"]
+        refused = [f for f in self.refused if f not in tail]
+        if refused:
+            return [], 0, refusal(layout, refused)
+        if len(others) > checks.repaired_rows * self.row_count:
+            raise over_budget(refusal(layout, others), len(others), self.row_count, checks)
+        notes = [
+            Note("N-TAIL", 1, f.line, f.line, f"the last line is cut, so it was dropped: {f.text[:200]!r}")
+            for f in tail
+        ]
+        for code, finite, what in (
+            ("N-BADROW", True, "rows that cannot be read were dropped"),
+            ("N-NAN", False, "rows without a finite number were dropped"),
+        ):
+            dropped = [f for f in others if (f.kind != "not_finite") == finite]
+            if dropped:
+                detail = f"{what}, each a gap; the longest run is {_longest_run(dropped)} long; the first: "
+                detail += dropped[0].message
+                notes.append(Note(code, len(dropped), dropped[0].line, dropped[-1].line, detail))
+        return notes, len(others), None
+
+
+def _longest_run(faults: list[Fault]) -> int:
+    """Return how many bad lines follow each other directly at most."""
+    lines = [f.line for f in faults]
+    ends = np.flatnonzero(np.diff([*lines, lines[-1] + 2]) > 1)
+    return int(np.diff(ends, prepend=-1).max())
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:

@@ -24,15 +24,15 @@ from pipeline.io.csv_layout import PARTS
 from pipeline.io.quality_flags import REPAIRED
 from pipeline.io.timestamps import sorted_once, time_error
 from pipeline.io.units import UNITS
-from pipeline.records import Note
 
 if TYPE_CHECKING:
     from fractions import Fraction
 
+    from pipeline.io.channel_table import ChannelTable
     from pipeline.io.csv_layout import Layout
-    from pipeline.io.csv_rows import Rows
+    from pipeline.io.csv_read import Rows
     from pipeline.io.ingest_settings import Checks, Column, CsvFormat
-    from pipeline.records import Integers, Values
+    from pipeline.records import Index, Integers, Values
 
 EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
 LONGEST_S = 9.2e9  # int64 nanoseconds end at 292 years
@@ -88,7 +88,7 @@ def times_of(rows: Rows, settings: CsvFormat) -> Integers:
     row = int(np.argmax(np.abs(values)))
     if abs(values[row]) * unit_s >= LONGEST_S:
         message = f"time {values[row] * unit_s:g} s is out of range; is {column.unit} the unit of column {name}?"
-        raise IngestError(message, rows.place(row), code="wrong_rate")
+        raise IngestError(message, f"{rows.layout.path}:{rows.lines[row]}", code="wrong_rate")
     if rows.exact_ns is None:
         return whole_times(values, column.unit, tick_ns)
     _refuse_coarse(values, rows.exact_ns, column.unit, name, rows.layout.path)
@@ -115,28 +115,33 @@ def _refuse_coarse(values: Values, exact_ns: Integers, unit: str, name: str, pat
         raise IngestError(message, path, code="coarse_time", hint="log them as integers")
 
 
-def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks) -> tuple[Rows, Integers]:
-    """Return rows in the order of their times, each time once, and these times.
+def in_order(table: ChannelTable, rows: Rows, settings: CsvFormat, checks: Checks) -> ChannelTable:
+    """Return a log in the order of its times, each time once.
 
     A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time
     that differ, and more repairs than ``checks`` allows.
     """
-    tick_ns = _tick_ns(rows, settings)
+    tick_ns, restarts = _tick_ns(rows, settings), rows.restarts
     if settings.session is not None:
-        rows, time_ns = _one_session(rows, time_ns, settings.session, tick_ns)
-    if bool(np.all(np.diff(time_ns) > 0)):
-        return rows, time_ns
-    rows, time_ns = _counted_on(rows, time_ns, tick_ns)
-    rows, time_ns = _once(rows, time_ns)
+        starts, count = _starts(table.time_ns, restarts, tick_ns), len(table.time_ns)
+        index = rows_of_session(rows, table.time_ns, settings)
+        note = table.note("N-SESSION", index, "")
+        detail = f"session {settings.session} of {len(starts)}: lines {note.first} to {note.last} were read"
+        table = table.select(index, replace(note, count=count - index.size, detail=detail))
+        restarts = []
+    if bool(np.all(np.diff(table.time_ns) > 0)):
+        return table
+    table = _once(_counted_on(table, tick_ns))
+    time_ns = table.time_ns
     back = np.flatnonzero(np.diff(time_ns) <= 0)
     if back.size == 0:
-        return rows, time_ns
-    error = _refusal(rows, time_ns, int(back[0]) + 1, tick_ns)
-    order, twice, same = sorted_once(time_ns, rows.numbers.values())
-    displacement = int(np.abs(order - np.arange(len(order))).max())
-    if displacement > LARGEST_DISPLACEMENT:
+        return table
+    error = _refusal(table, int(back[0]) + 1, _starts(time_ns, restarts, tick_ns))
+    order, twice, same = sorted_once(time_ns, table.values.values())
+    displaced = np.abs(order - np.arange(len(order)))
+    if displaced.max() > LARGEST_DISPLACEMENT:
         raise error
-    moved = np.flatnonzero(order != np.arange(len(order)))
+    moved = np.flatnonzero(displaced)
     if not same.all():
         if error.code != "duplicate_time":
             raise error
@@ -144,54 +149,55 @@ def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks)
         row = int(max(order[place], order[place - 1]))
         message = f"time repeats {time_ns[row] / 1e9:.9g} s in rows that differ ({twice.size} such times)"
         hint = "time has to increase; has the time enough digits, or were two logs merged?"
-        raise IngestError(message, rows.place(row), code="duplicate_time", hint=hint) from error
+        raise IngestError(message, table.place(row), code="duplicate_time", hint=hint) from error
     touched = rows.repaired + moved.size + twice.size
-    if touched > checks.repaired_rows * len(rows.lines):
-        raise over_budget(error, touched, len(rows.lines), checks)
-    notes = []
+    if touched > checks.repaired_rows * len(time_ns):
+        raise over_budget(error, touched, len(time_ns), checks)
+    table, notes = table.select(order), []
     for code, places, detail in (
-        ("N-SORT", moved, f"rows out of order were sorted by their times, displaced by {displacement} rows at most"),
+        (
+            "N-SORT",
+            moved,
+            f"rows out of order were sorted by their times, displaced by {displaced.max()} rows at most",
+        ),
         ("N-DUP", twice, "rows that repeat the one before them, time and all, were dropped"),
     ):
         if places.size:
-            ends = order[places[[0, -1]]]
-            first, last = sorted(rows.lines[ends].tolist())
-            start, end = (time_ns[ends] / 1e9).tolist()
-            notes.append(Note(code, int(places.size), first, last, detail, start, end))
-    keep = np.delete(np.arange(len(order)), twice)
+            note = table.note(code, places, detail)
+            notes.append(replace(note, first=min(note.first, note.last), last=max(note.first, note.last)))
     flags = np.zeros(len(order), np.uint16)
     flags[moved] = REPAIRED
-    rows = replace(rows.select(order[keep], *notes), flags=flags[keep] if moved.size else None)
-    return rows, time_ns[order[keep]]
+    return replace(table, flags=flags if moved.size else None).select(np.delete(np.arange(len(order)), twice), *notes)
 
 
-def _refusal(rows: Rows, time_ns: Integers, row: int, tick_ns: float) -> IngestError:
+def _refusal(table: ChannelTable, row: int, starts: list[int]) -> IngestError:
     """Return the refusal of a row whose time does not increase, with the earlier rows that it and the next repeat.
 
     Where the time falls back for good, the refusal names the parts of the log.
     """
-    error = time_error(time_ns, rows.place(row), row)
-    start, count = next(((a, n) for at, a, n in _repeats(rows, time_ns) if at == row), (row, 0))
+    error = time_error(table.time_ns, table.place(row), row)
+    lines = np.arange(1, len(table.time_ns) + 1) if table.lines is None else table.lines
+    start, count = next(((a, n) for at, a, n in _repeats(table) if at == row), (row, 0))
     if count > 1:
-        ends = rows.lines[[row, row + count - 1, start, start + count - 1]].tolist()
+        ends = lines[[row, row + count - 1, start, start + count - 1]].tolist()
         hint = "lines {} to {} repeat lines {} to {} exactly: delete them".format(*ends)
         error = IngestError(error.fact, error.file, code=error.code, hint=hint)
-    starts = _starts(rows, time_ns, tick_ns)
-    if len(starts) > 1 and min(np.diff([*starts, len(time_ns)])) >= SHORTEST_PART:
-        ends = [(int(rows.lines[a]), int(rows.lines[b - 1])) for a, b in pairwise([*starts, len(time_ns)])]
-        lines = "; ".join(f"{first} to {last}" for first, last in ends[:MOST_LISTED])
-        lines += " .." * (len(ends) > MOST_LISTED)
-        fact = f"{error.message if count > 1 else error.fact}; the log has {len(starts)} parts, lines {lines}"
+    bounds = [*starts, len(lines)]
+    if len(starts) > 1 and min(np.diff(bounds)) >= SHORTEST_PART:
+        parts = "; ".join(f"{lines[a]} to {lines[b - 1]}" for a, b in list(pairwise(bounds))[:MOST_LISTED])
+        parts += " .." * (len(starts) > MOST_LISTED)
+        fact = f"{error.message if count > 1 else error.fact}; the log has {len(starts)} parts, lines {parts}"
         error = IngestError(fact, error.file, code=error.code, hint=PARTS)
         error.sessions = len(starts)
     return error
 
 
-def _repeats(rows: Rows, time_ns: Integers) -> list[tuple[int, int, int]]:
+def _repeats(table: ChannelTable) -> list[tuple[int, int, int]]:
     """Return each row at which the time falls back to that of an earlier row, that row, and how many rows repeat it.
 
     Rows repeat others where the time and all columns in use do, not more than up to the row where the time falls back.
     """
+    time_ns = table.time_ns
     order = np.argsort(time_ns, kind="stable")
     again = np.flatnonzero(np.diff(time_ns[order]) == 0)
     before = dict(zip(order[again + 1].tolist(), order[again].tolist(), strict=True))
@@ -199,29 +205,25 @@ def _repeats(rows: Rows, time_ns: Integers) -> list[tuple[int, int, int]]:
     for row in (np.flatnonzero(np.diff(time_ns) < 0) + 1).tolist():
         start = before.get(row, row)
         length = min(row - start, len(time_ns) - row)
-        same = time_ns[start : start + length] == time_ns[row : row + length]
-        for column in rows.numbers.values():
-            one, two = column[start : start + length], column[row : row + length]
-            same &= (one == two) | (np.isnan(one) & np.isnan(two))
+        same = np.ones(length, np.bool_)
+        for column in (time_ns, *table.values.values()):
+            same &= column[start : start + length] == column[row : row + length]
         found.append((row, start, length if same.all() else int(np.argmin(same))))
     return found
 
 
-def _once(rows: Rows, time_ns: Integers) -> tuple[Rows, Integers]:
+def _once(table: ChannelTable) -> ChannelTable:
     """Drop blocks that were written twice, one copy directly after the other: no information is lost."""
-    keep, notes = np.ones(len(time_ns), np.bool_), []
-    for row, start, count in _repeats(rows, time_ns):
+    keep, notes = np.ones(len(table.time_ns), np.bool_), []
+    for row, start, count in _repeats(table):
         if start + count == row and count > 0:
-            keep[row : row + count] = False
-            ends = row, row + count - 1
-            first, last = (int(rows.lines[r]) for r in ends)
-            detail = (
-                f"lines {first} to {last} repeat lines {rows.lines[start]} to {rows.lines[row - 1]} exactly, time and "
-                "all, and were dropped"
-            )
-            times = (float(time_ns[r]) / 1e9 for r in ends)
-            notes.append(Note("N-REPEAT", count, first, last, detail, *times))
-    return (rows.select(np.flatnonzero(keep), *notes), time_ns[keep]) if notes else (rows, time_ns)
+            rows = np.arange(row, row + count)
+            keep[rows] = False
+            twin, note = table.note("", rows - count, ""), table.note("N-REPEAT", rows, "")
+            lines = f"lines {note.first} to {note.last} repeat lines {twin.first} to {twin.last} exactly"
+            detail = f"{lines}, time and all, and were dropped"
+            notes.append(replace(note, detail=detail))
+    return table.select(np.flatnonzero(keep), *notes) if notes else table
 
 
 def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> IngestError:
@@ -233,14 +235,15 @@ def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> 
     return IngestError(error.fact, error.file, code=error.code, hint=hint)
 
 
-def _counted_on(rows: Rows, time_ns: Integers, tick_ns: float) -> tuple[Rows, Integers]:
-    time_ns, wraps = _unwrap(time_ns, tick_ns)
-    if wraps:
-        modulus, lines = wraps[0][1], [int(rows.lines[row]) for row, _ in wraps]
-        bits = next((b for b in (16, 24, 32) if round(2**b * tick_ns) == modulus), 32)
-        what = f"the time counter of {bits} bits started again at 0 (every {modulus / 1e9:.9g} s) and was counted on"
-        rows = replace(rows, notes=(*rows.notes, Note("N-WRAP", len(wraps), lines[0], lines[-1], what)))
-    return rows, time_ns
+def _counted_on(table: ChannelTable, tick_ns: float) -> ChannelTable:
+    time_ns, wraps = _unwrap(table.time_ns, tick_ns)
+    if not wraps:
+        return table
+    modulus = wraps[0][1]
+    bits = next((b for b in (16, 24, 32) if round(2**b * tick_ns) == modulus), 32)
+    what = f"the time counter of {bits} bits started again at 0 (every {modulus / 1e9:.9g} s) and was counted on"
+    note = replace(table.note("N-WRAP", np.array([row for row, _ in wraps]), what), start_s=None, end_s=None)
+    return replace(table, time_ns=time_ns, notes=(*table.notes, note))
 
 
 def _unwrap(time_ns: Integers, tick_ns: float) -> tuple[Integers, list[tuple[int, int]]]:
@@ -262,14 +265,14 @@ def _unwrap(time_ns: Integers, tick_ns: float) -> tuple[Integers, list[tuple[int
     return time_ns, []
 
 
-def _starts(rows: Rows, time_ns: Integers, tick_ns: float) -> list[int]:
+def _starts(time_ns: Integers, restarts: list[int], tick_ns: float) -> list[int]:
     """Return the rows where a log was started: at a repeated header, or where time falls back for good."""
     steps = np.diff(time_ns)
     forward = steps[steps > 0]
     longest = RESET_INTERVALS * float(np.median(forward)) if forward.size else 0.0
-    wrapped = {row for row, _ in _unwrap(time_ns, tick_ns)[1]} if not rows.restarts else set()
+    wrapped = {row for row, _ in _unwrap(time_ns, tick_ns)[1]} if not restarts else set()
     resets = {int(r) + 1 for r in np.flatnonzero(steps < -longest)} - wrapped
-    return sorted({0, *resets, *rows.restarts} - {len(time_ns)})
+    return sorted({0, *resets, *restarts} - {len(time_ns)})
 
 
 def _tick_ns(rows: Rows, settings: CsvFormat) -> float:
@@ -277,23 +280,10 @@ def _tick_ns(rows: Rows, settings: CsvFormat) -> float:
     return float(settings.tick_ns or UNITS["time"][unit][0])
 
 
-def lines_of_session(rows: Rows, settings: CsvFormat) -> range:
-    """Return the lines of the part that is read of a log that was restarted."""
-    assert settings.session is not None  # noqa: S101  (the caller reads one part)
-    part, _ = _one_session(rows, times_of(rows, settings), settings.session, _tick_ns(rows, settings))
-    return range(int(part.lines[0]), int(part.lines[-1]) + 1)
-
-
-def _one_session(rows: Rows, time_ns: Integers, session: int, tick_ns: float) -> tuple[Rows, Integers]:
-    """Return one part of a log that was restarted."""
-    starts = _starts(rows, time_ns, tick_ns)
+def rows_of_session(rows: Rows, time_ns: Integers, settings: CsvFormat) -> Index:
+    """Return the rows of the part that is read of a log that was restarted."""
+    starts, session = _starts(time_ns, rows.restarts, _tick_ns(rows, settings)), settings.session or 1
     if session > len(starts):
         message = f"session is {session}, and the log was started {len(starts)} times"
         raise IngestError(message, rows.layout.path, code="session")
-    start, stop = [*starts, len(time_ns)][session - 1 : session + 1]
-    index = np.arange(start, stop)
-    first, last = int(rows.lines[start]), int(rows.lines[stop - 1])
-    detail = f"session {session} of {len(starts)}: lines {first} to {last} were read"
-    times = float(time_ns[start]) / 1e9, float(time_ns[stop - 1]) / 1e9
-    note = Note("N-SESSION", len(rows.lines) - index.size, first, last, detail, *times)
-    return rows.select(index, note), time_ns[start:stop]
+    return np.arange(*[*starts, len(time_ns)][session - 1 : session + 1])

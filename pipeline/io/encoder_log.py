@@ -87,8 +87,8 @@ def own_rows(table: ChannelTable) -> ChannelTable:
     """Return the table's channels of a log whose rows hold a time of the table's own."""
     time = np.rint(table.values[TABLE_TIME]).astype(np.int64)
     new = np.concatenate([[True], time[1:] > np.maximum.accumulate(time)[:-1]])
-    values = {c: table.values[c][new] for c in TABLE_CHANNELS if c in table.values}
-    return ChannelTable(table.path, time[new], values, table.source, table.line_of)
+    values = {c: table.values[c] for c in TABLE_CHANNELS if c in table.values}
+    return ChannelTable(table.path, time, values, table.source, table.lines).select(new)
 
 
 def unwrapped(table: ChannelTable) -> ChannelTable:
@@ -163,19 +163,14 @@ def _one_digit(value: float) -> str:
 def _merged(  # noqa: PLR0917  (parts of one table)
     sensor: ChannelTable, log: ChannelTable, rows: slice, tau: Values, clock: dict[str, float], notes: list[Note]
 ) -> ChannelTable:
-    values = {c: v[rows] for c, v in sensor.values.items() if c not in log.values and c != TABLE_TIME}
-    values |= {channel: at(tau) for channel, at in interpolators(log).items()}
-    source = {**sensor.source, "table_clock": clock} if clock else dict(sensor.source)
-    same = log.source is sensor.source
+    same, found = log.source is sensor.source, interpolators(log)
+    part = sensor.select(rows, *(() if same else log.notes), *notes)
+    own = {c: v for c, v in part.values.items() if c not in log.values and c != TABLE_TIME}
     return replace(
-        sensor,
-        time_ns=sensor.time_ns[rows],
-        values=values,
-        source=source if same else {**source, "table_log": log.source},
-        line_of=lambda row: sensor.line_of(row + rows.start),
-        encodings={c: e for c, e in sensor.encodings.items() if c in values and c not in log.values},
-        notes=(*sensor.notes, *(() if same else log.notes), *notes),
-        flags=None if sensor.flags is None else sensor.flags[rows],
+        part,
+        values=own | {channel: at(tau) for channel, at in found.items()},
+        source=sensor.source | ({"table_clock": clock} if clock else {}) | ({} if same else {"table_log": log.source}),
+        encodings={c: e for c, e in sensor.encodings.items() if c in own},
     )
 
 

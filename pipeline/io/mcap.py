@@ -7,7 +7,7 @@ messages belong to them by equal stamps, and a temperature with stamps of its ow
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -16,7 +16,7 @@ from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
 from pipeline.io.files import unchanged
 from pipeline.io.ingest_settings import HEADER, OWN
-from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
+from pipeline.io.message_decoder import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
 from pipeline.io.message_logs import open_reader
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.io.timestamps import averaged, check_fine, check_plausible, in_order, rows_covered, slower_first
@@ -47,15 +47,6 @@ def read_messages(reader: MessageReader, settings: McapFormat) -> ChannelTable:
     return _Log(reader, settings).table()
 
 
-@dataclass(frozen=True)
-class _Series:
-    """The messages of one topic: times, increasing, and channels."""
-
-    topic: str
-    time_ns: Integers
-    values: Columns
-
-
 @dataclass
 class _Topic:
     """The messages of one topic as they come; an error in them matters only if the topic is used."""
@@ -83,7 +74,7 @@ class _Topic:
         for name, column in batch.values.items():
             self.values.setdefault(name, []).append(column)
 
-    def series(self, settings: McapFormat, notes: list[Note]) -> _Series:
+    def series(self, settings: McapFormat, notes: list[Note]) -> ChannelTable:
         """Return all messages in the order of their times."""
         if self.error is not None:
             raise self.error
@@ -110,7 +101,7 @@ class _Topic:
         if one_by_one:
             detail = f"messages on {topic} vary in length or texts and were decoded one by one"
             notes.append(Note("N-FALLBACK", one_by_one, 0, 0, detail))
-        return _Series(topic, time, values)
+        return ChannelTable(path, time, values, {"topic": topic, "rows": len(time)})
 
 
 class _Log:
@@ -143,7 +134,7 @@ class _Log:
         time = base.time_ns[base.time_ns <= self.end_ns]
         values = {c: v[: len(time)] for c, v in values.items()}
         source = {"file": self.path, "sha256": self.reader.sha256, "rows": len(time)}
-        table = ChannelTable(self.path, time, values, source, lambda _row: 0, self.encodings, notes=tuple(self.notes))
+        table = ChannelTable(self.path, time, values, source, None, self.encodings, tuple(self.notes))
         if self.table_logs:
             from pipeline.io.encoder_log import align  # noqa: PLC0415  (few logs need it)
 
@@ -197,11 +188,11 @@ class _Log:
         hint = "ingest.mcap.topics reads other types by their fields" if kind == IMU else ""
         raise IngestError(f"{what}; the file has {listed}", self.path, code="missing_topic", hint=hint)
 
-    def _series(self, topic: _Topic) -> _Series:
+    def _series(self, topic: _Topic) -> ChannelTable:
         self.encodings |= topic.decoder.encodings
         return topic.series(self.settings, self.notes)
 
-    def _temperature(self, series: _Series, base: _Series) -> Columns:
+    def _temperature(self, series: ChannelTable, base: ChannelTable) -> Columns:
         if np.array_equal(series.time_ns, base.time_ns):
             return series.values
         count = len(series.time_ns)
@@ -211,7 +202,7 @@ class _Log:
         times, own = base.time_ns - base.time_ns[0], series.time_ns - base.time_ns[0]
         return {n: np.interp(times, own, numbers) for n, numbers in series.values.items()}
 
-    def _slower_first(self, base: _Series, others: list[_Series]) -> tuple[_Series, list[_Series]]:
+    def _slower_first(self, base: ChannelTable, others: list[ChannelTable]) -> tuple[ChannelTable, list[ChannelTable]]:
         """Return the rows of the slower of two sensors with the averages of the faster one, and all else."""
         sensors = {triad[0] for triad in TRIADS.values()}
         other = next((s for s in others if sensors & set(s.values)), None)
@@ -219,27 +210,28 @@ class _Log:
             return base, others
         others = [s for s in others if s is not other]
         slow, fast = (base, other) if slower_first(base.time_ns, other.time_ns) else (other, base)
-        rows = rows_covered(slow.time_ns, fast.time_ns, fast.topic, self.path)
+        topic = fast.source["topic"]
+        rows = rows_covered(slow.time_ns, fast.time_ns, topic, self.path)
         values = {c: averaged(slow.time_ns, rows, fast.time_ns, v) for c, v in fast.values.items()}
         for channel in fast.values:
             self.encodings.pop(channel, None)
         lost = len(slow.time_ns) - len(rows)
-        detail = f"{len(fast.time_ns)} messages on {fast.topic} averaged over the intervals of {slow.topic}"
+        detail = f"{len(fast.time_ns)} messages on {topic} averaged over the intervals of {slow.source['topic']}"
         detail += f", {lost} of whose messages they do not cover" if lost else ""
         self.notes.append(Note("N-AVERAGED", len(rows), 0, 0, detail))
         values |= {c: v[rows] for c, v in slow.values.items()}
-        return _Series(slow.topic, slow.time_ns[rows], values), others
+        return replace(slow.select(rows), values=values), others
 
-    def _at_rows(self, series: _Series, base: _Series) -> Columns:
+    def _at_rows(self, series: ChannelTable, base: ChannelTable) -> Columns:
         """Return the channels of a topic at the times of the rows; none of a table's with a clock of its own."""
         channels = set(series.values)
         if self.settings.table_clock == OWN and channels <= set(TABLE_CHANNELS):  # aligned with the rows later
-            source = {"topic": series.topic, "rows": len(series.time_ns)}
-            self.table_logs.append(ChannelTable(self.path, series.time_ns, series.values, source, lambda _row: 0))
+            self.table_logs.append(series)
             return {}
         return self._temperature(series, base) if channels == {"temperature"} else self._matched(series, base)
 
-    def _matched(self, series: _Series, base: _Series) -> Columns:
+    def _matched(self, series: ChannelTable, base: ChannelTable) -> Columns:
+        topic = series.source["topic"]
         index = np.minimum(np.searchsorted(series.time_ns, base.time_ns), len(series.time_ns) - 1)
         if self.reader.truncated:
             self.end_ns = min(self.end_ns, int(series.time_ns[-1]))
@@ -249,8 +241,8 @@ class _Log:
             what = f"both sensors have to bear the same stamps, and the {sensor} has its own"
             what = what if sensor else "the table has to be logged with the Imu's stamps"
             message = (
-                f"{unmatched.size} of {len(index)} Imu messages have no message of equal stamp on {series.topic}, the "
-                f"first at {base.time_ns[unmatched[0]] / 1e9:.9g} s; {what}"
+                f"{unmatched.size} of {len(index)} Imu messages have no message of equal stamp on {topic}, the first "
+                f"at {base.time_ns[unmatched[0]] / 1e9:.9g} s; {what}"
             )
             hint = "or, where its clock is another one, set ingest.mcap.table_clock=own"
             if sensor:
@@ -258,11 +250,11 @@ class _Log:
             raise IngestError(message, self.path, code="bad_time", hint=hint)
         extra = len(series.time_ns) - len(index)
         if extra > 0:
-            detail = f"messages on {series.topic} between the Imu's were not used"
+            detail = f"messages on {topic} between the Imu's were not used"
             self.notes.append(Note("N-UNMATCHED", extra, 0, 0, detail))
         return {c: numbers[index] for c, numbers in series.values.items()}
 
-    def _check_finite(self, values: Columns, base: _Series) -> None:
+    def _check_finite(self, values: Columns, base: ChannelTable) -> None:
         for channel, numbers in values.items():
             wrong = np.flatnonzero(~np.isfinite(numbers))
             if wrong.size:

@@ -15,7 +15,7 @@ of attachments, and reads an index entry by entry. Here such records are refused
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
@@ -80,6 +80,11 @@ class Rows:
         """Return the data of one message."""
         start = int(self.starts[row])
         return self.data[start : start + int(self.sizes[row])].tobytes()
+
+    def only(self, row: int) -> Rows:
+        """Return one message."""
+        part = slice(row, row + 1)
+        return replace(self, heads=self.heads[part], starts=self.starts[part], sizes=self.sizes[part], stride=0)
 
     def table(self, layout: np.dtype[np.void]) -> NDArray[np.void]:
         """Return all messages, each as one item of a type of their common size."""

@@ -1,17 +1,28 @@
-"""Logs of other programs as messages: ROS bags by ``rosbags``, and arrays (``pipeline.io.array_logs``).
+"""Logs of other programs as messages: ROS bags by ``rosbags``, and logs of arrays.
+
+    ULog       (pyulog)     each logged message is a topic; no units
+    DataFlash  (pymavlink)  each message type is a topic, with the units of the messages FMTU, UNIT and MULT
+    HDF5, MATLAB 7.3 (h5py), MATLAB 5 (scipy.io)
+                            a group (a struct) is a topic, its arrays are the fields; samples run along the longer
+                            dimension; a unit is the attribute ``unit`` or ``units``
 
 Arrays become messages of one length, so that fields, units, clocks and checks are those of MCAP (``pipeline.io.mcap``):
 
     message i = the bytes of row i of every array, little endian, one after the other
 
+A message of several sensors is ``IMU``, ``IMU[1]``, ``IMU[2]``. Where the arrays of a group differ in length, those of
+one length are a topic with the name of its first array. Times of ULog and DataFlash are microseconds since power-on.
 The readers' libraries are extras of the package, imported when a log of their format is read.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import json
-from contextlib import contextmanager
+import re
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -19,42 +30,47 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from pipeline.errors import IngestError
-from pipeline.io.array_logs import COPY_AGAIN, topics_of
 from pipeline.io.files import MESSAGE_FORMATS, is_mat_5
-from pipeline.io.mcap_channels import STATED
 from pipeline.io.mcap_chunk import HEAD, Rows
-from pipeline.io.mcap_reader import McapReader, MessageReader
-from pipeline.io.message_decoder import ARRAYS
+from pipeline.io.mcap_reader import COPY_AGAIN, McapReader, MessageReader
+from pipeline.io.message_decoder import ARRAYS, STATED
+from pipeline.records import Note
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
+    from pymavlink.DFReader import DFReader_binary
 
+    from pipeline.io.files import MessageFormat
     from pipeline.records import Integers
 
-
 RUN_SIZE = 4096  # messages of one topic of a bag that are decoded together
+ELEMENT = re.compile(r"(.+)\[(\d+)\]")
+MARKED = 3  # bytes of a DataFlash message before its fields: two marks and its type
+MARKS, FORMAT, LENGTH_OF_FORMAT = b"\xa3\x95", 0x80, 89  # libraries/AP_Logger/LogStructure.h of ArduPilot
+MOST_GARBAGE = 528  # bytes at the end of a log that was written in blocks, as pymavlink allows
+TIME = "TimeUS"
+FEWEST_ROWS = 2  # shorter arrays are settings, not samples
+DEEPEST = 3  # dimensions: images, not read
+WIDEST = 64  # columns; a wider array is an image or a matrix
+BYTES_OF_A_DOUBLE = 8  # longer numbers are no reading of a converter
 
 
 class LogReader(MessageReader):
-    """One pass over a log of another program."""
+    """One pass over a log of another program: a bag, or arrays."""
 
-    def __init__(self, path: Path, kind: str) -> None:
+    def __init__(self, path: Path, known: MessageFormat) -> None:
         super().__init__(str(path))
-        self.file, self.kind = path, kind
+        self.file, self.kind, self.messages = path, known.kind, _of_bag if known.extra == "ros" else _as_messages
         with path.open("rb") as stream:
             self.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-
-    def messages(self) -> Iterator[Rows]:
-        """Yield the messages; a subclass reads them from arrays or bytes."""
-        raise NotImplementedError
 
     def rows(self) -> Iterator[Rows]:
         """Yield the messages; what the format's library refuses raises ``IngestError``."""
         try:
-            for rows in self.messages():
+            for rows in self.messages(self):
                 self.counts[rows.channel] += len(rows.starts)
                 yield rows
         except IngestError:
@@ -72,58 +88,53 @@ class LogReader(MessageReader):
         return number
 
 
-class ArrayReader(LogReader):
-    """A log of arrays."""
-
-    def messages(self) -> Iterator[Rows]:
-        """Yield the arrays of each topic as messages."""
-        for topic in topics_of(self.file, self.notes):
-            self.has_recorder &= topic.recorded_ns is not None
-            codes = {n: f"<{a.dtype.kind}{a.dtype.itemsize}" for n, a in topic.columns.items()}
-            kind = np.dtype([(n, codes[n], a.shape[1:]) for n, a in topic.columns.items()])
-            count, size = len(next(iter(topic.columns.values()))), kind.itemsize
-            table, fields, places = np.empty(count, kind), dict(kind.fields or {}), []
-            for name, array in topic.columns.items():
-                table[name] = array
-                places.append([name, fields[name][1], codes[name], array.shape[1] if array.ndim > 1 else None])
-            metadata = {STATED + name: unit for name, unit in topic.units.items() if unit}
-            channel = self.define(topic.name, ARRAYS, (self.kind, ARRAYS, json.dumps(places).encode()), metadata)
-            times = np.zeros(count) if topic.recorded_ns is None else topic.recorded_ns
-            data = table.view(np.uint8).reshape(-1) if size else np.empty(0, np.uint8)
-            yield _rows(channel, data, np.arange(count, dtype=np.int64) * size, np.full(count, size), times)
+def _as_messages(log: LogReader) -> Iterator[Rows]:
+    """Yield the arrays of each topic as messages."""
+    for topic in topics_of(log.file, log.notes):
+        log.has_recorder &= topic.recorded_ns is not None
+        codes = {n: f"<{a.dtype.kind}{a.dtype.itemsize}" for n, a in topic.columns.items()}
+        kind = np.dtype([(n, codes[n], a.shape[1:]) for n, a in topic.columns.items()])
+        count, size = len(next(iter(topic.columns.values()))), kind.itemsize
+        table, fields, places = np.empty(count, kind), dict(kind.fields or {}), []
+        for name, array in topic.columns.items():
+            table[name] = array
+            places.append([name, fields[name][1], codes[name], array.shape[1] if array.ndim > 1 else None])
+        metadata = {STATED + name: unit for name, unit in topic.units.items() if unit}
+        channel = log.define(topic.name, ARRAYS, (log.kind, ARRAYS, json.dumps(places).encode()), metadata)
+        times = np.zeros(count) if topic.recorded_ns is None else topic.recorded_ns
+        data = table.view(np.uint8).reshape(-1) if size else np.empty(0, np.uint8)
+        yield _rows(channel, data, np.arange(count, dtype=np.int64) * size, np.full(count, size), times)
 
 
-class BagReader(LogReader):
-    """A ROS 1 bag, or the SQLite file of a ROS 2 bag; the messages are decoded as those of an MCAP file.
+def _of_bag(log: LogReader) -> Iterator[Rows]:
+    """Yield the messages of a ROS 1 bag, or of the SQLite file of a ROS 2 bag, in runs by connection."""
+    version = 1 if log.file.suffix.lower() == ".bag" else 2
+    with import_module(f"rosbags.rosbag{version}").Reader(log.file) as bag:
+        numbers = {}
+        for connection in bag.connections:
+            text = _definition(connection, version)
+            schema = (connection.msgtype, f"ros{version}msg" if text else "no", text.encode())  # no: it is not read
+            numbers[connection.id] = log.define(connection.topic, "ros1" if version == 1 else "cdr", schema, {})
+        waiting: dict[int, list[tuple[int, bytes]]] = {c.id: [] for c in bag.connections}
+        for connection, time, data in bag.messages(bag.connections):
+            run = waiting[connection.id]
+            run.append((time, data))
+            if len(run) == RUN_SIZE:
+                yield _joined(numbers[connection.id], run)
+                run.clear()
+        for key, run in waiting.items():
+            if run:
+                yield _joined(numbers[key], run)
 
-    ROS 2 wrote no message definitions into a bag before version Iron; then those of ``rosbags`` for Humble are used.
-    """
 
-    def messages(self) -> Iterator[Rows]:
-        """Yield the messages of each connection in runs, in the order of the recorder's times."""
-        version = 1 if self.file.suffix.lower() == ".bag" else 2
-        with import_module(f"rosbags.rosbag{version}").Reader(self.file) as bag:
-            numbers = {c.id: self._channel(c, version) for c in bag.connections}
-            waiting: dict[int, list[tuple[int, bytes]]] = {c.id: [] for c in bag.connections}
-            for connection, time, data in bag.messages(bag.connections):
-                run = waiting[connection.id]
-                run.append((time, data))
-                if len(run) == RUN_SIZE:
-                    yield _joined(numbers[connection.id], run)
-                    run.clear()
-            for key, run in waiting.items():
-                if run:
-                    yield _joined(numbers[key], run)
+def _definition(connection: Any, version: int) -> str:  # noqa: ANN401  (rosbags.interfaces.Connection)
+    """Return the message definition; that of Humble by ``rosbags`` where the bag, before version Iron, holds none."""
+    if version == 1 or connection.msgdef.format.name == "MSG":
+        return str(connection.msgdef.data)
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  (an extra)
 
-    def _channel(self, connection: Any, version: int) -> int:  # noqa: ANN401  (rosbags.interfaces.Connection)
-        text = connection.msgdef.data
-        if version == 2 and connection.msgdef.format.name != "MSG":
-            from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  (an extra)
-
-            store, name = get_typestore(Stores.ROS2_HUMBLE), connection.msgtype
-            text = store.generate_msgdef(name, ros_version=2)[0] if name in store.fielddefs else ""
-        schema = (connection.msgtype, f"ros{version}msg" if text else "no", text.encode())  # no: the topic is not read
-        return self.define(connection.topic, "ros1" if version == 1 else "cdr", schema, {})
+    store, name = get_typestore(Stores.ROS2_HUMBLE), connection.msgtype
+    return store.generate_msgdef(name, ros_version=2)[0] if name in store.fielddefs else ""
 
 
 def _joined(channel: int, run: list[tuple[int, bytes]]) -> Rows:
@@ -141,13 +152,7 @@ def _rows(channel: int, data: NDArray[np.uint8], starts: Integers, sizes: Intege
 
 
 def open_log(path: Path) -> LogReader:
-    """Return the reader of a log other than MCAP, by its suffix.
-
-    Raises
-    ------
-    IngestError
-        If the package that reads the format is not installed; the error names the extra.
-    """
+    """Return the reader of a log other than MCAP, by its suffix; ``IngestError``: its package is not installed."""
     known = MESSAGE_FORMATS[path.suffix.lower()]
     library = "scipy.io" if is_mat_5(path) else known.library
     try:
@@ -159,10 +164,10 @@ def open_log(path: Path) -> LogReader:
             code="missing_extra",
             hint=f"pip install 'imu-calibration[{known.extra}]'",
         ) from error
-    return (BagReader if known.extra == "ros" else ArrayReader)(path, known.kind)
+    return LogReader(path, known)
 
 
-@contextmanager
+@contextlib.contextmanager
 def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[MessageReader]:
     """Open a log of messages of any format, MCAP included."""
     if path.suffix.lower() in MESSAGE_FORMATS:
@@ -170,3 +175,185 @@ def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[Messag
         return
     with path.open("rb") as stream:
         yield McapReader(stream, str(path), allow_truncated=allow_truncated)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """The messages of one topic as arrays.
+
+    Attributes
+    ----------
+    name : str
+        Of the topic; where a log holds it several times, ``name[1]``, ``name[2]`` from the second one on.
+    columns : mapping of str to array
+        Field to (n,) or (n, k) numbers, all of the same n.
+    units : mapping of str to str
+        Field to the unit that the file states, as it writes it.
+    recorded_ns : (n,) array of int64, optional
+        Times of the logger.
+    """
+
+    name: str
+    columns: Mapping[str, NDArray[Any]]
+    units: Mapping[str, str] = field(default_factory=dict)
+    recorded_ns: Integers | None = None
+
+
+def topics_of(path: Path, notes: list[Note]) -> Iterator[Topic]:
+    """Yield the topics of a log by its suffix; what was lost is added to ``notes``, a damaged log is refused."""
+    suffix = path.suffix.lower()
+    if suffix == ".ulg":
+        return _of_ulog(path, notes)
+    return _of_dataflash(path, notes) if suffix == ".bin" else _of_arrays(path)
+
+
+def _of_ulog(path: Path, notes: list[Note]) -> Iterator[Topic]:
+    from pyulog import ULog  # noqa: PLC0415  (an extra)
+
+    with path.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()) as said:
+        log = ULog(stream)
+    complaint = said.getvalue().partition("\n")[0]
+    if log.file_corruption or "corrupt" in complaint:
+        message = f"damaged ULog file: {complaint or 'a part of it is no message'}"
+        raise IngestError(message, str(path), hint=COPY_AGAIN)
+    if log.dropouts:
+        lost = sum(d.duration for d in log.dropouts)
+        notes.append(Note("N-DROPOUT", len(log.dropouts), 0, 0, f"the logger lost data for {lost} ms in all"))
+    for data in log.data_list:
+        columns: dict[str, Any] = {}
+        for name, values in data.data.items():  # the elements name[0], name[1] .. of a field are one (n, k) array
+            element = ELEMENT.fullmatch(name)
+            if element:
+                columns.setdefault(element.group(1), []).append(values)
+            else:
+                columns[name] = values
+        columns = {n: np.column_stack(v) if isinstance(v, list) else v for n, v in columns.items()}
+        yield Topic(_instance(data.name, data.multi_id), columns, {}, data.data["timestamp"].astype(np.int64) * 1000)
+
+
+def _instance(name: str, number: int) -> str:
+    return f"{name}[{number}]" if number else name
+
+
+def _of_dataflash(path: Path, notes: list[Note]) -> Iterator[Topic]:
+    """Yield the topics of a log; refuse one in which other bytes stand between messages."""
+    from pymavlink.DFReader import DFReader_binary  # noqa: PLC0415  (an extra)
+
+    content = path.read_bytes()
+    _check_chain(content, str(path), notes)
+    data = np.frombuffer(content, np.uint8)
+    with DFReader_binary(str(path)) as log:
+        yield from _messages(log, data)
+
+
+def _check_chain(content: bytes, path: str, notes: list[Note]) -> None:
+    """Refuse a log whose messages do not follow one another to its end; the lengths are those of its FMT messages."""
+    lengths, at = {FORMAT: LENGTH_OF_FORMAT}, 0
+    while at + MARKED <= len(content):
+        if content[at : at + 2] != MARKS or content[at + 2] not in lengths:
+            if len(content) - at < MOST_GARBAGE and at:
+                break
+            message = (
+                f"damaged, or no DataFlash log: {content[at : at + MARKED].hex(' ')} begins no message that it defines"
+            )
+            raise IngestError(message, path, code="damaged", offset=at, hint=COPY_AGAIN)
+        if content[at + 2] == FORMAT and at + LENGTH_OF_FORMAT <= len(content):
+            lengths[content[at + 3]] = content[at + 4]
+        at += max(lengths[content[at + 2]], MARKED)
+    if at != len(content):
+        what = f"the log ends within a message, or with bytes that are none ({abs(len(content) - at)} bytes)"
+        notes.append(Note("N-TRUNCATED", 1, 0, 0, f"{what}; the complete messages were used"))
+
+
+def _messages(log: DFReader_binary, data: NDArray[np.uint8]) -> Iterator[Topic]:
+    for number, known in log.formats.items():
+        starts = np.array(log.offsets[number], np.int64)
+        starts = starts[starts + known.len <= len(data)]
+        fields = np.dtype([(n, _code(c)) for n, c in zip(known.columns, known.format, strict=False)])
+        if not len(starts) or TIME not in known.columns or fields.itemsize + MARKED != known.len:
+            continue
+        windows = np.lib.stride_tricks.sliding_window_view(data, known.len)[starts, MARKED:]
+        table = np.ascontiguousarray(windows).view(fields)[:, 0]
+        columns = {  # a multiplier: the field is sent in hundredths, or another fraction, of its unit
+            n: table[n] if m is None else table[n] / round(1.0 / m)
+            for n, m in zip(known.columns, known.msg_mults, strict=True)
+            if table[n].dtype.kind in "iuf"
+        }
+        units = {n: known.get_unit(n) for n in columns}
+        instance = table[known.instance_field] if known.instance_field in columns else np.zeros(len(table), np.int64)
+        for sensor in np.unique(instance).tolist():
+            own = instance == sensor
+            times = table[TIME][own].astype(np.int64) * 1000
+            yield Topic(_instance(known.name, sensor), {n: c[own] for n, c in columns.items()}, units, times)
+
+
+def _code(letter: str) -> str:
+    """Return numpy's type of a DataFlash field by its letter in the format."""
+    from pymavlink.DFReader import FORMAT_TO_STRUCT  # noqa: PLC0415  (an extra)
+
+    code = FORMAT_TO_STRUCT[letter][0]
+    return f"S{code[:-1]}" if code.endswith("s") else f"<{np.dtype(code).str[1:]}"
+
+
+def _of_arrays(path: Path) -> Iterator[Topic]:
+    if is_mat_5(path):
+        from scipy.io import loadmat  # noqa: PLC0415  (few logs need it)
+
+        content = loadmat(path, simplify_cells=True)
+        yield from _of_group("", {n: v for n, v in content.items() if not n.startswith("__")})
+    else:
+        import h5py  # noqa: PLC0415  (an extra)
+
+        with h5py.File(path, "r") as file:
+            yield from _of_group("", _tree(file))
+
+
+def _tree(group: Any) -> dict[str, Any]:  # noqa: ANN401  (h5py.Group)
+    """Return the groups and arrays of an HDF5 file; an array with its unit is a pair."""
+    found: dict[str, Any] = {}
+    for name, item in group.items():
+        if hasattr(item, "items"):
+            found[name] = _tree(item) if name != "#refs#" else {}
+        elif getattr(item, "ndim", DEEPEST) < DEEPEST:
+            unit = next((item.attrs[k] for k in ("units", "unit") if k in item.attrs), "")
+            found[name] = (item[()], unit.decode() if isinstance(unit, bytes) else str(unit))
+    return found
+
+
+def _of_group(place: str, tree: Mapping[str, Any]) -> Iterator[Topic]:
+    """Yield the topics of a group, and of those in it."""
+    arrays: dict[str, NDArray[Any]] = {}
+    units: dict[str, str] = {}
+    for name, item in tree.items():
+        if isinstance(item, dict):
+            yield from _of_group(f"{place}/{name}", item)
+            continue
+        value, unit = item if isinstance(item, tuple) else (item, "")
+        array = np.asarray(value)
+        if array.dtype.names:  # a table of named columns
+            columns = {n: c for n in array.dtype.names if (c := _samples(array[n])) is not None}
+            yield from _by_length(f"{place}/{name}", columns, {})
+        elif (samples := _samples(array)) is not None:
+            arrays[name], units[name] = samples, unit
+    yield from _by_length(place, arrays, units)
+
+
+def _by_length(place: str, arrays: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> Iterator[Topic]:
+    """Yield the arrays of a group, those of one length together."""
+    lengths = sorted({len(a) for a in arrays.values()})
+    for length in lengths:
+        own = {n: a for n, a in arrays.items() if len(a) == length}
+        name = (place or "/") if len(lengths) == 1 else f"{place}/{min(own)}"
+        yield Topic(name, own, {n: u for n, u in units.items() if n in own})
+
+
+def _samples(array: NDArray[Any]) -> NDArray[Any] | None:
+    """Return an array of numbers with its samples along the first dimension; None if it holds no samples."""
+    if array.dtype.kind not in "iufb" or array.dtype.itemsize > BYTES_OF_A_DOUBLE:
+        return None
+    array = np.squeeze(array)
+    if array.ndim == 2 and array.shape[0] < array.shape[1]:
+        array = array.T
+    if array.ndim not in (1, 2) or len(array) < FEWEST_ROWS or (array.ndim == 2 and array.shape[1] > WIDEST):
+        return None
+    return array.astype("u1") if array.dtype.kind == "b" else array

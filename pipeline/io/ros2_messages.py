@@ -19,6 +19,7 @@ from mcap.writer import Writer
 
 from pipeline.errors import InputError
 from pipeline.io.mcap_chunk import HEAD, MESSAGE_HEAD
+from pipeline.io.message_layout import LITTLE_ENDIAN
 from pipeline.io.units import SECOND_NS, STANDARD_GRAVITY
 from pipeline.records import SENSORS
 
@@ -101,41 +102,28 @@ VECTORS = {
 CHANNEL_AT = 9  # byte of a record where the channel's number stands
 
 
-class _Message:
-    """One message as CDR, with the places of its numbers."""
+def _count(value: int) -> bytes:
+    return struct.pack("<I", value)
 
-    def __init__(self, frame: str) -> None:
-        self.data = bytearray(b"\x00\x01\x00\x00" + bytes(8))  # little endian; stamp
-        self.places: list[int] = []
-        self.text(frame)
 
-    def align(self, size: int) -> None:
-        self.data += bytes(-(len(self.data) - 4) % size)
+def _text(value: str) -> bytes:
+    encoded = value.encode() + b"\0"
+    return _count(len(encoded)) + encoded
 
-    def count(self, value: int) -> None:
-        self.align(4)
-        self.data += struct.pack("<I", value)
 
-    def text(self, value: str) -> None:
-        encoded = value.encode() + b"\0"
-        self.count(len(encoded))
-        self.data += encoded
-
-    def doubles(self, count: int) -> None:
-        if count:
-            self.align(8)
-        for _ in range(count):
-            self.places.append(len(self.data))
-            self.data += bytes(8)
-
-    def fill(self, time_ns: Integers, numbers: Values) -> NDArray[np.uint8]:
-        """Return a message, a row of bytes, for each time and row of numbers."""
-        table = np.tile(np.frombuffer(bytes(self.data), np.uint8), (len(time_ns), 1))
-        stamps = np.stack([time_ns // SECOND_NS, time_ns % SECOND_NS], axis=1).astype("<u4")
-        table[:, 4:12] = stamps.view(np.uint8)
-        for column, place in enumerate(self.places):
-            table[:, place : place + 8] = np.ascontiguousarray(numbers[:, column], "<f8").view(np.uint8).reshape(-1, 8)
-        return table
+def as_messages(time_ns: Integers, frame: str, *parts: bytes | Values) -> NDArray[np.uint8]:
+    """Return CDR messages with a header, rows of bytes, of (n,) times; ``parts`` are constants and (n, k) numbers."""
+    constant = (len(time_ns), 1)
+    stamps = np.stack([time_ns // SECOND_NS, time_ns % SECOND_NS], axis=1).astype("<u4").view(np.uint8)
+    columns = [np.tile(np.frombuffer(LITTLE_ENDIAN, np.uint8), constant), stamps]
+    size = stamps.shape[1]  # after the encapsulation, from which alignment counts
+    for part in (_text(frame), *parts):
+        fixed = isinstance(part, bytes)
+        data = np.frombuffer(part, np.uint8) if fixed else np.ascontiguousarray(part, "<f8").view(np.uint8)
+        gap = -size % (4 if fixed else 8)
+        columns += [np.zeros((len(time_ns), gap), np.uint8), np.tile(data, constant) if fixed else data]
+        size += gap + data.shape[-1]
+    return np.hstack(columns)
 
 
 def write_mcap(path: Path, recording: Recording) -> None:
@@ -165,16 +153,16 @@ def _streams(recording: Recording) -> dict[str, NDArray[np.uint8]]:
     readings = {s: r for s in SENSORS if (r := recording.reading(s)) is not None}
     streams = {IMU: imu_table(time, readings)}
     if recording.temperature is not None:
-        message = _Message("imu")
-        message.doubles(2)
         numbers = np.stack([recording.temperature, np.zeros(len(time))], axis=1)
-        streams[TEMPERATURE] = message.fill(time, numbers)
-    if recording.table_angle is not None or recording.table_rate is not None:
-        streams[JOINT_STATE] = _joint(recording)
+        streams[TEMPERATURE] = as_messages(time, "imu", numbers)
+    joint = recording.table_angle, recording.table_rate  # position and velocity of the table's one joint; no effort
+    if any(log is not None for log in joint):
+        parts: list[bytes | Values] = [_count(1) + _text(JOINT)]
+        for log in joint:
+            parts += [_count(0)] if log is None else [_count(1), np.radians(log)[:, None]]
+        streams[JOINT_STATE] = as_messages(time, "table", *parts, _count(0))
     if recording.table_attitude is not None:
-        message = _Message("level")
-        message.doubles(4)
-        streams[QUATERNION_STAMPED] = message.fill(time, recording.table_attitude[:, [1, 2, 3, 0]])
+        streams[QUATERNION_STAMPED] = as_messages(time, "level", recording.table_attitude[:, [1, 2, 3, 0]])
     return streams
 
 
@@ -192,25 +180,7 @@ def imu_table(time_ns: Integers, readings: Readings, covariances: Readings | Non
         if f"{vector}.x" in found:
             numbers[:, start : start + 3] = np.stack([found[f"{vector}.{a}"] for a in "xyz"], axis=1)
             numbers[:, start + 3 : start + 12] = found.get(f"{vector}_covariance", 0.0)
-    message = _Message("imu")
-    message.doubles(37)
-    return message.fill(time_ns, numbers)
-
-
-def _joint(recording: Recording) -> NDArray[np.uint8]:
-    """Return JointState messages of the table's one joint."""
-    message = _Message("table")
-    message.count(1)
-    message.text(JOINT)
-    columns = []
-    for values in (recording.table_angle, recording.table_rate):
-        present = values is not None
-        message.count(int(present))
-        message.doubles(int(present))
-        if values is not None:
-            columns.append(np.radians(values))
-    message.count(0)  # effort
-    return message.fill(recording.time_ns, np.stack(columns, axis=1))
+    return as_messages(time_ns, "imu", numbers)
 
 
 def replaced(
@@ -225,7 +195,11 @@ def replaced(
     numbers = _in_ros_units(truths, covariances)
     if decoder.layout is not None:
         return _all_at_once(rows, decoder.layout, numbers, channel)
-    return [_one(row, rows, decoder.layout_of(row, rows), numbers, channel) for row in range(len(rows.starts))]
+    copies = []
+    for row in range(len(rows.starts)):
+        own = {path: column[row : row + 1] for path, column in numbers.items()}
+        copies.append(_all_at_once(rows.only(row), decoder.layout_of(row, rows), own, channel).tobytes())
+    return copies
 
 
 def _in_ros_units(readings: Readings, covariances: Readings) -> dict[str, Values]:
@@ -262,18 +236,6 @@ def _all_at_once(rows: Rows, layout: MessageLayout, numbers: dict[str, Values], 
     for path, column in numbers.items():
         records[path] = column
     return whole.view(np.uint8).reshape(len(starts), size)
-
-
-def _one(row: int, rows: Rows, layout: MessageLayout, numbers: dict[str, Values], channel: int) -> bytes:
-    start, end = int(rows.starts[row]) - HEAD.itemsize, int(rows.starts[row] + rows.sizes[row])
-    record = bytearray(rows.data[start:end].tobytes())
-    struct.pack_into("<H", record, CHANNEL_AT, channel)
-    for path, column in numbers.items():
-        place = layout.places[path]
-        at = HEAD.itemsize + place.offset
-        number = np.array([column[row]], place.code).tobytes()
-        record[at : at + len(number)] = number
-    return bytes(record)
 
 
 def new_imu(rows: Rows, truths: Readings, channel: int, time_ns: Integers, covariances: Readings) -> NDArray[np.uint8]:

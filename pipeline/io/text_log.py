@@ -64,29 +64,36 @@ class TextLog:
     """The rows of a text log, block by block, each block with the numbers of its lines, counted from 1.
 
     ``keep_open_line``: a last line without a newline is a row; else it is dropped with a note, as it may be cut.
-    ``head`` is None until the header, or the first row of a log without one, was read. ``lines`` were read so far.
+    ``head`` is None until the header, or the first row of a log without one, was read.
     """
 
     def __init__(
         self, stream: IO[bytes], path: str, settings: CsvFormat, *,
         keep_open_line: bool = False, block_bytes: int | None = None,
     ) -> None:  # fmt: skip
-        self.path, self.settings = path, settings
+        self.stream, self.path, self.settings = stream, path, settings
+        self.size, self.keep_open_line = block_bytes or BLOCK_BYTES, keep_open_line
         self.head: Head | None = None
         self.comments: list[int] = []
-        self.lines = 0
-        size, keep_nul = block_bytes or BLOCK_BYTES, settings.bad_rows == DROP
-        self._blocks = _Blocks(stream, path, size, keep_nul=keep_nul, keep_open_line=keep_open_line)
+        self.digest = hashlib.sha256()
+        self.line, self.offset = 1, 0  # the next ones
+        self.ends = {"CRLF": 0, "CR": 0, "LF": 0}
+        self.first_notes: list[Note] = []
+        self.last_notes: list[Note] = []
 
     @property
     def sha256(self) -> str:
         """Digest of the bytes that were read."""
-        return self._blocks.digest.hexdigest()
+        return self.digest.hexdigest()
 
     @property
     def notes(self) -> list[Note]:
         """What was repaired or left out, complete once all rows were read."""
-        notes = self._blocks.notes()
+        notes = [*self.first_notes]
+        if self.ends["CRLF"] or self.ends["CR"]:
+            listed = ", ".join(f"{count} {name}" for name, count in self.ends.items() if count)
+            notes.append(Note("N-EOL", sum(self.ends.values()), 0, 0, f"line ends other than LF alone: {listed}"))
+        notes += self.last_notes
         if self.comments:
             detail = f"lines that start with {self.settings.comment!r} are no data"
             notes.append(Note("N-COMMENT", len(self.comments), self.comments[0], self.comments[-1], detail))
@@ -95,8 +102,8 @@ class TextLog:
     def __iter__(self) -> Iterator[tuple[bytes, Integers]]:
         """Yield the rows, each with a newline after it; a block has at least one."""
         before = b""
-        for block, numbers in self._blocks:
-            self.lines, data = numbers.stop - 1, block
+        for block, numbers in self._blocks():
+            data = block
             if self.head is None:
                 before += block
                 start = self._find_head(before)
@@ -112,7 +119,7 @@ class TextLog:
     def no_rows(self) -> IngestError:
         """Return the refusal of a log without rows."""
         skipped = self.settings.skip_lines
-        if self.lines < skipped:
+        if self.line <= skipped:
             message = f"the file ends within the {skipped} lines that ingest.csv.skip_lines skips"
             return IngestError(message, self.path, code="no_rows")
         found = f"header on line {self.head.line}, " if self.head and self.head.header is not None else ""
@@ -171,42 +178,8 @@ class TextLog:
             lines = lines[keep]
         return data, lines
 
-
-def find_delimiter(settings: CsvFormat, line: str) -> str:
-    """Return the separator; ``auto`` takes the one that occurs most often in a line."""
-    if settings.delimiter == WHITESPACE:
-        return " "
-    if settings.delimiter != AUTO:
-        return settings.delimiter
-    counts = {d: line.count(d) for d in DELIMITERS if d != settings.decimal}
-    found = max(counts, key=lambda d: counts[d])
-    return found if counts[found] else " "
-
-
-def _single_blanks(body: bytes) -> bytes:
-    """Replace every run of blanks and tabs by one blank, and none at the ends of lines."""
-    body = body.replace(b"\t", b" ")
-    while b"  " in body:
-        body = body.replace(b"  ", b" ")
-    return body.replace(b"\n ", b"\n").replace(b" \n", b"\n").lstrip(b" ")
-
-
-class _Blocks:
-    """Blocks of whole lines in UTF-8, a newline after each line, with the numbers of the lines.
-
-    ``keep_nul``: whether lines with NUL bytes are kept; otherwise they are refused.
-    """
-
-    def __init__(self, stream: IO[bytes], path: str, size: int, *, keep_nul: bool, keep_open_line: bool) -> None:
-        self.stream, self.path, self.size = stream, path, size
-        self.keep_nul, self.keep_open_line = keep_nul, keep_open_line
-        self.digest = hashlib.sha256()
-        self.line, self.offset = 1, 0
-        self.ends = {"CRLF": 0, "CR": 0, "LF": 0}
-        self.first_notes: list[Note] = []
-        self.last_notes: list[Note] = []
-
-    def __iter__(self) -> Iterator[tuple[bytes, range]]:
+    def _blocks(self) -> Iterator[tuple[bytes, range]]:
+        """Yield blocks of whole lines in UTF-8, a newline after each, with the numbers of the lines."""
         rest = b""
         for chunk in self._chunks():
             end = chunk.rfind(b"\n") + 1
@@ -227,14 +200,6 @@ class _Blocks:
                 numbers = range(numbers.start, numbers.start + data.count(b"\n"))
             if data:
                 yield data, numbers
-
-    def notes(self) -> list[Note]:
-        """Return what was repaired."""
-        ends = []
-        if self.ends["CRLF"] or self.ends["CR"]:
-            listed = ", ".join(f"{count} {name}" for name, count in self.ends.items() if count)
-            ends = [Note("N-EOL", sum(self.ends.values()), 0, 0, f"line ends other than LF alone: {listed}")]
-        return [*self.first_notes, *ends, *self.last_notes]
 
     def _chunks(self) -> Iterator[bytes]:
         """Yield the bytes of the file without byte order mark and without NUL bytes at its end."""
@@ -264,7 +229,7 @@ class _Blocks:
         inside = b"\0" in kept
         if inside and data[1::2].count(0) > len(data) // 8 > data[::2].count(0):
             raise IngestError(f"not a text log but {UTF_16}", self.path, code="utf16")
-        if (not kept and position == 0) or (inside and not self.keep_nul):
+        if (not kept and position == 0) or (inside and self.settings.bad_rows != DROP):
             count = kept.count(b"\0") if kept else len(data)
             message = (
                 f"{count} NUL bytes, the first at byte {position + first}: data that a memory card lost, or UTF-16"
@@ -330,3 +295,22 @@ class _Blocks:
         detail = f"the last line does not end in a newline and may be cut, so it was dropped: {text[:200]!r}"
         self.last_notes.append(Note("N-TAIL", 1, self.line, self.line, detail))
         return data[:end]
+
+
+def find_delimiter(settings: CsvFormat, line: str) -> str:
+    """Return the separator; ``auto`` takes the one that occurs most often in a line."""
+    if settings.delimiter == WHITESPACE:
+        return " "
+    if settings.delimiter != AUTO:
+        return settings.delimiter
+    counts = {d: line.count(d) for d in DELIMITERS if d != settings.decimal}
+    found = max(counts, key=lambda d: counts[d])
+    return found if counts[found] else " "
+
+
+def _single_blanks(body: bytes) -> bytes:
+    """Replace every run of blanks and tabs by one blank, and none at the ends of lines."""
+    body = body.replace(b"\t", b" ")
+    while b"  " in body:
+        body = body.replace(b"  ", b" ")
+    return body.replace(b"\n ", b"\n").replace(b" \n", b"\n").lstrip(b" ")

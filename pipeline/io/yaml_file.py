@@ -62,17 +62,9 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+01234567
 
 
 def read_yaml(path: Path, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401  (whatever the file holds)
-    """Read a YAML file of plain values.
+    """Read a YAML file of plain values, of at most the size ``largest``.
 
-    Parameters
-    ----------
-    largest : int
-        The largest size, as above.
-
-    Raises
-    ------
-    ConfigurationError
-        If it is no regular file, cannot be read, is no YAML, or is beyond the limits.
+    ``ConfigurationError``: it is no regular file, cannot be read, is no YAML, or is beyond the limits.
     """
     return load_yaml(read_text(path, LARGEST_BYTES, "settings"), str(path), largest)
 

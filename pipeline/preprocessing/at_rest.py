@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.errors import IngestError
-    from pipeline.records import Index, Mask, Recording, Values
+    from pipeline.records import Mask, Recording, Values
 
 
 BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
@@ -235,11 +235,15 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
     for recording in recordings:
         if recording.role == "static" or recording.axis is None:
             continue
-        rests = [piece for piece in _still_rows(recording) if len(piece) >= FEWEST_OF_REST]
+        rows = np.concatenate([np.arange(0), *(np.arange(r.start, r.stop) for r in rests_from_table(recording))])
+        angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
+        stepped = np.abs(np.diff(angle)) > STEPPED_DEG  # the table moved between two samples
+        pieces = np.split(rows, np.flatnonzero((np.diff(rows) > 1) | stepped) + 1)
+        rests = [piece for piece in pieces if len(piece) >= FEWEST_OF_REST]
         for sensor in SENSORS:
             reading = recording.reading(sensor)
             if reading is not None:
-                found[sensor] += [_moments(reading[None, rows]) for rows in rests[:: len(rests) // RESTS + 1]]
+                found[sensor] += [_moments(reading[None, rest]) for rest in rests[:: len(rests) // RESTS + 1]]
     return {sensor: np.concatenate(moments) for sensor, moments in found.items()}
 
 
@@ -253,14 +257,6 @@ def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Values:
         scatter, white, _ = np.percentile(_moments(blocks), 10.0, axis=0)
         found.append(np.stack([scatter, white, np.full(3, np.nan)])[None])
     return np.concatenate(found)
-
-
-def _still_rows(recording: Recording) -> list[Index]:
-    """Return the rows of each rest of the table's log, cut where the table stepped between two samples."""
-    rows = np.concatenate([np.arange(0), *(np.arange(r.start, r.stop) for r in rests_from_table(recording))])
-    angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
-    stepped = np.abs(np.diff(angle)) > STEPPED_DEG
-    return np.split(rows, np.flatnonzero((np.diff(rows) > 1) | stepped) + 1)
 
 
 def _moments(blocks: Values) -> Values:

@@ -46,9 +46,7 @@ from pipeline.signal.rests import still_samples
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Recording
+    from pipeline.records import Mask, Recording, Values
 
 FEWEST = 10  # samples, five times the unknowns of an angle
 ACROSS = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
@@ -108,7 +106,7 @@ def found_bench(fit: TurnFit, axis: str) -> Bench | None:
     return bench_of(axis, sense, angle_ahead(a, fit.gravity.cosine, sense * fit.gravity.sine))
 
 
-def angle_ahead(axis: int, p: NDArray[np.float64], q: NDArray[np.float64]) -> float:
+def angle_ahead(axis: int, p: Values, q: Values) -> float:
     """Return the angle of the rotation that turns u and u x a onto p and q with least squares, deg."""
     up, across = UP_AT_ZERO[axis], ACROSS[axis]
     return float(np.degrees(np.arctan2(p @ across - q @ up, p @ up + q @ across)))
@@ -150,20 +148,20 @@ def usual_up(axis: str) -> str:
     return nearest_axis(UP_AT_ZERO[AXES.index(axis)])
 
 
-def signed_axis(name: str) -> NDArray[np.float64]:
+def signed_axis(name: str) -> Values:
     """Return the unit vector of ``+x``, ``-z`` ..: (3,) array."""
     vector = np.zeros(3)
     vector[AXES.index(name[1])] = 1.0 if name[0] == "+" else -1.0
     return vector
 
 
-def nearest_axis(direction: NDArray[np.float64]) -> str:
+def nearest_axis(direction: Values) -> str:
     """Return the signed axis that a direction is nearest to."""
     largest = int(np.argmax(np.abs(direction)))
     return f"{'+' if direction[largest] > 0.0 else '-'}{AXES[largest]}"
 
 
-def off_axis_deg(direction: NDArray[np.float64]) -> float:
+def off_axis_deg(direction: Values) -> float:
     """Return the angle between a direction and the signed axis that it is nearest to, deg."""
     return float(np.degrees(np.arccos(np.clip(np.max(np.abs(direction)) / np.linalg.norm(direction), -1.0, 1.0))))
 
@@ -171,9 +169,9 @@ def off_axis_deg(direction: NDArray[np.float64]) -> float:
 class Gravity(NamedTuple):
     """c, p and q above: (3,) arrays, g."""
 
-    constant: NDArray[np.float64]
-    cosine: NDArray[np.float64]
-    sine: NDArray[np.float64]
+    constant: Values
+    cosine: Values
+    sine: Values
 
 
 @dataclass(frozen=True)
@@ -181,20 +179,20 @@ class TurnFit:
     """Evidence of one recording."""
 
     gravity: Gravity | None  # None where the angle does not cover enough
-    gain: NDArray[np.float64] | None  # (3,), k above; None where the rate does not tell
+    gain: Values | None  # (3,), k above; None where the rate does not tell
     mean_rate: float  # deg/s, of the angle over the samples; with a time offset it is a part of the zero
     arc: float  # deg
     unknown: str = ""  # why gravity tells nothing
 
     @cached_property
-    def turn_axis(self) -> NDArray[np.float64] | None:
+    def turn_axis(self) -> Values | None:
         """Unit vector about which the unit turns as the angle grows, by gravity: (3,) array, or None."""
         if self.gravity is None or self.vertical is not None:
             return None
         return unit(np.cross(self.gravity.sine, self.gravity.cosine))
 
     @cached_property
-    def vertical(self) -> NDArray[np.float64] | None:
+    def vertical(self) -> Values | None:
         """Direction of gravity's reaction where the turn leaves it as it is (a vertical axis): (3,) array, or None."""
         if self.gravity is None:
             return None
@@ -236,17 +234,13 @@ def fit_turn(recording: Recording) -> TurnFit:
     return TurnFit(Gravity(constant, found[0], found[1]), gain, mean_rate, arc)
 
 
-def _of_rate(rate: NDArray[np.float64] | None, keep: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _of_rate(rate: Values | None, keep: Mask) -> Values:
     """Return 1, r, |r| and r^2, with the largest |r| as unit: (n, at most 4) array."""
-    ones = np.ones(int(keep.sum()))
-    largest = 0.0 if rate is None else float(np.max(np.abs(rate), initial=0.0))
-    if rate is None or largest == 0.0:
-        return ones[:, None]
-    r = rate[keep] / largest
-    return np.column_stack([ones, r, np.abs(r), r * r])
+    r = np.zeros(int(keep.sum())) if rate is None else rate[keep] / (np.max(np.abs(rate), initial=0.0) or 1.0)
+    return np.column_stack([np.ones_like(r), r, np.abs(r), r * r][: 4 if np.any(r) else 1])
 
 
-def _gain(recording: Recording, rate: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+def _gain(recording: Recording, rate: Values | None) -> Values | None:
     """Return k above where a gyroscope axis follows the rate."""
     if recording.gyroscope is None or rate is None:
         return None
@@ -264,6 +258,6 @@ def _gain(recording: Recording, rate: NDArray[np.float64] | None) -> NDArray[np.
     return np.asarray(gain) if alike >= ALIKE else None
 
 
-def unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def unit(vector: Values) -> Values:
     """Return a vector of length 1."""
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))

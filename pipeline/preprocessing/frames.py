@@ -30,13 +30,9 @@ from pipeline.records import AXES
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.io.gravity_rotation import Move
     from pipeline.preprocessing.bench import TurnFit
-    from pipeline.records import Recording
-
-    Matrix = NDArray[np.float64]
+    from pipeline.records import Recording, Values
 
 # From the nearest axis: beyond cross-axis sensitivity and seats, below the 45 deg between two axes.
 CLEAR_DEG = 30.0
@@ -44,7 +40,7 @@ FEWEST_MISSED, CLEARLY_FEWER = 2, 4  # moves that gravity does not follow: one m
 
 
 def check_frames(
-    turns: Sequence[tuple[Recording, TurnFit]], accelerometer: Matrix | None, maps: Mapping[str, Sequence[str]]
+    turns: Sequence[tuple[Recording, TurnFit]], accelerometer: Values | None, maps: Mapping[str, Sequence[str]]
 ) -> None:
     """Refuse turns in which gravity and the gyroscope turn about different axes; ``accelerometer`` is M_a above."""
     seen: list[tuple[Recording, str, str]] = []
@@ -95,12 +91,12 @@ def check_frames_by_hand(recording: Recording, maps: Mapping[str, Sequence[str]]
     )
 
 
-def _missed(moves: Sequence[Move], D: Matrix) -> int:
+def _missed(moves: Sequence[Move], D: Values) -> int:
     left = misfits_deg([replace(m, turns=m.turns @ D.T) for m in moves], [1.0])
     return int(np.sum(left > FAILS_DEG))
 
 
-def signed_permutations() -> list[Matrix]:
+def signed_permutations() -> list[Values]:
     """Return the 48 maps of axes onto signed axes: (3, 3) arrays."""
     return [
         axis_matrix([s + a for s, a in zip(signs, order, strict=True)])
@@ -109,7 +105,7 @@ def signed_permutations() -> list[Matrix]:
     ]
 
 
-def _between(seen: Sequence[tuple[Recording, str, str]]) -> Matrix | None:
+def _between(seen: Sequence[tuple[Recording, str, str]]) -> Values | None:
     """Return D where all three axes were turned about, and no two recordings disagree."""
     pairs = {(k[1], n if k[0] == "+" else n.translate(str.maketrans("+-", "-+"))) for _, n, k in seen}
     if len(pairs) != len(AXES) or {k for k, _ in pairs} != set(AXES):
@@ -118,7 +114,7 @@ def _between(seen: Sequence[tuple[Recording, str, str]]) -> Matrix | None:
     return D if abs(np.linalg.det(D)) > 0.5 else None
 
 
-def nearest_permutation(total: Matrix) -> Matrix | None:
+def nearest_permutation(total: Values) -> Values | None:
     """Return the signed permutation that a matrix of the order of 1 is near to, or None."""
     scale = np.linalg.norm(total, axis=0)
     if np.min(scale) < 0.25:
@@ -127,12 +123,12 @@ def nearest_permutation(total: Matrix) -> Matrix | None:
     return near[0] if near else None
 
 
-def as_map(matrix: Matrix) -> str:
+def as_map(matrix: Values) -> str:
     """Return a signed permutation as an axis map is written."""
     return f"[{','.join(nearest_axis(column) for column in np.asarray(matrix).T)}]"
 
 
-def _cure(D: Matrix | None, accelerometer: Matrix | None, maps: Mapping[str, Sequence[str]]) -> str:
+def _cure(D: Values | None, accelerometer: Values | None, maps: Mapping[str, Sequence[str]]) -> str:
     """Return which sensor is mirrored or turned, as far as it is known, and the map that would be right."""
     now = {sensor: axis_matrix(entries) for sensor, entries in maps.items()}
     if D is None:
@@ -155,7 +151,7 @@ def _cure(D: Matrix | None, accelerometer: Matrix | None, maps: Mapping[str, Seq
     return f"by the faces that are stated {which}: set {' and '.join(_settings(right, now))}"
 
 
-def _settings(right: Mapping[str, Matrix], now: Mapping[str, Matrix]) -> list[str]:
+def _settings(right: Mapping[str, Values], now: Mapping[str, Values]) -> list[str]:
     """Return the settings that bring the maps to the right ones."""
     if all(np.array_equal(right[s], right["gyroscope"]) and not np.array_equal(right[s], now[s]) for s in right):
         return [f"sensor.axis_map={as_map(right['gyroscope'])}"]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.channel_table import axis_maps, axis_matrix
+from pipeline.io.channel_table import STRAIGHT, axis_maps, axis_matrix
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.preprocessing.bench import (
     ACROSS,
@@ -42,12 +42,9 @@ from pipeline.records import AXES, Note, level_in_body
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.preprocessing.bench import Bench, TurnFit
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
 
-UNMAPPED = ["+x", "+y", "+z"]
 TOLERANCE_DEG = 5.0  # default of procedure.mounting_tolerance_deg: beyond misalignments and seats of a careful bench
 TIME_OFFSET_S = 0.04  # largest plausible one where the sensor's config states none: as in configs/sensor/*.yaml
 AGREES_G = 0.7  # of 1 g, within 45 deg of the axis
@@ -69,11 +66,16 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     for recording in recordings:
         if recording.role == "rests":
             check_frames_by_hand(recording, maps)
-    tolerance = _tolerance(procedure, table, sensor)
+    effects = (sensor.get("accelerometer") or {}).get("effects") or {}
+    tolerance = _Tolerance(
+        float(procedure.get("mounting_tolerance_deg") or TOLERANCE_DEG) + 3.0 * float(table.get("seat_deg") or 0.0),
+        float(effects.get("time_offset") or TIME_OFFSET_S),
+        float(table.get("rate_accuracy") or 0.0) if table.get("motion") == "commanded" else 0.0,
+    )
     departures = {t.name: d for t in known if (d := _departure(t, tolerance)) is not None}
     refused = [d for d in departures.values() if d.bench is None]
     found = [replace(t, found=departures[t.name].bench) if t.name in departures else t for t in known]
-    mapped = any(list(axes) != UNMAPPED for axes in maps.values())
+    mapped = any(axes != STRAIGHT for axes in maps.values())
     turned = any(d.code in {"wrong_axis", "wrong_face"} for d in departures.values())
     if _negated(found, tolerance.angle_deg) or (mapped and turned):  # an axis map that is stated may be wrong
         refused = list(departures.values())
@@ -85,7 +87,10 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
         else ""
     )
     if refused:
-        raise _refusal(refused, hint)
+        first, *others = refused
+        also = f"; likewise refused: {', '.join(d.turn.name for d in others)}" if others else ""
+        file = first.turn.recording.source.get("file")
+        raise IngestError(first.problem + also, file, code=first.code, hint=hint)
     applied = {} if seated else zeros
     used = {t.name: _as_found(t, departures.get(t.name), applied) for t in known}
     recordings = [_turned_attitude(r) if departures else r for r in recordings]
@@ -96,15 +101,6 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     ]
 
 
-def _tolerance(procedure: Mapping[str, Any], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> _Tolerance:
-    limits = (sensor.get("accelerometer") or {}).get("effects") or {}
-    return _Tolerance(
-        float(procedure.get("mounting_tolerance_deg") or TOLERANCE_DEG) + 3.0 * float(table.get("seat_deg") or 0.0),
-        float(limits.get("time_offset") or TIME_OFFSET_S),
-        float(table.get("rate_accuracy") or 0.0) if table.get("motion") == "commanded" else 0.0,
-    )
-
-
 def _turn(recording: Recording, entries: Mapping[str, Any], table: Mapping[str, Any]) -> Turn | None:
     if recording.axis is None or (recording.table_angle is None and recording.table_rate is None):
         return None
@@ -113,7 +109,7 @@ def _turn(recording: Recording, entries: Mapping[str, Any], table: Mapping[str, 
     return Turn(recording, stated, fit, found_bench(fit, recording.axis), recording.name in entries)
 
 
-def _accelerometer_axes(turns: Sequence[Turn]) -> NDArray[np.float64] | None:
+def _accelerometer_axes(turns: Sequence[Turn]) -> Values | None:
     """Return the signed permutation that takes the stated faces to what the accelerometer reads, if one does."""
     total, count = np.zeros((3, 3)), np.zeros(3)
     seen = []
@@ -132,17 +128,11 @@ def _accelerometer_axes(turns: Sequence[Turn]) -> NDArray[np.float64] | None:
     return found
 
 
-def _refusal(departures: Sequence[_Departure], hint: str) -> IngestError:
-    first, *others = departures
-    also = f"; likewise refused: {', '.join(d.turn.name for d in others)}" if others else ""
-    return IngestError(first.problem + also, first.turn.recording.source.get("file"), code=first.code, hint=hint)
-
-
 def _hint(
     departures: Sequence[_Departure],
     turns: int,
     zeros: Mapping[str, float],
-    accelerometer: NDArray[np.float64] | None,
+    accelerometer: Values | None,
     maps: Mapping[str, Sequence[str]],
     *,
     seated: bool,

@@ -249,16 +249,12 @@ def _unit(value: float, units: Units) -> str:
     return next((what for factor, what in units if abs(value / factor - 1.0) <= ALIKE), "")
 
 
-def _wrong(recording: Recording, name: str, what: str, seen: str, keys: str) -> IngestError:
-    whole = place(recording, 0, recording.samples - 1)
-    return refusal(recording, "reference_scale", f"{name} {what}: over {whole} {seen}", f"correct {keys}")
-
-
 def _wrong_angle(recording: Recording, limits: Limits, factor: float, against: str) -> IngestError:
-    what = _unit(factor, ANGLE_UNITS) or f"is {factor:.4g} times what it should be"
-    seen = f"it turns {factor:.4g} times as far as {against} says"
-    name, key = limits.column(recording, "table_angle"), "ingest.csv.columns.table_angle.unit"
-    return _wrong(recording, name, what, seen, key)
+    name, what = limits.column(recording, "table_angle"), _unit(factor, ANGLE_UNITS)
+    whole = place(recording, 0, recording.samples - 1)
+    what = what or f"is {factor:.4g} times what it should be"
+    message = f"{name} {what}: over {whole} it turns {factor:.4g} times as far as {against} says"
+    return refusal(recording, "reference_scale", message, "correct ingest.csv.columns.table_angle.unit")
 
 
 def _wrong_rate(recording: Recording, limits: Limits, ratio: _Ratio, against: str, *, gyro_agrees: bool) -> IngestError:
@@ -270,7 +266,9 @@ def _wrong_rate(recording: Recording, limits: Limits, ratio: _Ratio, against: st
     if gyro_agrees and what.startswith("looks"):
         keys += " and those of gyro_x, gyro_y, gyro_z"
         name, what = f"{name} and {limits.column(recording, 'gyroscope')}", what.replace("looks", "look", 1)
-    return _wrong(recording, name, what, f"the rate sums up to {ratio.value:.4g} times the angle by {against}", keys)
+    seen = f"the rate sums up to {ratio.value:.4g} times the angle by {against}"
+    whole = place(recording, 0, recording.samples - 1)
+    return refusal(recording, "reference_scale", f"{name} {what}: over {whole} {seen}", f"correct {keys}")
 
 
 def _wrong_time(recording: Recording, limits: Limits, ratio: _Ratio, seen: str) -> IngestError:

@@ -35,12 +35,9 @@ from pipeline.records import AXES, Note, motion_at_rest
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.preprocessing.bench import Bench, Gravity
     from pipeline.preprocessing.mounting import Turn
-
-    Vector = NDArray[np.float64]
+    from pipeline.records import Values
 
 # Seats smaller than this are left to the diagnosis: hidden table effects of the blind study (tilt 0.26 deg, leans 0.13
 # deg) reach 0.2 deg.
@@ -71,11 +68,11 @@ class _Conventional:
         return AXES.index(self.bench.axis)
 
     @property
-    def ideal(self) -> tuple[Vector, Vector]:
+    def ideal(self) -> tuple[Values, Values]:
         """Vectors p and q of an ideal sensor: u and u x a."""
         return UP_AT_ZERO[self.axis], ACROSS[self.axis]
 
-    def normal(self, K: Vector) -> Vector:
+    def normal(self, K: Values) -> Values:
         """Return the turn axis in the frame of K, ``K^T (q x p)`` with length 1: (3,) array."""
         return unit(K.T @ np.cross(self.gravity.sine, self.gravity.cosine))
 
@@ -84,9 +81,9 @@ class _Conventional:
 class _Seats:
     """How the unit sits in the turns for the accelerometer."""
 
-    K: Vector  # with the common seat that is left where zeros explain the rest, else with the mean of the seats
-    seats: Vector  # (n, 3), deg, rotation in each turn against the mean of all
-    zeros: Vector | None  # (n,), deg, of each turn, where one common seat and the zeros explain the turns
+    K: Values  # with the common seat that is left where zeros explain the rest, else with the mean of the seats
+    seats: Values  # (n, 3), deg, rotation in each turn against the mean of all
+    zeros: Values | None  # (n,), deg, of each turn, where one common seat and the zeros explain the turns
 
 
 def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
@@ -111,7 +108,7 @@ def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
     return _Seats(K @ turn_by_vector(np.radians(common)).T, seats - seats.mean(axis=0), zeros)
 
 
-def _zeros(turns: Sequence[_Conventional], seats: Vector) -> tuple[Vector, Vector | None]:
+def _zeros(turns: Sequence[_Conventional], seats: Values) -> tuple[Values, Values | None]:
     """Return a common seat and the zeros that explain the other seats, or their mean and None where none do."""
     design = np.zeros((seats.size, 3 + len(turns)))
     for k, turn in enumerate(turns):
@@ -124,7 +121,7 @@ def _zeros(turns: Sequence[_Conventional], seats: Vector) -> tuple[Vector, Vecto
     return np.asarray(seats.mean(axis=0), np.float64), None
 
 
-def _table_explains(turns: Sequence[_Conventional], K: Vector, limits: Sequence[float]) -> bool:
+def _table_explains(turns: Sequence[_Conventional], K: Values, limits: Sequence[float]) -> bool:
     """Return whether tilt, leaning axes and a time offset within limits explain the turns, and seats do not better."""
     tilt, lean = (np.stack([_columns_of(name, t) for t in turns]) for name in TABLE)
     late = np.stack([_offset_columns(t) for t in turns])
@@ -141,7 +138,7 @@ def _table_explains(turns: Sequence[_Conventional], K: Vector, limits: Sequence[
     return min(leaning, both + OF_TWO_MORE) < min(FITS, level_seats - CLEARLY)
 
 
-def _fit(turns: Sequence[_Conventional], K: Vector, columns: Vector, limits: Sequence[float]) -> float:
+def _fit(turns: Sequence[_Conventional], K: Values, columns: Values, limits: Sequence[float]) -> float:
     """Return chi-square of K, b and parameters of further columns; infinity where one exceeds its limit.
 
     ``columns`` is (n, 3, 3, m): of each turn c, p and q with K the unit matrix.
@@ -160,7 +157,7 @@ def _fit(turns: Sequence[_Conventional], K: Vector, columns: Vector, limits: Seq
     return float("inf") if exceeded else float(np.sum((y - A @ values) ** 2))
 
 
-def _columns_of(name: str, turn: _Conventional) -> Vector:
+def _columns_of(name: str, turn: _Conventional) -> Values:
     """Return the derivative of c, p and q by the m parameters of a table effect, 1/deg: (3, 3, m) array."""
     force, level = (turn_about_axis(v, turn.axis, -QUARTERS) for v in (turn.ideal[0], level_at_zero(turn.axis)))
     rest = motion_at_rest(QUARTERS)
@@ -172,13 +169,13 @@ def _columns_of(name: str, turn: _Conventional) -> Vector:
     return np.stack([(at_0 + at_90 + at_180 + at_270) / 4.0, (at_0 - at_180) / 2.0, (at_90 - at_270) / 2.0])
 
 
-def _offset_columns(turn: _Conventional) -> Vector:
+def _offset_columns(turn: _Conventional) -> Values:
     """Return the derivative by a time offset, 1/s: (3, 3, 1) array; the angle is ahead by offset times mean rate."""
     (up, across), mean_rate = turn.ideal, turn.bench.sense * turn.turn.fit.mean_rate
     return np.asarray(np.radians(mean_rate) * np.stack([np.zeros(3), across, -up])[..., None])
 
 
-def _axis_off_deg(turn: _Conventional, K: Vector, others: Sequence[_Conventional]) -> Vector:
+def _axis_off_deg(turn: _Conventional, K: Values, others: Sequence[_Conventional]) -> Values:
     """Return the rotation of a turn axis against the body axis, or that of another turn about it: (3,) array, deg.
 
     The smaller of the two: where the axes of the table lean, the gyroscope's lean with the accelerometer's.
@@ -188,7 +185,7 @@ def _axis_off_deg(turn: _Conventional, K: Vector, others: Sequence[_Conventional
     return min(off, key=lambda v: float(np.linalg.norm(v)))
 
 
-def _letters(vector: Vector) -> str:
+def _letters(vector: Values) -> str:
     return ", ".join(f"{v:+.2f} deg about {a}" for a, v in zip(AXES, vector, strict=True))
 
 

@@ -141,10 +141,10 @@ def find_columns(layout: TextLayout) -> Columns:
         channel = _other_channel(layout.names[i], w)
         low, high = TEMPERATURE_RANGE
         values = layout.numbers[i]
-        possible = channel != "temperature" or low < float(np.median(values)) < high or whole(values)
-        if channel and channel not in found.others and possible:
+        possible = low < float(np.median(values)) < high
+        if channel and channel not in found.others and (channel != "temperature" or possible or whole(values)):
             found.others[channel] = i
-        elif w == ["t"] and _is_temperature(values):
+        elif w == ["t"] and possible and not _advances(values):  # a column called T, which may be a time
             found.others.setdefault("temperature", i)
     texts = [n for i, n in enumerate(layout.names) if i not in layout.numbers]
     if texts:
@@ -225,12 +225,6 @@ def _advances(values: Values) -> bool:
     """Return whether numbers rise far more often than they fall, as times of several sessions do."""
     steps = np.diff(values)
     return int(np.count_nonzero(steps > 0)) > FEWEST_RISES * int(np.count_nonzero(steps < 0))
-
-
-def _is_temperature(values: Values) -> bool:
-    """Return whether a column called T, which may be a time, holds degC."""
-    low, high = TEMPERATURE_RANGE
-    return not _advances(values) and low < float(np.median(values)) < high
 
 
 def _triad(words: dict[int, list[str]]) -> Triad | None:
@@ -332,8 +326,9 @@ def find_layout(data: bytes, path: str) -> TextLayout:
     if width < FEWEST_COLUMNS or len(rows) < FEWEST_ROWS or not numbers:
         first = " / ".join(lines[:3])[:150]
         raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
-    stated = ((found, line.strip()) for line in lines[:start] if RATE_KEY.search(line) and (found := _rate_of(line)))
-    rate_hz, rate_line = next(stated, (None, ""))
+    stated = ((STATED_NUMBER.search(line), line.strip()) for line in lines[:start] if RATE_KEY.search(line))
+    rates = ((float(found.group(1)), line) for found, line in stated if found)
+    rate_hz, rate_line = next((rate for rate in rates if rate[0]), (None, ""))
     return TextLayout(
         path, separator, decimal, skip, names != _numbered(len(names)), comment, names, numbers,
         rate_hz, rate_line, len(kept) - len(rows),
@@ -383,8 +378,3 @@ def _numbers(rows: list[list[str]], decimal: str) -> dict[int, Values]:
         if np.isfinite(column).all():
             out[index] = column
     return out
-
-
-def _rate_of(line: str) -> float:
-    found = STATED_NUMBER.search(line)
-    return float(found.group(1)) if found else 0.0

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.gravity_rotation import interval_of, moves_of
+from pipeline.io.gravity_rotation import Move, interval_of, moves_of
 from pipeline.io.ingest_settings import AUTO
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
 from pipeline.profile_detection.columns import (
@@ -26,7 +26,7 @@ from pipeline.profile_detection.columns import (
     stated_unit,
     words_of,
 )
-from pipeline.profile_detection.topics import TopicLayout
+from pipeline.profile_detection.recording_facts import TopicLayout
 from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
     OF_SENSOR,
@@ -45,7 +45,6 @@ from pipeline.profile_detection.unit_guesses import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.io.gravity_rotation import Move
     from pipeline.profile_detection.columns import TextLayout
     from pipeline.records import Values
 
@@ -229,7 +228,12 @@ def _gyroscope(
     parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: dict[str, Any]
 ) -> Guess:
     """Return the unit of the rates by the table, by gravity, or of counts by the sensor's configuration."""
-    moves, why_none = _moves(force, rate, time_s, steady=parts[0].steady)
+    moves, why_none = list[Move](), "no accelerometer beside it to tell the unit by"
+    if force is not None and not parts[0].steady:
+        why_none = "the rows are not one series in time, so the turns of gravity cannot tell the unit"
+    elif force is not None:
+        moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
+        why_none = "" if moves else "no move between rests rotates gravity, which would show the unit"
     by_table = _by_table(next(c for c in parts if "gyroscope" in c.triads), rate, time_s)
     guess = by_table or rate_unit(rate, moves, why_none, timed=time_s is not None)
     if guess.entry["unit"] == COUNTS and guess.entry["counts_per_unit"] == UNKNOWN:
@@ -292,16 +296,6 @@ def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | Non
     proposal.columns[0]["time"] = {"column": key, "unit": COUNTS, "counts_per_unit": UNKNOWN if rate is None else rate}
     proposal.evidence["time"] = evidence
     return None if rate is None else (count - count[0]) / rate
-
-
-def _moves(force: Values | None, rate: Values, time_s: Values | None, *, steady: bool) -> tuple[list[Move], str]:
-    """Return the moves in which gravity turns, and why there are none."""
-    if force is None:
-        return [], "no accelerometer beside it to tell the unit by"
-    if not steady:
-        return [], "the rows are not one series in time, so the turns of gravity cannot tell the unit"
-    moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
-    return moves, "" if moves else "no move between rests rotates gravity, which would show the unit"
 
 
 def _by_table(columns: Columns, rate: Values, time_s: Values | None) -> Guess | None:

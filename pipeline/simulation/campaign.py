@@ -13,6 +13,7 @@ import csv
 import io
 import json
 from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,8 +66,11 @@ def write_campaign(
         path = directory / "configs" / "procedure" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-    for number, unit in enumerate([] if sheet_only else description.units):
-        origin = _origin(description, unit, number)
+    names = [unit.unit for unit in description.units]
+    for unit in () if sheet_only else description.units:
+        if (unit.copy_of or unit.unit) not in names:
+            raise ConfigurationError(f"unit {unit.unit}: copy_of names {unit.copy_of}, which is not among the units")
+        origin = names.index(unit.copy_of or unit.unit)
         original = replace(description.units[origin], table_log=unit.table_log)
         recordings, truth = simulate_unit(original, description.seed, origin)
         sheet = read_config("sensor", unit.sensor)
@@ -74,7 +78,9 @@ def write_campaign(
         folder.mkdir(parents=True, exist_ok=True)
         for recording in recordings:
             _write_recording(folder, recording, unit.format, sheet)
-        _write_json(directory / "truth" / f"{unit.unit}.json", {**truth, "unit": unit.unit})
+        path = directory / "truth" / f"{unit.unit}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({**truth, "unit": unit.unit}, indent=1) + "\n", encoding="utf-8")
         progress(f"{unit.unit}: {sum(r.samples for r in recordings)} samples in {len(recordings)} recordings")
     (directory / "units.csv").write_text(_table(_sheet_rows(description)), encoding="utf-8")
     if not (directory / "campaign.yaml").exists():
@@ -82,22 +88,19 @@ def write_campaign(
 
 
 def _sheet_rows(description: Description) -> list[dict[str, Any]]:
-    """Return the rows of ``units.csv``: of the units, of their variants, then the further ones."""
-    rows = [
+    """Return the rows of ``units.csv``: units, their variants from the same recordings, further rows."""
+    rows: list[dict[str, Any]] = [
         {"unit": unit.unit, "sensor": unit.sensor, "table": unit.table, "procedure": unit.procedure}
         | columns_of(unit)
         | unit.columns
         for unit in description.units
     ]
-    variants = [_variant(row, variant) for variant in description.variants for row in rows]
+    variants = []
+    for variant, row in product(description.variants, rows):
+        changed = {**row, **(variant.get("columns") or {}), "unit": f"{row['unit']}{variant['suffix']}"}
+        overrides = [changed.get("overrides"), f"procedure.folder=raw/{row['unit']}"]
+        variants.append(changed | {"overrides": "; ".join(o for o in overrides if o)})
     return rows + variants + [{str(k): v for k, v in row.items()} for row in description.rows]
-
-
-def _variant(row: dict[str, Any], variant: dict[str, Any]) -> dict[str, Any]:
-    """Return a unit's row once more, with other columns, from the same recordings."""
-    changed = {**row, **(variant.get("columns") or {}), "unit": f"{row['unit']}{variant['suffix']}"}
-    overrides = [changed.get("overrides"), f"procedure.folder=raw/{row['unit']}"]
-    return {**changed, "overrides": "; ".join(o for o in overrides if o)}
 
 
 def simulate_unit(
@@ -193,16 +196,6 @@ def _truth(sensor: SimulatedSensor, effects: Hidden, interval: float) -> dict[st
     }
 
 
-def _origin(description: Description, unit: UnitDescription, number: int) -> int:
-    """Return the number of the unit that makes the recordings."""
-    if unit.copy_of is None:
-        return number
-    names = [u.unit for u in description.units]
-    if unit.copy_of not in names:
-        raise ConfigurationError(f"unit {unit.unit}: copy_of names {unit.copy_of}, which is not among the units")
-    return names.index(unit.copy_of)
-
-
 def _table(rows: list[dict[str, Any]]) -> str:
     """Return units.csv: the known columns that any row has, then the others."""
     found = dict.fromkeys(key for row in rows for key in row)
@@ -212,8 +205,3 @@ def _table(rows: list[dict[str, Any]]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

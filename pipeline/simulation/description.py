@@ -145,15 +145,7 @@ class Description:
 
 
 def read_description(path: Path) -> Description:
-    """Read a ``simulation.yaml``.
-
-    Raises
-    ------
-    MissingInputError
-        If the file does not exist.
-    ConfigurationError
-        If it holds what is not known.
-    """
+    """Read a ``simulation.yaml``; ``MissingInputError``: there is none, ``ConfigurationError``: a key is not known."""
     return description_from(_read_mapping(path), str(path))
 
 
@@ -201,13 +193,7 @@ def _config(group: str, name: str) -> dict[str, Any]:
 
 
 def read_option(group: str, name: str) -> dict[str, Any]:
-    """Read one configuration of a group as its file states it, without composing it.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is none of that name.
-    """
+    """Read one configuration of a group as its file states it; ``ConfigurationError``: there is none of that name."""
     path = CONFIGS / group / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
@@ -216,16 +202,14 @@ def read_option(group: str, name: str) -> dict[str, Any]:
 
 
 def _counted(entry: dict[str, Any]) -> list[UnitDescription]:
+    """Return the units of an entry; with a count, its name is a prefix."""
     count = entry.get("count", 1)
     if count == 1:
         return [UnitDescription(**entry)]
-    width = max(3, len(str(count)))
-    units = []
-    for number in range(1, count + 1):
-        name = f"{entry['unit']}{number:0{width}d}"
-        columns = {"serial": name, "lot": f"L{(number - 1) // UNITS_OF_A_LOT + 1}", **entry.get("columns", {})}
-        units.append(UnitDescription(**{**entry, "unit": name, "count": 1, "columns": columns}))
-    return units
+    names = [f"{entry['unit']}{number:0{max(3, len(str(count)))}d}" for number in range(1, count + 1)]
+    lots = [{"serial": name, "lot": f"L{k // UNITS_OF_A_LOT + 1}"} for k, name in enumerate(names)]
+    own = [{"unit": name, "columns": lot | entry.get("columns", {})} for name, lot in zip(names, lots, strict=True)]
+    return [UnitDescription(**{**entry, "count": 1, **each}) for each in own]
 
 
 def _refuse_unknown(data: dict[str, Any], known: set[str], origin: str) -> None:

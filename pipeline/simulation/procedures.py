@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import ConfigurationError
+from pipeline.io.commanded_motion import Program
 from pipeline.records import AXES
-from pipeline.simulation.rate_table import ProgramBuilder
+from pipeline.simulation.rate_table import rest, turn, turn_with_plateau
 from pipeline.simulation.trajectory import (
-    COMES_UP_S,
-    Eased,
     Gimbals,
     Moves,
     Planned,
@@ -29,7 +28,7 @@ from pipeline.simulation.trajectory import (
     orientations_24,
     random_attitudes,
     random_gimbals,
-    rotation_about,
+    rotation_by,
     six_positions,
 )
 
@@ -92,16 +91,17 @@ class Course:
                 "course: give at least one rate in rates_dps, 2 positions, and steps up to 360 deg"
             )
 
+    @property
+    def signs(self) -> tuple[float, ...]:
+        """Directions of the turns at each rate."""
+        return (1.0, -1.0)[: 1 + self.both_directions]
+
 
 def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy: float = 0.0) -> list[Planned]:
     """Return the recordings of a procedure, in the order in which they are made.
 
-    Without a table, attitudes are set with the standard deviation ``hand_accuracy``, deg.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is no such procedure.
+    Without a table, attitudes are set with the standard deviation ``hand_accuracy``, deg. ``ConfigurationError``: there
+    is no such procedure.
     """
     if procedure in TABLE_PROCEDURES:
         planned = _turns(course) + _heldout(course, rng)
@@ -131,11 +131,7 @@ def fit_to_samples(procedure: str, course: Course, samples: int, interval: float
     """Return the course with dwells, rests and held-out motion of a length that gives about ``samples`` rows a unit.
 
     Unless ``keep_step``, a larger step of stop-and-go may be taken for a short recording. ``interval``: s.
-
-    Raises
-    ------
-    ConfigurationError
-        If the procedure cannot be run in so few samples.
+    ``ConfigurationError``: the procedure cannot be run in so few samples.
     """
     target = samples * interval
 
@@ -164,30 +160,24 @@ def fit_to_samples(procedure: str, course: Course, samples: int, interval: float
 
 def _turns(course: Course) -> list[Planned]:
     accelerometer = [Planned(f"accel_{a}", "accelerometer", i, _accelerometer(i, course)) for i, a in enumerate(AXES)]
-    gyroscope = [Planned(f"gyro_{a}", "gyroscope", i, _gyroscope(i, course)) for i, a in enumerate(AXES)]
+    turns = [_continuous(i, course, course.warm_up_rest_s, course.rates_dps) for i in range(3)]
+    gyroscope = [Planned(f"gyro_{a}", "gyroscope", i, t) for i, (a, t) in enumerate(zip(AXES, turns, strict=True))]
     return accelerometer + gyroscope
 
 
 def _accelerometer(axis: int, course: Course) -> Turn:
-    builder = ProgramBuilder(course.acceleration_dps2)
     if course.accelerometer_rates_dps:
-        return _continuous(axis, course, builder.rest(course.rest_s), course.accelerometer_rates_dps)
-    builder.rest(course.dwell_s)
-    for _ in range(round(360.0 / course.step_deg)):
-        builder.turn(course.step_deg, course.step_rate_dps).rest(course.dwell_s)
-    return Turn(axis, builder.build())
+        return _continuous(axis, course, course.rest_s, course.accelerometer_rates_dps)
+    stay, step = rest(course.dwell_s), turn(course.step_deg, course.step_rate_dps, course.acceleration_dps2)
+    return Turn(axis, Program([stay, *[step, stay] * round(360.0 / course.step_deg)]))
 
 
-def _gyroscope(axis: int, course: Course) -> Turn:
-    builder = ProgramBuilder(course.acceleration_dps2).rest(course.warm_up_rest_s)
-    return _continuous(axis, course, builder, course.rates_dps)
-
-
-def _continuous(axis: int, course: Course, builder: ProgramBuilder, rates: Sequence[float]) -> Turn:
-    for rate in rates:
-        for sign in (1.0, -1.0)[: 1 + course.both_directions]:
-            builder.turn_with_plateau(sign * 360.0 * course.turns, rate).rest(course.rest_s)
-    return Turn(axis, builder.build())
+def _continuous(axis: int, course: Course, before_s: float, rates: Sequence[float]) -> Turn:
+    """Return turns at full rates about an axis, after a rest of ``before_s``."""
+    steps = [rest(before_s)]
+    for rate, sign in product(rates, course.signs):
+        steps += [turn_with_plateau(sign * 360.0 * course.turns, rate, course.acceleration_dps2), rest(course.rest_s)]
+    return Turn(axis, Program(steps))
 
 
 def _heldout(course: Course, rng: np.random.Generator) -> list[Planned]:
@@ -200,22 +190,18 @@ def _heldout(course: Course, rng: np.random.Generator) -> list[Planned]:
 def _static(course: Course) -> list[Planned]:
     if course.static_s <= 0.0:
         return []
-    program = ProgramBuilder(course.acceleration_dps2).rest(course.static_s).build()
-    return [Planned("static", "static", None, Moves(program, np.eye(3)[:1]))]
+    return [Planned("static", "static", None, Moves(Program([rest(course.static_s)]), np.eye(3)[:1]))]
 
 
 def _rests(attitudes: Values, course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
     """Return rests in the attitudes, set within ``accuracy`` deg, and the shortest move from each to the next."""
-    tilt = accuracy * rng.standard_normal((len(attitudes), 3))
-    size = np.linalg.norm(tilt, axis=1)
-    attitudes = attitudes @ rotation_about(tilt / np.where(size > 0.0, size, 1.0)[:, None], size)
-    builder = ProgramBuilder(course.acceleration_dps2).rest(max(course.warm_up_rest_s, course.dwell_s))
-    axes = []
+    attitudes = attitudes @ rotation_by(accuracy * rng.standard_normal((len(attitudes), 3)))
+    steps, axes = [rest(max(course.warm_up_rest_s, course.dwell_s))], []
     for before, after in pairwise(attitudes):
         axis, angle = axis_and_angle(before.T @ after)
-        builder.turn(angle, course.step_rate_dps).rest(course.dwell_s)
+        steps += [turn(angle, course.step_rate_dps, course.acceleration_dps2), rest(course.dwell_s)]
         axes.append(axis)
-    return Moves(builder.build(), np.array(axes), attitudes[0])
+    return Moves(Program(steps), np.array(axes), attitudes[0])
 
 
 def _with_transits(planned: Sequence[Planned], course: Course) -> list[Planned]:
@@ -223,56 +209,38 @@ def _with_transits(planned: Sequence[Planned], course: Course) -> list[Planned]:
 
     Held-out motion begins and ends at rest here, where a file of its own begins and ends within it.
     """
-    planned = [replace(p, trajectory=_eased(p.trajectory)) if isinstance(p.trajectory, Gimbals) else p for p in planned]
+    planned = [replace(p, trajectory=p.trajectory.eased()) if isinstance(p.trajectory, Gimbals) else p for p in planned]
     out = [planned[0]]
     for one, two in pairwise(planned):
-        before, after = (_level(p, t) for p, t in ((one, one.trajectory.duration), (two, 0.0)))
+        ends = (one.trajectory, one.trajectory.duration), (two.trajectory, 0.0)
+        before, after = (motion.pose(np.array([time])).level[0] for motion, time in ends)
         axis, angle = axis_and_angle(before.T @ after)
-        builder = ProgramBuilder(course.acceleration_dps2).rest(course.pause_s / 2)
+        steps = [rest(course.pause_s / 2)]
         if angle > LEAST_ANGLE_DEG:
-            builder.turn(angle, TRANSIT_RATE_DPS).rest(course.pause_s / 2)
-        out += [Planned(TRANSIT, TRANSIT, None, Moves(builder.build(), axis[None], before)), two]
+            steps += [turn(angle, TRANSIT_RATE_DPS, course.acceleration_dps2), rest(course.pause_s / 2)]
+        out += [Planned(TRANSIT, TRANSIT, None, Moves(Program(steps), axis[None], before)), two]
     return out
-
-
-def _eased(motion: Gimbals) -> Eased:
-    """Return held-out motion that begins and ends at rest; it is longer by that."""
-    duration = max(motion.duration, COMES_UP_S) + COMES_UP_S
-    return Eased(motion.drift, motion.amplitude, motion.frequency, motion.phase, duration)
-
-
-def _level(plan: Planned, time: float) -> Values:
-    """Return the attitude at a time in s of a recording: (3, 3) array."""
-    level: Values = plan.trajectory.pose(np.array([time])).level[0]
-    return level
 
 
 def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
     """Return rests on six faces, then turns about each axis with its face up; a face and an axis keep their errors."""
     positions, tilt = six_positions(), accuracy * rng.standard_normal((6, 3))
     off = np.radians(course.turn_axis_error_deg) * rng.standard_normal((3, 3)) * (1.0 - np.eye(3))
-    builder = ProgramBuilder(course.acceleration_dps2).rest(max(course.warm_up_rest_s, course.dwell_s))
+    acceleration, stay = course.acceleration_dps2, rest(course.dwell_s)
+    steps = [rest(max(course.warm_up_rest_s, course.dwell_s))]
     axes: list[Values] = []
-    start = at = positions[0] @ _turned(tilt[0])
+    start = at = positions[0] @ rotation_by(tilt[0])
     upward = [int(np.argmax(positions[:, 2, axis])) for axis in range(3)]
     for face, axis in [*((f, None) for f in range(1, 6)), *zip(upward, range(3), strict=True)]:
-        target = positions[face] @ _turned(tilt[face] + AGAIN * accuracy * rng.standard_normal(3))
+        target = positions[face] @ rotation_by(tilt[face] + AGAIN * accuracy * rng.standard_normal(3))
         about, angle = axis_and_angle(at.T @ target)
-        builder.turn(angle, course.step_rate_dps).rest(course.dwell_s)
+        steps += [turn(angle, course.step_rate_dps, acceleration), stay]
         axes += [about] * bool(angle)
         at = target
-        for rate, sign in (
-            product(course.rates_dps, (1.0, -1.0)[: 1 + course.both_directions]) if axis is not None else ()
-        ):
+        for rate, sign in product(course.rates_dps, course.signs) if axis is not None else ():
             about = (np.eye(3)[axis] + off[axis]) / np.linalg.norm(np.eye(3)[axis] + off[axis])
             angle = sign * 360.0 * course.turns + course.turn_error_deg * float(rng.standard_normal())
-            builder.turn(angle, rate).rest(course.dwell_s)
+            steps += [turn(angle, rate, acceleration), stay]
             axes.append(about)
-            at = at @ _turned(angle * about)
-    return Moves(builder.build(), np.array(axes), start)
-
-
-def _turned(vector: Values) -> Values:
-    """Return the rotation by a vector in deg: (3, 3) array."""
-    size = float(np.linalg.norm(vector))
-    return np.asarray(rotation_about(vector / (size or 1.0), np.array([size]))[0])
+            at = at @ rotation_by(angle * about)
+    return Moves(Program(steps), np.array(axes), start)

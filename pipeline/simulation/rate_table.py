@@ -1,19 +1,4 @@
-"""The commanded program of a rate table, and the errors with which the table follows it.
-
-A program is a sequence of rests and of turns with trapezoidal rate.
-
-Between the knots ``t_k`` the angular acceleration is constant, so at any time, not only at samples,
-
-    A(t) = A_k + W_k s + a_k s^2 / 2,   dA/dt = W_k + a_k s,   d2A/dt2 = a_k,   s = t - t_k
-
-where
-
-A_k : angle at knot k, deg
-W_k : rate at knot k, deg/s
-a_k : acceleration after knot k, deg/s^2
-
-A turn by the angle D at the rate r with acceleration a ramps for r/a, holds r and ramps down; where |D| < r^2/a it
-never reaches r and the ramps meet in the middle.
+"""The errors with which a rate table follows its commanded program (``pipeline.io.commanded_motion.Program``).
 
 A turn is commanded to the angle ``phi(t)`` and reaches
 
@@ -42,75 +27,25 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
+    from pipeline.io.commanded_motion import Program
+    from pipeline.records import Index, Values
 
-    from pipeline.records import Values
-
-
-@dataclass(frozen=True)
-class Program:
-    """One axis over time: m segments of constant acceleration; before the first and after the last it rests."""
-
-    knots: Values  # (m,), s, starts of the segments
-    angle: Values  # (m,), deg, at each knot
-    rate: Values  # (m,), deg/s, at each knot
-    acceleration: Values  # (m,), deg/s^2, until the next knot
-    move: NDArray[np.int64]  # (m,), number of the move; of a rest that of the move before it, -1 before the first
-    stops: Values  # (moves + 1,), deg, before each move and after the last
-    duration: float  # s
-
-    def at(self, time: Values) -> tuple[Values, Values, Values, NDArray[np.int64]]:
-        """Return angle (deg), rate (deg/s), acceleration (deg/s^2) and number of the move at any times: (n,) arrays."""
-        k = np.clip(np.searchsorted(self.knots, time, side="right") - 1, 0, None)
-        s = np.clip(time - self.knots[k], 0.0, None)
-        acceleration = self.acceleration[k]
-        rate = self.rate[k] + acceleration * s
-        return self.angle[k] + (self.rate[k] + 0.5 * acceleration * s) * s, rate, acceleration, self.move[k]
+    Step = dict[str, float]
 
 
-class ProgramBuilder:
-    """Puts rests and turns one after the other; ``acceleration``: of every ramp, deg/s^2."""
+def rest(seconds: float) -> Step:
+    """Return a rest as a step of a program."""
+    return {"rest_s": seconds}
 
-    def __init__(self, acceleration: float) -> None:
-        self._acceleration = acceleration
-        self._time, self._angle = 0.0, 0.0
-        self._stops = [0.0]
-        self._rows: list[tuple[float, float, float, float, int]] = [(0.0, 0.0, 0.0, 0.0, -1)]
 
-    def rest(self, seconds: float) -> ProgramBuilder:
-        """Stay for a time in s."""
-        self._time += seconds
-        return self
+def turn(angle: float, rate: float, acceleration: float) -> Step:
+    """Return a turn as a step: deg (signed), at most at a rate in deg/s, with ramps in deg/s^2."""
+    return {"turn_deg": angle, "rate_dps": rate, "acceleration_dps2": acceleration}
 
-    def turn(self, angle: float, rate: float) -> ProgramBuilder:
-        """Turn by an angle (deg, signed), at most at ``rate`` (deg/s)."""
-        if angle == 0.0:
-            return self
-        sign, a = float(np.sign(angle)), self._acceleration
-        top = min(rate, float(np.sqrt(abs(angle) * a)))
-        ramp, hold = top / a, abs(angle) / top - top / a
-        number = len(self._stops) - 1
-        half = sign * 0.5 * top * ramp
-        t, start = self._time, self._angle
-        self._rows += [
-            (t, start, 0.0, sign * a, number),
-            (t + ramp, start + half, sign * top, 0.0, number),
-            (t + ramp + hold, start + angle - half, sign * top, -sign * a, number),
-            (t + 2 * ramp + hold, start + angle, 0.0, 0.0, number),
-        ]
-        self._time, self._angle = t + 2 * ramp + hold, start + angle
-        self._stops.append(self._angle)
-        return self
 
-    def turn_with_plateau(self, angle: float, rate: float) -> ProgramBuilder:
-        """Turn so that ``angle`` (deg, signed) is passed at full ``rate`` (deg/s), with the ramps before and after."""
-        return self.turn(angle + float(np.sign(angle)) * rate**2 / self._acceleration, rate)
-
-    def build(self) -> Program:
-        """Return the program."""
-        rows = np.array([row[:4] for row in self._rows])
-        move = np.array([row[4] for row in self._rows], np.int64)
-        return Program(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], move, np.array(self._stops), self._time)
+def turn_with_plateau(angle: float, rate: float, acceleration: float) -> Step:
+    """Return a turn that passes ``angle`` at full ``rate``, with the ramps before and after."""
+    return turn(angle + float(np.sign(angle)) * rate**2 / acceleration, rate, acceleration)
 
 
 @dataclass(frozen=True)
@@ -157,7 +92,7 @@ class TurnErrors:
             true_acceleration = true_acceleration - swing * w**2 * np.sin(w * time)
         return angle, true_rate, true_acceleration
 
-    def _stops(self, program: Program, phi: Values, move: NDArray[np.int64]) -> tuple[Values, Values]:
+    def _stops(self, program: Program, phi: Values, move: Index) -> tuple[Values, Values]:
         """Return the angle between its stops, and its slope in the commanded angle."""
         if (self.stops is None and not self.backlash) or len(program.stops) < 2:
             return phi, np.ones_like(phi)

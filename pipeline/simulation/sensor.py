@@ -59,13 +59,11 @@ from pipeline.simulation.trajectory import Turn, mounted, rotation_about, rotati
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipeline.records import Values
-    from pipeline.simulation.trajectory import Gimbals, Moves, Pose
-
-    Alteration = Callable[["Scene", Values], "Scene"]
     from pipeline.model.effects.base import Effect
     from pipeline.records import Values
+    from pipeline.simulation.trajectory import Gimbals, Moves
 
+    Alteration = Callable[["Scene", Values], "Scene"]
     Hidden = dict[str, tuple[Effect, Values]]  # by name: an effect and the values of its parameters
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
@@ -108,7 +106,9 @@ class Scene:
         gravity = self.gravity * (self.up @ pose.level)
         force = gravity
         if np.any(self.lever_arm):
-            force = force + _lever_arm_force(pose, self.lever_arm)
+            turning, r = np.radians(pose.omega), self.lever_arm
+            acceleration = np.cross(turning, np.cross(turning, r)) + np.cross(np.radians(pose.alpha), r)
+            force = force + acceleration / STANDARD_GRAVITY
         if pose.force is not None:
             force = force + pose.force
         omega = pose.omega if self.earth is None else pose.omega + self.earth @ pose.level
@@ -134,12 +134,6 @@ def _lag_rule() -> tuple[Values, Values]:
     nodes = np.concatenate([middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)])
     weights = np.tile(half, 2) * np.exp(-nodes)
     return nodes, weights / weights.sum()
-
-
-def _lever_arm_force(pose: Pose, r: Values) -> Values:
-    omega, alpha = np.radians(pose.omega), np.radians(pose.alpha)
-    force: Values = np.cross(omega, np.cross(omega, r)) + np.cross(alpha, r)
-    return force / STANDARD_GRAVITY
 
 
 def _earth_rotation(scene: Scene, values: Values) -> Scene:
@@ -192,9 +186,8 @@ ALTERATIONS: dict[str, Alteration] = {
 
 def alter(scene: Scene, effects: Mapping[str, Values]) -> Scene:
     """Return the scene with those of the effects in it that are not the sensor's own."""
-    for name, values in effects.items():
-        if name in ALTERATIONS:
-            scene = ALTERATIONS[name](scene, values)
+    for name in [name for name in effects if name in ALTERATIONS]:
+        scene = ALTERATIONS[name](scene, effects[name])
     return scene
 
 
@@ -266,10 +259,7 @@ def drawn_sensors(
 ) -> dict[str, SimulatedSensor]:
     """Return accelerometer and gyroscope of a unit, from the section of the configuration and the description of each.
 
-    Raises
-    ------
-    ConfigurationError
-        If a key of the description is not known.
+    ``ConfigurationError``: a key of the description is not known.
     """
     mounting = rng.uniform(-1.0, 1.0, 3)
     out = {}
@@ -312,10 +302,7 @@ def drawn_effects(
 ) -> dict[str, Hidden]:
     """Return the effects that a description's ``effects`` hide in each sensor.
 
-    Raises
-    ------
-    ConfigurationError
-        If there is no such effect, it does not apply, its formula is wrong, or the number of values is.
+    ``ConfigurationError``: there is no such effect, it does not apply, its formula or the number of values is wrong.
     """
     out: dict[str, Hidden] = {sensor: {} for sensor in SENSORS}
     for key, value in specification.items():

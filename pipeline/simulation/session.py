@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.io.commanded_motion import Program
     from pipeline.records import Values
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.procedures import Course
-    from pipeline.simulation.rate_table import Program
     from pipeline.simulation.sensor import Hidden, SimulatedSensor
     from pipeline.simulation.trajectory import Planned
 
@@ -307,22 +307,9 @@ def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values, *
 
 
 def as_program(program: Program) -> list[dict[str, Any]]:
-    """Return a table's program as the steps of a procedure's ``program``: rests and turns, repeated ones together."""
-    steps: list[dict[str, Any]] = []
-    time = 0.0
-    for ramp in np.flatnonzero((program.rate == 0) & (program.acceleration != 0)).tolist():
-        hold, end = ramp + 1, ramp + 3
-        if program.knots[ramp] > time + 1e-9:
-            steps.append({"rest_s": round(float(program.knots[ramp] - time), 9)})
-        turn = float(program.angle[end] - program.angle[ramp])
-        steps.append({
-            "turn_deg": round(turn, 9),
-            "rate_dps": round(abs(float(program.rate[hold])), 9),
-            "acceleration_dps2": round(abs(float(program.acceleration[ramp])), 9),
-        })  # fmt: skip
-        time = float(program.knots[end])
-    steps.append({"rest_s": round(float(program.duration - time), 9)})
-    return _folded(steps)
+    """Return a table's program as the steps of a procedure's ``program``, repeated ones together."""
+    steps = [{key: round(float(value), 9) for key, value in step.items()} for step in program.steps]
+    return _folded([step for step in steps if step.get("rest_s") != 0.0])
 
 
 def _folded(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -344,28 +331,19 @@ def _folded(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def columns_of(unit: UnitDescription) -> dict[str, str]:
     """Return the columns of ``units.csv`` that the layout asks for."""
-    if unit.log.kind == FILE:
-        return {"ingest": INGEST}
-    return {"procedure": _commanded(unit)} if unit.log.kind == PROGRAM else {}
-
-
-def _commanded(unit: UnitDescription) -> str:
-    return f"{unit.procedure}_commanded"
+    return {FILE: {"ingest": INGEST}, PROGRAM: {"procedure": f"{unit.procedure}_commanded"}}.get(unit.log.kind, {})
 
 
 def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
     """Return the procedures of tables that log nothing, each with its program: name to YAML.
 
-    Raises
-    ------
-    ConfigurationError
-        If units of one procedure follow different programs.
+    ``ConfigurationError``: units of one procedure follow different programs.
     """
     found: dict[str, str] = {}
     for unit in units:
         if unit.log.kind == PROGRAM:
             text = _procedure_text(unit.procedure, course_of(unit))
-            if found.setdefault(_commanded(unit), text) != text:
+            if found.setdefault(columns_of(unit)["procedure"], text) != text:
                 raise ConfigurationError(
                     f"unit {unit.unit}: its table follows another program than those of the units before; simulate it "
                     "as a campaign of its own"

@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.model.kinematics import attitude_matrix, level_at_zero
+from pipeline.model.kinematics import attitude_matrix, level_at_zero, turn_by_vector
 from pipeline.simulation.rate_table import TurnErrors
 
 if TYPE_CHECKING:
+    from pipeline.io.commanded_motion import Program
     from pipeline.records import Values
-    from pipeline.simulation.rate_table import Program
 
 
 SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])  # 42 deg of the middle gimbal: all attitudes evenly (``random_gimbals``)
@@ -58,19 +58,13 @@ def mounted(pose: Pose, rotation: Values) -> Pose:
 
 
 def rotation_about(axis: Values, angle_deg: Values) -> Values:
-    """Return ``R_u(A) = I + sin A [u]x + (1 - cos A) [u]x^2``: (n, 3, 3), for unit vectors (3,) or (n, 3)."""
-    x, y, z = np.moveaxis(np.atleast_2d(axis), -1, 0)
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-    angle = np.radians(angle_deg)[:, None, None]
-    rotation: Values = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    return rotation
+    """Return the rotations by (n,) angles about unit vectors, (3,) or (n, 3): (n, 3, 3) array."""
+    return rotation_by(axis * np.asarray(angle_deg)[:, None])
 
 
 def rotation_by(vector_deg: Values) -> Values:
-    """Return the rotation about a vector, by its length in deg: (3, 3) array."""
-    size = float(np.linalg.norm(vector_deg))
-    return rotation_about(vector_deg / size, np.array([size]))[0] if size else np.eye(3)
+    """Return the rotations by vectors, deg: (..., 3) array to (..., 3, 3)."""
+    return turn_by_vector(np.radians(vector_deg))
 
 
 @dataclass(frozen=True)
@@ -178,6 +172,11 @@ class Gimbals:
             -1,
         )
         return Pose(attitude_matrix(self.quaternion(time)), np.degrees(omega), np.degrees(alpha))
+
+    def eased(self) -> Eased:
+        """Return the same motion that begins and ends at rest; it is longer by that."""
+        duration = max(self.duration, COMES_UP_S) + COMES_UP_S
+        return Eased(self.drift, self.amplitude, self.frequency, self.phase, duration)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.io.channel_table import ChannelTable
 from pipeline.io.units import ATTITUDE, TRIADS
 from pipeline.simulation.campaign import simulate_unit
@@ -34,7 +36,7 @@ def as_table(recording: Recording) -> ChannelTable:
     for name in ("table_angle", "table_rate"):
         if getattr(recording, name) is not None:
             values[name] = getattr(recording, name)
-    return ChannelTable(recording.name, recording.time_ns, values, {}, lambda row: row)
+    return ChannelTable(recording.name, recording.time_ns, values, {}, np.arange(recording.samples))
 
 
 def clock_errors(

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 from simulated_logs import as_table
 
 from pipeline.errors import IngestError
-from pipeline.io.commanded_motion import follow_program
+from pipeline.io.commanded_motion import Program, follow_program
 from pipeline.records import Recording
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.session import Streams, as_program
 from pipeline.simulation.trajectory import Turn
-
-if TYPE_CHECKING:
-    from pipeline.simulation.rate_table import Program
 
 BIAS, SCALE = np.array([1.3, -0.4, 0.2]), 1.01
 COURSE = Course(step_deg=30.0, rates_dps=(30.0, 60.0), both_directions=True, validation_s=0.0, static_s=0.0)
@@ -32,7 +29,7 @@ def program_of(name: str) -> Program:
 def felt(name: str, begun: float, drift: float, pauses: Any, interval: float = 0.02) -> tuple[Recording, Any]:
     """A recording of a table that began late, by a clock that drifts, and paused before some moves; its angle."""
     program = program_of(name)
-    moves = np.append(program.knots[np.flatnonzero((program.rate == 0) & (program.acceleration != 0))], np.inf)
+    moves = np.append(program.knots[1::4, 0], np.inf)
     time = np.arange(0.0, begun + program.duration + float(np.sum(pauses)) + 3.0, interval)
     own = (time - begun) * (1.0 + drift)
     late = np.zeros_like(own)
@@ -49,6 +46,16 @@ def felt(name: str, begun: float, drift: float, pauses: Any, interval: float = 0
     up += 1e-3 * rng.standard_normal(up.shape)
     ns = np.rint(time * 1e9).astype(np.int64)
     return Recording(name, "gyroscope", name[-1], ns, accelerometer=up, gyroscope=gyro), (angle, rate)
+
+
+def test_a_turn_is_a_trapezoid_of_the_rate_whose_ramps_meet_where_it_is_short() -> None:
+    steps = [{"rest_s": 2.0}, {"turn_deg": 90.0, "rate_dps": 30.0, "acceleration_dps2": 60.0}, {"rest_s": 1.0}]
+    program = Program([*steps, {"turn_deg": -15.0, "rate_dps": 60.0, "acceleration_dps2": 60.0}])
+    # 90 deg at 30 deg/s with ramps of 0.5 s last 3.5 s; 15 deg are turned in two ramps of 0.5 s
+    assert program.duration == pytest.approx(2.0 + 3.5 + 1.0 + 1.0)
+    angle, rate, *_ = program.at(np.array([2.0, 2.5, 4.0, 5.25, 6.0, 7.0, 9.0]))
+    np.testing.assert_allclose(angle, [0.0, 7.5, 52.5, 90.0 - 0.5 * 60.0 * 0.25**2, 90.0, 82.5, 75.0], atol=1e-12)
+    np.testing.assert_allclose(rate, [0.0, 30.0, 30.0, 15.0, 0.0, -30.0, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["accel_x", "gyro_y"])

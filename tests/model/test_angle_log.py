@@ -1,11 +1,14 @@
 """A table that logs its angle alone: the rate is known where the angle tells it, and said to be vague where not."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
+from pipeline.io.commanded_motion import Program
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import Motion, Recording
-from pipeline.simulation.rate_table import Program, ProgramBuilder
+from pipeline.simulation.rate_table import rest, turn, turn_with_plateau
 
 INTERVAL = 0.12
 
@@ -20,17 +23,14 @@ def motion(program: Program, *, decimals: int = 4) -> tuple[Motion, np.ndarray]:
 
 
 def stop_and_go() -> Program:
-    builder = ProgramBuilder(100.0).rest(2.0)
-    for _ in range(36):
-        builder.turn(10.0, 20.0).rest(1.0)
-    return builder.build()
+    return Program([rest(2.0), *[turn(10.0, 20.0, 100.0), rest(1.0)] * 36])
 
 
 def turns() -> Program:
-    builder = ProgramBuilder(100.0).rest(10.0)
-    for rate in (60.0, 100.0):
-        builder.turn_with_plateau(360.0, rate).rest(5.0).turn_with_plateau(-360.0, rate).rest(5.0)
-    return builder.build()
+    steps = [rest(10.0)]
+    for rate, angle in product((60.0, 100.0), (360.0, -360.0)):
+        steps += [turn_with_plateau(angle, rate, 100.0), rest(5.0)]
+    return Program(steps)
 
 
 @pytest.mark.parametrize("program", [stop_and_go(), turns()], ids=["stop-and-go", "turns"])

@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.io.commanded_motion import Program
 from pipeline.model.encoder_trajectory import EncoderTrajectory, nearest_slope
-from pipeline.simulation.rate_table import Program, ProgramBuilder
+from pipeline.simulation.rate_table import rest, turn_with_plateau
 
 
 @pytest.fixture(scope="module")
 def program() -> Program:
-    builder = ProgramBuilder(100.0).rest(3.0)
+    steps = [rest(3.0)]
     for rate in (30.0, 60.0, -100.0):
-        builder.turn_with_plateau(360.0 * np.sign(rate), abs(rate)).rest(2.0)
-    return builder.build()
+        steps += [turn_with_plateau(360.0 * np.sign(rate), abs(rate), 100.0), rest(2.0)]
+    return Program(steps)
 
 
 def log_of(program: Program, interval: float = 0.12) -> EncoderTrajectory:

@@ -167,7 +167,7 @@ def test_an_attitude_alone_gives_the_rate_of_held_out_motion() -> None:
     part = next(r for r in cut(session()) if r.name == "validation")
     assert part.table_attitude is not None
     values = {f"table_q{c}": part.table_attitude[:, i] for i, c in enumerate("wxyz")}
-    table = ChannelTable("log", part.time_ns, values, {"file": "log"}, lambda _: 0)
+    table = ChannelTable("log", part.time_ns, values, {"file": "log"})
     read = to_recording("validation", {"role": "validation", "axis": None}, unwrapped(table), {}, Checks())
     assert read.table_rate is not None
     assert part.table_rate is not None

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from pipeline.io.commanded_motion import Program
 from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import Owner, truth
 from pipeline.model.effects.formula_effect import FormulaEffect
 from pipeline.model.kinematics import earth_rate
 from pipeline.simulation.description import read_config
-from pipeline.simulation.rate_table import ProgramBuilder, TurnErrors
+from pipeline.simulation.rate_table import TurnErrors, rest, turn_with_plateau
 from pipeline.simulation.sensor import (
     ALTERATIONS,
     STANDARD_GRAVITY,
@@ -36,8 +37,8 @@ SIZES = {
 
 
 def turn_scene(axis: int = 2, rate: float = 200.0, acceleration: float = 100.0) -> Scene:
-    builder = ProgramBuilder(acceleration).rest(1.0).turn_with_plateau(360.0, rate).rest(1.0)
-    return Scene(Turn(axis, builder.turn_with_plateau(-360.0, rate).rest(1.0).build()), axis=axis)
+    there, back = (turn_with_plateau(angle, rate, acceleration) for angle in (360.0, -360.0))
+    return Scene(Turn(axis, Program([rest(1.0), there, rest(1.0), back, rest(1.0)])), axis=axis)
 
 
 def test_a_lever_arm_of_5_cm_at_200_deg_s_reads_omega_squared_r() -> None:
@@ -117,7 +118,9 @@ def test_a_mounting_and_a_zero_of_one_recording_are_the_rotations_of_their_effec
     time, plain = np.arange(0.03, 12.0, 0.12), turn_scene(axis=axis)
     theta, zero = np.array([1.5, -2.0, 0.7]), 3.0
     program = plain.trajectory.program
-    turned = replace(plain, trajectory=Turn(axis, replace(program, angle=program.angle + zero)))
+    ahead = Program(program.steps)
+    ahead.knots[:, 1] += zero
+    turned = replace(plain, trajectory=Turn(axis, ahead))
     for name, values, log, true in (
         ("mounting", theta, plain, replace(plain, mounting=rotation_by(theta))),
         ("encoder_zero", np.array([zero]), turned, plain),

@@ -6,16 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.io.commanded_motion import Program
 from pipeline.model.kinematics import UP_AT_ZERO, attitude_matrix, turn_about_axis
 from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.rate_table import Program, ProgramBuilder, TurnErrors
+from pipeline.simulation.rate_table import TurnErrors, rest, turn, turn_with_plateau
 from pipeline.simulation.trajectory import Moves, Turn, axis_and_angle, random_gimbals, rotation_about
 
 STEP = 1e-5
 
 
 def a_program() -> Program:
-    return ProgramBuilder(100.0).rest(1.0).turn_with_plateau(360.0, 60.0).rest(2.0).turn(-30.0, 60.0).rest(1.0).build()
+    there, back = turn_with_plateau(360.0, 60.0, 100.0), turn(-30.0, 60.0, 100.0)
+    return Program([rest(1.0), there, rest(2.0), back, rest(1.0)])
 
 
 def trajectories() -> Iterator[tuple[str, Any]]:
@@ -36,7 +38,7 @@ def trajectories() -> Iterator[tuple[str, Any]]:
 
 @pytest.mark.parametrize(("name", "trajectory"), list(trajectories()))
 def test_rates_are_the_derivatives_of_the_attitude(name: str, trajectory: Any) -> None:
-    knots = [] if name == "random motion" else trajectory.program.knots
+    knots = [] if name == "random motion" else trajectory.program.knots[:, 0]
     time = np.arange(0.0131, trajectory.duration, 0.0977)
     time = time[[np.all(np.abs(t - np.asarray(knots)) > 2 * STEP) for t in time]]
     before, now, after = (trajectory.pose(t) for t in (time - STEP, time, time + STEP))
@@ -67,7 +69,7 @@ def test_a_program_turns_by_what_was_asked_at_no_more_than_the_rate() -> None:
 
 
 def test_an_angle_may_be_asked_for_at_any_time() -> None:
-    program = ProgramBuilder(50.0).rest(1.0).turn(90.0, 20.0).build()
+    program = Program([rest(1.0), turn(90.0, 20.0, 50.0)])
     angle, rate, acceleration, move = program.at(np.array([-5.0, 0.5, 1.2, 3.0, 100.0]))
     np.testing.assert_allclose(angle, [0.0, 0.0, 0.5 * 50.0 * 0.2**2, 4.0 + 20.0 * 1.6, 90.0])
     np.testing.assert_allclose(rate, [0.0, 0.0, 10.0, 20.0, 0.0])
