@@ -15,15 +15,9 @@ rates; one curve gives all three.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from pipeline.records import Values, median
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+from pipeline.records import Index, Mask, Values, median
 
 TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3  # a good encoder's resolution; 17 ug of specific force
 GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for; and an interval without any
@@ -68,27 +62,27 @@ class EncoderTrajectory:
         miss = np.abs(excess + np.diff(slope) * self._step**2 / 12.0)
         gentle = np.convolve(miss > GENTLE_DEG, np.ones(3), "same") < 0.5
         gentle &= np.abs(excess) > EXACT_DEG
-        self.explained: NDArray[np.bool_] = np.logical_and(even | bent, np.logical_not(gentle))
+        self.explained: Mask = np.logical_and(even | bent, np.logical_not(gentle))
         self.acceleration = self._at_samples(slope)
-        self.valid: NDArray[np.bool_] = self.explained | self._smooth(miss)
+        self.valid: Mask = self.explained | self._smooth(miss)
         self.valid_samples = self._filter_settled()
 
-    def _filter_settled(self) -> NDArray[np.bool_]:
+    def _filter_settled(self) -> Mask:
         """Return the samples with valid intervals after them and while a filter of the sensor settles before them."""
         lost = np.concatenate([[0], np.cumsum(~self.valid)])  # invalid intervals before each sample
         first = np.searchsorted(self.time, self.time - MEMORY_S, side="right") - 1
         past = lost - lost[np.maximum(first, 0)] == 0
-        known: NDArray[np.bool_] = np.logical_and(past, np.append(self.valid, True))
+        known: Mask = np.logical_and(past, np.append(self.valid, True))
         known[1:-1] &= ~self._corners()
         return known
 
-    def _corners(self) -> NDArray[np.bool_]:
+    def _corners(self) -> Mask:
         """Return which inner samples a stretch ends at: there the acceleration is that before or that after."""
         jump = np.abs(self._before[1:] - self._after[:-1])
         both = self.explained[1:] & self.explained[:-1]
         return np.asarray(both & (jump > CORNER_DPS2))
 
-    def _bends(self, even: NDArray[np.bool_]) -> tuple[Values, Values, Values, NDArray[np.bool_]]:
+    def _bends(self, even: Mask) -> tuple[Values, Values, Values, Mask]:
         """Return for each interval where it bends, the acceleration before and after, and whether that holds."""
         step, mean = self._step, self._mean
         left, right = np.concatenate([[False], even[:-1]]), np.concatenate([even[1:], [False]])
@@ -121,7 +115,7 @@ class EncoderTrajectory:
         mean = (known * weight).sum(0) / np.where(total > 0, total, 1.0)
         return np.where(total > 0, mean, slope)
 
-    def _smooth(self, miss: Values) -> NDArray[np.bool_]:
+    def _smooth(self, miss: Values) -> Mask:
         moving = np.abs(self._mean) + np.abs(self.rate[1:]) + np.abs(self.rate[:-1]) > MOVING_DPS
         inside = np.convolve(moving, np.ones(7), "same") > 6.5
         noise = 4.0 * float(median(miss[inside])) if inside.sum() > 20 else 0.0
@@ -161,7 +155,7 @@ class EncoderTrajectory:
         value = through + gain * shown[k]
         return value, (self._piecewise(k, x)[1] - value) / lag
 
-    def _lag_step(self, k: NDArray[np.intp], x: Values, lag: float) -> tuple[Values, Values]:
+    def _lag_step(self, k: Index, x: Values, lag: float) -> tuple[Values, Values]:
         """Return what a lag shows at x into intervals: a part of its own, and the factor on what it showed before."""
         a, b, s = self._before[k], self._after[k], self._bend[k]
         first, second = np.minimum(x, s), np.maximum(x - s, 0.0)
@@ -170,14 +164,14 @@ class EncoderTrajectory:
         own = middle - a * lag + (a * lag - self.rate[k]) * fade
         return middle + b * (second - lag) + (own - middle + b * lag) * fade_after, fade * fade_after
 
-    def _piecewise(self, k: NDArray[np.intp], x: Values) -> tuple[Values, Values, Values]:
+    def _piecewise(self, k: Index, x: Values) -> tuple[Values, Values, Values]:
         a, b, s = self._before[k], self._after[k], self._bend[k]
         past = np.maximum(x - s, 0.0)
         rate = self.rate[k] + a * x + (b - a) * past
         angle = self.angle[k] + self.rate[k] * x + 0.5 * a * x**2 + 0.5 * (b - a) * past**2
         return angle, rate, np.where(x > s, b, a)
 
-    def _quintic(self, k: NDArray[np.intp], x: Values) -> tuple[Values, Values, Values]:
+    def _quintic(self, k: Index, x: Values) -> tuple[Values, Values, Values]:
         h = self._step[k]
         r0, a0 = self.rate[k], self.acceleration[k]
         dA = self.angle[k + 1] - self.angle[k] - r0 * h - 0.5 * a0 * h**2

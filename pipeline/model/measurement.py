@@ -24,9 +24,7 @@ from pipeline.model.effects.base import Effect, Owner, truth
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import FittedEffect, Motion, SensorCalibration, Values
+    from pipeline.records import FittedEffect, Mask, Motion, SensorCalibration, Values
 
     Truths = dict[str, Values]
 
@@ -141,7 +139,7 @@ def inverse_of(calibration: SensorCalibration) -> Values:
     return np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)), np.float64)
 
 
-def _near(new: Values, old: Values) -> NDArray[np.bool_]:
+def _near(new: Values, old: Values) -> Mask:
     """Return which samples have not moved, relative to their size; a missing one stays missing: (n,) array."""
     far = np.abs(new - old) > TOLERANCE * np.maximum(np.abs(new), 1.0)
     return np.logical_not(far[:, 0] | far[:, 1] | far[:, 2])

@@ -39,10 +39,8 @@ from pipeline.estimation.selection import ALIKE, DELAYS, GATE_BIC, GATE_P, Selec
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.multi_position import selection as by_hand
-    from pipeline.records import Noise, Values
+    from pipeline.records import Mask, Noise, Values
 
     Squares = tuple[Values, Values, Values]  # of draws, of draws with signals, of signals
 
@@ -124,7 +122,7 @@ class DetectionLimits(abc.ABC):
             _alike(rivals, signal.rivals.values()),
         )
 
-    def _fixed(self, j: int) -> NDArray[np.bool_]:
+    def _fixed(self, j: int) -> Mask:
         """Return which parameters of a candidate are time constants: (p,) array."""
         this = self.candidates[j].effect
         return np.array([p.name in this.nonlinear and not this.moves for p in this.parameters(self.sensor)])

@@ -14,9 +14,8 @@ from pipeline.report.numbers import MINUS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Integers, Values
 
-    Values = NDArray[np.float64]
 
 SUBDIVISION = 10  # drawing units in a pixel
 ANGLE_STEPS = (10.0, 15.0, 30.0, 45.0, 90.0, 180.0, 360.0, 720.0, 1800.0, 3600.0)  # deg, parts and multiples of a turn
@@ -104,7 +103,7 @@ class Axis:
         at = float(scaled(value, self.kind)) if "log" in self.kind else value
         return self.start + (max(at, self.low) - self.low) / (self.high - self.low) * (self.stop - self.start)
 
-    def units(self, values: Values) -> NDArray[np.int64]:
+    def units(self, values: Values) -> Integers:
         """Return the places of values in whole drawing units; values beyond the axis stand at its end."""
         at = np.minimum(np.maximum(scaled(values, self.kind), self.low), self.high)
         slope = SUBDIVISION * (self.stop - self.start) / (self.high - self.low)

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.outcome import VERDICTS, findings_of, next_commands, verdict_groups
-from pipeline.records import SENSOR_UNITS, SENSORS
+from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart
 from pipeline.report.fleet import Table
 from pipeline.report.held_out_section import FAR
@@ -24,8 +24,6 @@ from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
-
-    from numpy.typing import NDArray
 
 
 JSON = dict[str, Any]
@@ -247,7 +245,7 @@ def strips(rows: Sequence[JSON], placed: Table) -> list[Told]:
     return out
 
 
-def _strip(name: str, title: str, units: list[str], numbers: NDArray[np.intp], placed: Table) -> Told:
+def _strip(name: str, title: str, units: list[str], numbers: Index, placed: Table) -> Told:
     """Return the plot of some siblings and the text of each dot."""
     value, limit = (frame.to_numpy(float) for frame in placed.frames)
     labels = [column.partition(" ")[2] for column in placed.frames[0]]
@@ -290,7 +288,7 @@ def _strip(name: str, title: str, units: list[str], numbers: NDArray[np.intp], p
     return chart(figure, description, [panel], label, margin=0.03, left=LEFT, units="units"), values
 
 
-def _bar(ends: NDArray[np.float64], low: float, high: float, colour: int) -> Layer:
+def _bar(ends: Values, low: float, high: float, colour: int) -> Layer:
     return Area(low, high, colour, 100.0 * np.clip(ends, -EDGE, EDGE))
 
 

@@ -26,9 +26,8 @@ from pipeline.report.axis import SUBDIVISION, Axis
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.report.axis import Tick, Values
+    from pipeline.records import Integers, Values
+    from pipeline.report.axis import Tick
 
 AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
 WIDTH = 420  # px, of the drawing; the page scales it
@@ -254,7 +253,7 @@ def _samples(layer: Samples, values: Values, colour: str, x: Axis, y: Axis) -> s
     return out
 
 
-def _buckets(samples: int, most: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _buckets(samples: int, most: int) -> tuple[Integers, Integers]:
     """Return start and length of equal buckets; the last one also takes the remainder."""
     size = -(-samples // most)
     start = np.arange(0, samples // size * size, size)
@@ -272,7 +271,7 @@ def _full(x: Values, values: Values, axis: Axis) -> str:
     return f' data-full="{b64encode(numbers.tobytes()).decode()}"'
 
 
-def _line(x: NDArray[np.int64], y: NDArray[np.int64]) -> str:
+def _line(x: Integers, y: Integers) -> str:
     """Return the path through points, as differences."""
     if len(x) < 2:
         return _dots(x, y)
@@ -281,12 +280,12 @@ def _line(x: NDArray[np.int64], y: NDArray[np.int64]) -> str:
     return f"M{x[0]} {y[0]}l{_path(' %d %d', x[1:] - x[:-1], y[1:] - y[:-1])[1:]}"
 
 
-def _dots(x: NDArray[np.int64], y: NDArray[np.int64]) -> str:
+def _dots(x: Integers, y: Integers) -> str:
     """Return a path of dots: lines of length zero, which round line ends make visible."""
     return f"M{x[0]} {y[0]}h0{_path('m%d %dh0', x[1:] - x[:-1], y[1:] - y[:-1])}" if len(x) else ""
 
 
-def _path(form: str, *columns: NDArray[np.int64]) -> str:
+def _path(form: str, *columns: Integers) -> str:
     """Return the form once for each row of the columns."""
     return form * len(columns[0]) % tuple(np.array(columns).T.ravel().tolist())
 

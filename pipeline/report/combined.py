@@ -29,14 +29,11 @@ from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.uncertainty_budget import NOISE, own_and_bench
 from pipeline.estimation.uncertainty_budget import combined as budget_of
 from pipeline.io.files import wrong_name
-from pipeline.records import NORMAL, SENSORS, Contribution, SensorCalibration, StageResult
+from pipeline.records import NORMAL, SENSORS, Contribution, Index, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    Values = NDArray[np.float64]
 
 JSON = dict[str, Any]
 KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and other elements of the matrix
@@ -132,7 +129,7 @@ def values_of(calibration: SensorCalibration) -> Values:
     return np.concatenate([calibration.bias, calibration.matrix.ravel(), *(e.values for e in calibration.effects)])
 
 
-def kinds_of(calibration: SensorCalibration) -> NDArray[np.intp]:
+def kinds_of(calibration: SensorCalibration) -> Index:
     """Return the kind of each parameter, 0 ..: bias, scale factors, cross-axis elements, then each effect."""
     return np.concatenate([KIND, *(np.full(len(e.values), 3 + k) for k, e in enumerate(calibration.effects))])
 
@@ -149,7 +146,7 @@ def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[C
     return budget_of(changed, lines, {})
 
 
-def repeatability(x: Values, variance: Values, kind: NDArray[np.intp]) -> Values:
+def repeatability(x: Values, variance: Values, kind: Index) -> Values:
     """Return r, the standard deviation beyond the stated variances, of (n, p) values: (p,) array.
 
     ``variance``: (n, p). ``kind``: (p,), 0 ..; parameters of one kind have one r. The sum falls as r grows, so that

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, parameter_limits
-from pipeline.records import AXES, SENSOR_UNITS
+from pipeline.records import AXES, SENSOR_UNITS, Values
 from pipeline.report.axis import LINEAR_TO
 from pipeline.report.chart import Dots, Figure, Layer, Line, Panel, chart
 from pipeline.report.group_charts import Point, bars
@@ -23,7 +23,6 @@ from pipeline.report.numbers import MINUS, measured, number, percent, plain, uni
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.report.axis import Values
 
 JSON = dict[str, Any]
 GATE = LINEAR_TO  # delta BIC, strong evidence: A. E. Raftery, Sociological Methodology 25 (1995) 139, table 6

@@ -6,19 +6,16 @@ A unit without limits neither passes nor fails; a unit that failed does not pass
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from pipeline.records import SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration
+from pipeline.records import SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration, Values
 from pipeline.report.chart import Area, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
 from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.samples import OTHER, samples_of_motion
-
-if TYPE_CHECKING:
-    from pipeline.report.axis import Values
 
 JSON = dict[str, Any]
 ALIKE = 1.2  # the diagnosis's held-out error may continue the validation's steps where both agree within this factor

@@ -18,7 +18,7 @@ from pipeline.estimation.lot_prior import FEWEST, LotPrior, Prediction, lot_prio
 from pipeline.estimation.uncertainty_budget import NOISE, own_and_bench
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import Owner
-from pipeline.records import NORMAL, SENSORS, Contribution, SensorCalibration, StageResult
+from pipeline.records import NORMAL, SENSORS, Contribution, Index, Mask, SensorCalibration, StageResult, Values
 from pipeline.report.combined import BENCH, kinds_of, values_of, with_values
 from pipeline.report.numbers import number, plain
 from pipeline.report.pages import template
@@ -28,10 +28,6 @@ from pipeline.report.run_section import MARK
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from numpy.typing import NDArray
-
-    Mask = NDArray[np.bool_]
-    Values = NDArray[np.float64]
 
 JSON = dict[str, Any]
 LINE = "prior of the lot"
@@ -55,7 +51,7 @@ class Estimate(NamedTuple):
     own: Values
     freedom: Values
     shared: Values
-    kind: NDArray[np.intp]
+    kind: Index
     names: list[str]
     known: Mask  # the sensor's own parameters, of a stated uncertainty
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from pipeline.records import SENSORS, Recording
+from pipeline.records import SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, Line, Panel, chart
 from pipeline.report.numbers import NOTHING, number, plain
 from pipeline.signal.rests import Rest, rests_from_table
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 
 JSON = dict[str, Any]
 LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name
@@ -84,7 +80,7 @@ def _motion(recording: Recording, rests: int) -> str:
     return f"{kind}, {rests} rest{'s' if rests != 1 else ''}, up to {number(fastest)} deg/s{by}"
 
 
-def _range(values: NDArray[np.float64] | None) -> str:
+def _range(values: Values | None) -> str:
     if values is None or not np.isfinite(values).any():
         return NOTHING
     return f"{np.nanmin(values):.1f} to {np.nanmax(values):.1f}"

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.model.kinematics import table_motion
 from pipeline.model.measurement import predicted_reading
-from pipeline.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, Motion, Recording, SensorCalibration
+from pipeline.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, Integers, Motion, Recording, SensorCalibration, Values
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
@@ -33,9 +33,6 @@ from pipeline.signal.filters import filtered
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
-    from pipeline.report.axis import Values
 
 JSON = dict[str, Any]
 BINS = 36  # of a covariate, and of a turn: 10 deg each
@@ -159,7 +156,7 @@ def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
     return {label: out[label] for label in order if label not in forces[1:]}
 
 
-def _angle_bins(angle: Values) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _angle_bins(angle: Values) -> tuple[Integers, Integers]:
     """Return in which of 36 bins of a turn each of (n,) angles (deg) is, and how many are in each bin."""
     cell = (np.mod(angle, 360.0) * (BINS / 360.0)).astype(np.int64) % BINS
     return cell, np.bincount(cell, minlength=BINS)

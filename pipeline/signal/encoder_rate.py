@@ -28,9 +28,7 @@ import numpy as np
 from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pipeline.records import Recording, Values
+    from pipeline.records import Mask, Recording, Values
 
 VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; below it a doubtful rate does no harm
 WHOLE = 1e-3  # of a step, to which the angles of an encoder are multiples of it: printed decimals
@@ -52,7 +50,7 @@ class EncoderRate:
     angle: Values  # deg, smoothed where the encoder is coarse
     rate: Values  # deg/s
     noise: Values  # deg/s, standard deviation of the rate by the encoder's resolution; 0 of a fine one and at rest
-    vague: NDArray[np.bool_]  # where the rate is not known: at a bend of a fine angle, at a gap of a coarse one
+    vague: Mask  # where the rate is not known: at a bend of a fine angle, at a gap of a coarse one
 
 
 def rate_by_angle(recording: Recording) -> EncoderRate | None:

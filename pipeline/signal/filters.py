@@ -54,8 +54,6 @@ from pipeline.records import Integers, Note, Recording, Values, noise_of_steps
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
 
 GAP = 1.5  # medians of the interval: a lost sample makes two of one
 JITTER = 0.1  # of the interval: beyond it samples count as uneven
@@ -299,9 +297,7 @@ ROUNDING = 1e-12  # relative: some thousand roundings of a double
 DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
 
 
-def smooth_temperature(
-    time: NDArray[np.float64], temperature: NDArray[np.float64], bandwidth: float = 10.0
-) -> NDArray[np.float64]:
+def smooth_temperature(time: Values, temperature: Values, bandwidth: float = 10.0) -> Values:
     """Return a smoothed temperature log: (n,) array, degC; ``time`` increases.
 
     ``bandwidth``, s, is the largest standard deviation of the kernel; 10 s averages over about 30 s.
@@ -324,7 +320,7 @@ def smooth_temperature(
     return smooth
 
 
-def temperature_of(recording: Recording) -> NDArray[np.float64]:
+def temperature_of(recording: Recording) -> Values:
     """Return the smoothed temperature of a recording that logs it: (n,) array, degC; shared."""
     assert recording.temperature is not None  # noqa: S101
     if "temperature" not in recording.cache:
@@ -332,7 +328,7 @@ def temperature_of(recording: Recording) -> NDArray[np.float64]:
     return np.asarray(recording.cache["temperature"])
 
 
-def _local_line(time: NDArray[np.float64], temperature: NDArray[np.float64], bandwidth: float) -> NDArray[np.float64]:
+def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:
     """Return the value of the local line at each time: (n,) array, degC."""
     cell = np.floor((time - time[0]) / (bandwidth / 5.0)).astype(np.int64)
     cell = np.concatenate([[0], np.cumsum(cell[1:] != cell[:-1])])  # without empty ones, as times increase
@@ -354,7 +350,7 @@ def _local_line(time: NDArray[np.float64], temperature: NDArray[np.float64], ban
         level[block] = value[start] + line
     if len(t) == 1:
         return np.full_like(time, level[0])
-    smooth: NDArray[np.float64] = np.interp(time, t, level)
+    smooth: Values = np.interp(time, t, level)
     # np.interp holds the end cells' means; go on along their slope instead.
     before, after = time < t[0], time > t[-1]
     smooth[before] = level[0] + (time[before] - t[0]) * (level[1] - level[0]) / (t[1] - t[0])

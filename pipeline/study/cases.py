@@ -24,15 +24,12 @@ shortest of the register map.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipeline.model.effects import effect
-from pipeline.records import SENSORS
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from pipeline.records import SENSORS, Values
 
 NOISES = ("white", "normal", "wander", "random_walk", "one_over_f", "ar_06", "ar_09")
 SHAPES = ("gear_mesh", "temperature_step", "saturation", "exponential", "band")
@@ -266,7 +263,7 @@ def observable(model: str, sensor: str, procedure: str) -> list[str]:
     return [name for name in SIZES[model][sensor] if name not in hidden]
 
 
-def drawn(model: str, sensor: str, name: str, rng: np.random.Generator, factor: float = 1.0) -> NDArray[np.float64]:
+def drawn(model: str, sensor: str, name: str, rng: np.random.Generator, factor: float = 1.0) -> Values:
     """Return the parameters of an effect at its size times ``factor``, within 30 %, with random signs."""
     count = len(effect(name).parameters(sensor))
     size = SIZES[model][sensor][name]

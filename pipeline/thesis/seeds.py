@@ -40,7 +40,7 @@ from pipeline.estimation.gyroscope.cholesky_lu import turns_of
 from pipeline.estimation.stages import apply_correction
 from pipeline.estimation.turns import Part, parts_of
 from pipeline.model.measurement import linear_truth
-from pipeline.records import SENSORS, Recording, Values
+from pipeline.records import SENSORS, Mask, Recording, Values
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import Description, UnitDescription, read_config, read_description
@@ -52,8 +52,6 @@ from pipeline.validation.samples import samples_of_motion
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 FOUND = ("O_y", "O_z", "M", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
@@ -106,7 +104,7 @@ class Set:
         """The recordings without noise or loss, with the table's motion."""
         return parts_of(self.still, "accelerometer", read_config("table", self.unit.table), "the study")
 
-    def drawn(self, seed: int, cause: str = LOST) -> list[tuple[Recording, NDArray[np.bool_]]]:
+    def drawn(self, seed: int, cause: str = LOST) -> list[tuple[Recording, Mask]]:
         """Return the recordings of one seed, whole, and which of their samples arrive.
 
         They are disturbed by ``cause`` and those before it in ``CAUSES``.

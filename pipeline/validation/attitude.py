@@ -28,12 +28,10 @@ from pipeline.estimation.multi_position.moves import moves_of, observed_rests
 from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect
-from pipeline.records import Noise, Recording, SensorCalibration, Values, continuous, level_in_body
+from pipeline.records import Integers, Noise, Recording, SensorCalibration, Values, continuous, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
 
 
 MINUTE = 60.0  # s over which a drift is stated
@@ -136,7 +134,7 @@ def _between(p: Values, q: Values) -> Values:
     return _product(p * [[1.0], [-1.0], [-1.0], [-1.0]], q)
 
 
-def _fuse(time: Values, force: Values, alone: Values) -> tuple[NDArray[np.int64], Values]:
+def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]:
     """Return samples about 0.1 s or 5 deg apart, and the attitude of the complementary filter there.
 
     Its rates are those of the attitude ``alone`` of the gyroscope between these samples; the first attitude is given.

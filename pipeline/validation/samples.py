@@ -41,9 +41,7 @@ from pipeline.signal.quiet_motion import believed_rates, creep_in
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Motion, Noise, Recording, Values
+    from pipeline.records import Mask, Motion, Noise, Recording, Values
     from pipeline.signal.rests import Rest
 
 OTHER = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
@@ -78,7 +76,7 @@ class Samples:
         return self.white + self.wander
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """Whether reading and reference of each sample are there: (n,) array."""
         return np.asarray(np.isfinite(self.reading).all(axis=1) & np.isfinite(self.magnitude))
 
