@@ -55,6 +55,7 @@ class Problem:
     versions: Mapping[str, Sequence[Version]]
     limits: Mapping[str, Values]  # (k,), of the parameters of each effect; the unit of its columns
     excluded: Mapping[str, Set] = field(default_factory=dict)  # effects that are never in a set with this one
+    least: float = 0.0  # of sigma^2
 
     @cached_property
     def padded(self) -> Values:
@@ -62,8 +63,16 @@ class Problem:
         return np.pad(self.products, ((0, 0), (0, 1), (0, 1)))
 
     def rss(self, squares: Values) -> Values:
-        """Return -nu/2 log RSS of sums of squares."""
-        return np.asarray(-0.5 * self.free * np.log(np.maximum(squares + self.within, 1e-300)))
+        """Return -nu/2 log RSS of sums of squares; where sigma has a least value, with the sigma of most likelihood."""
+        total = np.maximum(squares + self.within, 1e-300)
+        if not self.least:
+            return np.asarray(-0.5 * self.free * np.log(total))
+        variance = self.variance(total)
+        return np.asarray(-0.5 * (self.free * np.log(variance) + total / variance))
+
+    def variance(self, total: Values) -> Values:
+        """Return sigma^2 by sums of squares of all."""
+        return np.maximum(total / self.free, self.least)
 
     def under(self, kept: Values) -> Problem:
         """Return the problem under some of the hypotheses."""
@@ -121,7 +130,7 @@ class Given:
             k = inner.shape[-1]
             inverse = np.linalg.inv(inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(k))
             mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
-            spread = np.einsum("nkk->nk", inverse) * (squares[:, :, 0][kept] / self.problem.free)[:, None]
+            spread = np.einsum("nkk->nk", inverse) * self.problem.variance(squares[:, :, 0][kept])[:, None]
             deviation = np.sqrt(np.maximum(spread, 0.0))
             for place, name in enumerate(block.names):
                 own = owner[m] == place

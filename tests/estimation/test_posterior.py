@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from scipy.linalg import null_space
 from scipy.special import logsumexp
 
 from pipeline.estimation.candidates import excited, time_constants
-from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Problem, Version
+from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Given, Problem, Version
 from pipeline.estimation.free_curves import BEND, free_curves
 from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantiles
 from pipeline.estimation.ranking import without
@@ -91,6 +92,22 @@ def test_the_score_of_every_set_is_its_evidence_by_the_definition(sizes: dict[st
         expected = dense.averaged(sorted(names)) + zero
         assert found.score == pytest.approx(expected, abs=1e-8 if len(names) < 2 else 0.15), names
     assert search.best() == frozenset(sizes)
+
+
+def test_residuals_below_the_known_noise_are_no_evidence_of_less_noise() -> None:
+    dense = Dense(3, {"a": 0.0, "b": 0.0, "c": 0.0})
+    problem = dense.problem()
+    free, size = problem.free, 0.3 * problem.free / float(problem.products[0, -1, -1])
+    for factor, known in ((size, True), (1e4 * size, False)):  # of the readings' squares
+        products = problem.products.copy()
+        products[:, -1] *= np.sqrt(factor)
+        products[:, :, -1] *= np.sqrt(factor)
+        given = Given(replace(problem, products=products, least=1.0), [{}, {"b": (0, 2)}])
+        rss = given.squares[0]
+        assert bool(np.all(rss < free)) == known
+        gain = np.diff(given.alone()[0])[0] - np.diff(given.level[0])[0]
+        wanted = 0.5 * (rss[0] - rss[1]) if known else 0.5 * free * np.log(rss[0] / rss[1])
+        assert gain == pytest.approx(wanted, rel=1e-6)
 
 
 def test_an_upper_limit_is_the_quantile_of_draws_from_the_posterior() -> None:

@@ -8,7 +8,8 @@ of a few rests. Selected effects whose own delta BIC has become negative are dro
 delta BIC > 10 is exchanged.
 
 The posterior over effects is that of the linear problem of ``pipeline.estimation.evidence``: columns are taken at the
-fit of what was selected, with its values put back into the residual, ``y = r + Z p``.
+fit of what was selected, with its values put back into the residual, ``y = r + Z p``. As in the likelihood of the
+selection, white noise is known and a scatter only adds to it: sigma is at least 1.
 """
 
 from __future__ import annotations
@@ -331,7 +332,7 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     for (name, at), (_, _, weight) in zip(places, listed, strict=True):
         versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
     free = float(max(samples - kept, 1))
-    return Problem(products, prior, 0.0, free, versions, limits, excluded([*effects.values()]))
+    return Problem(products, prior, 0.0, free, versions, limits, excluded([*effects.values()]), 1.0)
 
 
 def _random_walks(hypotheses: Sequence[NoiseHypothesis]) -> list[NoiseHypothesis]:
