@@ -63,6 +63,7 @@ ANGLE_UNITS = (
     *WRONG_FACTORS,
 )
 TIMES = ((1e3, "ms declared as s"), (1e6, "us declared as s"), (1e9, "ns declared as s"), (1e-3, "s declared as ms"))
+OTHER_AXIS = 0.5  # the axis that turns reads more than twice as much as one that leans by up to 26 deg
 LEAST_TOTAL_DEG = 1.0  # over a recording, for a ratio
 SPREAD = 0.2  # relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale
 EVEN = 1e-2  # relative change of a rate that is constant
@@ -95,7 +96,12 @@ class _Ratio(NamedTuple):
 
 
 def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
-    """Refuse a turn in which angle, rate, gyroscope, gravity and time contradict each other in scale."""
+    """Refuse a turn in which angle, rate, gyroscope, gravity and time contradict each other in scale.
+
+    A turn about another axis than the stated one is left to the check of the mounting.
+    """
+    if _about_another_axis(recording):
+        return
     angle, rate, gyro, gravity = _turned(recording)
     true_angle, true_rate = _ratio(angle, gravity), _ratio(rate, gravity)
     ratio, by_gyro = _ratio(rate, angle), _ratio(rate, gyro)
@@ -118,6 +124,14 @@ def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
         factor = _ratio(gyro, angle)
         if factor is not None and factor.of_time:
             raise _wrong_time(recording, limits, factor, "the gyroscope's readings sum up to")
+
+
+def _about_another_axis(recording: Recording) -> bool:
+    gyro = recording.gyroscope
+    if gyro is None or recording.axis is None or not recording.valid.any():
+        return False
+    spread = np.std(gyro[recording.valid], axis=0)
+    return bool(spread["xyz".index(recording.axis)] < OTHER_AXIS * spread.max())
 
 
 def _turned(recording: Recording) -> tuple[Values | None, ...]:

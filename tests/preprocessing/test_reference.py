@@ -125,3 +125,16 @@ def test_the_azimuth_of_a_shaft_is_told_as_that_of_each_body_axis_on_a_left_hand
     checked = check_recordings(turned, SETTINGS | {"table": SETTINGS["table"] | place})
     (note,) = (n for r in checked for n in r.notes if n.code == "N-AZIMUTH")
     assert "body x to 172 deg in accel_x, body y to 172 deg in accel_y" in note.detail
+
+
+def test_a_turn_about_another_axis_is_not_told_as_a_wrong_unit_of_the_angle() -> None:
+    swap = [1, 0, 2]  # the sensor's x along body y, and its y against body x
+    turn = np.array([1.0, -1.0, 1.0])
+    recordings = [
+        replace(r, accelerometer=(r.accelerometer * turn)[:, swap], gyroscope=(r.gyroscope * turn)[:, swap])
+        for r in sound()
+    ]
+    angles_only = [r if r.axis is None else replace(r, table_rate=None) for r in recordings]
+    seated = SETTINGS | {"table": SETTINGS["table"] | {"seat_deg": 2.0}}
+    found = check_recordings(angles_only, seated)
+    assert [r.axis for r in found if r.name in {"accel_x", "gyro_x", "gyro_z"}] == ["y", "y", "z"]
