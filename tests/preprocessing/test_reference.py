@@ -128,13 +128,22 @@ def test_the_azimuth_of_a_shaft_is_told_as_that_of_each_body_axis_on_a_left_hand
 
 
 def test_a_turn_about_another_axis_is_not_told_as_a_wrong_unit_of_the_angle() -> None:
-    swap = [1, 0, 2]  # the sensor's x along body y, and its y against body x
-    turn = np.array([1.0, -1.0, 1.0])
-    recordings = [
-        replace(r, accelerometer=(r.accelerometer * turn)[:, swap], gyroscope=(r.gyroscope * turn)[:, swap])
-        for r in sound()
-    ]
-    angles_only = [r if r.axis is None else replace(r, table_rate=None) for r in recordings]
-    seated = SETTINGS | {"table": SETTINGS["table"] | {"seat_deg": 2.0}}
-    found = check_recordings(angles_only, seated)
-    assert [r.axis for r in found if r.name in {"accel_x", "gyro_x", "gyro_z"}] == ["y", "y", "z"]
+    pause = [np.zeros(75)]
+    turns = [part for rate in (60.0, -60.0, 120.0, -120.0) for part in (np.full(150, rate), *pause)]
+    rate = np.concatenate([np.zeros(500), *turns])
+    angle, generator = np.cumsum(rate) / 25.0, np.random.default_rng(1)
+    a, bias = np.radians(angle), np.full(len(rate), 0.5)
+    force = np.column_stack([0.03 - np.sin(a), np.full(len(a), 0.02), 0.05 + np.cos(a)])
+    recording = Recording(
+        "gyro_x",
+        "gyroscope",
+        "x",
+        40_000_000 * np.arange(len(a)),
+        accelerometer=force + 5e-4 * generator.standard_normal((len(a), 3)),
+        gyroscope=np.column_stack([bias, rate - 0.8, bias]) + 0.02 * generator.standard_normal((len(a), 3)),
+        table_angle=angle,
+        source={"file": "gyro_x.csv"},
+    )
+    (found,) = check_recordings([recording], SETTINGS | {"table": SETTINGS["table"] | {"seat_deg": 2.0}})
+    assert found.axis == "y"
+    assert [n.code for n in found.notes] == ["N-FOUND"]
