@@ -6,6 +6,10 @@ Each unit goes through the checks of its recordings, noise, fit, held-out error 
 a unit holds the error of each parameter over its expanded uncertainty, in the frame of the mean of the mountings. A
 unit of one number is the same sensor with the same hidden effect on every bench, so that benches compare in pairs. A
 unit that is in the file is not run again. Without --units the table of the file is printed.
+
+With --coverage the units are fitted only, hide nothing, and each bench has units of its own. ``--coverage sheet``: the
+bias wander is that of the data sheet. ``--coverage drawn``: each sensor has another one, whose standard deviation and
+correlation time are drawn from the prior that a fit takes from the data sheet (``pipeline.estimation.gauss_markov``).
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections import defaultdict
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +27,8 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import PipelineError
-from pipeline.estimation.noise import noise_of
+from pipeline.estimation.gauss_markov import TIME_FACTORS, TIME_PRIOR
+from pipeline.estimation.noise import noise_of, static_or_sheet
 from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.uncertainty_budget import with_stated
 from pipeline.model.effects import built_in
@@ -47,10 +52,11 @@ KINDS = {
     "plain": "plain", "remounted": "plain", "single": "single", "seats": "single", "seats_remounted": "single",
 }  # fmt: skip
 LARGEST_SEAT_DEG = 5.0
+INDEPENDENT = 100_000  # between the numbers of units of two benches
 NOT_HIDDEN = {"mounting", "encoder_zero", "table_axis_nonorthogonality", "earth_rotation", "table_tilt"}
 
 
-def drawn(kind: str, seed: int, number: int, hidden: float) -> tuple[UnitDescription, dict[str, Any]]:
+def drawn(kind: str, seed: int, number: int, hidden: float, coverage: str = "") -> tuple[UnitDescription, dict[str, Any]]:
     """Return a unit and what is departed from: the rotation of each recording and the hidden effect."""
     rng = np.random.default_rng([seed, number, 1 + list(KINDS).index(kind)])
     of_unit = np.random.default_rng([seed, number, 0])
@@ -61,8 +67,9 @@ def drawn(kind: str, seed: int, number: int, hidden: float) -> tuple[UnitDescrip
         for name in seats:
             direction = rng.standard_normal(3)
             seats[name] = size * rng.uniform(0.0, 1.0) * direction / np.linalg.norm(direction)
+    leans = coverage and kind == "single"  # as the table states; seats contain it
     bench: dict[str, Any] = {
-        "direction_deg": np.zeros((3, 2)).tolist() if KINDS[kind] == "single" else None,
+        "direction_deg": np.zeros((3, 2)).tolist() if KINDS[kind] == "single" and not leans else None,
         "rate_error": [0.0, 0.0, 0.0],  # encoders keep the angle over any number of turns; see ``judged``
         "mounting_deg": {n: (face * Rotation.from_rotvec(s, degrees=True)).as_rotvec(degrees=True).tolist()
                          for n, s in seats.items()},
@@ -77,11 +84,13 @@ def drawn(kind: str, seed: int, number: int, hidden: float) -> tuple[UnitDescrip
     names = [n for n, e in built_in().items() if sensor in e.sensors and sensor not in e.unseen and n not in NOT_HIDDEN]
     effect = str(of_unit.choice(names)) if of_unit.random() < hidden else ""
     table = "acutronic" if KINDS[kind] == "plain" else "single_axis"
+    model = ("mpu6050", "stim300")[number % 2]
     description = UnitDescription(
         f"u{number}",
-        sensor=("mpu6050", "stim300")[number % 2],
+        sensor=model,
         table=table,
         course=COURSE,
+        **({s: _drawn_wander(model, s, of_unit) for s in SENSORS} if coverage == "drawn" else {}),
         imperfections=bench,
         effects={f"{sensor}.{effect}": None} if effect else {},
     )
@@ -90,13 +99,22 @@ def drawn(kind: str, seed: int, number: int, hidden: float) -> tuple[UnitDescrip
     return description, {**departure, "hidden": f"{sensor}.{effect}" if effect else ""}
 
 
-def judged(kind: str, seed: int, number: int, hidden: float) -> dict[str, Any]:
+def _drawn_wander(model: str, sensor: str, rng: np.random.Generator) -> dict[str, float]:
+    """Return a bias wander of the prior that a fit takes from the data sheet."""
+    prior = static_or_sheet(None, read_config("sensor", model)[sensor])
+    return {
+        "bias_wander": prior.wander * float(np.exp(prior.width * rng.standard_normal())),
+        "wander_time_s": prior.time * float(rng.choice(TIME_FACTORS, p=TIME_PRIOR)),
+    }
+
+
+def judged(kind: str, seed: int, number: int, hidden: float, coverage: str = "") -> dict[str, Any]:
     """Return what is said of one unit, by the functions that the stages of a run call, in their order.
 
     The rate of each turn axis has an error as its table states, without one of the angle, as by a wrong clock of the
     table: the true matrix of the gyroscope is ``diag(1 + error)`` times that of the simulation.
     """
-    description, bench = drawn(kind, seed, number, hidden)
+    description, bench = drawn(kind, seed, number, hidden, coverage)
     recordings, truth = simulate_unit(description, seed, number)
     nominal = {r.name: _nominal(r, description.imperfections) for r in recordings if r.name in TURNS}
     if bench["face"].magnitude() > 0.0 or "seats" in kind:
@@ -126,14 +144,17 @@ def judged(kind: str, seed: int, number: int, hidden: float) -> dict[str, Any]:
             matrix = np.diag(1.0 + bench["rate_error"]) @ matrix
         error = np.concatenate([found.bias - truth[sensor]["bias"], (found.matrix - matrix).ravel()])
         U = coverage_factor(found.freedom[:12]) * np.sqrt(np.diag(found.covariance)[:12])
+        line["sensors"][sensor] = {"error_over_U": (error / U).tolist()}
+        if coverage:
+            continue
         held = validate(found, recordings, noises[sensor], settings)
         gravity = line["sensors"].get("accelerometer")
         said = diagnose(
             found, recordings, noises[sensor], settings, fits["accelerometer"], validation=held, gravity=gravity
         )
         inside = held["expected_rms_error"][0] <= held["steps"][-1]["rms_error"] <= held["expected_rms_error"][1]
-        line["sensors"][sensor] = {
-            "error_over_U": (error / U).tolist(), "over_floor": held["steps"][-1]["rms_error"] / held["noise_floor"],
+        line["sensors"][sensor] |= {
+            "over_floor": held["steps"][-1]["rms_error"] / held["noise_floor"],
             "inside": bool(inside), "verdict": said["verdict"], "selected": said["selected"], "reason": said["reason"],
             "not_observable": [entry["effect"] for entry in said["not_observable"]],
         }  # fmt: skip
@@ -186,14 +207,15 @@ def table(lines: list[dict[str, Any]]) -> str:
             if plain:
                 covered = np.abs([p["error_over_U"] for p in plain]) <= 1.0
                 low, high = wilson(int(covered.sum()), covered.size)
-                inside, silent = sum(p["inside"] for p in plain), defaultdict(int)
-                for p in plain:
-                    silent[p["verdict"]] += 1
-                rows.append(
+                each = 100.0 * covered.mean(axis=0)
+                text = (
                     f"  {sensor}: coverage {100 * covered.mean():.1f} % ({100 * low:.1f} to {100 * high:.1f}), "
-                    f"parameters {100 * covered.mean(axis=0).min():.1f} to {100 * covered.mean(axis=0).max():.1f} %; "
-                    f"held-out inside {inside} of {len(plain)}; {dict(silent)}"
+                    f"parameters {each.min():.1f} to {each.max():.1f} %: {' '.join(f'{e:.1f}' for e in each)}"
                 )
+                if "verdict" in plain[0]:
+                    verdicts = dict(Counter(p["verdict"] for p in plain))
+                    text += f"; held-out inside {sum(p['inside'] for p in plain)} of {len(plain)}; {verdicts}"
+                rows.append(text)
             if hidden:
                 rows.append(f"  {sensor}: hidden effect named first {sum(map(_named, hidden))} of {len(hidden)}")
         rows += _in_pairs(kind, fine, lines)
@@ -237,16 +259,20 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kinds", nargs="+", default=list(KINDS))
     parser.add_argument("--hidden", type=float, default=0.4, help="share of units with a hidden effect")
+    parser.add_argument("--coverage", choices=["sheet", "drawn"], default="")
     parser.add_argument("--out", required=True)
     options = parser.parse_args()
+    hidden = 0.0 if options.coverage else options.hidden
     file = Path(options.out)
     lines = [json.loads(text) for text in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
     known = {(line["kind"], line["seed"], line["number"]) for line in lines}
     for place in range(options.units):
         number, kind = place // len(options.kinds), options.kinds[place % len(options.kinds)]
+        if options.coverage:
+            number += INDEPENDENT * list(KINDS).index(kind)
         if (kind, options.seed, number) in known:
             continue
-        lines.append(judged(kind, options.seed, number, options.hidden))
+        lines.append(judged(kind, options.seed, number, hidden, options.coverage))
         with file.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(lines[-1]) + "\n")
     sys.stdout.write(table(lines))
