@@ -71,6 +71,9 @@ class Prior:
     wander: float = 0.0  # unit of the sensor; its standard deviation; 0 where nothing is known
     time: float = DEFAULT_TIME_S  # s; its correlation time
     width: float = SHEET_WIDTH  # standard deviation of the logarithm of ``wander``
+    stated: Prior | None = None  # what is known beside the static recording, where ``seen`` holds what that tells
+    # wanders tried, (w,), and the log likelihood of a static recording at them, (t, w), by ``TIME_FACTORS``
+    seen: tuple[Values, Values] | None = None
 
     def log_belief(self, wander: Values) -> Values:
         """Return the log prior, up to a constant, of (m,) standard deviations of which the first is 0.
@@ -84,11 +87,15 @@ class Prior:
 
     def grid(self, white: float) -> list[Setting]:
         """Return the hypotheses over which a covariance is averaged, for white noise of ``white`` per sample."""
-        belief = self.log_belief(RATIOS * white)
+        wander = RATIOS * white
+        belief = (self.stated or self).log_belief(wander)
+        told = np.zeros((len(TIME_FACTORS), 1))
+        if self.seen is not None:
+            told = np.stack([np.interp(wander, self.seen[0], row) for row in self.seen[1]])
         return [
             Setting(float(ratio), factor * self.time, float(log + np.log(share)))
-            for factor, share in zip(TIME_FACTORS, TIME_PRIOR, strict=True)
-            for ratio, log in zip(RATIOS, belief, strict=True)
+            for factor, share, logs in zip(TIME_FACTORS, TIME_PRIOR, belief + told, strict=True)
+            for ratio, log in zip(RATIOS, logs, strict=True)
             if np.isfinite(log)
         ]
 

@@ -45,8 +45,10 @@ import numpy as np
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.estimation.gauss_markov import (
     DEFAULT_TIME_S,
+    FARTHEST,
     SHARPEST_WIDTH,
     SHEET_WIDTH,
+    TIME_FACTORS,
     Blocks,
     GaussMarkov,
     Prior,
@@ -113,10 +115,12 @@ def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
 
 
 def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Prior:
-    """Return what a static recording tells of the bias instability, or else the data sheet.
+    """Return what the data sheet and a static recording tell of the bias instability.
 
-    A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative uncertainty
-    ``sqrt(tau / T)``.
+    The prior is that of the data sheet times the likelihood of the static recording at each wander and correlation
+    time. A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative
+    uncertainty ``sqrt(tau / T)``. Where that is below ``SHARPEST_WIDTH``, the likelihood counts as that of a shorter
+    rest: no sensor is a Gauss-Markov process that well.
 
     ``settings``: section ``sensor``.
     """
@@ -126,11 +130,20 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
 
 
 def static_or_sheet(noise: Noise | None, sheet: Mapping[str, Any]) -> Prior:
-    """Return the prior by a noise that a static recording tells, or else by the data sheet."""
-    if noise and noise.source == "static":
-        width = float(np.clip(np.sqrt(noise.correlation_time / noise.length), SHARPEST_WIDTH, SHEET_WIDTH))
-        return Prior(float(np.sqrt(np.mean(noise.wander**2))), noise.correlation_time, width)
-    return Prior(float(sheet.get("bias_wander") or 0.0), _wander_time(sheet))
+    """Return the prior by the data sheet, and by a noise that a static recording tells (``prior_of``)."""
+    stated = Prior(float(sheet.get("bias_wander") or 0.0), _wander_time(sheet))
+    if noise is None or noise.source != "static" or noise.seen is None:
+        return stated
+    width = np.sqrt(noise.correlation_time / noise.length)
+    seen = noise.seen * min(1.0, float(width / SHARPEST_WIDTH) ** 2)
+    least = seen.max() - 0.5 * FARTHEST**2
+    return Prior(
+        float(np.sqrt(np.mean(noise.wander**2))),
+        noise.correlation_time,
+        float(np.clip(width, SHARPEST_WIDTH, SHEET_WIDTH)),
+        stated,
+        (RATIOS * float(np.sqrt(np.mean(noise.white**2))), np.maximum(seen, least)),
+    )
 
 
 def _rests_of(recordings: Sequence[Recording], sensor: str, *, everything: bool) -> list[Rest]:
@@ -209,16 +222,18 @@ def _best(blocks: _RestBlocks, design: Values, covariance: Values, sheet: dict[s
     pooled = gain.sum(axis=2).max(axis=1)
     row = int(np.argmax(pooled))
     sheet_row = int(np.argmin(np.abs(TIMES - 1.0)))
-    if pooled[row] - pooled[sheet_row] < AGREES:
+    if pooled[row] < max(pooled[sheet_row] + AGREES, SEEN):
         row = sheet_row
+    near = np.clip(row + np.log2(TIME_FACTORS).astype(int), 0, len(TIMES) - 1)
+    seen = 0.5 * gain[near].sum(axis=2) if source == "static" else None
     if pooled[row] < SEEN:
-        return _unseen(gain[sheet_row], white[sheet_row, 0], sheet, source)
+        return replace(_unseen(gain[sheet_row], white[sheet_row, 0], sheet, source), seen=seen)
     columns = range(gain.shape[2])
     apart = gain[row].max(axis=0).sum() - pooled[row] > SEEN
     axes = [slice(c, c + 1) for c in columns] if apart else [slice(None)] * len(columns)
     ratio = np.array([_peak(gain[row][:, axis].sum(axis=1)) for axis in axes])
     own = np.maximum([np.interp(ratio[c], RATIOS, white[row, :, c]) for c in columns], SMALLEST_WHITE)
-    return Noise(own, own * ratio, float(times[row]), source)
+    return Noise(own, own * ratio, float(times[row]), source, seen=seen)
 
 
 def _peak(gain: Values) -> float:

@@ -169,7 +169,8 @@ class Noise:
 
     ``source``: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (of a fit) or ``data_sheet``.
     ``length``, s, is that of the static rest, else 0; the relative uncertainty of the wander is about
-    ``sqrt(correlation_time / length)``.
+    ``sqrt(correlation_time / length)``. ``seen``: log likelihood of the static rest at each correlation time and wander
+    tried (``pipeline.estimation.noise``), where it tells any.
     """
 
     white: Values
@@ -177,15 +178,16 @@ class Noise:
     correlation_time: float
     source: str
     length: float = 0.0
+    seen: Values | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the noise as JSON values."""
-        return {**vars(self), "white": self.white.tolist(), "wander": self.wander.tolist()}
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Read back what ``to_json`` wrote."""
-        return cls(**{**data, "white": np.array(data["white"]), "wander": np.array(data["wander"])})
+        return cls(**{k: np.array(v) if isinstance(v, list) else v for k, v in data.items()})
 
 
 def noise_of_steps(step: Values, axis: int = 0, *, keepdims: bool = False) -> Values:

@@ -5,11 +5,19 @@ from dataclasses import replace
 import bench_session
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.signal import lfilter
+from scipy.stats import norm
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.gauss_markov import block_covariance, variance_of_average
-from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.gauss_markov import (
+    SHEET_WIDTH,
+    TIME_FACTORS,
+    TIME_PRIOR,
+    block_covariance,
+    variance_of_average,
+)
+from pipeline.estimation.noise import estimate_noise, static_or_sheet
 from pipeline.estimation.noise_terms import allan_deviation
 from pipeline.records import Recording
 from pipeline.signal.filters import apply_filter, filter_autocovariance
@@ -33,9 +41,11 @@ def gauss_markov(n: int, tau: float, rng: np.random.Generator) -> np.ndarray:
     return lfilter([1.0], [1.0, -phi], steps, axis=0)
 
 
-def rest(n: int, wander: float, seed: int, *, role: str = "static", start: float = 3000.0) -> Recording:
+def rest(
+    n: int, wander: float, seed: int, *, role: str = "static", start: float = 3000.0, tau: float = 100.0
+) -> Recording:
     rng = np.random.default_rng(seed)
-    values = np.array([0.0, 0.0, 1.0]) + WHITE * rng.standard_normal((n, 3)) + wander * gauss_markov(n, 100.0, rng)
+    values = np.array([0.0, 0.0, 1.0]) + WHITE * rng.standard_normal((n, 3)) + wander * gauss_markov(n, tau, rng)
     time_ns = ((start + np.arange(n) * DT) * 1e9).astype(np.int64)
     return Recording("static", role, None, time_ns, accelerometer=values)
 
@@ -61,6 +71,25 @@ def test_wander_is_recovered_from_a_static_recording(name: str, wander: float) -
     assert np.std(rms) < 0.25 * wander
     assert 50.0 <= np.median([n.correlation_time for n in noises]) <= 200.0
     assert {n.source for n in noises} == {"static"}
+
+
+def test_hypotheses_of_a_static_recording_predict_the_scatter_of_an_average() -> None:
+    rng, covered, length = np.random.default_rng(3), [], 100.0
+    for seed in range(100):
+        wander = SHEET["bias_wander"] * np.exp(SHEET_WIDTH * rng.standard_normal())
+        tau = 100.0 * rng.choice(TIME_FACTORS, p=TIME_PRIOR)
+        noise = estimate_noise("accelerometer", [rest(7500, wander, seed, tau=tau)], SHEET)
+        settings = static_or_sheet(noise, SHEET).grid(WHITE)
+        weight = np.exp(np.array([s.prior for s in settings]) - max(s.prior for s in settings))
+        sigma = np.array([scatter_of_average(WHITE * s.ratio, s.time, length) for s in settings])
+        x = brentq(lambda x: weight @ (2.0 * norm.cdf(x / sigma) - 1.0) - 0.95 * weight.sum(), 0.0, 4.0 * sigma.max())  # noqa: B023
+        covered.append(2.0 * norm.cdf(x / scatter_of_average(wander, tau, length)) - 1.0)
+    assert abs(np.mean(covered) - 0.95) < 3.0 * np.std(covered) / 10.0
+    assert np.std(covered) < 0.06
+
+
+def scatter_of_average(wander: float, tau: float, length: float) -> float:
+    return float(np.sqrt(WHITE**2 * DT / length + wander**2 * variance_of_average(np.array(length), tau)))
 
 
 def test_no_wander_is_invented_in_white_noise() -> None:

@@ -56,7 +56,9 @@ INDEPENDENT = 100_000  # between the numbers of units of two benches
 NOT_HIDDEN = {"mounting", "encoder_zero", "table_axis_nonorthogonality", "earth_rotation", "table_tilt"}
 
 
-def drawn(kind: str, seed: int, number: int, hidden: float, coverage: str = "") -> tuple[UnitDescription, dict[str, Any]]:
+def drawn(
+    kind: str, seed: int, number: int, hidden: float, coverage: str = ""
+) -> tuple[UnitDescription, dict[str, Any]]:
     """Return a unit and what is departed from: the rotation of each recording and the hidden effect."""
     rng = np.random.default_rng([seed, number, 1 + list(KINDS).index(kind)])
     of_unit = np.random.default_rng([seed, number, 0])
