@@ -120,7 +120,8 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
     The prior is that of the data sheet times the likelihood of the static recording at each wander and correlation
     time. A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative
     uncertainty ``sqrt(tau / T)``. Where that is below ``SHARPEST_WIDTH``, the likelihood counts as that of a shorter
-    rest: no sensor is a Gauss-Markov process that well.
+    rest: no sensor is a Gauss-Markov process that well. A wander above the likeliest is never less likely than by
+    ``exp(-FARTHEST**2)``, so that the residuals of turns can show what a rest does not: the lack of fit.
 
     ``settings``: section ``sensor``.
     """
@@ -136,13 +137,14 @@ def static_or_sheet(noise: Noise | None, sheet: Mapping[str, Any]) -> Prior:
         return stated
     width = np.sqrt(noise.correlation_time / noise.length)
     seen = noise.seen * min(1.0, float(width / SHARPEST_WIDTH) ** 2)
-    least = seen.max() - 0.5 * FARTHEST**2
+    largest = int(np.argmax(seen.max(axis=0)))  # turns may show more than a rest, never less
+    seen[:, largest:] = np.maximum(seen[:, largest:], seen.max() - FARTHEST**2)
     return Prior(
         float(np.sqrt(np.mean(noise.wander**2))),
         noise.correlation_time,
         float(np.clip(width, SHARPEST_WIDTH, SHEET_WIDTH)),
         stated,
-        (RATIOS * float(np.sqrt(np.mean(noise.white**2))), np.maximum(seen, least)),
+        (RATIOS * float(np.sqrt(np.mean(noise.white**2))), seen),
     )
 
 
