@@ -187,7 +187,8 @@ class Noise:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Read back what ``to_json`` wrote."""
-        return cls(**{k: np.array(v) if isinstance(v, list) else v for k, v in data.items()})
+        known: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in data.items()}
+        return cls(**known)
 
 
 def noise_of_steps(step: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
