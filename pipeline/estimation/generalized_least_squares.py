@@ -175,10 +175,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     spare = max(n - design.count, 1.0)
     products, logarithms = design.products(settings)
     gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
-    unit = np.sqrt(np.maximum(np.einsum("gpp->gp", gram), 1e-30))
-    values, vectors = np.linalg.eigh(gram / (unit[:, :, None] * unit[:, None, :]))
-    kept = values > RANK * values[:, -1:]
-    half = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :] / unit[:, :, None]
+    values, kept, unit, half = _roots(gram)
     steps = np.einsum("gpi,gqi,gq->gp", half, half, rhs, optimize=True)
     rss = np.maximum(np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within, 1e-300)
     scores = -0.5 * n * np.log(rss / n) - 0.5 * logarithms + np.array([s.prior for s in settings])
@@ -200,10 +197,19 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     )
 
 
+def _roots(gram: Values) -> tuple[Values, Values, Values, Values]:
+    """Return the pseudo-inverse of (g, p, p) products of columns: eigenvalues, those above 0, column sizes, a root."""
+    unit = np.sqrt(np.maximum(np.einsum("gpp->gp", gram), 1e-30))
+    values, vectors = np.linalg.eigh(gram / (unit[:, :, None] * unit[:, None, :]))
+    kept = values > RANK * values[:, -1:]
+    half = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :] / unit[:, :, None]
+    return values, kept, unit, half
+
+
 def _residual_noise(
     design: Design, observations: Observations, settings: Sequence[Setting], reference: Reference
 ) -> ResidualNoise:
-    """Weight hypotheses about the noise by their restricted likelihood, given a design of full rank at its solution."""
+    """Weight hypotheses about the noise by their restricted likelihood, given a design at its solution."""
     weight, blocks, white = observations.weight, observations.blocks, design.scale
     disturbed = disturbance(reference, observations.reading, blocks, weight, white)
     if disturbed is not None:
@@ -220,12 +226,14 @@ def _residual_noise(
     products, logarithms = design.products(settings)
     gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
     gram += (np.einsum("gpp->gp", gram) <= RANK)[:, :, None] * np.eye(len(size))  # columns of zeros
-    steps = np.linalg.solve(gram, rhs[:, :, None])[:, :, 0]
+    values, kept, unit, half = _roots(gram)
+    steps = np.einsum("gpi,gqi,gq->gp", half, half, rhs, optimize=True)
+    determinants = np.sum(np.log(np.where(kept, values, 1.0)), axis=1) + 2.0 * np.sum(np.log(unit), axis=1)
     within = float(np.sum(observations.scatter / design.scale**2))
     rss = np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within
     free = max(3.0 * observations.samples - design.count, 1.0)
     variance = np.maximum(rss / free, np.finfo(float).tiny)[:, None]
-    found = ResidualNoise.of(blocks, settings, logarithms + np.linalg.slogdet(gram)[1], variance, free, weight)
+    found = ResidualNoise.of(blocks, settings, logarithms + determinants, variance, free, weight)
     return replace(found, white_variance=found.white_variance * design.scale**2)
 
 
