@@ -39,7 +39,7 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.model.effects.base import Layout, truth
 from pipeline.model.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-from pipeline.records import NORMAL, Contribution, Noise, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import NORMAL, Contribution, Mask, Noise, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -197,7 +197,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     )
 
 
-def _roots(gram: Values) -> tuple[Values, Values, Values, Values]:
+def _roots(gram: Values) -> tuple[Values, Mask, Values, Values]:
     """Return the pseudo-inverse of (g, p, p) products of columns: eigenvalues, those above 0, column sizes, a root."""
     unit = np.sqrt(np.maximum(np.einsum("gpp->gp", gram), 1e-30))
     values, vectors = np.linalg.eigh(gram / (unit[:, :, None] * unit[:, None, :]))
