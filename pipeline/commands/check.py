@@ -20,7 +20,8 @@ from pipeline.files import write_atomically
 from pipeline.io.files import SUFFIXES, recording_files
 from pipeline.model.data_sheet import settings_of_ranges
 from pipeline.profile_detection.columns import find_layout
-from pipeline.profile_detection.proposal import as_yaml, propose
+from pipeline.profile_detection.profile_text import as_yaml, not_found
+from pipeline.profile_detection.proposal import propose
 from pipeline.profile_detection.recording_facts import as_text, facts, topic_lines, topics_of
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.run_progress import Countdown
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from pipeline.profile_detection.recording_facts import Line
 
 SEARCHED_BYTES = 1 << 25  # of a log, for its layout
+MOST_IN_FULL = 3  # logs of one layout
+WIDTH = 118  # characters of a line
 UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")
 EPILOG = """\
 Recordings of a campaign are checked as a run would do it: with the settings of their unit, compared with the other
@@ -78,22 +81,37 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(argv)
     tasks = _tasks(arguments)
     countdown, refused = Countdown(len(tasks)), list[Refused]()
+    alike: dict[str, list[str]] = {}
     for number, (what, task) in enumerate(tasks):
         countdown(number, f"checking {what} ({number + 1} of {len(tasks)})")
         text, found = task()
         countdown.end()
-        print(f"{text}\n")
+        key = _same_layout(found)
+        if key and key in alike:
+            alike[key].append(what)
+        else:
+            alike[key] = [what]
+            print(f"{text}\n")
         refused += found
+    for key, (first, *others) in alike.items():
+        if key and others:
+            print(textwrap.fill(f"REFUSED as {first}: {', '.join(others)}", WIDTH, subsequent_indent="  ") + "\n")
+    sys.stdout.flush()
+    for one in refused:
+        print(f"python -m pipeline check: {one.place}: refused ({one.code})", file=sys.stderr, flush=True)
     unknown = [(r.reading, layout) for r in refused if r.reading for layout in _layouts(r.reading, r.code)]
     if unknown:
         sensor = unknown[0][0].settings["sensor"]
         _print_proposals(propose([layout for _, layout in unknown], sensor), sensor, arguments.save)
     elif arguments.save:
         print(f"{arguments.save} was not written: no profile is proposed")
-    sys.stdout.flush()
-    for one in refused:
-        print(f"python -m pipeline check: {one.place}: refused ({one.code})", file=sys.stderr)
     return 2 if refused else 0
+
+
+def _same_layout(refused: Sequence[Refused]) -> str:
+    """Return the message of a log alone whose layout is unknown, empty for any other."""
+    one = refused[0] if len(refused) == 1 else None
+    return one.message if one and one.code in UNKNOWN_LAYOUT and one.reading and not one.reading.has_topics else ""
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -310,21 +328,25 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
         raise ConfigurationError(f"{len(proposals)} profiles are proposed and --save writes one: check fewer files")
     name = "my_logger" if save is None else save.stem
     for proposal in proposals:
-        print(f"PROPOSED PROFILE for {', '.join(proposal.files)}\n")
-        text = as_yaml(proposal, name)
-        print(textwrap.indent(text, "    "))
         if proposal.complete:
-            print("With it:\n")
+            print("WITH THE PROFILE PROPOSED BELOW:\n")
             ingest = proposal.ingest(name, sensor)
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
-            for group in groups:
-                print(f"{_check_log(Reading.alone(group, ingest, sensor, 'the proposed profile'))[0]}\n")
-        elif proposal.unknown():
+            for number, group in enumerate(groups):
+                text, refused = _check_log(Reading.alone(group, ingest, sensor, "the proposed profile"))
+                if number < MOST_IN_FULL or refused:
+                    print(f"{text}\n")
+            if len(groups) > MOST_IN_FULL:
+                print("Every other file is read without a refusal: check it alone for what it holds.\n")
+        print(textwrap.fill(f"PROPOSED PROFILE for {', '.join(proposal.files)}", WIDTH, subsequent_indent="  ") + "\n")
+        text = as_yaml(proposal, name)
+        print(textwrap.indent(text, "    "))
+        if proposal.unknown():
             print(f"Fill in {UNKNOWN} for {', '.join(proposal.unknown())}.")
         if save is not None:
             write_atomically(save, text)
             print(f"Saved as {save}. No configuration uses it yet.")
-        print(NEXT.format(name=name))
+        print("\n".join([*not_found(proposal), NEXT.format(name=name)]))
 
 
 NEXT = """\

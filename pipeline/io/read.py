@@ -188,7 +188,7 @@ def to_recording(
         table.values["table_rate"] = rate_of_attitude((table.time_ns - table.time_ns[0]) / 1e9, attitude)
     values = table.values
     for lacking in (s for s, triad in TRIADS.items() if triad[0] not in values):
-        detail = f"the file holds no readings of the {lacking}: it cannot calibrate this sensor"
+        detail = f"the file has no column that the profile assigns to the {lacking}: it cannot calibrate this sensor"
         notes.append(Note("N-ABSENT", len(table.time_ns), 0, 0, detail))
     recording = Recording(
         name=name,

@@ -30,11 +30,25 @@ SCATTER = 0.2  # of intervals over their median: times of arrival, not of sampli
 TEMPERATURE_RANGE = (-60.0, 130.0)  # degC, of electronics and their tests
 
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
-MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|omega|rot)([xyz])")
+MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|om|omega|rot|rate)([xyz])")
 AXIS_WORDS = ("x", "y", "z", "0", "1", "2", "3")
 SENSOR_WORDS = {
     "accelerometer": {"a", "ac", "acc", "accl", "accel", "accelerometer", "acceleration", "f", "force"},
-    "gyroscope": {"g", "gy", "gyr", "gyro", "gyroscope", "w", "omega", "rotation", "rot", "angular"},
+    "gyroscope": {
+        "g",
+        "gy",
+        "gyr",
+        "gyro",
+        "gyroscope",
+        "w",
+        "om",
+        "omega",
+        "rotation",
+        "rot",
+        "angular",
+        "rate",
+        "rates",
+    },
 }
 NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
 TIME_FIRST = {
@@ -77,7 +91,7 @@ class Columns:
 
     ``counter`` counts samples. ``arrival``: a time that scatters beside a counter without a gap, which then is the
     time. ``triads``: sensor to its x, y, z. ``others``: temperature, table_angle ... ``steady``: time, or the counter
-    of samples, never falls back.
+    of samples, never falls back. ``turn``: counts a turn of the table's encoder, and how they show.
     """
 
     layout: TextLayout
@@ -87,7 +101,13 @@ class Columns:
     triads: dict[str, Triad] = field(default_factory=dict)
     others: dict[str, int] = field(default_factory=dict)
     steady: bool = True
+    turn: tuple[float, str] | None = None
     remarks: list[str] = field(default_factory=list)
+
+    def free(self) -> list[int]:
+        """Return the columns of numbers that hold nothing known."""
+        used = {self.time, self.counter, self.arrival, *self.others.values(), *sum(self.triads.values(), ())}
+        return [i for i in self.layout.numbers if i not in used]
 
 
 def words_of(name: str) -> list[str]:
@@ -146,9 +166,6 @@ def find_columns(layout: TextLayout) -> Columns:
             found.others[channel] = i
         elif w == ["t"] and possible and not _advances(values):  # a column called T, which may be a time
             found.others.setdefault("temperature", i)
-    texts = [n for i, n in enumerate(layout.names) if i not in layout.numbers]
-    if texts:
-        found.remarks.append(f"left out, as not all of it is numbers: {', '.join(texts)}")
     return found
 
 

@@ -7,9 +7,6 @@ one recording. What one file does not determine is taken from another of the sam
 
 from __future__ import annotations
 
-import json
-import re
-import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,19 +24,20 @@ from pipeline.profile_detection.columns import (
     words_of,
 )
 from pipeline.profile_detection.recording_facts import TopicLayout
+from pipeline.profile_detection.table_encoder import CENTIDEGREES, find_encoder, unit_by_table
 from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
     OF_SENSOR,
     UNKNOWN,
     Guess,
-    counts_a_turn,
     counts_of_sensor,
+    even_steps,
     force_unit,
     other_range,
     rate_unit,
-    rate_unit_by_table,
     temperature_counts,
     time_unit,
+    whole,
 )
 
 if TYPE_CHECKING:
@@ -49,10 +47,7 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
-CENTIDEGREES = "cdeg"  # in the name of a table's angle
 Entries = dict[str, dict[str, Any]]
-WIDTH = 116  # of comments in a proposed profile
-WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
 
 
 @dataclass
@@ -61,7 +56,7 @@ class Proposal:
 
     ``files``: of a recording in parts, the file of each. ``csv``: the section without columns. ``columns``: of each
     part, channel to its entry; ``???`` stands for what has to be filled in. ``evidence``: by key of ``csv``, ``time``,
-    sensor or channel. ``remarks``: what has to be decided, or is odd.
+    sensor or channel. ``remarks``: what has to be decided, or is odd. ``seen``: of each part, column to what it holds.
     """
 
     files: list[str]
@@ -70,6 +65,7 @@ class Proposal:
     columns: list[Entries]
     evidence: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    seen: list[dict[str | int, str]] = field(default_factory=list)
 
     @property
     def parts(self) -> list[str]:
@@ -101,7 +97,7 @@ class Proposal:
             for entries in self.columns
         ]
         if self.topic is not None:
-            return {"name": name, "csv": {}, "mcap": {"topics": {self.topic: _fields(columns[0])}}}
+            return {"name": name, "csv": {}, "mcap": {"topics": {self.topic: fields_of(columns[0])}}}
         if not self.parts:
             return {"name": name, "csv": {**self.csv, "columns": columns[0]}, "mcap": {}}
         parts = [{"file": f, "columns": c} for f, c in zip(self.parts, columns, strict=True)]
@@ -170,29 +166,28 @@ def _fill_in(proposal: Proposal, other: Proposal) -> None:
     if proposal.csv.get("delimiter") != other.csv.get("delimiter"):
         proposal.csv["delimiter"] = AUTO
         proposal.evidence["delimiter"] = "the files differ: by the header of each"
+    proposal.seen[0] = other.seen[0] | proposal.seen[0]
     for channel in other.columns[0].keys() - proposal.columns[0].keys():
         proposal.columns[0][channel] = other.columns[0][channel]
         proposal.evidence[channel] = f"{other.evidence.get(channel, '')} ({Path(other.files[0]).name})"
     for channel, entry in proposal.columns[0].items():
         better = other.columns[0].get(channel, entry)
-        if UNKNOWN in entry.values() and UNKNOWN not in better.values():
+        by_turns = channel == "table_angle" and (better["unit"], entry["unit"]) == (COUNTS, "deg")
+        if (UNKNOWN in entry.values() and UNKNOWN not in better.values()) or by_turns:
             proposal.columns[0][channel] = better
             key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
             proposal.evidence[key] = f"{other.evidence[key]} ({Path(other.files[0]).name})"
+        elif channel == "table_angle" and better != entry and better["unit"] == COUNTS:
+            proposal.remarks.append(f"{Path(other.files[0]).name} differs: {other.evidence[channel]}")
     proposal.remarks += [r for r in other.remarks if r not in proposal.remarks]
 
 
 def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
     layouts = [c.layout for c in parts]
     proposal = Proposal([s.path for s in layouts], layouts, _csv_section(layouts[0]), [{} for _ in parts])
+    proposal.seen = [{s.key(i): _described(s.numbers.get(i)) for i in range(len(s.names))} for s in layouts]
     if layouts[0].rate_hz is not None:
         proposal.evidence["rate_hz"] = f"the file states {layouts[0].rate_line!r}"
-    for columns in parts:
-        proposal.remarks += columns.remarks
-        if proposal.topic is not None and columns.time is None:
-            proposal.remarks.append("no field of the topic is a time, which each topic needs")
-        if columns.layout.odd_rows:
-            proposal.remarks.append(f"{columns.layout.odd_rows} rows have another number of fields than the others")
     time_s = _time(parts, proposal)
     force = _readings("accelerometer", parts)
     if force is not None:
@@ -201,14 +196,30 @@ def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
         _add("accelerometer", parts, proposal, guess)
         proposal.remarks += other_range(guess, sensor)
         force = force - guess.centre
+    find_encoder(parts, force, None, time_s)
     rate = _readings("gyroscope", parts)
     if rate is not None:
         _add("gyroscope", parts, proposal, _gyroscope(parts, force, rate, time_s, sensor))
+        find_encoder(parts, None, _in_dps(rate, proposal), time_s)
     for columns, entries in zip(parts, proposal.columns, strict=True):
         _others(columns, entries, proposal, str(sensor.get("name", "")))
+        proposal.remarks += columns.remarks
+        if proposal.topic is not None and columns.time is None:
+            proposal.remarks.append("no field of the topic is a time, which each topic needs")
+        if columns.layout.odd_rows:
+            proposal.remarks.append(f"{columns.layout.odd_rows} rows have another number of fields than the others")
     if force is None and rate is None:
         _add_template(proposal)
     return proposal
+
+
+def _described(values: Values | None) -> str:
+    if values is None:
+        return "not all of it is numbers"
+    low, high = float(values.min()), float(values.max())
+    kind = "whole numbers " if whole(values) else ""
+    even = ", grows evenly with the rows" if even_steps(values) else ""
+    return f"{kind}{low:.6g} to {high:.6g}{even}" if high > low else f"{low:.6g} throughout"
 
 
 def _add_template(proposal: Proposal) -> None:
@@ -234,7 +245,7 @@ def _gyroscope(
     elif force is not None:
         moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
         why_none = "" if moves else "no move between rests rotates gravity, which would show the unit"
-    by_table = _by_table(next(c for c in parts if "gyroscope" in c.triads), rate, time_s)
+    by_table = unit_by_table(next(c for c in parts if "gyroscope" in c.triads), rate, time_s)
     guess = by_table or rate_unit(rate, moves, why_none, timed=time_s is not None)
     if guess.entry["unit"] == COUNTS and guess.entry["counts_per_unit"] == UNKNOWN:
         return counts_of_sensor(guess, "gyroscope", sensor)
@@ -298,25 +309,14 @@ def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | Non
     return None if rate is None else (count - count[0]) / rate
 
 
-def _by_table(columns: Columns, rate: Values, time_s: Values | None) -> Guess | None:
-    """Return what the table's rate, or the slope of its angle, in the same rows says of the gyroscope's unit."""
-    channel = next((c for c in ("table_rate", "table_angle") if c in columns.others), None)
-    if channel is None or (channel == "table_angle" and not columns.steady):
+def _in_dps(rate: Values, proposal: Proposal) -> Values | None:
+    """Return rates in deg/s, but for their offset; None where their unit is not known."""
+    entry = next(e[GYROSCOPE[0]] for e in proposal.columns if GYROSCOPE[0] in e)
+    counts = entry.get("counts_per_unit", 1.0)
+    if entry["unit"] == UNKNOWN or isinstance(counts, str):
         return None
-    index = columns.others[channel]
-    stated, _ = stated_unit(columns.layout.names[index], channel)
-    multiplier, divisor = UNITS[channel][stated or {"table_rate": "deg/s", "table_angle": "deg"}[channel]]
-    if CENTIDEGREES in words_of(columns.layout.names[index]):
-        divisor *= 100
-    values = columns.layout.numbers[index]
-    if channel == "table_angle" and stated is None and (turn := counts_a_turn(values)):
-        divisor *= turn / 360.0
-    values = values * multiplier / divisor
-    if channel == "table_angle":
-        if time_s is None:
-            return None
-        values = np.gradient(np.unwrap(values, period=360.0), time_s)
-    return rate_unit_by_table(rate, values)
+    multiplier, divisor = UNITS[GYROSCOPE[0]][entry["unit"]]
+    return np.asarray(rate * multiplier / divisor / counts, np.float64)
 
 
 def _readings(sensor: str, parts: list[Columns]) -> Values | None:
@@ -350,10 +350,10 @@ def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str)
         entries[channel] = {"column": layout.key(index), "unit": stated or usual, "optional": True}
         span = f"{values.min():.6g} to {values.max():.6g}"
         proposal.evidence[channel] = f"{why}: {span}" if stated else f"{span}, so {usual}"
-        turn = counts_a_turn(values) if channel == "table_angle" and stated is None else None
-        if turn:
+        if channel == "table_angle" and stated is None and columns.turn:
+            turn, why = columns.turn
             entries[channel] |= {"unit": COUNTS, "counts_per_unit": float(f"{turn / 360.0:.12g}")}
-            proposal.evidence[channel] = f"{span}, and starts again after {turn} counts: {turn} / 360 counts a degree"
+            proposal.evidence[channel] = f"{span}, and {why}: {turn} / 360 counts a degree"
         if channel == "table_angle" and CENTIDEGREES in words_of(layout.names[index]):
             entries[channel] |= {"unit": COUNTS, "counts_per_unit": 100.0}
             proposal.evidence[channel] = f"the name says hundredths of a degree: {span}"
@@ -365,65 +365,9 @@ def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str)
         proposal.remarks.append("a table's log, without the sensor's readings")
 
 
-def as_yaml(proposal: Proposal, name: str) -> str:
-    """Return a proposal as the text of a profile that Hydra reads."""
-    files = ", ".join(Path(f).name for f in proposal.files)
-    lines = _comment(f"Proposed by python -m pipeline check for {files}. Read each line: nothing of it is certain.")
-    for remark in proposal.remarks:
-        lines += _comment(f"To decide: {remark}.")
-    if proposal.topic is not None:
-        lines += ["defaults:", "  - canonical_csv", "  - _self_", ""]
-    lines += [f"name: {_scalar(name)} # name of the profile, for the report", ""]
-    if proposal.topic is not None:
-        lines += ["mcap: # logs of messages of every format", "  topics:", f"    {_scalar(proposal.topic)}:"]
-        return "\n".join([*lines, *_entries(_fields(proposal.columns[0]), proposal.evidence, "      ")]) + "\n"
-    lines += ["csv:"]
-    for key, value in proposal.csv.items():
-        if key in proposal.evidence:
-            lines += _comment(proposal.evidence[key], "  ")
-        lines.append(f"  {key}: {_scalar(value)}")
-    if proposal.parts:
-        lines += ["  columns: {} # described by part", "  parts: # files of one recording, joined on equal time"]
-        for file, entries in zip(proposal.parts, proposal.columns, strict=True):
-            lines += [f"    - file: {_scalar(file)}", "      columns:"]
-            lines += _entries(entries, proposal.evidence, "        ")
-    else:
-        lines += ["  columns: # channel: the column's name (or index from 0) and its unit"]
-        lines += _entries(proposal.columns[0], proposal.evidence, "    ")
-    return "\n".join(lines) + "\n"
-
-
-def _fields(columns: Entries) -> Entries:
+def fields_of(columns: Entries) -> Entries:
+    """Return the columns of a topic as the fields of a profile."""
     return {
         c: {"field": e["column"], **{k: v for k, v in e.items() if k not in ("column", "optional")}}
         for c, e in columns.items()
     }
-
-
-def _entries(entries: Entries, evidence: dict[str, str], indent: str) -> list[str]:
-    lines: list[str] = []
-    said: set[str] = set()
-    for channel, entry in entries.items():
-        key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
-        if key in evidence and key not in said:
-            lines += _comment(evidence[key], indent)
-            said.add(key)
-        inner = ", ".join(f"{k}: {_scalar(v)}" for k, v in entry.items())
-        lines.append(f"{indent}{channel}: {{{inner}}}")
-    return lines
-
-
-def _comment(text: str, indent: str = "") -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
-
-
-def _scalar(value: Any) -> str:  # noqa: ANN401  (any scalar of YAML)
-    """Return a scalar as YAML: JSON is YAML; plain words need no quotes."""
-    if not isinstance(value, str):
-        return json.dumps(value)
-    keyword = value.lower() in ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
-    if WORD.fullmatch(value) and not keyword:
-        return value
-    if value in map(OF_SENSOR.format, TRIADS):
-        return json.dumps(value)
-    return json.dumps(value, ensure_ascii=False).replace("${", "\\\\${")

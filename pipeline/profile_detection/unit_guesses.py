@@ -26,17 +26,13 @@ OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: the figure of the 
 MPU60X0_TEMPERATURE = {"counts_per_unit": 340.0, "offset": -12420.2}  # MPU-6000/6050 register map 4.2, 4.18
 CLOSE = 0.12  # bias and scale factor of a low-cost sensor in one position
 CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and a unit that leans on the table
+SLOWEST = 1.0  # deg/s rms of a table: below, noise and bias wander tell more than the table
 FOLLOWED = 0.3  # share of the rates' rms that the table's rate leaves at most: axes lean, and rates are noisy
 CLOSE_BY_TURNS = 0.2  # those of both sensors, in few moves
 USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
-# Counts a turn of encoders: 8 to 20 bits, and usual numbers of lines, once, twice and four times.
-ENCODERS = (
-    *(2**bits for bits in range(8, 21)),
-    *(k * n for n in (500, 600, 900, 1000, 1250, 2500, 9000) for k in (1, 2, 4)),
-)
-CLOSE_TURN = 0.01  # half of the least distance of two of them, but 4000 and 4096
+EVEN = 0.02  # of the span, off a straight line
 OFFSETS = (0.0, 32768.0, 8192.0, 2048.0)  # middle of 16, 14 and 12 bits without a sign
 SCALES = np.geomspace(1.0, 1000.0, 481)  # counts per deg/s that are tried, 1.4 % apart
 ASSUMED_HZ = 100.0  # where the time is not known
@@ -164,16 +160,9 @@ def rate_unit(rate: Values, moves: Sequence[Move], why_none: str, *, timed: bool
 
 def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
     """Return the unit of (n, 3) angular rates by the table's, deg/s, in the same rows; None: they do not follow it."""
-    table = table_rate - table_rate.mean()
-    power = float(table @ table)
-    if power < len(table):  # 1 deg/s rms: below, noise and bias wander tell more than the table
+    size = slope(rate, table_rate)
+    if size is None or np.std(table_rate) < SLOWEST:
         return None
-    centred = rate - rate.mean(axis=0)
-    slopes = table @ centred / power
-    left = centred - np.outer(table, slopes)
-    if np.sum(left**2) > FOLLOWED**2 * np.sum(centred**2):
-        return None
-    size = float(np.linalg.norm(slopes))
     seen = f"{size:.4g} a deg/s of the table's rate in the same rows"
     if whole(rate):
         entry, taken = _usual_counts(size, CLOSE_BY_TABLE)
@@ -181,6 +170,16 @@ def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
     units = {"deg/s": 1.0, "rad/s": 1.0 / DEGREES}
     unit = next((u for u, one in units.items() if abs(size / one - 1) < CLOSE_BY_TABLE), UNKNOWN)
     return Guess({"unit": unit}, f"{seen}, " + ("neither deg/s nor rad/s" if unit == UNKNOWN else f"so {unit}"))
+
+
+def slope(rate: Values, table: Values) -> float | None:
+    """Return the length of (n, 3) rates per unit of the table's rate; None where they do not follow it."""
+    table, centred = table - table.mean(), rate - rate.mean(axis=0)
+    if not np.any(table):
+        return None
+    slopes = table @ centred / (table @ table)
+    left = centred - np.outer(table, slopes)
+    return None if np.sum(left**2) > FOLLOWED**2 * np.sum(centred**2) else float(np.linalg.norm(slopes))
 
 
 def _usual_counts(measured: float, close: float) -> tuple[dict[str, Any], str]:
@@ -242,15 +241,10 @@ def counts_of_sensor(guess: Guess, name: str, sensor: dict[str, Any]) -> Guess:
     return Guess({**guess.entry, "counts_per_unit": figure}, text)
 
 
-def counts_a_turn(values: Values) -> int | None:
-    """Return the counts a turn of an encoder that starts again at each turn; None where it shows no such count."""
-    steps = np.abs(np.diff(values))
-    wraps = np.flatnonzero(steps[1:-1] > np.ptp(values) / 2.0) + 1
-    if not wraps.size or not whole(values):
-        return None
-    turn = float(np.median(steps[wraps] + (steps[wraps - 1] + steps[wraps + 1]) / 2.0))
-    usual = min((n for n in ENCODERS if n > np.ptp(values)), key=lambda n: abs(np.log(n / turn)), default=0)
-    return usual if usual and abs(turn / usual - 1.0) < CLOSE_TURN else None
+def even_steps(values: Values) -> bool:
+    """Return whether numbers grow evenly with the rows, as times and counters do."""
+    line = np.linspace(values[0], values[-1], len(values))
+    return bool(np.ptp(values) > 0.0 and np.abs(values - line).max() < EVEN * np.ptp(values))
 
 
 def temperature_counts(span: str, sensor: str) -> Guess:

@@ -161,6 +161,26 @@ def test_a_saved_proposal_is_used_when_it_is_named(
     assert "--ingest mine is one of" in capsys.readouterr().err
 
 
+def test_files_alike_share_one_proposal_which_is_printed_last(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = [f"log{i}.csv" for i in range(5)]
+    for name in names:
+        Path(name).write_text("t,ax,ay,az,state\n" + "".join(f"{0.01 * i:.2f},0,0,1,A\n" for i in range(100)))
+    checked = Checked(capsys, *names)
+    assert checked.out.count("REFUSED  ") == 1
+    assert "REFUSED as log0.csv: log1.csv, log2.csv, log3.csv, log4.csv" in checked.out
+    assert checked.err.count("refused (missing_column)") == 5
+    assert checked.words.count("read with the proposed profile") == 3
+    assert "no column that the profile assigns to the gyroscope" in checked.words
+    listed = ", ".join(names)
+    order = ["WITH THE PROFILE", f"PROPOSED PROFILE for {listed}", "# not used: state", "NOT FOUND: the gyroscope"]
+    places = [checked.out.index(text) for text in [*order, "If every line is right"]]
+    assert places == sorted(places)
+    assert checked.out.count("PROPOSED PROFILE") == 1
+
+
 def test_a_profile_with_something_left_to_fill_in_is_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -151,4 +151,14 @@ LOGGERS = {
          {"column": "gyro_rad[2]", "unit": "rad/s"})},
         order="tga",
     ),
+    **{
+        f"a gyroscope called {name}": Logger(
+            f"t_us,acc_x,acc_y,acc_z,{name}_x,{name}_y,{name}_z",
+            (1e6, GRAVITY, scale),
+            triads({"column": "acc_x", "unit": "m/s^2"}, {"column": f"{name}_z", "unit": unit}),
+        )
+        for name, scale, unit in (
+            ("om", np.pi / 180, "rad/s"), ("omega", 1.0, "deg/s"), ("rate", np.pi / 180, "rad/s"), ("w", 1.0, "deg/s"),
+        )
+    },
 }  # fmt: skip

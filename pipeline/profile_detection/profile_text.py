@@ -1,0 +1,103 @@
+"""The text of a proposed profile: YAML with the evidence of each line, and the columns that it does not use."""
+
+from __future__ import annotations
+
+import json
+import re
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.io.units import TABLE_CHANNELS, TRIADS
+from pipeline.profile_detection.proposal import UNITS_OF, fields_of
+from pipeline.profile_detection.unit_guesses import OF_SENSOR, UNKNOWN
+
+if TYPE_CHECKING:
+    from pipeline.profile_detection.proposal import Entries, Proposal
+
+WIDTH = 116  # of comments in a proposed profile
+WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
+
+
+def as_yaml(proposal: Proposal, name: str) -> str:
+    """Return a proposal as the text of a profile that Hydra reads."""
+    files = ", ".join(Path(f).name for f in proposal.files)
+    lines = _comment(f"Proposed by python -m pipeline check for {files}. Read each line: nothing of it is certain.")
+    for remark in proposal.remarks:
+        lines += _comment(f"To decide: {remark}.")
+    if proposal.topic is not None:
+        lines += ["defaults:", "  - canonical_csv", "  - _self_", ""]
+    lines += [f"name: {_scalar(name)} # name of the profile, for the report", ""]
+    if proposal.topic is not None:
+        lines += ["mcap: # logs of messages of every format", "  topics:", f"    {_scalar(proposal.topic)}:"]
+        lines += _entries(fields_of(proposal.columns[0]), proposal.evidence, "      ")
+        return "\n".join(lines + _not_used(proposal, 0, "      ")) + "\n"
+    lines += ["csv:"]
+    for key, value in proposal.csv.items():
+        if key in proposal.evidence:
+            lines += _comment(proposal.evidence[key], "  ")
+        lines.append(f"  {key}: {_scalar(value)}")
+    if proposal.parts:
+        lines += ["  columns: {} # described by part", "  parts: # files of one recording, joined on equal time"]
+        for part, file in enumerate(proposal.parts):
+            lines += [f"    - file: {_scalar(file)}", "      columns:"]
+            lines += _entries(proposal.columns[part], proposal.evidence, "        ")
+            lines += _not_used(proposal, part, "        ")
+    else:
+        lines += ["  columns: # channel: the column's name (or index from 0) and its unit"]
+        lines += _entries(proposal.columns[0], proposal.evidence, "    ")
+        lines += _not_used(proposal, 0, "    ")
+    return "\n".join(lines) + "\n"
+
+
+def _not_used(proposal: Proposal, part: int, indent: str) -> list[str]:
+    used = {entry["column"] for entry in proposal.columns[part].values()}
+    return [f"{indent}# not used: {c} ({found})" for c, found in proposal.seen[part].items() if c not in used]
+
+
+def not_found(proposal: Proposal) -> list[str]:
+    """Return sentences on the sensors and references that no column is assigned to, and what to add."""
+    channels = {c for entries in proposal.columns for c, e in entries.items() if e["column"] != UNKNOWN}
+    found = [
+        f"the {s}, which such a log cannot calibrate. If the log holds it, add {', '.join(triad)}, each with its "
+        f"column and unit ({', '.join(UNITS_OF[s])}, or counts with counts_per_unit)."
+        for s, triad in TRIADS.items()
+        if not set(triad) <= channels
+    ]
+    if not channels & set(TABLE_CHANNELS):
+        found.append(
+            "the angle or rate of a table. If a column is its encoder, add table_angle with the column, unit: counts "
+            "and counts_per_unit (counts a turn / 360). Without a table nothing is to be added."
+        )
+    if "temperature" not in channels:
+        found.append("the temperature. If a column holds it, add temperature with the column and unit: degC.")
+    return [line for text in found for line in textwrap.wrap(f"NOT FOUND: {text}", WIDTH, subsequent_indent="  ")]
+
+
+def _entries(entries: Entries, evidence: dict[str, str], indent: str) -> list[str]:
+    lines: list[str] = []
+    said: set[str] = set()
+    for channel, entry in entries.items():
+        key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
+        if key in evidence and key not in said:
+            lines += _comment(evidence[key], indent)
+            said.add(key)
+        inner = ", ".join(f"{k}: {_scalar(v)}" for k, v in entry.items())
+        lines.append(f"{indent}{channel}: {{{inner}}}")
+    return lines
+
+
+def _comment(text: str, indent: str = "") -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
+
+
+def _scalar(value: Any) -> str:  # noqa: ANN401  (any scalar of YAML)
+    """Return a scalar as YAML: JSON is YAML; plain words need no quotes."""
+    if not isinstance(value, str):
+        return json.dumps(value)
+    keyword = value.lower() in ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
+    if WORD.fullmatch(value) and not keyword:
+        return value
+    if value in map(OF_SENSOR.format, TRIADS):
+        return json.dumps(value)
+    return json.dumps(value, ensure_ascii=False).replace("${", "\\\\${")
