@@ -139,6 +139,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         *lines_of(verdict_groups(findings)),
     ]
     lines += first(_not_held_out(results, [row["unit"] for row in rows]), NAMED, "reasons")
+    lines += first([f"{r['unit']}, left out: {what}" for r in rows if (what := r.get("left_out"))], NAMED, "units")
     entries = read_history(results) if of_this_run else []
     if entries:
         lines += first(_changes(entries), NAMED, "sensors that changed")

@@ -18,6 +18,7 @@ from pipeline.config.options import nearest
 from pipeline.errors import ConfigurationError, IngestError, PipelineError
 from pipeline.files import write_atomically
 from pipeline.io.files import SUFFIXES, recording_files
+from pipeline.model.calibration_file import LEFT_OUT
 from pipeline.model.data_sheet import settings_of_ranges
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.profile_text import as_yaml, not_found
@@ -215,14 +216,16 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
         told.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
     elif not names and not refused:
         lines = [(sensor, f"null: {reason}") for sensor, reason in trial.not_calibrated.items()]
-        noted: dict[str, dict[str, str]] = {}
+        noted: dict[tuple[str, str], dict[str, str]] = {}
         for recording in trial.recordings:
             for note in recording.notes:
-                noted.setdefault(note.code, {}).setdefault(recording.name, note.detail)
-        for code, details in noted.items():
+                place = f", line {note.first} to {note.last}" if note.code in LEFT_OUT and note.first else ""
+                noted.setdefault((note.code, place), {}).setdefault(recording.name, note.detail)
+        for (code, place), details in noted.items():
             name, detail = next(iter(details.items()))
             others = f"; likewise {', '.join([*details][1:])}" if len(details) > 1 else ""
-            lines.append(("notes" if code == next(iter(noted)) else "", f"{code} {name}: {detail}{others}"))
+            label = "notes" if (code, place) == next(iter(noted)) else ""
+            lines.append((label, f"{code} {name}{place}: {detail}{others}"))
         told.append(
             "\n".join(
                 [f"unit {unit}: {len(trial.recordings)} recordings, no refusal", *([as_text(lines)] if lines else [])]

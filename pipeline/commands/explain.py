@@ -20,7 +20,7 @@ from pipeline.exports.reading import CALIBRATION, FoundCalibration, counts_of, f
 from pipeline.files import CONFIGS, read_json
 from pipeline.history import read_history
 from pipeline.io.yaml_file import read_yaml
-from pipeline.model.calibration_file import sentences
+from pipeline.model.calibration_file import left_out, sentences
 from pipeline.outcome import Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
@@ -87,6 +87,7 @@ def main(argv: Sequence[str]) -> int:
         )
         texts.append(explain(unit, document, validation, found))
         texts[-1] += "".join(f"  {line}\n" for s in SENSORS for line in sentences(s, calibration.get(s)))
+        texts[-1] += "".join(f"  Left out: {line}.\n" for line in left_out(calibration.get("inputs")))
         texts[-1] += "".join(f"{line}\n" for line in board_lines(calibration)[1:])
     texts += [_failed(unit, failure) for unit, failure in found.failures.items()]
     if len(texts) > 1:

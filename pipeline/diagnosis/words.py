@@ -118,7 +118,7 @@ def _selected(entry: Mapping[str, Any], sensor: str, most_values: int | None, *,
     if entry["look_alikes"]:
         alike = ", ".join(f"{plain(a['effect'])} ({100 * a['share']:.0f} %)" for a in entry["look_alikes"])
         lines.append(f"Its signal is similar to that of {alike}.")
-    if entry["effect"] == TILT and any(is_held(p) for p in entry["parameters"].values()):
+    if entry["effect"] == TILT and any(is_held(name, p) for name, p in entry["parameters"].items()):
         lines.append(HELD)
     before, after = entry["held_out_error_before"], entry["held_out_error_after"]
     owner = known.owner if known else Owner.SENSOR
@@ -140,7 +140,7 @@ def _selected(entry: Mapping[str, Any], sensor: str, most_values: int | None, *,
 
 def _value(name: str, parameter: Mapping[str, Any]) -> str:
     unit = "" if parameter["unit"] == "1" else f" {parameter['unit']}"
-    if is_held(parameter):
+    if is_held(name, parameter):
         return f"{name} = 0{unit} (held)"
     uncertainty = parameter["standard_uncertainty"]
     spread = f" +- {2 * uncertainty:.2g}" if uncertainty else ""

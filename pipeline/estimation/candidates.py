@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  # in place of a list of effects: what the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
+TILTS = ("d_x", "d_y")  # parameters of ``table_tilt``
 HELD_DEG = 1e-4  # standard deviation of a tilt that is held at 0: a hundredth of a good encoder's accuracy
 HELD = (
     "The part of the tilt about the shaft is the same as a common zero of the turns: the recordings do not determine "
@@ -155,10 +156,11 @@ def tilt_like_zeros(motions: Sequence[Motion], beside: Sequence[str]) -> Values 
     return np.asarray(shafts[0] / np.linalg.norm(shafts[0]), np.float64)
 
 
-def is_held(parameter: Mapping[str, Any]) -> bool:
-    """Return whether a tilt was held at 0, by its ``value, standard_uncertainty``."""
-    u = parameter.get("standard_uncertainty")
-    return u is not None and u < 10.0 * HELD_DEG and abs(parameter["value"]) < 0.01 * HELD_DEG
+def is_held(name: str, parameter: Mapping[str, Any]) -> bool:
+    """Return whether a parameter is a tilt that was held at 0, by its ``value, standard_uncertainty``."""
+    u = parameter.get("standard_uncertainty") or 0.0
+    is_tilt = name.rpartition(".")[2] in TILTS and parameter.get("unit") == "deg"
+    return is_tilt and u < 10.0 * HELD_DEG and abs(parameter["value"]) < 0.01 * HELD_DEG
 
 
 def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, Values]:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.candidates import HELD, TILT, parameter_names, require_available, starts_of
+from pipeline.estimation.candidates import HELD, TILT, is_held, parameter_names, require_available, starts_of
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base, placed, stepped
 from pipeline.estimation.engine import AVERAGED_OUT, RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
@@ -330,6 +330,14 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     covariance = change @ fit.covariance @ change.T
     change = change @ turned
     effects, parameters = effect_parameters(sensor, fit.terms, covariance)
+    held = [is_held(name, parameter) for name, parameter in parameters.items()]
+    if any(held):  # no estimates: 0 without an uncertainty
+        rows = BASE + np.flatnonzero(held)
+        change[rows] = covariance[rows] = covariance[:, rows] = 0.0
+        of_terms = np.split(held, np.cumsum([len(term.values) for term in fit.terms])[:-1])
+        terms = [replace(t, values=np.where(own, 0.0, t.values)) for t, own in zip(fit.terms, of_terms, strict=True)]
+        fit = replace(fit, terms=tuple(terms))
+        effects, parameters = effect_parameters(sensor, fit.terms, covariance)
     details: dict[str, Any] = {
         "samples": round(observations.samples),
         "rounds": fit.rounds,

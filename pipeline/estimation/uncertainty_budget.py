@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.candidates import TILT, tilt_like_zeros
 from pipeline.estimation.design import BASE, BASE_NAMES, Term
 from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
 from pipeline.estimation.table_errors import Reference, table_errors, type_b
@@ -54,6 +55,10 @@ DITHERED = 0.5  # counts of white noise above which rounding errors are independ
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not tell it: calibrate the unit again after switching it off"
 TEMPERATURE = "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is stated"
+ACROSS = (
+    "table_tilt estimates the component across the shaft alone; the one about the shaft is the same as a common zero "
+    "of the turns"
+)
 TIME_BASE = "the table logs angle and rate itself, so that a wrong clock changes neither"
 FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
 ACCURACY = "temperature_accuracy_degc"
@@ -169,6 +174,8 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     sensor = calibration.sensor
     counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
     found, absent = table_errors(reference, estimated)
+    if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
+        absent["levelling"] = ACROSS
     lines, missing = list(contributions), {"temperature": TEMPERATURE, "time base": TIME_BASE}
     if noise.row_weight is None:
         rounded = _quantisation(noise, reference.fit, counts, SENSOR_UNITS[sensor])
@@ -311,7 +318,7 @@ def effect_parameters(
         pairs = zip(term.effect.parameters(sensor), term.values.tolist(), strict=True)
         described: dict[str, dict[str, Any]] = {p.name: {"value": value, "unit": p.unit} for p, value in pairs}
         for name, shared in described.items():
-            parameters[f"{term.effect.name}.{name}"] = {**shared, "standard_uncertainty": next(u)}
+            parameters[f"{term.effect.name}.{name}"] = {**shared, "standard_uncertainty": next(u) or None}
         effects.append(FittedEffect(term.effect.name, described, term.effect.definition))
     return tuple(effects), parameters
 
@@ -339,7 +346,7 @@ def _with_uncertainty(
     for effect in calibration.effects:
         renewed = {}
         for name, parameter in effect.parameters.items():
-            renewed[name] = {**parameter, "expanded_uncertainty": float(factors[at] * u[at])}
+            renewed[name] = {**parameter, "expanded_uncertainty": float(factors[at] * u[at]) if u[at] else None}
             at += 1
         effects.append(replace(effect, parameters=renewed))
     return replace(

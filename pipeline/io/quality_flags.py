@@ -40,6 +40,7 @@ WINDOW = 64  # samples in which the share of equal neighbours is counted
 BY_CHANCE = 1e-6  # expected number of such runs in the recording
 SHORTEST_RUN = 20  # samples; the estimate of p from windows of 64 is too coarse for less
 QUIET = 0.5  # share of equal neighbours at which noise is below the resolution
+MOST_STRETCHES = 10  # of stuck rows that have a note each; more are one note: ``check`` lists 20 notes of a file
 DEAD_ROWS = 1000  # shorter recordings may be constant by their resolution
 FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is off by 9.8 or 1000
 QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
@@ -129,13 +130,13 @@ def _at_rail(size: Values, full_scale: float, count: float) -> Mask:
     return np.asarray(clipped)
 
 
-def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> list[Note]:
-    """Flag readings that stay the same for longer than the channel's own noise allows.
+def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
+    """Flag readings that stay the same for longer than the channel's own noise allows; return their rows by channel.
 
     An axis that never changes, or stays for half of the rows while the others of its sensor change, is refused.
     """
     neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
-    notes = []
+    found = {}
     for channel, same in neighbours.items():
         if not _in_a_row(same, SHORTEST_RUN - 1):
             continue
@@ -154,9 +155,38 @@ def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
             raise IngestError(message, table.path if dead else table.place(int(rows[0])), code="stuck", hint=hint)
         if rows.size < len(same) / 2:
             flags[rows] |= STUCK
-            detail = f"{channel} stays at {value} for longer than its noise allows: stuck, and left out of every fit"
-            notes.append(table.note("N-STUCK", rows, detail))
+            found[channel] = rows
+    return found
+
+
+def _stuck_notes(table: ChannelTable, found: Mapping[str, Index]) -> list[Note]:
+    """Return a note for each stretch of rows in which channels are stuck; one for all where there are many."""
+    if not found:
+        return []
+    every = np.unique(np.concatenate([*found.values()]))
+    stretches = np.split(every, np.flatnonzero(np.diff(every) > 1) + 1)
+    where = f" in {len(stretches)} places" if len(stretches) > MOST_STRETCHES else ""
+    notes = []
+    for rows in [every] if where else stretches:
+        own = {channel: stuck[0] for channel, at in found.items() if (stuck := at[np.isin(at, rows)]).size}
+        channel, row = next(iter(own.items()))
+        one = f"stays at {table.values[channel][row] + 0.0:.6g} {_unit_of(channel)}"
+        stay = one if len(own) == 1 and not where else f"stay{'s' * (len(own) == 1)} at one value{where}"
+        first, last = int(rows[0]), int(rows[-1])
+        detail = f"{', '.join(own)} {stay} for longer than noise allows"
+        if not where:
+            detail += f", for {(table.time_ns[last] - table.time_ns[first]) / 1e9:.3g} s"
+        if not where and "table_angle" in table.values:
+            detail += (
+                f" while the table turns by {abs(np.subtract(*table.values['table_angle'][[last, first]])):.3g} deg"
+            )
+        notes.append(table.note("N-STUCK", rows, f"{detail}: stuck, and left out of every fit"))
     return notes
+
+
+def _unit_of(channel: str) -> str:
+    """Return the unit of a sensor's channel."""
+    return next(SENSOR_UNITS[sensor] for sensor, triad in TRIADS.items() if channel in triad)
 
 
 def equal_share(same: Mask) -> float:
@@ -206,11 +236,13 @@ def examine(
     _check_attitude(table)
     flags = np.zeros(len(table.time_ns), np.uint16) if table.flags is None else table.flags.copy()
     notes = flag_gaps(table, flags, checks)
+    stuck: dict[str, Index] = {}
     for name in TRIADS:
         full_scale = (sensor.get(name) or {}).get("full_scale")
         if full_scale is not None:
             notes += flag_clipped(table, name, float(full_scale), flags)
-        notes += flag_stuck(table, name, flags)
+        stuck |= flag_stuck(table, name, flags)
+    notes += _stuck_notes(table, stuck)
     _check_turn_rate(table)
     return (flags if flags.any() else None), notes
 

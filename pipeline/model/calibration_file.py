@@ -39,7 +39,7 @@ from pipeline.pack import read_published
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration, Values
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from pipeline.model.checked import Check
@@ -53,6 +53,13 @@ LARGEST_CONDITION = 100.0
 
 FAST_S = 0.1  # shorter than estimators average over between two images or scans: there a process counts as white
 WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
+LEFT_OUT = {
+    "N-STUCK": "stuck",
+    "N-CLIP": "at full scale",
+    "N-DISTURBED": "glitches or knocks",
+    "N-SHAKEN": "shaken at rest",
+    "N-MOVED": "moving",
+}  # notes on rows that no fit uses, and the reason
 
 _VECTOR = items(number, 3)
 _EFFECT = fields(
@@ -337,4 +344,26 @@ def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
             f"{worst['ratio']:.3g} times the data sheet's limit of {worst['limit']:.4g}{unit}. Likely cause: {cause}. "
             f"Where it is meant so: sensor.{sensor}.accept_implausible=true."
         )
+    return found
+
+
+def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:
+    """Return what no fit uses of recordings, by their notes: ``404 of 18,247 rows of gyro_z (3.2 s stuck)``.
+
+    ``inputs``: as in ``calibrations/<unit>.json``. Of lost time, the share is stated.
+    """
+    found = []
+    for entry in inputs or []:
+        name, rate, rows = entry.get("recording") or entry.get("file"), entry.get("rate_hz"), entry.get("rows")
+        counts: dict[str, list[int]] = {}
+        for note in entry.get("notes") or []:
+            if note["code"] in LEFT_OUT:
+                counts.setdefault(note["code"], []).append(note["count"])
+            elif note["code"] == "N-GAP":
+                found.append(f"{name}: {note['detail'].rpartition(', ')[2]}")
+        for code, each_note in counts.items():
+            several = code == "N-CLIP" and len(each_note) > 1  # a note for each channel, some for the same rows
+            count = max(each_note) if several else sum(each_note)
+            share = f"{'at least ' * several}{count:,}{f' of {rows:,}' if rows else ''} rows of {name}"
+            found.append(f"{share} ({f'{count / rate:.2g} s ' if rate else ''}{LEFT_OUT[code]})")
     return found

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.estimation.candidates import TILT, is_held
+from pipeline.estimation.candidates import is_held
 from pipeline.records import AXES
 from pipeline.report.numbers import measured, number, plain, unit_text
 
@@ -50,22 +50,24 @@ def fitted_parameters(part: JSON) -> list[Parameter]:
     ``bias_x``, ``matrix_xy`` (row, column) and ``<effect>.<parameter>``. Each has its own coverage factor,
     as the effective degrees of freedom differ between parameters.
     """
-    U = part.get("expanded_uncertainty") or NO_UNCERTAINTY
+    of_base = part.get("expanded_uncertainty") or NO_UNCERTAINTY
     k = part.get("coverage_factor") or NO_UNCERTAINTY
     budget = part.get("uncertainty_budget") or {"parameters": [], "coverage_factor": []}
     own = dict(zip(budget["parameters"], budget["coverage_factor"], strict=True))
     found = [
-        Parameter(f"bias_{a}", part["bias"][i], part["unit"], U["bias"][i], k["bias"][i]) for i, a in enumerate(AXES)
+        Parameter(f"bias_{a}", part["bias"][i], part["unit"], of_base["bias"][i], k["bias"][i])
+        for i, a in enumerate(AXES)
     ]
     found += [
-        Parameter(f"matrix_{a}{b}", part["matrix"][i][j], "1", U["matrix"][i][j], k["matrix"][i][j])
+        Parameter(f"matrix_{a}{b}", part["matrix"][i][j], "1", of_base["matrix"][i][j], k["matrix"][i][j])
         for i, a in enumerate(AXES)
         for j, b in enumerate(AXES)
     ]
     for effect in part.get("effects") or []:
         for symbol, p in effect["parameters"].items():
             name = f"{effect['name']}.{symbol}"
-            found.append(Parameter(name, p["value"], p["unit"], p.get("expanded_uncertainty"), own.get(name)))
+            U = p.get("expanded_uncertainty")
+            found.append(Parameter(name, p["value"], p["unit"], U, None if U is None else own.get(name)))
     return found
 
 
@@ -112,7 +114,7 @@ def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
 
 def _of_effect(p: Parameter) -> str:
     """Return the name of an effect's parameter, and whether it was held."""
-    held = p.name.startswith(TILT) and is_held({"value": p.value, "standard_uncertainty": p.standard_uncertainty})
+    held = is_held(p.name, {"value": p.value, "unit": p.unit, "standard_uncertainty": p.standard_uncertainty})
     return f"{p.words} (not determined, held at 0)" if held else p.words
 
 
@@ -133,6 +135,9 @@ def parameter_texts(parameters: JSON | None) -> list[str]:
     texts = []
     for name, given in (parameters or {}).items():
         p = given if isinstance(given, dict) else {"value": given}
+        if is_held(name, p):
+            texts.append(f"{name} held at 0")
+            continue
         standard = p.get("standard_uncertainty")
         expanded = p.get("expanded_uncertainty", 2.0 * standard if standard else None)
         texts.append(f"{name} = {measured(p.get('value'), expanded)} {unit_text(p.get('unit'))}".rstrip())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from pipeline.model.calibration_file import left_out
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import first_and_last_step, passes
 from pipeline.report.numbers import unit_text
@@ -20,7 +21,7 @@ SENSOR_COLUMNS = (
     "answers",
 )  # fmt: skip
 IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
-COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE)
+COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE, "left_out")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 
 
@@ -41,6 +42,7 @@ def summary_row(
         "sensor": calibration.get("sensor"),
         "method": calibration.get("method"),
         "pass": passes(calibration, validation),
+        "left_out": "; ".join(left_out(calibration.get("inputs"))) or None,
     }
     for sensor in SENSORS:
         held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.files import json_text
-from pipeline.model.calibration_file import sentences
+from pipeline.model.calibration_file import left_out, sentences
 from pipeline.outcome import VERDICTS, commands_of, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS, Recording
 from pipeline.report.diagnosis_section import evidence_figures, limit_rows, ranking_rows, upper_limits
@@ -66,6 +66,7 @@ def render(
         ok=ok,
         passed=passes(calibration, validation),
         checks=checks(validation),
+        left_out=left_out(calibration.get("inputs")),
         sensors=sorted(sensors, key=_order),
         attitude=attitude if attitude.get("curve") else None,
         attitude_figure=attitude_over_time(attitude),

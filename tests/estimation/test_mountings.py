@@ -116,7 +116,13 @@ def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(
     if held:
         assert wider[3:12].max() < 1.1 * u[3:12].max()  # 100 times with that part of the tilt free
         assert np.abs(errors_over_u(tilted, seats)).max() < 4.0
-        assert abs(d[0]) < 1e-6
+        held_part, across = tilted.effects[-1].parameters.values()
+        assert (held_part["value"], held_part["expanded_uncertainty"]) == (0.0, None)
+        assert across["expanded_uncertainty"] > 1.9 * wider[-1] > 0.0 == wider[-2]
+        assert tilted.stages[-1].parameters["table_tilt.d_x"]["standard_uncertainty"] is None
+        assert tilted.budget is not None
+        why = {line["source"]: line["reason"] for line in tilted.budget["not_included"]}
+        assert why["levelling"].startswith("table_tilt estimates the component across the shaft alone")
         assert abs(d[1]) < 4.0 * wider[-1]  # the part across the shaft is estimated; the truth is 0
         whole["table"]["levelling_deg"] = 0.1
         stated = fit("accelerometer", recordings, None, whole)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from bad_logs import FILE, TABLE_ANGLE, VALUES, Case, cases
+from bad_logs import FILE, RATE, TABLE_ANGLE, VALUES, Case, cases, table
 from sample_logs import SENSOR, procedure
 from stage_files import load_recordings, save_recordings
 
@@ -17,6 +17,7 @@ from pipeline.io import text_log
 from pipeline.io.csv_layout import Layout
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.read import read_recordings
+from pipeline.model.calibration_file import left_out
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.report.campaign_page import render
 from pipeline.stages.gather import same_files
@@ -122,6 +123,24 @@ def test_notes_on_rows_name_their_lines_and_times(tmp_path: Path) -> None:
     write(tmp_path, case, "34")
     (note,) = read(tmp_path, case).notes
     assert (note.count, note.first, note.last, note.start_s, note.end_s) == (2, 702, 703, 7.0, 7.01)
+
+
+def test_channels_that_stand_still_together_have_one_note_for_each_stretch(tmp_path: Path) -> None:
+    values = VALUES.copy()
+    values[1400:1500, 1:] = values[1400, 1:]  # the table turns a quarter meanwhile
+    values[2600:2700, 5] = values[2600, 5]
+    case = Case({FILE: table(values, table_angle_deg=TABLE_ANGLE, table_rate_dps=RATE)})
+    write(tmp_path, case, "38")
+    both, one = read(tmp_path, case).notes
+    assert [(n.code, n.count, n.first, n.last) for n in (both, one)] == [
+        ("N-STUCK", 100, 1402, 1501),
+        ("N-STUCK", 100, 2602, 2701),
+    ]
+    assert both.detail.startswith("accel_x, accel_y, accel_z, gyro_x, gyro_y, gyro_z stay at one value")
+    assert "for 0.99 s while the table turns by 89.1 deg" in both.detail
+    assert one.detail.startswith(f"gyro_y stays at {values[2600, 5]:.6g} deg/s")
+    entry = {"recording": "x", "rows": 3000, "rate_hz": 100.0, "notes": [vars(both), vars(one)]}
+    assert left_out([entry]) == ["200 of 3,000 rows of x (2 s stuck)"]
 
 
 def test_offset_and_drift_of_a_tables_own_clock_are_found_within_their_uncertainty(tmp_path: Path) -> None:
