@@ -40,7 +40,7 @@ class Bench:
         return self.directory / "results" / self.campaign.name
 
     def snakemake(self, *config: str, dry: bool = False) -> Run:
-        command = [sys.executable, "-m", "snakemake", "--cores", "2", "-s", str(ROOT / "Snakefile")]
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", "-p", "-s", str(ROOT / "Snakefile")]
         command += ["--dry-run"] * dry + ["--config", f"campaign={self.campaign}", *config]
         environment = os.environ | {"PYTHONWARNINGS": "", "NO_COLOR": "1"}
         done = subprocess.run(
