@@ -63,7 +63,7 @@ class Problem:
         return np.pad(self.products, ((0, 0), (0, 1), (0, 1)))
 
     def rss(self, squares: Values) -> Values:
-        """Return -nu/2 log RSS of sums of squares; where sigma has a least value, with the sigma of most likelihood."""
+        """Return -nu/2 log RSS of sums of squares; where sigma has a lower bound, log L at its likeliest value."""
         total = np.maximum(squares + self.within, 1e-300)
         if not self.least:
             return np.asarray(-0.5 * self.free * np.log(total))

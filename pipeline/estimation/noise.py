@@ -120,8 +120,8 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
     The prior is that of the data sheet times the likelihood of the static recording at each wander and correlation
     time. A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative
     uncertainty ``sqrt(tau / T)``. Where that is below ``SHARPEST_WIDTH``, the likelihood counts as that of a shorter
-    rest: no sensor is a Gauss-Markov process that well. A wander above the likeliest is never less likely than by
-    ``exp(-FARTHEST**2)``, so that the residuals of turns can show what a rest does not: the lack of fit.
+    rest: no sensor is a Gauss-Markov process that well. Above the likeliest wander, the likelihood is at least
+    ``exp(-FARTHEST**2)`` of its maximum: the residuals of turns can show more wander than the rest (lack of fit).
 
     ``settings``: section ``sensor``.
     """

@@ -348,7 +348,7 @@ def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
 
 
 def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:
-    """Return what no fit uses of recordings, by their notes: ``404 of 18,247 rows of gyro_z (3.2 s stuck)``.
+    """Return the rows of each recording that no fit uses, by its notes: ``404 of 18,247 rows of gyro_z (3.2 s stuck)``.
 
     ``inputs``: as in ``calibrations/<unit>.json``. Of lost time, the share is stated.
     """
