@@ -10,6 +10,8 @@ standard uncertainty of independent errors:
     levelling      tilt of the table about level x and y (``table_tilt``)
     gravity        local gravity
     azimuth        of level x, where Earth's rotation is in the model
+    time base      of the sensor's clock, relative, where the log holds no rate: the rate is the change of the angle
+                   over the time by that clock
 
 An attitude log has no stops: its angle errors are three constant turns of each recording, about the body axes.
 """
@@ -37,6 +39,16 @@ ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times 
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
 COUNTED_STOPS = 4  # rests of a recording from which on it stops and goes: its steps are counted, whatever their rate
 TILTS = ("angle_accuracy_deg", "orthogonality_deg", "wobble_deg", "levelling_deg")
+
+TIME_BASE = "time base"
+TIMED_BY_SENSOR = (
+    "the log holds no rate, so that the rate is the change of the angle over the time by the sensor's clock: an error "
+    "of 100 ppm of that clock is one of 100 ppm of the matrix"
+)
+CLOCK_OF_TABLE = (
+    "the log holds no rate; the rate is the change of the angle over the time by the table's own clock, which counts "
+    "as exact"
+)
 
 
 @dataclass(frozen=True)
@@ -88,7 +100,7 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
         setups = {motion.setup for motion in reference.motions}
         each = [n for n in replaced_by if all(f"{n}@{setup}" in estimated for setup in setups)]
         fitted = [name for name in replaced_by if name in estimated or name in each]
-        reason = f"estimated by {fitted[0]}" if fitted else _without(source, key, reference.table)
+        reason = f"estimated by {fitted[0]}" if fitted else _without(source, key, reference)
         if reason:
             missing[source] = reason
         elif u:
@@ -129,11 +141,18 @@ def _largest(reference: Reference) -> float:
     return size
 
 
-def _without(source: str, key: str, table: Mapping[str, Any]) -> str:
+def _without(source: str, key: str, reference: Reference) -> str:
     """Return why a source is not included; empty where it is, or where its accuracy is stated as 0."""
+    table, clocks = reference.table, {motion.timed_by for motion in reference.motions}
     placed = table.get("latitude_deg") is not None and table.get("azimuth_deg") is not None
     if source == "Earth's rotation" and not placed:
         return "not in the model: table.latitude_deg and table.azimuth_deg are not set; up to 0.0042 deg/s"
+    if source == TIME_BASE:
+        if reference.sensor == "accelerometer":
+            return "no time enters the direction of gravity at an angle of the table"
+        if "sensor" not in clocks:
+            return CLOCK_OF_TABLE if "table" in clocks else "the table states the rate itself: no clock changes it"
+        return "" if table.get(key) is not None else f"table.{key} is not stated; {TIMED_BY_SENSOR}"
     return f"table.{key} is not stated" if table.get(key) is None else ""
 
 
@@ -278,6 +297,11 @@ def _azimuth(reference: Reference) -> Values:
     )
 
 
+def _clock(reference: Reference) -> Values:
+    """Return what an error of the sensor's clock, per ppm, does to rates that follow from it: (p, 1) array."""
+    return reference.summed(lambda m: 1e-6 * m.angular_rate[:, :, None] if m.timed_by == "sensor" else None, 1)
+
+
 # Source, setting of the table, unit, sensors whose readings it changes, effects that estimate it, what it does.
 ACCURACIES = (
     ("table angle", "angle_accuracy_deg", "deg", SENSORS, (), _angle),
@@ -290,4 +314,5 @@ ACCURACIES = (
     ("levelling", "levelling_deg", "deg", ("accelerometer",), ("table_tilt",), _levelling),
     ("local gravity", "gravity_accuracy_g", "g", ("accelerometer",), (), _gravity),
     ("Earth's rotation", "azimuth_accuracy_deg", "deg", ("gyroscope",), ("earth_rotation",), _azimuth),
+    (TIME_BASE, "clock_accuracy_ppm", "ppm", SENSORS, (), _clock),
 )  # fmt: skip

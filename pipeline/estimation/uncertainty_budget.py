@@ -59,7 +59,6 @@ ACROSS = (
     "table_tilt estimates the component across the shaft alone; the one about the shaft is the same as a common zero "
     "of the turns"
 )
-TIME_BASE = "the table logs angle and rate itself, so that a wrong clock changes neither"
 FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
 ACCURACY = "temperature_accuracy_degc"
 
@@ -176,7 +175,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     found, absent = table_errors(reference, estimated)
     if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
         absent["levelling"] = ACROSS
-    lines, missing = list(contributions), {"temperature": TEMPERATURE, "time base": TIME_BASE}
+    lines, missing = list(contributions), {"temperature": TEMPERATURE}
     if noise.row_weight is None:
         rounded = _quantisation(noise, reference.fit, counts, SENSOR_UNITS[sensor])
     else:

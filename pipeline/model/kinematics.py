@@ -107,7 +107,14 @@ def reference_motion(
                 recording.source.get("file"),
             )
         temperature = None if recording.temperature is None else temperature_of(recording)
-        logged = partial(replace, temperature=temperature, recording=recording.name, setup=recording.setup)
+        own_clock = "table" if "table_clock" in recording.source else "sensor"
+        logged = partial(
+            replace,
+            temperature=temperature,
+            timed_by=own_clock if recording.table_rate is None else "",
+            recording=recording.name,
+            setup=recording.setup,
+        )
         recording.cache[key] = build(recording, gravity_g, earth_rate_level, logged)
     found: Motion = recording.cache[key]
     return found
@@ -210,13 +217,13 @@ def _motion_of_attitude(
         q = spline(there) if np.any(offset) else attitude
         level = attitude_matrix(q)
         force = gravity_g * level[:, 2, :]
-        omega = np.degrees(2.0 * conjugate_product(q, spline(there, 1)))
+        omega = np.degrees(2.0 * conjugate_product(q, spline(there, 1))) / recording.table_seconds
         return logged(
             Motion(
                 time=time,
                 specific_force=force,
                 angular_rate=omega if earth is None else omega + np.einsum("i,nij->nj", earth, level),
-                angular_acceleration=np.degrees(2.0 * conjugate_product(q, spline(there, 2))),
+                angular_acceleration=np.degrees(2.0 * conjugate_product(q, spline(there, 2))) / recording.table_seconds**2,
                 specific_force_rate=-np.cross(np.radians(omega), force),
                 temperature=None,
                 angle=None,

@@ -140,6 +140,11 @@ class Recording:
         """Results computed from this recording that several steps use: smoothed temperature, reference motions."""
         return {}
 
+    @property
+    def table_seconds(self) -> float:
+        """Seconds by the table's own clock in one of the sensor's, as aligned; 1 where both have one clock."""
+        return 1.0 + 1e-6 * float(self.source.get("table_clock", {}).get("drift_ppm", 0.0))
+
     @cached_property
     def logged_rate(self) -> Values | None:
         """Rate of the table, deg/s: as logged, else by central differences of its angle; None without either."""
@@ -233,6 +238,7 @@ class Motion:
     # computed yet (pipeline.model.effects.base.turning_direction).
     direction: Values | None = None
     reference_valid: Mask | None = None  # (n,), around which the table's log is dense enough to be interpolated
+    timed_by: str = ""  # clock by which the rate follows from the angle, "sensor" or "table"; empty: a rate is logged
     recording: str = ""
     setup: str = ""  # table, mounting or session of the recording; empty where there is one alone
 

@@ -1,4 +1,4 @@
-"""The table's rate where its log holds the angle alone.
+"""The table's rate where its log holds the angle alone, by the table's own clock where it has one.
 
 A fine angle is differentiated: by a cubic spline, or by central differences where it bends between two samples. An
 encoder of the resolution q hides a rate below the noise of that: then the angle A is smoothed,
@@ -59,7 +59,7 @@ def rate_by_angle(recording: Recording) -> EncoderRate | None:
         return None
     key = "encoder_rate"
     if key not in recording.cache:
-        recording.cache[key] = _rate_of(recording.time, recording.table_angle)
+        recording.cache[key] = _rate_of(recording.time * recording.table_seconds, recording.table_angle)
     found: EncoderRate = recording.cache[key]
     return found
 

@@ -135,6 +135,25 @@ def test_what_a_wrong_table_does_to_a_fit_is_what_its_budget_says(
     assert stated.max() > 1e-6
 
 
+@pytest.mark.parametrize("method", ["reference", "staged", "cholesky"])
+def test_a_wrong_clock_changes_a_gyroscope_whose_table_logs_the_angle_alone_as_the_budget_says(method: str) -> None:
+    stages, ppm = STAGES[method]["gyroscope"], 1000.0
+    recordings = [replace(r, table_rate=None) for r in recordings_of("gyroscope")]
+    found = run_stages("gyroscope", stages, recordings, settings(clock_accuracy_ppm=ppm))
+    stated = next(line for line in found.budget["contributions"] if line["source"] == "time base")["contribution"]
+    slow = [replace(r, time_ns=np.round(r.time_ns / (1.0 + 1e-6 * ppm)).astype(np.int64)) for r in recordings]
+    change = values(run_stages("gyroscope", stages, slow, settings())) - values(found)
+    assert np.abs(change) == pytest.approx(stated, rel=5e-3, abs=1e-4 * max(stated))
+    assert max(stated) == pytest.approx(1e-6 * ppm * np.abs(found.matrix).max(), rel=1e-2)
+
+    # Aligned with the table's own clock, which gains as much, the rate is by that clock.
+    aligned = [replace(r, source={"table_clock": {"drift_ppm": ppm}}) for r in slow]
+    right = run_stages("gyroscope", stages, aligned, settings())
+    assert values(right) == pytest.approx(values(found), abs=2e-7)
+    missing = {entry["source"]: entry["reason"] for entry in right.budget["not_included"]}
+    assert "table's own clock" in missing["time base"]
+
+
 def test_the_lines_of_a_budget_add_up_to_what_the_calibration_states() -> None:
     found = run_stages(
         "gyroscope", ["reference_least_squares"], recordings_of("gyroscope", 0.01), settings(rate_accuracy=1e-3)
