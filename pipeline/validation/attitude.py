@@ -67,26 +67,27 @@ def attitude(
     except InputError as error:
         return {"reason": str(error)}
     reference = (logged / np.linalg.norm(logged, axis=1, keepdims=True)).T
+    time = known.time * known.table_seconds  # by the clock of the reference
     found: dict[str, Any] = {"reason": None, "recording": recording.name}
-    found["seconds"] = float(min(MINUTE, known.time[-1] - known.time[0]))
+    found["seconds"] = float(min(MINUTE, time[-1] - time[0]))
     found |= {"drift_deg": {}, "tilt_rms_deg": {} if accelerometer and known.accelerometer is not None else None}
     shown = np.unique(np.linspace(0, known.samples - 1, CURVE).astype(int))
-    found["curve"] = {"time_s": _rounded(known.time[shown] - known.time[0])}
+    found["curve"] = {"time_s": _rounded(time[shown] - time[0])}
     pairs = {
         "before": (known.accelerometer, known.gyroscope),
         "after": (compensated.accelerometer, compensated.gyroscope),
     }
     for name, (force, rate) in pairs.items():
         assert rate is not None  # noqa: S101
-        alone = integrate(known.time, rate, reference[:, 0])
-        found["drift_deg"][name] = drift(known.time, alone, reference, found["seconds"])
+        alone = integrate(time, rate, reference[:, 0])
+        found["drift_deg"][name] = drift(time, alone, reference, found["seconds"])
         found["curve"][f"drift_{name}"] = _rounded(angle_between(alone, reference)[shown])
         if found["tilt_rms_deg"] is not None:
             assert force is not None  # noqa: S101
-            at, fused = _fuse(known.time, force, alone)
-            tilt, since = _tilt_between(fused, reference[:, at].T), known.time[at] - known.time[0]
+            at, fused = _fuse(time, force, alone)
+            tilt, since = _tilt_between(fused, reference[:, at].T), time[at] - time[0]
             found["tilt_rms_deg"][name] = float(np.sqrt(np.mean(tilt[since >= min(SETTLED, 0.5 * since[-1])] ** 2)))
-            found["curve"][f"tilt_{name}"] = _rounded(np.interp(known.time[shown] - known.time[0], since, tilt))
+            found["curve"][f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
     return found
 
 

@@ -56,3 +56,15 @@ def test_corners_of_ramps_are_said_to_be_vague() -> None:
     wrong = np.abs(found.rate - rate) > 0.1
     assert wrong.sum() >= 8
     assert not found.reference_valid[wrong].any()
+
+
+def test_the_rate_of_an_attitude_log_with_a_clock_of_its_own_is_by_that_clock() -> None:
+    """The table turns by 40 deg a second of its clock, which gains 5000 ppm on that of the sensor."""
+    time_ns = np.arange(400) * round(INTERVAL * 1e9)
+    half = np.radians(40.0) * 1.005 * time_ns * 1e-9 / 2.0
+    q = np.stack([np.cos(half), np.zeros(400), np.zeros(400), np.sin(half)], axis=1)
+    source = {"table_clock": {"drift_ppm": 5000.0}}
+    found = reference_motion(Recording("held_out", "validation", None, time_ns, table_attitude=q, source=source))
+    assert found is not None
+    assert found.timed_by == "table"
+    assert found.angular_rate[5:-5] == pytest.approx(np.tile([0.0, 0.0, 40.0], (390, 1)), abs=1e-6)
