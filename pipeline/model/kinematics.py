@@ -209,21 +209,22 @@ def _motion_of_attitude(
 
     assert recording.table_attitude is not None  # noqa: S101
     time, attitude = recording.time, continuous(recording.table_attitude)
-    spline = make_interp_spline(time, attitude, k=5)
+    clock = recording.table_seconds
+    spline = make_interp_spline(time * clock, attitude, k=5)
 
     def at(before: float | Values, offset: float | Values = 0.0) -> Motion:
         offset = before + offset
-        there = time + offset
+        there = (time + offset) * clock
         q = spline(there) if np.any(offset) else attitude
         level = attitude_matrix(q)
         force = gravity_g * level[:, 2, :]
-        omega = np.degrees(2.0 * conjugate_product(q, spline(there, 1))) / recording.table_seconds
+        omega = np.degrees(2.0 * conjugate_product(q, spline(there, 1)))
         return logged(
             Motion(
                 time=time,
                 specific_force=force,
                 angular_rate=omega if earth is None else omega + np.einsum("i,nij->nj", earth, level),
-                angular_acceleration=np.degrees(2.0 * conjugate_product(q, spline(there, 2))) / recording.table_seconds**2,
+                angular_acceleration=np.degrees(2.0 * conjugate_product(q, spline(there, 2))),
                 specific_force_rate=-np.cross(np.radians(omega), force),
                 temperature=None,
                 angle=None,
