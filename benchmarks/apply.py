@@ -232,7 +232,7 @@ def in_c(folder: Path, real: str) -> float:
 
 def samples_by_themselves(folder: Path, count: int = 3000) -> None:
     """Time a sample by itself, in an array, and in C."""
-    from pipeline.exports import export  # noqa: PLC0415
+    from pipeline.exports import ExportedUnit, export  # noqa: PLC0415
     from pipeline.model.compensation import load  # noqa: PLC0415
 
     generator = np.random.default_rng(0)
@@ -242,7 +242,9 @@ def samples_by_themselves(folder: Path, count: int = 3000) -> None:
     print("CPU us a sample: by itself, in an array, in C (double, float)")
     for name, effects in EFFECTS.items():
         write_calibration(folder / "U1.json", effects)
-        header = export("calibration.h", json.loads((folder / "U1.json").read_text()), {})["calibration.h"]
+        header = export("calibration.h", ExportedUnit(json.loads((folder / "U1.json").read_text()), {}))[
+            "calibration.h"
+        ]
         (folder / "calibration.h").write_text(header)
         compensation = load(folder / "U1.json")
         stream = compensation.stream()

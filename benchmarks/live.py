@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from apply import EFFECTS, in_c, write_calibration
 
-from pipeline.exports import export
+from pipeline.exports import ExportedUnit, export
 from pipeline.field_logs.ros2_node import MessageCalibrator
 from pipeline.model.compensation import load
 
@@ -80,7 +80,7 @@ def main() -> None:
 
             print(f"| {title} | stream | {latencies(one, count)} |")
             print(f"| {title} | node | {latencies(received, count)} |")
-            header = export("calibration.h", json.loads(file.read_text()), {})["calibration.h"]
+            header = export("calibration.h", ExportedUnit(json.loads(file.read_text()), {}))["calibration.h"]
             (folder / "calibration.h").write_text(header)
             print(f"| {title} | C | double {in_c(folder, 'double'):.3f}, float {in_c(folder, 'float'):.3f} us mean |")
 

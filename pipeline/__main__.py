@@ -15,8 +15,7 @@ for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 COMMANDS = {  # name: module and function in pipeline/commands
     **{name: (name, "main") for name in ("run", "new", "check", "plan", "guide", "explain", "add")},
     "remove": ("add", "remove"),
-    "convert": ("explain", "convert"),
-    **{name: (name, "main") for name in ("apply", "noise", "simulate", "unpack", "config")},
+    **{name: (name, "main") for name in ("convert", "apply", "noise", "simulate", "unpack", "config")},
     "study": ("research", "study"),
     "thesis": ("research", "thesis"),
 }

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import json
 import sys
-import textwrap
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.commands import parser_of
-from pipeline.config.options import LARGEST_CONFIG
+from pipeline.commands.convert import sensor_config
 from pipeline.diagnosis.words import in_words
-from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.exports import formats
+from pipeline.errors import InputError, MissingInputError
 from pipeline.exports.conversion import board_lines, explain_calibration
-from pipeline.exports.conversion import convert as write_converted
-from pipeline.exports.reading import CALIBRATION, FoundCalibration, counts_of, format_of, read_any
-from pipeline.files import CONFIGS, read_json
+from pipeline.exports.reading import counts_of, read_any
+from pipeline.files import read_json
 from pipeline.history import read_history
-from pipeline.io.yaml_file import read_yaml
 from pipeline.model.calibration_file import left_out, sentences
 from pipeline.outcome import Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
 from pipeline.pack import batches_of, is_published, read_published
@@ -34,17 +30,6 @@ examples:
   python -m pipeline explain demo mpu6050-2-hidden                       what is missing, and the evidence
   python -m pipeline explain results/demo/calibrations/mpu6050-1.json    how the numbers are to be used
   python -m pipeline explain kalibr.yaml                                 the same of another program's calibration
-"""
-CONVERT = """\
-The format of IN follows from its name and content, that of OUT from its name: kalibr.yaml, px4.params,
-calibration.json ... What is written is read back and compared with IN; the terminal states what is lost. Formats in
-counts, and those with noise densities, need --sensor where IN does not name the sensor.
-
-examples:
-  python -m pipeline convert results/demo/calibrations/mpu6050-1.json px4.params
-  python -m pipeline convert my_kalibr.yaml calibration.json
-  python -m pipeline convert rig_acc.calib out/d435i.json --to realsense
-  python -m pipeline convert inav.txt kalibr.yaml --sensor mpu6050
 """
 
 
@@ -72,7 +57,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     file = Path(arguments.campaign)
     if is_published(file) and not _is_diagnosis(_json(file)):
-        counts = counts_of(sheets_of(arguments.sensor))
+        counts = counts_of(sensor_config(arguments.sensor))
         try:
             sys.stdout.write(explain_calibration(read_any(file, arguments.format, counts)))
         except InputError as error:
@@ -193,45 +178,3 @@ def _json(file: Path) -> Any:  # noqa: ANN401
         return json.loads(read_published(file))
     except (OSError, ValueError):
         return None
-
-
-def convert(argv: Sequence[str]) -> int:
-    """Convert a calibration into the format of another program, and state what is lost."""
-    known = textwrap.fill(f"formats: {', '.join([CALIBRATION, *formats()])}", 118)
-    parser = parser_of("convert", convert.__doc__, f"{CONVERT}\n{known}\n", ("--sensor",))
-    add = parser.add_argument
-    add("source", type=Path, metavar="IN", help="a calibration in any of the formats")
-    add("target", type=Path, metavar="OUT", help="the file to write")
-    add("--from", dest="source_format", metavar="FORMAT", help="format of IN, where name and content are ambiguous")
-    add("--to", dest="target_format", metavar="FORMAT", help="format of OUT, where its name is another")
-    arguments = parser.parse_args(argv)
-    found = read_any(arguments.source, arguments.source_format, counts_of(sheets_of(arguments.sensor)))
-    sheets = sheets_of(arguments.sensor, found)
-    name = format_of(arguments.target.name if arguments.target_format is None else arguments.target_format)
-    if arguments.target.exists() and arguments.source.exists() and arguments.target.samefile(arguments.source):
-        raise ConfigurationError("OUT is the file IN: choose another name", str(arguments.target))
-    files, lost = write_converted(found, name, arguments.target, sheets)
-    print(f"{arguments.source} ({found.name}): {' and '.join(found.sensors)}")
-    for note in found.notes:
-        print(f"  {note}")
-    print(f"written: {', '.join(map(str, files))}")
-    print("lost: nothing" if not lost else "lost:")
-    for line in lost:
-        print(f"  {line}")
-    if name == CALIBRATION and found.document is None:
-        stated = [s for s, c in found.sensors.items() if c.covariance is not None]
-        print(f"uncertainty: {f'of the bias of the {stated}' if stated else 'none'} is known; zeros stand for it")
-    return 0
-
-
-def sheets_of(sensor: str | None, found: FoundCalibration | None = None) -> dict[str, Any]:
-    """Return the parts of a sensor's configuration: of the one that is named, or that a calibration was made with."""
-    name = sensor or (found.document or {}).get("sensor") if found else sensor
-    file = CONFIGS / "sensor" / f"{name}.yaml"
-    if name is None or (sensor is None and not file.is_file()):
-        return {}
-    if not file.is_file():
-        known = ", ".join(sorted(path.stem for path in file.parent.glob("*.yaml")))
-        raise ConfigurationError(f"--sensor {name}: no such sensor; known: {known}")
-    content = read_yaml(file, LARGEST_CONFIG)
-    return {s: content[s] for s in SENSORS if content.get(s)}

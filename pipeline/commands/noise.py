@@ -10,7 +10,7 @@ from pipeline.commands import parser_of
 from pipeline.commands.readings import Reading, config_of_log
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.exports import Subject, export, formats
+from pipeline.exports import ExportedUnit, export, formats
 from pipeline.files import json_text, write_atomically
 from pipeline.records import AXES, SENSORS
 from pipeline.report.noise_section import remarks, term_rows
@@ -59,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
         if missing:
             raise ConfigurationError(f"the log holds no noise of the {' and '.join(missing)}: state --sensor", str(log))
         exported = {"sensor": known, "table": {"gravity_g": 1.0}}
-        (text,) = export(target.name, Subject(document, exported)).values()
+        (text,) = export(target.name, ExportedUnit(document, exported)).values()
     write_atomically(target, text)
     print(f"written: {target}", file=sys.stderr)
     return 0

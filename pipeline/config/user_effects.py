@@ -169,7 +169,7 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
     except PipelineError as error:
         raise Problem(f"method.file: {error}") from error
-    given: dict[str, Any] = {"source": f"{file.name} ({found.name})", "sha256": digest, "notes": found.notes}
+    given: dict[str, Any] = {"source": f"{file.name} ({found.format_name})", "sha256": digest, "notes": found.notes}
     for sensor in SENSORS:
         if method[sensor] != GIVEN:
             continue

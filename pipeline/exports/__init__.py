@@ -1,15 +1,15 @@
 """Exports: a calibration in the formats of the programs that use it. One template in ``templates/`` is one format.
 
 A template has two parts, separated by a line ``---``: a declaration (``Format``: what the format can hold, in which
-units, and how ``reading`` reads it back), and the text of the file in Jinja2. The text sees
+units, and how ``convert`` reads it back), and the text of the file in Jinja2. The text has the variables
 
     accelerometer, gyroscope   ``sensors.ExportedSensor`` in the units of the format, None where it is not calibrated
     sensors                    those of the two that are calibrated, by name
     remarks                    convention, what is left out, the error that remains, the held-out errors
     unit, document, settings   name of the unit, its calibration, the sections ``sensor`` and ``table``
 
-and the functions of ``sensors.FUNCTIONS``. The file has the name of its template without ``.j2``. There is no list to
-extend.
+and the functions of ``sensors.FUNCTIONS``. The name of the template without ``.j2`` is that of the format and,
+by default, that of its file. Nothing else lists the formats.
 """
 
 from __future__ import annotations
@@ -33,51 +33,59 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """What a format can hold.
+    """What a format can hold: the keys above the line ``---`` of a template.
 
     Attributes
     ----------
     consumer, equation, source : str
         Who reads the file, how it corrects a reading, and where that is documented.
+    file : str
+        Name of the file, in which ``{unit}`` is the name of the unit; by default that of the template.
+    sensor_endings : dict
+        Sensor to what its name adds to the stem of the file, where each sensor has a file of its own.
     units : dict
         Sensor to the unit of readings: g or m/s^2, deg/s or rad/s. A sensor without a unit is not in the format.
-    needs, needs_counts : list of str
-        Sensors that must be calibrated (``board``: the unit must be the reference chip of a board), and whose counts
-        per unit must be known; without them no file is written.
+    required, required_counts : list of str
+        Sensors that must be calibrated (``board``: the unit must be the reference chip of a board), and sensors whose
+        counts per unit must be known; without them no file is written.
     matrix : dict
         Sensor to what the format holds of its matrix; ``full`` by default.
-    holds : list of str
-        Effects that the format carries in addition to bias and matrix; ``any``: the template deals with all of them.
-    approximates : dict of str to str
-        Effect that the format carries in part, to how well.
-    says, adds, adds_with_temperature : list of str
-        Remarks: before the others, after what is left out, and there where a bias follows the temperature.
+    effects : list of str
+        Effects that the format holds in addition to bias and matrix; ``all``: its text writes or names each of them.
+    effects_in_part : dict of str to str
+        Effect that the format approximates, to how well.
+    opening_remarks : list of str
+        Lines before all other remarks. They may contain ``{unit}, {sensor}, {counts[...]}, {sensors[0]...}``.
+    closing_remarks : list of str
+        Lines after those on what is left out.
+    temperature_remarks : list of str
+        Lines after these, only where a bias of the unit depends on the temperature.
     noise : bool
-        Whether the format carries noise parameters: remarks state their origin, interval and the effective density.
-    errors : str
-        How the held-out errors are introduced; by default as those of the export, or of the full calibration.
-    files : dict
-        Sensor to file name, where each sensor has a file of its own.
-    reads : dict
-        How the file is read back (``pipeline.exports.reading``); empty where it holds no calibration.
+        Whether the format holds noise parameters: remarks state their origin, interval and the effective density.
+    error_sentence : str
+        Sentence in which ``{}`` is a held-out error. By default it says whether the error is that of the export or of
+        the full calibration.
+    read_back : dict
+        How ``convert`` reads the file (``pipeline.exports.reading``); empty where it holds no calibration.
     """
 
     consumer: str
     equation: str
     source: str
-    says: list[str]
+    file: str
+    opening_remarks: list[str]
     units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]
-    needs: list[str] = field(default_factory=list)
-    needs_counts: list[str] = field(default_factory=list)
+    sensor_endings: dict[str, str] = field(default_factory=dict)
+    required: list[str] = field(default_factory=list)
+    required_counts: list[str] = field(default_factory=list)
     matrix: dict[str, Literal["full", "diagonal", "none"]] = field(default_factory=dict)
-    holds: list[str] = field(default_factory=list)
-    approximates: dict[str, str] = field(default_factory=dict)
-    adds: list[str] = field(default_factory=list)
-    adds_with_temperature: list[str] = field(default_factory=list)
+    effects: list[str] = field(default_factory=list)
+    effects_in_part: dict[str, str] = field(default_factory=dict)
+    closing_remarks: list[str] = field(default_factory=list)
+    temperature_remarks: list[str] = field(default_factory=list)
     noise: bool = False
-    errors: str | None = None
-    files: dict[str, str] = field(default_factory=dict)
-    reads: JSON = field(default_factory=dict)
+    error_sentence: str | None = None
+    read_back: JSON = field(default_factory=dict)
 
 
 @cache
@@ -93,15 +101,16 @@ def formats() -> dict[str, tuple[Format, Template]]:
     )
     environment.filters |= {"comment": _comment, "json": _json, "yaml": _yaml, "numbers": _numbers}
     environment.globals |= {**FUNCTIONS, "plan_of": plan_of}
-    found = {}
-    for file in sorted(TEMPLATES.glob("*.j2")):
-        declared, _, text = file.read_text(encoding="utf-8").partition("\n---\n")
-        found[file.stem] = Format(**yaml.safe_load(declared)), environment.from_string(text)
-    return found
+    formats_by_name = {}
+    for template in sorted(TEMPLATES.glob("*.j2")):
+        header, _, text = template.read_text(encoding="utf-8").partition("\n---\n")
+        declared = Format(**{"file": template.stem, **yaml.safe_load(header)})
+        formats_by_name[template.stem] = declared, environment.from_string(text)
+    return formats_by_name
 
 
 @dataclass(frozen=True)
-class Subject:
+class ExportedUnit:
     """A unit to export: its documents, as in ``exports``, and what several formats need of them."""
 
     document: JSON
@@ -121,77 +130,84 @@ class Subject:
 
     def sensors(self, declared: Format) -> dict[str, ExportedSensor]:
         """Return the calibrated sensors in the units of a format."""
-        sheets = self.settings.get("sensor") or {}
+        configs = self.settings.get("sensor") or {}
         units = declared.units
-        return {s: ExportedSensor(c, units[s], sheets.get(s) or {}) for s, c in self.calibrations.items() if s in units}
+        return {
+            s: ExportedSensor(c, units[s], configs.get(s) or {}) for s, c in self.calibrations.items() if s in units
+        }
 
 
 def exports(
     calibration: JSON, settings: JSON, validation: JSON | None = None, diagnosis: JSON | None = None
 ) -> dict[str, str]:
-    """Return the texts of a calibration in every format, by file.
+    """Return the texts of a calibration in every format, by file name.
 
     ``calibration, validation, diagnosis``: as in the published files of the unit; ``settings``: the sections ``sensor``
     and ``table`` of its configuration.
     """
-    subject = Subject(calibration, settings, validation, diagnosis)
-    return {file: text for name in formats() for file, text in export(name, subject).items()}
+    exported = ExportedUnit(calibration, settings, validation, diagnosis)
+    return {file: text for format_name in formats() for file, text in export(format_name, exported).items()}
 
 
-def export(name: str, subject: Subject) -> dict[str, str]:
-    """Return the files of one format, by name: none where the format can hold nothing of this unit."""
-    declared, template = formats()[name]
+def export(format_name: str, exported: ExportedUnit, file: str | None = None) -> dict[str, str]:
+    """Return the texts of one format by file name: none where the format can hold nothing of this unit.
+
+    ``file``: the name to use, by default that of the declaration; a file for each sensor has its ending added.
+    """
+    declared, template = formats()[format_name]
+    path = Path(declared.file.replace("{unit}", exported.document["unit"]) if file is None else file)
     parts = {
-        file: replace(declared, units={s: declared.units[s]}, needs=[s]) for s, file in declared.files.items()
-    } or {name: declared}
-    texts = {file: _rendered(part, template, subject) for file, part in parts.items()}
-    return {file: text for file, text in texts.items() if text is not None}
+        f"{path.stem}{ending}{path.suffix}": replace(declared, units={s: declared.units[s]}, required=[s])
+        for s, ending in declared.sensor_endings.items()
+    } or {path.name: declared}
+    texts = {name: _rendered(part, template, exported) for name, part in parts.items()}
+    return {name: text for name, text in texts.items() if text is not None}
 
 
-def _rendered(declared: Format, template: Template, subject: Subject) -> str | None:
+def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> str | None:
     """Return the text of a file, None where a sensor or its counts are missing."""
-    sensors = subject.sensors(declared)
-    without_counts = [s for s in declared.needs_counts if s in sensors and not sensors[s].counts]
-    known = {*sensors, "board"} if (subject.document.get("board") or {}).get("chips") else set(sensors)
-    if without_counts or not set(declared.needs) <= known:
+    sensors = exported.sensors(declared)
+    without_counts = [s for s in declared.required_counts if s in sensors and not sensors[s].counts]
+    available = {*sensors, "board"} if (exported.document.get("board") or {}).get("chips") else set(sensors)
+    if without_counts or not set(declared.required) <= available:
         return None
     return template.render(
         **{s: sensors.get(s) for s in SENSORS},
         sensors=sensors,
-        unit=subject.document["unit"],
-        document=subject.document,
-        settings=subject.settings,
-        remarks=_remarks(declared, sensors, subject) + (subject.noise_remarks if declared.noise else []),
+        unit=exported.document["unit"],
+        document=exported.document,
+        settings=exported.settings,
+        remarks=_remarks(declared, sensors, exported) + (exported.noise_remarks if declared.noise else []),
     )
 
 
-def _remarks(declared: Format, sensors: dict[str, ExportedSensor], subject: Subject) -> list[str]:
+def _remarks(declared: Format, sensors: dict[str, ExportedSensor], exported: ExportedUnit) -> list[str]:
     """Return what a reader of the file must know, a sentence or a line each."""
-    document = subject.document
+    document = exported.document
     counts = {s: sensor.counts for s, sensor in sensors.items()}
-    known = {"unit": document["unit"], "sensor": document["sensor"], "counts": counts, "sensors": [*sensors.values()]}
-    lines = [line.format(**known) for line in declared.says] + (before_use(document) if declared.units else [])
+    fields = {"unit": document["unit"], "sensor": document["sensor"], "counts": counts, "sensors": [*sensors.values()]}
+    lines = [line.format(**fields) for line in declared.opening_remarks]
+    lines += before_use(document) if declared.units else []
     if len(declared.units) == len(SENSORS):
         reasons = document.get("not_calibrated") or {}
         absent = [s for s in SENSORS if not document.get(s)]
         lines += [f"Left out: the {s} is not calibrated: {reasons.get(s, 'no reason given')}." for s in absent]
-    carried = [*declared.holds, *declared.approximates]
+    held = [*declared.effects, *declared.effects_in_part]
     partly = any(kind != "full" for kind in declared.matrix.values())
     for s, sensor in sensors.items():
-        lost = [] if "any" in declared.holds else [name for name in sensor.effects if name not in carried]
+        lost = [] if "all" in declared.effects else [name for name in sensor.effects if name not in held]
         lines += [f"Left out of this format, {s}: {', '.join(lost)}."] if lost else []
         partly = partly or bool(lost)
         lines += [f"Of the bench, not of the {s}: {', '.join(sensor.bench_effects)}."] if sensor.bench_effects else []
     for s, sensor in sensors.items():
-        partial = [name for name in sensor.effects if name in declared.approximates]
-        lines += [f"{declared.approximates[name]}, {s}: {name}." for name in partial]
+        in_part = [name for name in sensor.effects if name in declared.effects_in_part]
+        lines += [f"{declared.effects_in_part[name]}, {s}: {name}." for name in in_part]
         lines += sensor.left_by_matrix(declared.matrix.get(s, "full"))
-    lines += declared.adds + (
-        declared.adds_with_temperature if any(x.follows_temperature for x in sensors.values()) else []
-    )
-    errors = declared.errors or ("With all of the calibration: {}." if partly else "The {}.")
-    of_these = [line for s in SENSORS for line in final_errors(subject.validation, s) if s in declared.units]
-    return lines + [errors.format(line) for line in of_these]
+    lines += declared.closing_remarks
+    lines += declared.temperature_remarks if any(x.follows_temperature for x in sensors.values()) else []
+    sentence = declared.error_sentence or ("With all of the calibration: {}." if partly else "The {}.")
+    errors = [error for s in SENSORS if s in declared.units for error in final_errors(exported.validation, s)]
+    return lines + [sentence.format(error) for error in errors]
 
 
 def _comment(lines: list[str], mark: str = "# ", end: str = "\n", *, escape: tuple[str, str] = ("", "")) -> str:

@@ -1,9 +1,9 @@
-"""What becomes of each effect in ``calibration.h``: C expressions, sorted by what they depend on.
+"""The effects of a calibration as C expressions of ``calibration.h``, sorted by what they depend on.
 
 The header does what ``pipeline.model.compensation`` does with one sample, in the same order, so that double
 precision without fused operations gives the same last bit where no function of the C library is called. Effects of time
-and temperature alone (``steady``) are taken off once; those of the motion (``moving``) by fixed point where a sensor's
-effects depend, directly or through the other sensor, on what they change (``in_turn``).
+and temperature alone (``steady``) are subtracted once. Those of the motion (``moving``) are subtracted by fixed point
+where a sensor's effects depend on its own calibrated reading, also through the other sensor (``circular_sensors``).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pipeline.exports.sensors import ExportedSensor
     from pipeline.records import FittedEffect, SensorCalibration
 
-ROUNDS = 12  # of the fixed point: each gains about two digits, and 1e-13 is asked for
+ROUNDS = 12  # of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal
 IN_C = set(SIGNALS) - {"specific_force_rate"}
 
 
@@ -43,10 +43,10 @@ class SensorPlan:
 
 @dataclass
 class Plan:
-    """The header's contents: of each sensor, and what they ask of the functions around them."""
+    """The contents of the header: of each sensor, and which functions they need."""
 
     sensors: dict[str, SensorPlan]
-    in_turn: set[str]
+    circular_sensors: set[str]
     past: bool
     temperature: bool
     with_time: list[str]
@@ -67,17 +67,17 @@ def plan_of(sensors: Mapping[str, ExportedSensor]) -> Plan:
     for sensor in SENSORS:
         calibration = sensors[sensor].calibration if sensor in sensors else None
         plans[sensor], steps[sensor] = _sensor_plan(sensor, calibration)
-    in_turn = circular(steps)
+    circular_sensors = circular(steps)
     used = set().union(*(step.used for step in steps.values()))
     past = bool(used & OF_THE_PAST)
     return Plan(
         sensors=plans,
-        in_turn=in_turn,
+        circular_sensors=circular_sensors,
         past=past,
         temperature="temperature" in used,
         with_time=sorted({name for plan in plans.values() for name in plan.with_time}),
-        rounds=ROUNDS if in_turn else 1,
-        ends=ROUNDS if in_turn and past else 1,
+        rounds=ROUNDS if circular_sensors else 1,
+        ends=ROUNDS if circular_sensors and past else 1,
     )
 
 
@@ -88,13 +88,13 @@ def _sensor_plan(sensor: str, calibration: SensorCalibration | None) -> tuple[Se
         return SensorPlan([c_number(0.0)] * 3, unchanged), Steps.of(sensor, ())
     matrix = [[c_number(x) for x in row] for row in calibration.matrix.tolist()]
     plan = SensorPlan([c_number(b) for b in calibration.bias.tolist()], matrix)
-    known = []
+    included = []
     for fitted in sensor_effects(calibration):
         if why := _not_in_c(sensor, fitted):
             plan.left_out.append(f"{fitted.name} ({why})")
         else:
-            known.append(fitted)
-    steps = Steps.of(sensor, known)
+            included.append(fitted)
+    steps = Steps.of(sensor, included)
     for effects, lines in ((steps.steady, plan.steady), (steps.moving, plan.moving)):
         for fitted in effects:
             with_time = bool(steps.fields[fitted.name] & ({"time"} | OF_THE_PAST))
@@ -108,9 +108,9 @@ def _sensor_plan(sensor: str, calibration: SensorCalibration | None) -> tuple[Se
 def _not_in_c(sensor: str, fitted: FittedEffect) -> str:
     """Return why the header leaves an effect out; empty where it does not."""
     if fitted.definition and "python" in fitted.definition:
-        return "it is in Python; python -m pipeline apply --python-effect takes it off"
+        return "it is in Python; python -m pipeline apply --python-effect subtracts it"
     effect = effect_of(fitted)
     if effect.in_c(fitted.values) is None:
-        return "its equation has no form in C; python -m pipeline apply takes it off"
+        return "its equation has no form in C; python -m pipeline apply subtracts it"
     unknown = sorted(effect.fields(sensor, fitted.values) - IN_C)
     return f"it needs {', '.join(unknown)}, which this header does not know" if unknown else ""

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.exports import Subject, export, formats
-from pipeline.exports.reading import CALIBRATION, FoundCalibration, counts_of, read_any
+from pipeline.exports import ExportedUnit, export, formats
+from pipeline.exports.reading import CALIBRATION, ImportedCalibration, counts_of, read_any
 from pipeline.exports.sensors import FACTORS, SI, ExportedSensor, before_use
 from pipeline.files import json_text, write_atomically
 from pipeline.model.compensation import Compensation
@@ -26,114 +26,115 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from pipeline.exports.reading import FoundCalibration
-    from pipeline.records import SensorCalibration, Values
+    from pipeline.records import Values
 
 JSON = dict[str, Any]
-KEPT = 1e-9  # relative to 1 and in g or deg/s: what differs less is kept
+TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding
 WALK_S = 100.0  # correlation time of the wander that stands for a random walk: K = s sqrt(2 / T), any T serves
 
 
-def document_of(found: FoundCalibration) -> JSON:
-    """Return ``calibrations/<unit>.json`` of what a file holds; what no file tells is null."""
-    if found.document is not None:
-        return found.document
-    missing = {s: f"{found.name} holds no calibration of it" for s in SENSORS if s not in found.sensors}
+def document_of(imported: ImportedCalibration) -> JSON:
+    """Return ``calibrations/<unit>.json`` of what a file holds; what it does not state is null."""
+    if imported.document is not None:
+        return imported.document
+    missing = {s: f"{imported.format_name} holds no calibration of it" for s in SENSORS if s not in imported.sensors}
     return {
         "schema_version": 1,
-        "unit": found.unit,
+        "unit": imported.unit,
         "status": "ok",
         "error": None,
         **dict.fromkeys(("sensor", "table", "procedure", "method", "config_sha256")),
         "software": {"imu-calibration": version("imu-calibration")},
         "inputs": [],
         "not_calibrated": missing,
-        **{s: found.sensors[s].to_json() if s in found.sensors else None for s in SENSORS},
+        **{s: imported.sensors[s].to_json() if s in imported.sensors else None for s in SENSORS},
     }
 
 
-def settings_of(found: FoundCalibration, sheets: Mapping[str, Any]) -> JSON:
+def settings_of(imported: ImportedCalibration, config: Mapping[str, Any]) -> JSON:
     """Return the settings that exports read: the sensor's configuration, with the noise that the file states."""
-    sensor: JSON = {s: dict(sheets.get(s) or {}) for s in SENSORS}
+    sensor: JSON = {s: dict(config.get(s) or {}) for s in SENSORS}
     for s, unit in SI.items():
-        density, walk = (found.noise.get(f"{s}_{what}") for what in ("noise_density", "random_walk"))
+        density, walk = (imported.noise.get(f"{s}_{what}") for what in ("noise_density", "random_walk"))
         if density is not None and walk is not None:
             sensor[s] |= {"noise_density": np.sqrt(2.0) * density / FACTORS[unit], "wander_time_s": WALK_S}  # one-sided
-            sensor[s]["noise_origin"] = f"as {found.name} states it"
+            sensor[s]["noise_origin"] = f"as {imported.format_name} states it"
             sensor[s]["bias_wander"] = walk / FACTORS[unit] * np.sqrt(WALK_S / 2.0)
     return {"sensor": sensor, "table": {"gravity_g": 1.0}}
 
 
 def convert(
-    found: FoundCalibration, name: str, target: Path, sheets: Mapping[str, Any]
+    imported: ImportedCalibration, format_name: str, target: Path, config: Mapping[str, Any]
 ) -> tuple[list[Path], list[str]]:
-    """Write a calibration in the format ``name``; return the files and what is lost, in sentences.
+    """Write a calibration in a format; return the files and what is lost, in sentences.
 
-    ``target``: the file, or where the format has a file for each sensor, the beginning of their names; ``sheets``:
-    sensor to its part of the sensor's configuration, for counts and noise, may be empty.
+    ``target``: the file; where the format has a file for each sensor, their endings are added to its stem.
+    ``config``: the sensor's configuration, sensor to its part, for counts and noise; may be empty.
     """
-    document, settings = document_of(found), settings_of(found, sheets)
-    if name == CALIBRATION:
+    document, settings = document_of(imported), settings_of(imported, config)
+    if format_name == CALIBRATION:
         write_atomically(target, json_text(document))
-        return [target], ["the noise densities and random walks"] if found.noise else []
+        return [target], ["the noise densities and random walks"] if imported.noise else []
     try:
-        texts = export(name, Subject(document, settings))
+        texts = export(format_name, ExportedUnit(document, settings), target.name)
     except KeyError as missing:
+        quantity = str(missing.args[0]).replace("_", " ")
         raise ConfigurationError(
-            f"{name} holds {missing.args[0]} of a sensor, which the input does not: state the sensor (--sensor NAME)"
+            f"{format_name} needs the {quantity}; IN does not state it: give --sensor NAME"
         ) from None
     if not texts:
-        needed = [*formats()[name][0].needs, *(f"the counts of the {s}" for s in formats()[name][0].needs_counts)]
-        raise ConfigurationError(f"{name} needs {', '.join(needed)}, which the input does not hold (see --sensor)")
-    first = name.partition(".")[0]
-    files = []
-    for file, text in texts.items():
-        path = target if len(texts) == 1 and file == name else target.with_name(file.replace(first, target.stem, 1))
-        write_atomically(path, text)
-        files.append(path)
-    return files, lost(found, name, files[0], sheets)
+        declared = formats()[format_name][0]
+        needed = [*declared.required, *(f"the counts per unit of the {s}" for s in declared.required_counts)]
+        raise ConfigurationError(
+            f"{format_name} needs {', '.join(needed)}; IN does not hold it (--sensor NAME states counts)"
+        )
+    files = [target.with_name(name) for name in texts]
+    for file, text in zip(files, texts.values(), strict=True):
+        write_atomically(file, text)
+    return files, lost(imported, format_name, files[0], config)
 
 
-def lost(found: FoundCalibration, name: str, file: Path, sheets: Mapping[str, Any]) -> list[str]:
+def lost(imported: ImportedCalibration, format_name: str, file: Path, config: Mapping[str, Any]) -> list[str]:
     """Return what a written file does not hold, in sentences, by reading it back."""
-    declared = formats()[name][0]
-    if not declared.reads:
-        return [f"bias and matrix: {name} is for {declared.equation}"]
-    back = read_any(file, name, counts_of(sheets))
+    declared = formats()[format_name][0]
+    if not declared.read_back:
+        return [f"bias and matrix: {format_name} is for {declared.equation}"]
+    back = read_any(file, format_name, counts_of(config))
     lines = []
-    for s, calibration in found.sensors.items():
+    for s, calibration in imported.sensors.items():
         if s not in back.sensors:
-            lines.append(f"{s}: all of it; {name} holds no {s}")
+            lines.append(f"{s}: all of it; {format_name} holds no {s}")
             continue
         lines += [
-            f"{s}: {line}" for line in _differences(calibration, back.sensors[s], any_effect=declared.holds == ["any"])
+            f"{s}: {line}"
+            for line in _differences(calibration, back.sensors[s], all_effects=declared.effects == ["all"])
         ]
         exported = ExportedSensor(calibration, declared.units[s], {})
         lines += [f"{s}: {line}" for line in exported.left_by_matrix(declared.matrix.get(s, "full"))]
-    if found.noise and not back.noise:
+    if imported.noise and not back.noise:
         lines.append("the noise densities and random walks")
-    if any(c.covariance is not None for c in found.sensors.values()):
+    if any(c.covariance is not None for c in imported.sensors.values()):
         lines.append("expanded uncertainties, covariances and uncertainty budgets")
-    if found.document is not None:
+    if imported.document is not None:
         lines.append("the stages of the fit, the input files with their digests, and the diagnosis")
     return lines
 
 
-def _differences(before: SensorCalibration, after: SensorCalibration, *, any_effect: bool) -> list[str]:
-    """Return what of a sensor's calibration did not arrive."""
+def _differences(before: SensorCalibration, after: SensorCalibration, *, all_effects: bool) -> list[str]:
+    """Return what a sensor's calibration has lost, in sentences."""
     unit = SENSOR_UNITS[before.sensor]
     bias, matrix = (np.abs(getattr(after, key) - getattr(before, key)).max() for key in ("bias", "matrix"))
     lines = []
-    if bias > KEPT:
-        gone = np.any(before.bias) and not np.any(after.bias)
-        lines.append("the bias" if gone else f"the bias is rounded, by up to {bias:.2g} {unit}")
-    if matrix > KEPT:
+    if bias > TOLERANCE:
+        left_out = np.any(before.bias) and not np.any(after.bias)
+        lines.append("the bias" if left_out else f"the bias is rounded, by up to {bias:.2g} {unit}")
+    if matrix > TOLERANCE:
         lines.append(f"elements of the matrix change by up to {matrix:.2g}")
-    kept = {e.name: e.values for e in after.effects}
-    for effect in () if any_effect else before.effects:
-        if effect.name not in kept:
+    values = {e.name: e.values for e in after.effects}
+    for effect in () if all_effects else before.effects:
+        if effect.name not in values:
             lines.append(f"the effect {effect.name}")
-        elif (change := np.abs(kept[effect.name] - effect.values).max()) > KEPT:
+        elif (change := np.abs(values[effect.name] - effect.values).max()) > TOLERANCE:
             lines.append(f"the effect {effect.name} changes by up to {change:.2g}")
     return lines
 
@@ -148,19 +149,19 @@ SAMPLE: dict[str, Any] = {
 }
 
 
-def explain_calibration(found: FoundCalibration) -> str:
+def explain_calibration(imported: ImportedCalibration) -> str:
     """Return the explanation of a calibration in any format."""
-    lines = [f"{found.unit} ({found.name})"]
-    if found.document is None:
-        declared = formats()[found.name][0]
+    lines = [f"{imported.unit} ({imported.format_name})"]
+    if imported.document is None:
+        declared = formats()[imported.format_name][0]
         lines += [f"  {declared.consumer}: {declared.equation}", "  The same in g, deg/s and body axes:"]
-    lines += [f"  {line}" for line in (before_use(found.document) if found.document else [])]
-    lines += [f"  {note}" for note in found.notes]
+    lines += [f"  {line}" for line in (before_use(imported.document) if imported.document else [])]
+    lines += [f"  {note}" for note in imported.notes]
     for sensor in SENSORS:
-        calibration = found.sensors.get(sensor)
+        calibration = imported.sensors.get(sensor)
         lines += ["", f"  {sensor}"]
-        lines += [f"    {line}" for line in _sensor(calibration, found)] if calibration else ["    not calibrated"]
-    return "\n".join(lines + board_lines(found.document or {})) + "\n"
+        lines += [f"    {line}" for line in _sensor(calibration, imported)] if calibration else ["    not calibrated"]
+    return "\n".join(lines + board_lines(imported.document or {})) + "\n"
 
 
 def board_lines(document: dict[str, Any]) -> list[str]:
@@ -178,8 +179,8 @@ def board_lines(document: dict[str, Any]) -> list[str]:
             *(f"      {'R =' if i == 0 else '   '} {_row(np.array(row))}" for i, row in enumerate(chip["rotation"])),
         ]
         for parameter, p in chip["parameters"].items():
-            seen = "" if p["observable"] else "   not observable"
-            lines.append(f"      {parameter:26s} {p['value']:.6g} ± {p['expanded_uncertainty']:.2g} {p['unit']}{seen}")
+            note = "" if p["observable"] else "   not observable"
+            lines.append(f"      {parameter:26s} {p['value']:.6g} ± {p['expanded_uncertainty']:.2g} {p['unit']}{note}")
         for lost in chip["not_observable"]:
             along = f" along {lost['direction']}" if lost["direction"] else ""
             lines.append(f"      not observable: {lost['parameter']}{along}: {lost['reason']}")
@@ -187,10 +188,10 @@ def board_lines(document: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _sensor(calibration: SensorCalibration, found: FoundCalibration) -> list[str]:
-    unit, own = SENSOR_UNITS[calibration.sensor], sensor_effects(calibration)
-    names = [e.name for e in own]
-    bench = [e.name for e in calibration.effects if e not in own]
+def _sensor(calibration: SensorCalibration, imported: ImportedCalibration) -> list[str]:
+    unit, effects = SENSOR_UNITS[calibration.sensor], sensor_effects(calibration)
+    names = [e.name for e in effects]
+    bench = [e.name for e in calibration.effects if e not in effects]
     minus = "".join(f" - {name}" for name in names)
     lines = [
         f"calibrated = matrix (reading - bias{minus}), {unit}; vectors are columns x, y, z",
@@ -204,43 +205,41 @@ def _sensor(calibration: SensorCalibration, found: FoundCalibration) -> list[str
         *(f"{'matrix =' if i == 0 else '        '} {_row(row)}" for i, row in enumerate(calibration.matrix)),
         *_uncertainty(calibration, unit),
     ]
-    for effect in own:
+    for effect in effects:
         expressions = effect_of(effect).in_c(effect.values) or ()
         terms = "" if expressions else ", ".join(f"{n} = {p['value']:.6g}" for n, p in effect.parameters.items())
         lines.append(f"{effect.name}, {unit}: {terms}".rstrip(": "))
         lines += [f"  {axis}: {_plain(term)}" for axis, term in zip("xyz", expressions, strict=False)]
-    if own:
+    if effects:
         lines.append(
             "  (f: specific force, g; w: angular rate, deg/s; u: that of this sensor, all calibrated; dt: T - 25 degC)"
         )
-    lines += [f"of the bench, not taken off: {', '.join(bench)}"] * bool(bench)
-    return lines + _worked(calibration, found)
+    lines += [f"of the bench, not subtracted: {', '.join(bench)}"] * bool(bench)
+    return lines + _worked(calibration, imported)
 
 
 def _uncertainty(calibration: SensorCalibration, unit: str) -> list[str]:
     """Return the expanded uncertainties (95 %) of bias and matrix, or that none is known."""
     if calibration.covariance is None:
-        return ["uncertainty: none is known"]
+        return ["uncertainty: not stated"]
     freedom = calibration.freedom if calibration.freedom is not None else np.array(calibration.degrees_of_freedom)
     U = coverage_factor(np.broadcast_to(freedom, len(calibration.covariance)))
     U = U * np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None))
     return [f"expanded uncertainty (95 %): bias {_row(U[:3], '.2g')} {unit}, matrix up to {U[3:12].max():.2g}"]
 
 
-def _worked(calibration: SensorCalibration, found: FoundCalibration) -> list[str]:
-    """Return one reading, calibrated step by step; the effects are what the compensation takes off."""
+def _worked(calibration: SensorCalibration, imported: ImportedCalibration) -> list[str]:
+    """Return one reading, calibrated step by step; the effects are those that the compensation subtracts."""
     sensor, unit = calibration.sensor, SENSOR_UNITS[calibration.sensor]
-    compensation = Compensation(found.sensors.get("accelerometer"), found.sensors.get("gyroscope"), found.unit)
+    compensation = Compensation(imported.sensors.get("accelerometer"), imported.sensors.get("gyroscope"), imported.unit)
     truth = getattr(compensation.apply(**SAMPLE, smoothing=0.0), sensor)
     reading, centred = SAMPLE[sensor], SAMPLE[sensor] - calibration.bias
-    taken = centred - np.linalg.solve(calibration.matrix, truth)
+    effects = centred - np.linalg.solve(calibration.matrix, truth)
     lines = [f"worked sample: reading      {_row(reading)} {unit}", f"  - bias                    {_row(centred)}"]
     if sensor_effects(calibration):
         at = f"at {SAMPLE['temperature']:g} degC, {SAMPLE['time']:g} s"
         other = "gyroscope" if sensor == "accelerometer" else "accelerometer"
-        lines.append(
-            f"  - effects                 {_row(centred - taken)}  ({at}, {other} {_row(SAMPLE[other], '.4g')})"
-        )
+        lines.append(f"  - effects                 {_row(effects)}  ({at}, {other} {_row(SAMPLE[other], '.4g')})")
     return [*lines, f"  matrix times that         {_row(truth)} {unit}  calibrated"]
 
 

@@ -1,7 +1,8 @@
 """Exports read back: the file of a format to the calibration that it holds.
 
-The declaration of a template states under ``reads`` how its file is read, next to the text that writes it: the kind of
-text, and for each sensor where it stands in the file and one expression for each quantity (``SensorRead``).
+The declaration of a template states under ``read_back`` how its file is read: the ``kind`` of text
+(``pipeline.exports.text_kinds``), and for each sensor ``where``, the path of a value that only a file with this sensor
+has, and an expression for each quantity:
 
     bias | bias_after_matrix | bias_polynomial,   matrix | K,   g_sensitivity, scale_factor_temperature, bias_deviation
 
@@ -14,15 +15,17 @@ import json
 import re
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jinja2 import TemplateError
-from yaml import YAMLError
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.exports import formats, text_kinds
+from pipeline.exports import formats
 from pipeline.exports.sensors import FACTORS, FUNCTIONS
+from pipeline.exports.text_kinds import Expressions, Node, parsed
 from pipeline.io.files import read_text
 from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.effects import effect
@@ -31,36 +34,37 @@ from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from pipeline.exports import Format
     from pipeline.records import Values
 
 CALIBRATION = "calibration.json"  # the name of the product's own format among the formats
 LARGEST_BYTES = 50_000_000  # of a file to read; a calibration has some kilobytes, a vehicle's parameters 100
-NEAR_ONE = (0.5, 2.0)  # what a matrix multiplies by where readings and truth have the same unit
-C_EFFECT = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
-TURNED = re.compile(r"Turn the readings to body axes first: [^.]*\.")  # a remark of our own exports
-SAME = 1e-12  # relative to the largest: what is smaller is rounding of the formats' own arithmetic
+UNIT_SCALE = (0.5, 2.0)  # range of a matrix's singular values where readings and truth have the same unit
+EFFECT_IN_C = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
+TURNED_READINGS = re.compile(r"Turn the readings to body axes first: [^.]*\.")  # a remark of our own exports
+ROUNDING = 1e-12  # of the formats' own arithmetic, relative to the largest number
 
 
 @dataclass(frozen=True)
-class FoundCalibration:
+class ImportedCalibration:
     """A calibration as a file holds it.
 
     Attributes
     ----------
+    format_name, unit : str
+        Name of the format, and that of the unit: the stem of the file where the format holds none.
     sensors : dict of str to SensorCalibration
         Those that the file holds; the covariance is None where it states no uncertainty.
     noise : dict
         Kalibr's four noise parameters (``pipeline.exports.sensors``), as far as the file states them.
     notes : list of str
-        What was taken for granted or not read.
+        What was assumed, and what was not read.
     document : dict or None
         ``calibrations/<unit>.json``, where the file is one.
     """
 
-    name: str
+    format_name: str
     unit: str
     sensors: dict[str, SensorCalibration]
     noise: dict[str, float] = field(default_factory=dict)
@@ -68,137 +72,148 @@ class FoundCalibration:
     document: dict[str, Any] | None = None
 
 
-def read_any(file: Path, name: str | None = None, counts: Mapping[str, float | None] | None = None) -> FoundCalibration:
+def read_any(
+    file: Path, format_name: str | None = None, counts: Mapping[str, float | None] | None = None
+) -> ImportedCalibration:
     """Read a calibration in any format; where a format has a file for each sensor, from either of them.
 
-    ``name``: of the format, or its beginning (``format_of``), found from the file's name and content where not given;
+    ``format_name``: or its beginning (``format_of``); found from the file's name and content where not given;
     ``counts``: sensor to its counts per g or deg/s, for formats in counts. ``ConfigurationError``: no format, or
     several, have this name; ``InputError``: the file does not hold what the format needs.
     """
-    stated = None if name is None else format_of(name)
+    named = None if format_name is None else format_of(format_name)
     if not is_published(file):
         raise MissingInputError("there is no such calibration", str(file))
     text = _text(file)
-    name = stated or _recognised(file, text)
-    if name == CALIBRATION:
+    named = named or _recognised(file, text)
+    if named == CALIBRATION:
         document = read_calibration(file)
-        own = {s: c for s in SENSORS if (c := sensor_of(document, s, file)) is not None}
-        for sensor, c in own.items():  # a published one holds zeros where no uncertainty is known
+        sensors = {s: c for s in SENSORS if (c := sensor_of(document, s, file)) is not None}
+        for s, c in sensors.items():  # a published one holds zeros where no uncertainty is known
             if c.covariance is None or not np.any(np.diag(c.covariance) > 0.0):
-                own[sensor] = replace(c, covariance=None)
-        return FoundCalibration(name, str(document["unit"]), own, document=document)
-    declared = formats()[name][0]
-    if not declared.reads:
-        raise InputError(f"the format {name} holds no calibration that can be read: {declared.equation}", str(file))
-    parts = [_read_text(each, name, declared, counts or {}) for each in _files_of(file, declared)]
+                sensors[s] = replace(c, covariance=None)
+        return ImportedCalibration(named, str(document["unit"]), sensors, document=document)
+    declared = formats()[named][0]
+    if not declared.read_back:
+        raise InputError(f"the format {named} holds no calibration that can be read: {declared.equation}", str(file))
+    files = _files_of(file, declared)
+    parts = [_read_file(each, named, declared, counts or {}) for each in files]
     sensors = {s: c for part in parts for s, c in part.sensors.items()}
-    notes = [f"read together with it: {each.name}" for each in _files_of(file, declared) if each != file]
+    notes = [f"read together with it: {each.name}" for each in files if each != file]
     return replace(parts[0], sensors=sensors, notes=[*notes, *(note for part in parts for note in part.notes)])
 
 
 def _files_of(file: Path, declared: Format) -> list[Path]:
     """Return the file, and that of the other sensor in the same folder, where each has its own."""
-    ends = [name.rpartition("_")[2] for name in declared.files.values()]
-    own = next((end for end in ends if file.name.endswith(end)), None)
-    if own is None:
+    endings = declared.sensor_endings.values()
+    ending = next((e for e in endings if file.stem.endswith(e)), None)
+    if ending is None:
         return [file]
-    found = [file.with_name(file.name.removesuffix(own) + end) for end in ends]
-    return [each for each in found if is_published(each)]
+    files = [file.with_stem(file.stem.removesuffix(ending) + e) for e in endings]
+    return [each for each in files if is_published(each)]
 
 
 def _text(file: Path) -> str:
     return read_text(file, LARGEST_BYTES, "a calibration") if file.exists() else read_published(file).decode()
 
 
-def _read_text(file: Path, name: str, declared: Format, counts: Mapping[str, float | None]) -> FoundCalibration:
+def _read_file(
+    file: Path, format_name: str, declared: Format, counts: Mapping[str, float | None]
+) -> ImportedCalibration:
     text = _text(file)
     try:
-        found = _read(file, name, declared, text_kinds.parsed(declared.reads["text"], text), counts)
-    except (TemplateError, YAMLError, KeyError, ValueError, TypeError, np.linalg.LinAlgError) as error:
-        told = error.args[0] if isinstance(error, KeyError) else error
-        raise InputError(f"this is no {name} ({declared.consumer}): {told}", str(file)) from error
-    found.notes.extend(TURNED.findall(text))
-    if effects := dict.fromkeys(C_EFFECT.findall(text)):
-        found.notes.append(f"effects in C expressions, which are not read: {', '.join(effects)}")
-    return found
+        imported = _read(file, format_name, declared, parsed(declared.read_back["kind"], text), counts)
+    except (TemplateError, KeyError, ValueError, TypeError, np.linalg.LinAlgError) as error:
+        reason = error.args[0] if isinstance(error, KeyError) else error
+        raise InputError(f"this is no {format_name} ({declared.consumer}): {reason}", str(file)) from error
+    imported.notes.extend(TURNED_READINGS.findall(text))
+    if effects := dict.fromkeys(EFFECT_IN_C.findall(text)):
+        imported.notes.append(f"effects in C expressions, which are not read: {', '.join(effects)}")
+    return imported
 
 
-def counts_of(sheets: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return the counts per g or deg/s of each sensor, from its part of the sensor's configuration; None: not known."""
-    return {s: (sheets.get(s) or {}).get("counts_per_unit") for s in SENSORS}
+def counts_of(config: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the counts per g or deg/s of each sensor by the sensor's configuration; None: not stated."""
+    return {s: (config.get(s) or {}).get("counts_per_unit") for s in SENSORS}
 
 
-def format_of(given: str) -> str:
-    """Return the format that a name or the beginning of a name stands for."""
-    known = [CALIBRATION, *formats()]
-    found = [name for name in known if given in (name, name.partition(".")[0])]
-    found = found or [name for name in known if name.startswith(given)]
-    if len(found) == 1:
-        return found[0]
-    raise ConfigurationError(f"{given} is the name of {'several formats' if found else 'no format'}: "
-                             f"{', '.join(found or known)}; choose one (convert --from, --to)")  # fmt: skip
+def format_of(words: str) -> str:
+    """Return the format whose name, beginning of the name, or pattern of file names fits."""
+    names = [CALIBRATION, *formats()]
+    fitting = (
+        [name for name in names if words in (name, name.partition(".")[0])]
+        or [name for name in names if name.startswith(words)]
+        or [name for name, (d, _) in formats().items() if fnmatchcase(words, d.file.replace("{unit}", "*"))]
+    )
+    if len(fitting) == 1:
+        return fitting[0]
+    raise ConfigurationError(f"{words} is the name of {'several formats' if fitting else 'no format'}: "
+                             f"{', '.join(fitting or names)}; choose one (convert --from, --to)")  # fmt: skip
 
 
 def _recognised(file: Path, text: str) -> str:
     """Return the name of the only format whose keys a file has."""
-    known = {name: declared for name, (declared, _) in formats().items()}
-    if file.name in known:
+    declarations = {name: declared for name, (declared, _) in formats().items() if declared.read_back}
+    if file.name in formats():
         return file.name
-    found = []
-    for name, declared in known.items():
-        with suppress(ValueError, YAMLError):
-            if declared.reads and _sensors_in(file, declared, text_kinds.parsed(declared.reads["text"], text)):
-                found.append(name)
+    fitting = []
+    for name, declared in declarations.items():
+        with suppress(ValueError):
+            if _sensors_in(file, declared, parsed(declared.read_back["kind"], text)):
+                fitting.append(name)
     with suppress(ValueError):
         document = json.loads(text)
         if isinstance(document, dict) and {"schema_version", "status", *SENSORS} <= set(document):
-            found = [CALIBRATION]
-    if len(found) == 1:
-        return found[0]
-    listed = ", ".join(found or [CALIBRATION, *(n for n, d in known.items() if d.reads)])
-    reason = "the file fits several formats" if found else "the file has the keys of no format"
-    raise InputError(f"{reason}: {listed}; name it (convert --from, method.format)", str(file))
+            fitting = [CALIBRATION]
+    if len(fitting) == 1:
+        return fitting[0]
+    names = ", ".join(fitting or [CALIBRATION, *declarations])
+    reason = "the file fits several formats" if fitting else "the file has the keys of no format"
+    raise InputError(f"{reason}: {names}; name it (convert --from, method.format)", str(file))
 
 
-def _sensors_in(file: Path, declared: Format, content: text_kinds.Node) -> dict[str, dict[str, str]]:
-    """Return the expressions of the sensors that stand in a file."""
-    reads = declared.reads
-    if declared.files:  # the end of its name tells the sensor
-        ends = {s: name.rpartition("_")[2] for s, name in declared.files.items()}
-        chosen = [s for s in SENSORS if file.name.endswith(ends[s])] if content.has(reads["sensor"]["where"]) else []
-        return {s: dict(reads["sensor"]) for s in chosen}
-    return {s: reads[s] for s in SENSORS if s in reads and content.has(reads[s]["where"])}
+def _sensors_in(file: Path, declared: Format, content: Node) -> dict[str, dict[str, str]]:
+    """Return the expressions of the sensors that a file holds."""
+    read_back, endings = declared.read_back, declared.sensor_endings
+    expressions = {s: read_back["sensor"] for s in endings if file.stem.endswith(endings[s])} or read_back
+    return {s: dict(expressions[s]) for s in SENSORS if s in expressions and content.has(expressions[s]["where"])}
 
 
 def _read(
-    file: Path, name: str, declared: Format, content: text_kinds.Node, counts: Mapping[str, float | None]
-) -> FoundCalibration:
+    file: Path, format_name: str, declared: Format, content: Node, counts: Mapping[str, float | None]
+) -> ImportedCalibration:
     sensors = _sensors_in(file, declared, content)
     if not sensors:
-        wanted = ", ".join(declared.files.values()) or ", ".join(str(declared.reads[s]["where"]) for s in SENSORS
-                                                                   if s in declared.reads)  # fmt: skip
-        raise InputError(f"this is no {name} ({declared.consumer}): expected {wanted}", str(file))
-    known = {s: counts.get(s) for s in SENSORS}
-    lacking = [s for s in declared.needs_counts if s in sensors and not known[s]]
+        names = [
+            f"a name that ends in {ending}{Path(declared.file).suffix}" for ending in declared.sensor_endings.values()
+        ]
+        wanted = " or ".join(names) or ", ".join(
+            str(declared.read_back[s]["where"]) for s in SENSORS if s in declared.read_back
+        )
+        raise InputError(f"this is no {format_name} ({declared.consumer}): expected {wanted}", str(file))
+    per_unit = {s: counts.get(s) for s in SENSORS}
+    lacking = [s for s in declared.required_counts if s in sensors and not per_unit[s]]
     if lacking:
-        raise InputError(f"{name} is in counts: state the sensor, whose config knows the counts per unit", str(file))
-    tree = text_kinds.Expressions({**FUNCTIONS, "file": content, "counts": known})
+        raise InputError(
+            f"{format_name} is in counts: state the sensor, whose config states the counts per unit", str(file)
+        )
+    tree = Expressions({**FUNCTIONS, "file": content, "counts": per_unit})
     notes: list[str] = []
-    found = {}
+    calibrations = {}
     for s, expressions in sensors.items():
-        tree.globals |= {key: tree.value(e) for key, e in declared.reads.get("let", {}).items()}
+        tree.globals |= {key: tree.value(e) for key, e in declared.read_back.get("let", {}).items()}
         if "model" in expressions:
             tree.globals["model"] = tree.value(expressions["model"])
         values = {key: tree.value(e) for key, e in expressions.items() if key not in ("where", "model")}
-        found[s] = _calibration(s, declared, values, known[s], notes)
-    noise = {key: float(np.ravel(content.at(path))[0]) for key, path in declared.reads.get("noise", {}).items()
+        calibrations[s] = _calibration(s, declared, values, per_unit[s], notes)
+    noise = {key: float(np.ravel(content.at(path))[0]) for key, path in declared.read_back.get("noise", {}).items()
              if content.has(path) and content.at(path) is not None}  # fmt: skip
     unread = content.unread()
     if unread:
-        more = f" and {len(unread) - 12} more" if len(unread) > 12 else ""
-        notes.append(f"not read: {', '.join(unread[:12])}{more}")
-    notes += [f"{s}: the file states no bias; it counts as 0" for s, c in found.items() if not np.any(c.bias)]
-    return FoundCalibration(name, file.stem, found, noise, notes)
+        others = f" and {len(unread) - 12} more" if len(unread) > 12 else ""
+        notes.append(f"not read: {', '.join(unread[:12])}{others}")
+    notes += [f"{s}: the file states no bias; it counts as 0" for s, c in calibrations.items() if not np.any(c.bias)]
+    return ImportedCalibration(format_name, file.stem, calibrations, noise, notes)
 
 
 def _calibration(
@@ -216,8 +231,11 @@ def _calibration(
         polynomial = held["bias"].reshape(3, 1)
     raw = factor  # units of the format per g or deg/s of a reading
     sizes = np.linalg.svd(matrix, compute_uv=False)
-    if not NEAR_ONE[0] < sizes[2] <= sizes[0] < NEAR_ONE[1]:
-        if counts is None or not NEAR_ONE[0] < sizes[2] * counts / factor <= sizes[0] * counts / factor < NEAR_ONE[1]:
+    if not UNIT_SCALE[0] < sizes[2] <= sizes[0] < UNIT_SCALE[1]:
+        if (
+            counts is None
+            or not UNIT_SCALE[0] < sizes[2] * counts / factor <= sizes[0] * counts / factor < UNIT_SCALE[1]
+        ):
             raise ValueError(
                 f"the matrix of the {sensor} multiplies readings by {sizes[2]:.3g} to {sizes[0]:.3g}: they are not in "
                 f"{declared.units[sensor]}, and not in the counts of the sensor that is stated "
@@ -230,7 +248,9 @@ def _calibration(
     polynomial = polynomial / raw
     if np.any(np.abs(held.get("left_out", 0.0)) > 0.0):
         most = float(np.abs(held["left_out"]).max())
-        notes += [f"{sensor}: cross-axis terms change by up to {most:.2g} per degC, which is not read"] * (most > SAME)
+        notes += [f"{sensor}: cross-axis terms change by up to {most:.2g} per degC, which is not read"] * (
+            most > ROUNDING
+        )
     effects = _thermal(sensor, polynomial, notes)
     for name, unit in (("g_sensitivity", raw), ("scale_factor_temperature", 1.0)):
         if np.any(values_of := held.get(name, np.zeros(1))):
@@ -246,7 +266,7 @@ def _calibration(
 
 def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEffect]:
     """Return the effect of a bias that follows the temperature: a polynomial in T - 25 degC, (3, k) array."""
-    polynomial = np.where(np.abs(polynomial) > SAME * np.abs(polynomial).max(), polynomial, 0.0)
+    polynomial = np.where(np.abs(polynomial) > ROUNDING * np.abs(polynomial).max(), polynomial, 0.0)
     if np.any(polynomial[:, 3:]):
         notes.append(f"{sensor}: the bias beyond the second order of the temperature is left out")
     if np.any(polynomial[:, 2:3]):

@@ -1,8 +1,8 @@
-"""What the templates of exports see of a calibrated sensor, and the mathematics that several formats need.
+"""A calibrated sensor as the templates of exports get it, and functions that several formats need.
 
 truth = matrix @ (reading - bias - effects),    reading = bias + K @ truth + effects,    K = matrix^-1
 
-White noise n and random walk k, for estimators that know these two alone, follow from the terms that were identified:
+White noise n and random walk k, for estimators with these two terms alone, follow from the terms identified at rest:
 
     n^2 = N^2 + sum 2 G^2 T  (T < ``FAST_S``)
     k^2 = K^2 + sum 2 G^2 / T  (other processes) + 3 (2 ln 2 / pi)^2 B^4 / n^2
@@ -10,9 +10,9 @@ White noise n and random walk k, for estimators that know these two alone, follo
 A fast Gauss-Markov process is white over the times that estimators average over; a slow one starts as the walk of the
 same increments. The walk for a bias instability B has its Allan variance where that of white noise has it. n is
 continuous: the standard deviation of a sample is n sqrt(rate). An axis without any slow term has the walk that stands
-for the bias wander of the sensor's configuration, s sqrt(2 / T), or its own upper limit where that is less. The figure
-of a sensor is the root mean square of its axes. Where nothing was identified, the configuration gives both,
-``n = noise_density / sqrt(2)``, as that is one-sided. Quantisation, ramps and sinusoids are in neither.
+for the bias wander of the sensor's configuration, s sqrt(2 / T), or its own upper limit if that is less. The figure of
+a sensor is the root mean square of its axes. Where no term was identified, the configuration gives both, with
+``n = noise_density / sqrt(2)``, because its density is one-sided. Quantisation, ramps and sinusoids are in neither.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ JSON = dict[str, Any]
 FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 AVERAGING_S = 1.0  # of the effective density in remarks; the diagnosis has others
-FLAT = 2.0 * np.log(2.0) / np.pi  # Allan variance of a bias instability of 1
+INSTABILITY_FLOOR = 2.0 * np.log(2.0) / np.pi  # Allan variance of a bias instability of 1 (IEEE Std 952)
 
 
 def noise(settings: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return Kalibr's four noise parameters in m/s^2 and rad/s; None where neither recording nor configuration tell."""
-    found: dict[str, float | None] = {}
+    """Return Kalibr's four noise parameters in m/s^2 and rad/s; None where they are not known."""
+    parameters: dict[str, float | None] = {}
     for sensor in SENSORS:
         figures = _figures(sensor, settings, document)
         for name, key in (("noise_density", "white"), ("random_walk", "walk")):
             value = figures[key]
-            found[f"{sensor}_{name}"] = None if value is None else float(value * FACTORS[SI[sensor]])
-    return found
+            parameters[f"{sensor}_{name}"] = None if value is None else float(value * FACTORS[SI[sensor]])
+    return parameters
 
 
 def noise_remarks(settings: Mapping[str, Any], document: Mapping[str, Any], diagnosis: JSON | None) -> list[str]:
@@ -64,9 +64,11 @@ def noise_remarks(settings: Mapping[str, Any], document: Mapping[str, Any], diag
             interval = figures[f"{key}_interval"]
             within = f", 95 %: {factor * interval[0]:.3g} to {factor * interval[1]:.3g}" if interval else ""
             lines.append(f"{sensor}, {key}: {factor * figures[key]:.4g} {unit}{within}; {figures[f'{key}_origin']}.")
-        found = (document.get("noise") or {}).get(sensor) or {}
-        axes = (found.get("axes") or {}).values()
-        doubts = dict.fromkeys([*(found.get("doubts") or []), *(d for axis in axes for d in axis.get("doubts") or [])])
+        identified = (document.get("noise") or {}).get(sensor) or {}
+        axes = (identified.get("axes") or {}).values()
+        doubts = dict.fromkeys(
+            [*(identified.get("doubts") or []), *(d for axis in axes for d in axis.get("doubts") or [])]
+        )
         lines += [f"{sensor}, in doubt: {doubt}." for doubt in doubts]
         effective = ((diagnosis or {}).get(sensor) or {}).get("effective_noise")
         lines += [effective_text(sensor, effective)] if effective else []
@@ -76,8 +78,10 @@ def noise_remarks(settings: Mapping[str, Any], document: Mapping[str, Any], diag
 def effective_text(sensor: str, effective: Mapping[str, Any]) -> str:
     """Return a sentence on the effective density of a sensor, in m/s^2 or rad/s, over about ``AVERAGING_S``."""
     factor, si, motion = FACTORS[SI[sensor]], SI[sensor], effective["motion"]
-    found = min(effective["densities"], key=lambda d: abs(np.log(d["averaging_time_s"] / AVERAGING_S)))
-    shares = [f"{e['effect'].replace('_', ' ')} {factor * e['density']:.3g}" for e in found["effects"] if e["density"]]
+    nearest = min(effective["densities"], key=lambda d: abs(np.log(d["averaging_time_s"] / AVERAGING_S)))
+    shares = [
+        f"{e['effect'].replace('_', ' ')} {factor * e['density']:.3g}" for e in nearest["effects"] if e["density"]
+    ]
     of_effects = f"; of effects that the diagnosis found and nothing compensates: {', '.join(shares)}" if shares else ""
     moving = [
         f"{value:.3g} {unit} rms"
@@ -86,8 +90,8 @@ def effective_text(sensor: str, effective: Mapping[str, Any]) -> str:
     ]
     return (
         f"{sensor}, effective density in the motion of {', '.join(effective['recordings'])} ({', '.join(moving)}), "
-        f"averaged over {found['averaging_time_s']:g} s: {factor * found['density']:.3g} {si}/sqrt(Hz), "
-        f"{found['over_white']:.3g} times the white noise{of_effects}."
+        f"averaged over {nearest['averaging_time_s']:g} s: {factor * nearest['density']:.3g} {si}/sqrt(Hz), "
+        f"{nearest['over_white']:.3g} times the white noise{of_effects}."
     )
 
 
@@ -96,57 +100,57 @@ def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, An
 
     ``KeyError`` where nothing was measured and there is no configuration.
     """
-    found = (document.get("noise") or {}).get(sensor) or {}
-    axes = [axis["terms"] for axis in (found.get("axes") or {}).values() if axis["terms"]]
+    identified = (document.get("noise") or {}).get(sensor) or {}
+    axes = [axis["terms"] for axis in (identified.get("axes") or {}).values() if axis["terms"]]
     keys = ("noise_density", "bias_wander", "wander_time_s")
     density, wander, time = (settings["sensor"][sensor].get(k) if axes else settings["sensor"][sensor][k] for k in keys)
     white = None if density is None else density / np.sqrt(2.0)
     walk = None if wander is None or not time else wander * np.sqrt(2.0 / time)
-    converted = settings["sensor"][sensor].get("noise_origin")  # of another program's file
-    out: JSON = {"white": white, "white_interval": None, "white_origin": converted or "of the sensor's configuration"}
+    origin = settings["sensor"][sensor].get("noise_origin")  # another program's file
+    out: JSON = {"white": white, "white_interval": None, "white_origin": origin or "of the sensor's configuration"}
     out |= {"walk": walk, "walk_interval": None}
-    out["walk_origin"] = converted or "for the bias wander of the sensor's configuration"
+    out["walk_origin"] = origin or "for the bias wander of the sensor's configuration"
     if not axes:
         return out
     of_axes, walks = zip(*map(_white_and_walk, axes), strict=True)
     whites = [w for w in of_axes if w is not None]
     if whites:
         out["white"], *out["white_interval"] = _rms(whites)
-        out["white_origin"] = f"measured at rest ({found['source']}), root mean square of the axes"
-    seen = [w for w in walks if w is not None]
+        out["white_origin"] = f"measured at rest ({identified['source']}), root mean square of the axes"
+    measured = [w for w in walks if w is not None]
     limits = [t["random_walk"].get("upper_limit") for t, w in zip(axes, walks, strict=True) if w is None]
-    lesser = [least for limit in limits if (least := min((v for v in (limit, walk) if v), default=None)) is not None]
-    if seen or lesser:
-        out["walk"] = _rms([w[0] for w in seen] + lesser)
-    if seen and lesser:
+    bounds = [bound for limit in limits if (bound := min((v for v in (limit, walk) if v), default=None)) is not None]
+    if measured or bounds:
+        out["walk"] = _rms([w[0] for w in measured] + bounds)
+    if measured and bounds:
         out["walk_origin"] = (
-            f"measured at rest on {len(seen)} of {len(axes)} axes; on the others it is the lesser of the sensor's "
+            f"measured at rest on {len(measured)} of {len(axes)} axes; on the others it is the lesser of the sensor's "
             "configuration and the upper limit"
         )
-    elif seen:
-        out |= {"walk_origin": "measured at rest", "walk_interval": _rms(seen)[1:]}
-    elif lesser:
-        most = f"{FACTORS[SI[sensor]] * max(v for v in limits if v):.3g} {SI[sensor]}/sqrt(s)"
+    elif measured:
+        out |= {"walk_origin": "measured at rest", "walk_interval": _rms(measured)[1:]}
+    elif bounds:
+        limit = f"{FACTORS[SI[sensor]] * max(v for v in limits if v):.3g} {SI[sensor]}/sqrt(s)"
         out["walk_origin"] = (
-            f"not seen at rest ({found['length_s']:.3g} s), below {most}: the lesser of the sensor's configuration and "
-            "this limit"
+            f"not found at rest ({identified['length_s']:.3g} s), below {limit}: the lesser of the sensor's "
+            "configuration and this limit"
         )
     return out
 
 
 def _white_and_walk(terms: JSON) -> list[Values | None]:
-    """Return white noise and walk of an axis with the ends of their intervals, (3,); None where no term was seen."""
+    """Return white noise and walk of an axis with the ends of their intervals, (3,); None where no term was found."""
 
-    def seen(*parts: JSON) -> list[Values]:
+    def intervals(*parts: JSON) -> list[Values]:
         return [np.array([p["value"], *p["interval"]], float) for p in parts if p["value"] is not None]
 
     processes = [(part, part["correlation_time_s"]["value"]) for part in terms["gauss_markov"]]
-    fast = [np.sqrt(2.0 * time) * value for part, time in processes if time < FAST_S for value in seen(part)]
-    slow = [np.sqrt(2.0 / time) * value for part, time in processes if time >= FAST_S for value in seen(part)]
-    white, walk = [*seen(terms["white"]), *fast], [*seen(terms["random_walk"]), *slow]
+    fast = [np.sqrt(2.0 * time) * value for part, time in processes if time < FAST_S for value in intervals(part)]
+    slow = [np.sqrt(2.0 / time) * value for part, time in processes if time >= FAST_S for value in intervals(part)]
+    white, walk = [*intervals(terms["white"]), *fast], [*intervals(terms["random_walk"]), *slow]
     if white:
         density = np.sqrt(np.sum(np.square(white), axis=0))[0]
-        walk += [np.sqrt(3.0) * FLAT / density * b**2 for b in seen(terms["bias_instability"])]
+        walk += [np.sqrt(3.0) * INSTABILITY_FLOOR / density * b**2 for b in intervals(terms["bias_instability"])]
     return [np.sqrt(np.sum(np.square(parts), axis=0)) if parts else None for parts in (white, walk)]
 
 
@@ -172,15 +176,15 @@ class ExportedSensor:
         Counts per g or deg/s.
     """
 
-    def __init__(self, calibration: SensorCalibration, unit: str, sheet: dict[str, Any]) -> None:
-        self.calibration, self.name, self.unit, self.sheet = calibration, calibration.sensor, unit, sheet
+    def __init__(self, calibration: SensorCalibration, unit: str, config: dict[str, Any]) -> None:
+        self.calibration, self.name, self.unit, self.config = calibration, calibration.sensor, unit, config
         self.factor = FACTORS[unit]
         self.bias, self.matrix = calibration.bias * self.factor, calibration.matrix
         self.K: Values = np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)))
-        own = [e for e in calibration.effects if owner_of(e) == Owner.SENSOR]
-        self.effects = {e.name: e.values for e in own}
-        self.bench_effects = [e.name for e in calibration.effects if e not in own]
-        self.counts = sheet.get("counts_per_unit")
+        of_sensor = [e for e in calibration.effects if owner_of(e) == Owner.SENSOR]
+        self.effects = {e.name: e.values for e in of_sensor}
+        self.bench_effects = [e.name for e in calibration.effects if e not in of_sensor]
+        self.counts = config.get("counts_per_unit")
 
     @property
     def bias_after_matrix(self) -> Values:
@@ -211,7 +215,7 @@ class ExportedSensor:
 
     @property
     def bias_error(self) -> float:
-        """Likewise of the error that taking off the bias alone leaves: ``|1 - K| / sqrt(3)``."""
+        """Likewise of the error after the subtraction of the bias alone: ``|1 - K| / sqrt(3)``."""
         return float(np.linalg.norm(np.eye(3) - self.K) / np.sqrt(3.0))
 
     @property
@@ -222,11 +226,11 @@ class ExportedSensor:
     @property
     def bias_polynomial(self) -> Values:
         """The bias, and how it changes per degC and per degC^2 from 25 degC: (3, 3) array, a row an axis."""
-        found = np.zeros((3, 3))
-        found[:, 0] = self.calibration.bias
-        found[:, 1] += self.effects.get("bias_temperature", np.zeros(3))
-        found[:, 1:] += self.effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
-        return found * self.factor
+        polynomial = np.zeros((3, 3))
+        polynomial[:, 0] = self.calibration.bias
+        polynomial[:, 1] += self.effects.get("bias_temperature", np.zeros(3))
+        polynomial[:, 1:] += self.effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
+        return polynomial * self.factor
 
     @property
     def g_sensitivity(self) -> Values:
@@ -236,7 +240,7 @@ class ExportedSensor:
     @property
     def noise_density(self) -> float:
         """White noise by the sensor's configuration, unit/sqrt(Hz); 0 where it is not stated."""
-        return float((self.sheet["noise_density"] or 0.0) * self.factor)
+        return float((self.config["noise_density"] or 0.0) * self.factor)
 
     @property
     def temperature_polynomials(self) -> tuple[Values, Values]:
@@ -276,24 +280,24 @@ def shifted(coefficients: Values, before: float, after: float) -> Values:
 def before_use(document: dict[str, Any]) -> list[str]:
     """Return what to know before using an export: how readings become body axes, and what is implausible."""
     maps = maps_of_log(document.get("log") or {})
-    whose = dict.fromkeys(maps.values(), "sensor") if len(set(maps.values())) == 1 else {m: s for s, m in maps.items()}
+    owners = dict.fromkeys(maps.values(), "sensor") if len(set(maps.values())) == 1 else {m: s for s, m in maps.items()}
     lines = []
-    for axis_map, sensor in whose.items():
+    for axis_map, sensor in owners.items():
         if axis_map != STRAIGHT:
             pairs = ", ".join(f"{a} along body {b}" for a, b in zip("xyz", axis_map, strict=True))
             lines.append(f"Turn the readings to body axes first: the {sensor}'s {pairs}.")
     for sensor, prior in (document.get("lot_prior") or {}).items():
-        told = prior["refused"] or f"{prior['siblings']} siblings; held-out errors are those without it"
-        lines.append(f"With{'out' if prior['refused'] else ''} the prior of {prior['lot']}, {sensor}: {told}.")
+        state = prior["refused"] or f"{prior['siblings']} siblings; held-out errors are those without it"
+        lines.append(f"With{'out' if prior['refused'] else ''} the prior of {prior['lot']}, {sensor}: {state}.")
     return lines + [line for s in SENSORS for line in sentences(s, document.get(s))]
 
 
 def final_errors(validation: dict[str, Any] | None, sensor: str) -> list[str]:
     """Return a sentence on the held-out error of a sensor with and without each effect."""
-    found, lines = (validation or {}).get(sensor) or {}, []
-    for step in found.get("steps") or []:
+    part, lines = (validation or {}).get(sensor) or {}, []
+    for step in part.get("steps") or []:
         if step["name"] == "calibrated" or step["name"].startswith("+ "):
-            error = "unknown" if step["rms_error"] is None else f"{step['rms_error']:.4g} {found['unit']}"
+            error = "unknown" if step["rms_error"] is None else f"{step['rms_error']:.4g} {part['unit']}"
             lines.append(f"held-out rms error of the {sensor}, {step['name']}: {error}")
     return lines
 
@@ -341,8 +345,8 @@ def pose(rotation: Values, place: Values) -> Values:
 
 def lever_arm_of(chip: dict[str, Any]) -> list[float]:
     """Return the place of a chip of a board, m; zeros where no lever arm could be estimated."""
-    known = (chip["parameters"].get(f"lever_arm_{axis}") for axis in AXES)
-    return [p["value"] if p else 0.0 for p in known]
+    parameters = (chip["parameters"].get(f"lever_arm_{axis}") for axis in AXES)
+    return [p["value"] if p else 0.0 for p in parameters]
 
 
 def static_transform(rotation: Values, place: Values) -> str:
@@ -360,7 +364,7 @@ def sampling_rate(document: dict[str, Any]) -> float:
 
 
 def plain(content: Any) -> Any:  # noqa: ANN401
-    """Return content with lists in place of arrays."""
+    """Return content with lists instead of arrays."""
     if isinstance(content, dict):
         return {key: plain(value) for key, value in content.items()}
     if isinstance(content, (list, tuple)):

@@ -1,14 +1,16 @@
-"""The texts of other programs' calibrations as trees of values, and the mathematics that the ``reads`` of formats use.
+"""The texts of other programs' calibrations as trees of values, and the functions of the expressions in ``read_back``.
 
 json, yaml   : as they are; a list of mappings becomes a mapping by ``SensorType``, or by number
-parameters   : a line a parameter: ``NAME value``, ``NAME,value``, ``set NAME = a,b``, or PX4's five columns
-c            : initialised arrays of C by name, ``NAME ... = {...};``, flat
+ini          : sections with ``NAME = value`` (configparser); several numbers are separated by blanks or commas
+parameters   : a line for each parameter: ``NAME value``, ``NAME,value``, ``set NAME = a,b``, or PX4's five columns
+c            : initialised arrays of C by name, ``NAME ... = {...};``, without their nesting
 xml          : ``<define name= value=>`` by name
-numbers      : the numbers before the first word that is none, as ``numbers``
+numbers      : the 21 numbers with which the file begins, as ``numbers``
 """
 
 from __future__ import annotations
 
+import configparser
 import json
 import re
 from itertools import takewhile
@@ -63,18 +65,18 @@ class Node(dict[str, Any]):
 
     def at(self, path: str) -> Any:  # noqa: ANN401
         """Return the value at a dotted path."""
-        found: Any = self
+        value: Any = self
         for key in path.split("."):
-            found = found[key]
-        return found
+            value = value[key]
+        return value
 
     def has(self, path: str) -> bool:
         """Return whether there is a value at a dotted path."""
-        found: Any = self
+        value: Any = self
         for key in path.split("."):
-            if not isinstance(found, Node) or key not in found:
+            if not isinstance(value, Node) or key not in value:
                 return False
-            found = dict.__getitem__(found, key)
+            value = dict.__getitem__(value, key)
         return True
 
     def leaves(self) -> Iterator[str]:
@@ -97,9 +99,9 @@ class Node(dict[str, Any]):
 class Expressions(Environment):
     """Jinja2's expressions over a tree, whose missing values are named by their place."""
 
-    def __init__(self, known: dict[str, Any]) -> None:
+    def __init__(self, variables: dict[str, Any]) -> None:
         super().__init__(undefined=StrictUndefined, autoescape=False)  # no HTML
-        self.globals |= FUNCTIONS | known
+        self.globals |= FUNCTIONS | variables
 
     def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401
         """Return a value of a mapping, or an attribute."""
@@ -111,8 +113,11 @@ class Expressions(Environment):
 
 
 def parsed(kind: str, text: str) -> Node:
-    """Return the tree of a text; ``ValueError`` or ``yaml.YAMLError`` where it is not of that kind."""
-    content = PARSERS[kind](text)
+    """Return the tree of a text; ``ValueError`` where it is not of that kind."""
+    try:
+        content = PARSERS[kind](text)
+    except (yaml.YAMLError, configparser.Error) as error:
+        raise ValueError(str(error)) from error
     if not isinstance(content, dict):
         raise ValueError(f"{kind} with keys is expected")  # noqa: TRY004  (a text of another kind)
     only = next(iter(content.values())) if list(content) == ["value0"] else content  # cereal's root, in Basalt's files
@@ -120,32 +125,48 @@ def parsed(kind: str, text: str) -> Node:
 
 
 def _parameters(text: str) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
     for line in text.splitlines():
         words = re.split(r"[\s,=]+", line.partition("#")[0].strip().removeprefix("set ").strip())
         if len(words) == 5 and words[0].isdigit() and words[1].isdigit():
             words = words[2:4]
         if len(words) < 2 or not re.match(r"[A-Za-z]", words[0]):
             continue
-        values = [float(w) if re.fullmatch(NUMBER, w) else w for w in words[1:]]
-        found[words[0]] = values[0] if len(values) == 1 else values
-    return found
+        parameters[words[0]] = _values(words[1:])
+    return parameters
+
+
+def _values(words: list[str]) -> Any:  # noqa: ANN401
+    """Return words with numbers for those that are numbers; of one word its value."""
+    values = [float(w) if re.fullmatch(NUMBER, w) else w for w in words]
+    return values[0] if len(values) == 1 else values
+
+
+def _ini(text: str) -> dict[str, Any]:
+    parser = configparser.ConfigParser(interpolation=None)
+    parser.optionxform = str  # type: ignore[assignment,method-assign]  # names keep their case
+    parser.read_string(text)
+    return {
+        section: {name: _values(re.split(r"[\s,]+", value)) for name, value in parser.items(section)}
+        for section in parser.sections()
+    }
 
 
 def _c_arrays(text: str) -> dict[str, Any]:
     bare = re.sub(r"//[^\n]*|/\*.*?\*/", "", text, flags=re.DOTALL)
-    found = {name: [float(x) for x in re.findall(rf"(?<![\w.]){NUMBER}", body)] for name, body in ARRAY.findall(bare)}
-    return {name: numbers for name, numbers in found.items() if numbers}
+    arrays = {name: [float(x) for x in re.findall(rf"(?<![\w.]){NUMBER}", body)] for name, body in ARRAY.findall(bare)}
+    return {name: numbers for name, numbers in arrays.items() if numbers}
 
 
 def _numbers(text: str) -> dict[str, Any]:
-    found = [float(word) for word in takewhile(re.compile(NUMBER).fullmatch, text.split())]
-    return {"numbers": found} if len(found) == 21 else {}
+    numbers = [float(word) for word in takewhile(re.compile(NUMBER).fullmatch, text.split())]
+    return {"numbers": numbers} if len(numbers) == 21 else {}
 
 
 PARSERS: dict[str, Callable[[str], Any]] = {
     "json": json.loads,
     "yaml": lambda text: yaml.safe_load(text.removeprefix("%YAML:1.0")),  # as OpenCV writes, which YAML does not know
+    "ini": _ini,
     "parameters": _parameters,
     "c": _c_arrays,
     "xml": lambda text: {name: float(value) for name, value in DEFINE.findall(text)},

@@ -8,7 +8,7 @@ import pytest
 from test_c_header import document, needs_compiler
 
 from pipeline import load_calibration
-from pipeline.exports import Subject, export
+from pipeline.exports import ExportedUnit, export
 from pipeline.files import write_json
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "imu_loop.c"
@@ -39,7 +39,7 @@ int main(void)
 def test_the_example_gives_what_apply_gives(tmp_path: Path, real: str, tolerance: float) -> None:
     made = document(EFFECTS)
     write_json(tmp_path / "U1.json", made)
-    (tmp_path / "calibration.h").write_text(export("calibration.h", Subject(made, {}))["calibration.h"])
+    (tmp_path / "calibration.h").write_text(export("calibration.h", ExportedUnit(made, {}))["calibration.h"])
     (tmp_path / "board.c").write_text(BOARD)
     flags = [
         "-std=c99",

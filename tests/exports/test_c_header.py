@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline import load_calibration
-from pipeline.exports import Subject, export
+from pipeline.exports import ExportedUnit, export
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.model.effects import catalogue, effect, effect_from
 from pipeline.model.effects.base import Owner
@@ -115,7 +115,7 @@ def samples(n: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
 
 
 def compiled(folder: Path, made: dict[str, Any], real: str, *, alone: bool = False) -> np.ndarray:
-    (folder / "calibration.h").write_text(export("calibration.h", Subject(made, {}))["calibration.h"])
+    (folder / "calibration.h").write_text(export("calibration.h", ExportedUnit(made, {}))["calibration.h"])
     (folder / "main.c").write_text(MAIN)
     flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-ffp-contract=off"]
     flags += [f"-DIMU_REAL={real}", f"-DALONE={int(alone)}"]
@@ -185,7 +185,7 @@ def test_every_effect_of_a_sensor_is_in_the_header() -> None:
     for sensor in SENSORS:
         for name, known in catalogue().items():
             if known.owner == Owner.SENSOR and sensor in known.sensors:
-                text = export("calibration.h", Subject(document({sensor: {name: 1e-3}}), {}))["calibration.h"]
+                text = export("calibration.h", ExportedUnit(document({sensor: {name: 1e-3}}), {}))["calibration.h"]
                 assert "Left out" not in text
                 assert f"/* {name} */" in text
 
@@ -194,4 +194,6 @@ def test_an_effect_in_python_is_named_as_left_out() -> None:
     made = document({})
     own = {"python": "mine.py", "sha256": "0" * 64, "owner": "sensor"}
     made["gyroscope"]["effects"] = [{"name": "mine", "parameters": {}, "definition": own}]
-    assert "Left out, gyroscope: mine (it is in Python" in export("calibration.h", Subject(made, {}))["calibration.h"]
+    assert (
+        "Left out, gyroscope: mine (it is in Python" in export("calibration.h", ExportedUnit(made, {}))["calibration.h"]
+    )

@@ -255,9 +255,10 @@ def test_axes_of_one_sensor_that_are_not_the_bodys_are_stated_with_its_name(tmp_
 def test_every_format_says_what_it_leaves_out(tmp_path: Path) -> None:
     quadratic = effect("quadratic_nonlinearity", K2_x=1e-3, K2_y=1e-3, K2_z=1e-3)
     Unit(tmp_path, accelerometer=(quadratic,))
-    for name, (declared, _) in formats().items():
-        if "accelerometer" in declared.units and "any" not in declared.holds:
-            path = tmp_path / declared.files.get("accelerometer", name)
+    for declared, _ in formats().values():
+        if "accelerometer" in declared.units and "all" not in declared.effects:
+            ending = declared.sensor_endings.get("accelerometer", "")
+            path = tmp_path / f"{Path(declared.file).stem}{ending}{Path(declared.file).suffix}"
             assert "Left out of this format, accelerometer: quadratic_nonlinearity" in path.read_text(), path.name
     assert len(formats()) < len(list(tmp_path.iterdir()))
 

@@ -1,5 +1,7 @@
 """Every format, read back by its consumer's own formula, gives what the calibration gives."""
 
+import configparser
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,9 @@ import yaml
 from stage_files import export_all
 
 from pipeline import exports
+from pipeline.commands.convert import main as convert
 from pipeline.exports import formats
+from pipeline.exports.reading import read_any
 from pipeline.exports.sensors import lower_times_rotation
 from pipeline.model.effects import effect
 from pipeline.records import FittedEffect, SensorCalibration
@@ -21,18 +25,9 @@ FILES = {
     *("imucal.json", "inav.txt", "kalibr.yaml", "kalibr_imu.yaml", "kalibr_imu_chain.yaml", "paparazzi_imu.xml"),
     *("px4.params", "realsense_calibration.json"),
 }
-MINE = """\
-consumer: mine
-equation: a = s (raw - b)
-source: none
-units: {accelerometer: m/s^2}
-needs: [accelerometer]
-matrix: {accelerometer: diagonal}
-says: ["Unit {unit}: a = s (raw - b)."]
----
-{{ remarks | comment -}}
-{{ accelerometer.bias | numbers }}
-"""
+EXAMPLE = (
+    (Path(__file__).parents[2] / "docs" / "exports.md").read_text().rpartition("\n```\n")[0].rpartition("\n```\n")[2]
+)
 ACCELEROMETER = np.array([[0.994, 0.004, -0.002], [0.021, 1.007, 0.003], [-0.005, 0.012, 0.951]])
 GYROSCOPE = np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0.005, 0.998]])
 
@@ -73,19 +68,39 @@ def samples(n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rng.uniform(-1.5, 1.5, (n, 3)), rng.uniform(-200, 200, (n, 3)), rng.uniform(10, 50, n)
 
 
-def test_one_template_adds_a_format(tmp_path: Path, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_template_of_the_documentation_adds_a_format_whose_file_is_named_by_the_unit(
+    tmp_path: Path, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run writes the file; convert takes the format from the name of OUT, writes OUT, and reads it by its keys."""
     shutil.copytree(exports.TEMPLATES, tmp_path / "templates")
-    (tmp_path / "templates" / "mine.txt.j2").write_text(MINE)
+    (tmp_path / "templates" / "mine.j2").write_text(EXAMPLE)
     monkeypatch.setattr(exports, "TEMPLATES", tmp_path / "templates")
     formats.cache_clear()
+    made = document({"accelerometer": {"hysteresis": 1e-3}}) | {"unit": "U1.b", "error": None}
     try:
-        export_all(document({"accelerometer": {"hysteresis": 1e-3}}), settings, tmp_path)
+        export_all(made, settings, tmp_path)
+        (tmp_path / "calibration.json").write_text(json.dumps(made))
+        assert convert([str(tmp_path / "calibration.json"), str(tmp_path / "other.ini")]) == 0
+        content = configparser.ConfigParser()
+        content.read(tmp_path / "other.ini")
+        assert [*content["imu"]] == ["offset", "scale"]
+        back = read_any(tmp_path / "other.ini")
     finally:
         formats.cache_clear()
-    lines = (tmp_path / "mine.txt").read_text().splitlines()
-    assert lines[:2] == ["# Unit U1 */: a = s (raw - b).", "# Left out of this format, accelerometer: hysteresis."]
+    assert (back.format_name, back.unit, [*back.sensors]) == ("mine", "other", ["accelerometer"])
+    K = np.linalg.inv(ACCELEROMETER)
+    np.testing.assert_allclose(back.sensors["accelerometer"].bias, [0.031, -0.022, 0.067], rtol=1e-8)
+    np.testing.assert_allclose(
+        back.sensors["accelerometer"].matrix, np.diag(np.diag(K) / np.sum(K**2, axis=1)), rtol=1e-8
+    )
+    lines = (tmp_path / "U1.b.ini").read_text().splitlines()
+    assert lines[:2] == [
+        "# Unit U1.b: corrected = (raw - offset) * scale.",
+        "# Left out of this format, accelerometer: hysteresis.",
+    ]
     assert lines[2].startswith("# Cross-axis terms of the accelerometer are left out")
-    assert [float(x) for x in lines[3].split()] == pytest.approx([0.031 * 9.80665, -0.022 * 9.80665, 0.067 * 9.80665])
+    offset = [float(x) for x in lines[4].partition("=")[2].split(",")]
+    assert offset == pytest.approx([0.031 * 9.80665, -0.022 * 9.80665, 0.067 * 9.80665])
 
 
 def test_every_format_writes_its_file(tmp_path: Path, settings: dict[str, Any]) -> None:

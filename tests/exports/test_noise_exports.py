@@ -13,10 +13,10 @@ from stage_files import export_all
 
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_terms import allan_variance, each_term
-from pipeline.exports import Subject, export
+from pipeline.exports import ExportedUnit, export
 from pipeline.exports.conversion import document_of, settings_of
 from pipeline.exports.reading import read_any
-from pipeline.exports.sensors import FLAT, noise
+from pipeline.exports.sensors import INSTABILITY_FLOOR, noise
 from pipeline.records import SENSORS, Recording, SensorCalibration
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def test_each_consumer_gets_the_noise_of_the_recording(measured: dict[str, Any],
 
 
 def test_the_variances_of_vins_are_those_of_the_integrals_of_the_recording(measured: dict[str, Any]) -> None:
-    text = export("vins.yaml", Subject(measured, SETTINGS))["vins.yaml"]
+    text = export("vins.yaml", ExportedUnit(measured, SETTINGS))["vins.yaml"]
     vins, dt, steps = yaml.safe_load(text.replace("%YAML:1.0", "")), 1.0 / RATE, 2000
     velocity = bias = 0.0
     for _ in range(steps):  # integration_base.h: V noise V^T of the velocity and of the bias
@@ -114,9 +114,9 @@ def test_a_walk_that_was_not_seen_is_at_most_its_upper_limit() -> None:
     loud = {"sensor": {s: SHEET | {"bias_wander": 10.0} for s in SENSORS}, "table": SETTINGS["table"]}
     found = noise(loud, quiet)["gyroscope_random_walk"]
     assert found == pytest.approx(np.sqrt(np.mean(np.square(limits))) * np.pi / 180.0)
-    text = export("kalibr_imu.yaml", Subject(quiet, loud))["kalibr_imu.yaml"]
+    text = export("kalibr_imu.yaml", ExportedUnit(quiet, loud))["kalibr_imu.yaml"]
     assert "gyroscope, walk:" in text
-    assert "not seen at rest (1.2e+03 s), below" in text
+    assert "not found at rest (1.2e+03 s), below" in text
 
 
 def test_a_process_is_white_or_a_walk_by_its_correlation_time_and_flicker_meets_white_noise() -> None:
@@ -146,7 +146,7 @@ def test_a_process_is_white_or_a_walk_by_its_correlation_time_and_flicker_meets_
         assert found == pytest.approx(exact, rel=0.02)
     flicker = {"value": 0.05, "interval": [0.04, 0.06]}
     n, k = exported(bias_instability=flicker)
-    meets = n**2 / (FLAT * 0.05**2)
+    meets = n**2 / (INSTABILITY_FLOOR * 0.05**2)
     assert k**2 * meets / 3.0 == pytest.approx(allan_variance("bias_instability", flicker, np.array([meets]))[0])
     assert n == pytest.approx(2.0)
 
@@ -166,7 +166,9 @@ def test_a_simulated_short_process_is_exported_as_its_plateau() -> None:
 def test_noise_that_no_composition_fits_is_exported_as_doubtful() -> None:
     drive = np.random.default_rng(4).standard_normal((SAMPLES, 3))
     shaken = lfilter([1.0], [1.0, -1.6, 0.95], drive, axis=0)  # a resonance, as of vibration
-    text = export("kalibr_imu.yaml", Subject(document(dict.fromkeys(SENSORS, shaken)), SETTINGS))["kalibr_imu.yaml"]
+    text = export("kalibr_imu.yaml", ExportedUnit(document(dict.fromkeys(SENSORS, shaken)), SETTINGS))[
+        "kalibr_imu.yaml"
+    ]
     assert "# gyroscope, in doubt: no composition fits the spectrum" in text
 
 
