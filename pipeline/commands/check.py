@@ -216,16 +216,17 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
         told.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
     elif not names and not refused:
         lines = [(sensor, f"null: {reason}") for sensor, reason in trial.not_calibrated.items()]
-        noted: dict[tuple[str, str], dict[str, str]] = {}
+        noted: dict[str, dict[tuple[str, str], list[str]]] = {}
         for recording in trial.recordings:
             for note in recording.notes:
                 place = f", line {note.first} to {note.last}" if note.code in LEFT_OUT and note.first else ""
-                noted.setdefault((note.code, place), {}).setdefault(recording.name, note.detail)
-        for (code, place), details in noted.items():
-            name, detail = next(iter(details.items()))
-            others = f"; likewise {', '.join([*details][1:])}" if len(details) > 1 else ""
-            label = "notes" if (code, place) == next(iter(noted)) else ""
-            lines.append((label, f"{code} {name}{place}: {detail}{others}"))
+                noted.setdefault(note.code, {}).setdefault((place, note.detail), []).append(recording.name)
+        texts = [
+            f"{code} {name}{place}: {detail}" + f"; likewise {', '.join(others)}" * bool(others)
+            for code, found in noted.items()
+            for (place, detail), (name, *others) in found.items()
+        ]
+        lines += [("notes" if i == 0 else "", text) for i, text in enumerate(texts)]
         told.append(
             "\n".join(
                 [f"unit {unit}: {len(trial.recordings)} recordings, no refusal", *([as_text(lines)] if lines else [])]

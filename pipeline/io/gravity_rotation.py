@@ -29,7 +29,9 @@ BLOCK_S = 0.25  # two blocks make the shortest rest, half a second
 SHORTEST_BLOCK = 5  # samples, for a variance
 STILL = 9.0  # times the 10th percentile of the variance
 SMALLEST_VARIANCE = 1e-7  # relative to the square of the specific force
-LARGEST_DRIFT_DEG = 2.0  # between the ends of a rest; more is slow motion
+LARGEST_DRIFT_DEG = 2.0  # between any two parts of a rest; more is slow motion
+LARGEST_STEP_DEG = 0.5  # from block to block of a rest; a turn at 2 deg/s
+BLOCK_NOISE = 5.0  # standard deviations between the means of two blocks; in 10^5 blocks noise exceeds it less than once
 BINS = 64  # a half turn rotates by less than 3 deg in each
 LONGEST_MOVE_S = 30.0  # a bias of 0.5 deg/s then adds 15 deg, what still fits
 SMALLEST_TURN_DEG = 20.0  # above what fits, so that no rotation at all fails
@@ -56,6 +58,11 @@ class Move:
         """Angle by which gravity turned in the sensor's axes, deg."""
         return float(np.degrees(np.arccos(np.clip(self.before @ self.after, -1.0, 1.0))))
 
+    @property
+    def way(self) -> float:
+        """Angle that the move turned through, by the gyroscope in its unit times s."""
+        return float(np.linalg.norm(self.turns, axis=1).sum())
+
 
 def interval_of(steps: Values) -> float:
     """Return the usual interval of times by their steps; the mean step forward where most times are written twice."""
@@ -74,16 +81,13 @@ def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
     scatter = blocks.var(axis=1).sum(axis=1)
     size = float(np.median(np.linalg.norm(means, axis=1)))
     still = scatter < max(STILL * float(np.quantile(scatter, 0.1)), SMALLEST_VARIANCE * size**2)
+    noise = BLOCK_NOISE * float(np.sqrt(2.0 * np.quantile(scatter, 0.1) / width))
+    slow = np.linalg.norm(np.diff(means, axis=0), axis=1) <= max(np.radians(LARGEST_STEP_DEG) * size, noise)
+    still &= np.append(slow, False) | np.append(False, slow)  # noqa: FBT003
     edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
     found = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
-    return [(a * width, b * width) for a, b in found if _keeps_its_direction(means[a:b])]
-
-
-def _keeps_its_direction(means: Values) -> bool:
-    """Return whether the ends of a stretch point the same way; slow motion all along is no rest."""
-    first, last = means[0], means[-1]
-    size = float(np.linalg.norm(first))
-    return bool(np.linalg.norm(last - first) <= np.radians(LARGEST_DRIFT_DEG) * max(size, 1e-30))
+    drift = max(np.radians(LARGEST_DRIFT_DEG) * size, noise)
+    return [(a * width, b * width) for a, b in found if np.linalg.norm(means[a:b] - means[a], axis=1).max() <= drift]
 
 
 def moves_of(force: Values, rate: Values, time_s: Values) -> list[Move]:

@@ -130,8 +130,8 @@ def _at_rail(size: Values, full_scale: float, count: float) -> Mask:
     return np.asarray(clipped)
 
 
-def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
-    """Flag readings that stay the same for longer than the channel's own noise allows; return their rows by channel.
+def find_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
+    """Return the rows, by channel, of readings that stay the same for longer than the channel's own noise allows.
 
     An axis that never changes, or stays for half of the rows while the others of its sensor change, is refused.
     """
@@ -154,19 +154,35 @@ def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> d
             hint = "is the column right, and the sensor's axis alive?"
             raise IngestError(message, table.path if dead else table.place(int(rows[0])), code="stuck", hint=hint)
         if rows.size < len(same) / 2:
-            flags[rows] |= STUCK
             found[channel] = rows
     return found
 
 
-def _stuck_notes(table: ChannelTable, found: Mapping[str, Index]) -> list[Note]:
-    """Return a note for each stretch of rows in which channels are stuck; one for all where there are many."""
+def _common_rows(found: Mapping[str, Index]) -> dict[str, Index]:
+    """Return the rows without those by which a channel is equal longer, by chance, than others stuck with it."""
+    runs = {c: np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) for c, rows in found.items()}
+    starts, stops = (np.array([run[end] for of in runs.values() for run in of]) for end in (0, -1))
+
+    def cut(first: int, last: int) -> Index:
+        first = starts[(starts >= first) & (starts < first + SHORTEST_RUN) & (starts <= last)].max()
+        last = stops[(stops <= last) & (stops > last - SHORTEST_RUN) & (stops >= first)].min()
+        return np.arange(first, last + 1)
+
+    return {c: np.concatenate([cut(int(run[0]), int(run[-1])) for run in of]) for c, of in runs.items()}
+
+
+def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[np.uint16]) -> list[Note]:
+    """Flag stuck rows; return a note for each stretch of rows, one for all where there are many."""
     if not found:
         return []
+    found = _common_rows(found)
+    temperature = table.values.get("temperature")
+    same = None if temperature is None else temperature[1:] == temperature[:-1]
     every = np.unique(np.concatenate([*found.values()]))
     stretches = np.split(every, np.flatnonzero(np.diff(every) > 1) + 1)
     where = f" in {len(stretches)} places" if len(stretches) > MOST_STRETCHES else ""
     notes = []
+    flags[every] |= STUCK
     for rows in [every] if where else stretches:
         own = {channel: stuck[0] for channel, at in found.items() if (stuck := at[np.isin(at, rows)]).size}
         channel, row = next(iter(own.items()))
@@ -180,6 +196,8 @@ def _stuck_notes(table: ChannelTable, found: Mapping[str, Index]) -> list[Note]:
             detail += (
                 f" while the table turns by {abs(np.subtract(*table.values['table_angle'][[last, first]])):.3g} deg"
             )
+        if not where and same is not None and same[first:last].all() and equal_share(same) <= QUIET:
+            detail += ", and the temperature with them"
         notes.append(table.note("N-STUCK", rows, f"{detail}: stuck, and left out of every fit"))
     return notes
 
@@ -241,8 +259,8 @@ def examine(
         full_scale = (sensor.get(name) or {}).get("full_scale")
         if full_scale is not None:
             notes += flag_clipped(table, name, float(full_scale), flags)
-        stuck |= flag_stuck(table, name, flags)
-    notes += _stuck_notes(table, stuck)
+        stuck |= find_stuck(table, name, flags)
+    notes += flag_stuck(table, stuck, flags)
     _check_turn_rate(table)
     return (flags if flags.any() else None), notes
 

@@ -71,24 +71,32 @@ def check_frames_by_hand(recording: Recording, maps: Mapping[str, Sequence[str]]
         return
     part = slice(0, MOST_SAMPLES)
     moves = moves_of(recording.accelerometer[part], recording.gyroscope[part], recording.time[part])
-    if len(moves) < FEWEST_MOVES:
+    found = other_axes(moves)
+    if found is None:
         return
-    missed = _missed(moves, np.eye(3))
-    if missed < FEWEST_MISSED:
-        return
-    others = sorted((_missed(moves, D), i) for i, D in enumerate(signed_permutations()))
-    best, alone = others[0][0], others[1][0] > others[0][0]
-    if best > missed / CLEARLY_FEWER:
-        return
-    D = signed_permutations()[others[0][1]] if alone else None
+    text, D = found
     raise IngestError(
-        f"accelerometer and gyroscope contradict each other: in {missed} of {len(moves)} moves between rests gravity "
-        f"turns by more than {FAILS_DEG:g} deg otherwise than the angular rates say, and with other axes of the "
-        f"gyroscope in {best}; both belong in one right-handed frame",
+        f"accelerometer and gyroscope contradict each other: {text}; both belong in one right-handed frame",
         recording.source.get("file"),
         code="mirrored_axes",
         hint=_cure(D, None, maps),
     )
+
+
+def other_axes(moves: Sequence[Move]) -> tuple[str, Values | None] | None:
+    """Return that gravity turns as the rates say only with other axes, in words, and D where one map alone fits."""
+    missed = _missed(moves, np.eye(3)) if len(moves) >= FEWEST_MOVES else 0
+    if missed < FEWEST_MISSED:
+        return None
+    others = sorted((_missed(moves, D), i) for i, D in enumerate(signed_permutations()))
+    best, alone = others[0][0], others[1][0] > others[0][0]
+    if best > missed / CLEARLY_FEWER:
+        return None
+    text = (
+        f"in {missed} of {len(moves)} moves between rests gravity turns by more than {FAILS_DEG:g} deg otherwise than "
+        f"the angular rates say, and with other axes of the gyroscope in {best}"
+    )
+    return text, signed_permutations()[others[0][1]] if alone else None
 
 
 def _missed(moves: Sequence[Move], D: Values) -> int:

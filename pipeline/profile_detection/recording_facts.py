@@ -16,13 +16,14 @@ import numpy as np
 from pipeline.errors import IngestError
 from pipeline.io.field_path import STAMPS
 from pipeline.io.files import MESSAGE_FORMATS
-from pipeline.io.gravity_rotation import misfit_deg, moves_of, rests_of
+from pipeline.io.gravity_rotation import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.message_decoder import KINDS, STATED, object_decoder, ros_layouts
 from pipeline.io.message_layout import short_name
 from pipeline.io.message_logs import open_reader
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
-from pipeline.io.units import TRIADS
+from pipeline.io.units import DEGREES, TRIADS
+from pipeline.preprocessing.frames import other_axes
 from pipeline.profile_detection.columns import FEWEST_ROWS, MOST_ROWS, TextLayout, find_columns
 from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
     from mcap.records import Channel, Schema
 
+    from pipeline.io.gravity_rotation import Move
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.mcap_reader import MessageReader
     from pipeline.records import Note, Recording, Values
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 ENOUGH = 500_000  # samples that rests and moves are looked for in
 FEWEST_SAMPLES = 3  # of a rest, for a variance
 PLATEAU = 3  # samples at the largest value; noise repeats it less often
-AS_SAID, ABOUT_AS_SAID = 0.1, 0.35  # of the angle; an accelerometer that is not calibrated leaves some degrees
+CLEARLY = 2.0  # times that one unit of the rates misses by more than another, from which the moves show the unit
 LABEL = 16  # width of the labels, characters
 WIDTH = 118  # characters of a line
 LISTED_NOTES = 20  # the rest is counted; they fit one screen
@@ -217,16 +219,38 @@ def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]
     means = [force[a:b].mean(axis=0) for a, b in rests]
     centre = sphere(np.array(means))[0] if len(means) >= FEWEST_RESTS_FOR_A_SPHERE else np.zeros(3)
     moves = moves_of(force - centre, recording.gyroscope[part], recording.time[part])
-    if not moves and recording.table_rate is not None:
+    if moves:
+        return [("units", _rates_and_gravity(moves))]
+    if recording.table_rate is not None:
         return []
-    if not moves:
-        return [("units", "no move between rests turns gravity, so nothing shows whether the rates' unit is right")]
-    left = float(misfit_deg(moves, (1.0,))[0])
-    angle = float(np.median([m.angle_deg for m in moves]))
-    share = left / angle
-    verdict = "as" if share < AS_SAID else "about as" if share < ABOUT_AS_SAID else "NOT as"
-    over = f"{len(moves)} moves of {angle:.0f} deg" if len(moves) > 1 else f"a move of {angle:.0f} deg"
-    return [("units", f"gravity turns {verdict} the rates say: {left:.2g} deg are left over {over}")]
+    return [("units", "no move between rests turns gravity, so nothing shows whether the rates' unit is right")]
+
+
+def _rates_and_gravity(moves: Sequence[Move]) -> str:
+    """Tell how far the rates turn gravity as it turned, and whether another unit or other axes would be nearer."""
+    scales = (1.0, DEGREES, 1 / DEGREES)
+    left, *others = misfit_deg(moves, scales)
+    best = int(np.argmin(others))
+    angle, way = np.median([(m.angle_deg, m.way) for m in moves], axis=0)
+    over = f"{counted(len(moves), 'move')} that turn{'s' * (len(moves) == 1)} it by {angle:.0f} deg (medians)"
+    axes = other_axes(moves)
+    if axes is not None:
+        return f"accelerometer and gyroscope contradict each other: {axes[0]}: check the order and signs of the axes"
+    if left <= FAILS_DEG and CLEARLY * left <= others[best]:
+        return (
+            f"gravity turns as the rates say, to within {left:.2g} deg in {over}; that is {left / way:.1%} of the "
+            f"{way:.0f} deg turned through, where scale factors and biases are not calibrated yet; another unit of the "
+            f"rates misses by {others[best]:.0f} deg"
+        )
+    if others[best] <= FITS_DEG and CLEARLY * others[best] <= left:
+        return (
+            f"check the unit of the rates: multiplied by {scales[1 + best]:.4g} they turn gravity to within "
+            f"{others[best]:.2g} deg in {over}, as declared to within {left:.2g} deg"
+        )
+    return (
+        f"nothing shows whether the rates' unit is right: as declared they turn gravity to within {left:.2g} deg in "
+        f"{over}, in another unit to within {others[best]:.2g} deg"
+    )
 
 
 def _notes(notes: Sequence[Note]) -> list[str]:

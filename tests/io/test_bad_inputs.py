@@ -128,8 +128,12 @@ def test_notes_on_rows_name_their_lines_and_times(tmp_path: Path) -> None:
 def test_channels_that_stand_still_together_have_one_note_for_each_stretch(tmp_path: Path) -> None:
     values = VALUES.copy()
     values[1400:1500, 1:] = values[1400, 1:]  # the table turns a quarter meanwhile
+    values[1398:1400, 4], values[1500:1503, 6] = values[1400, [4, 6]]  # neighbours that are equal by chance
     values[2600:2700, 5] = values[2600, 5]
-    case = Case({FILE: table(values, table_angle_deg=TABLE_ANGLE, table_rate_dps=RATE)})
+    temperature = 25.0 + np.round(0.05 * np.random.default_rng(3).standard_normal(len(values)), 2)
+    temperature[1400:1500] = temperature[1400]
+    logged = {"table_angle_deg": TABLE_ANGLE, "table_rate_dps": RATE, "temperature_degc": temperature}
+    case = Case({FILE: table(values, **logged)})
     write(tmp_path, case, "38")
     both, one = read(tmp_path, case).notes
     assert [(n.code, n.count, n.first, n.last) for n in (both, one)] == [
@@ -137,7 +141,8 @@ def test_channels_that_stand_still_together_have_one_note_for_each_stretch(tmp_p
         ("N-STUCK", 100, 2602, 2701),
     ]
     assert both.detail.startswith("accel_x, accel_y, accel_z, gyro_x, gyro_y, gyro_z stay at one value")
-    assert "for 0.99 s while the table turns by 89.1 deg" in both.detail
+    assert "for 0.99 s while the table turns by 89.1 deg, and the temperature with them" in both.detail
+    assert "temperature" not in one.detail
     assert one.detail.startswith(f"gyro_y stays at {values[2600, 5]:.6g} deg/s")
     entry = {"recording": "x", "rows": 3000, "rate_hz": 100.0, "notes": [vars(both), vars(one)]}
     assert left_out([entry]) == ["200 of 3,000 rows of x (2 s stuck)"]
