@@ -1,14 +1,13 @@
 """What the terminal shows of a run in addition to Snakemake's log: progress, failed jobs, the command that recovers.
 
-    time left = sum over stages of (units left * seconds a unit) / jobs at a time
+    time left = max(sum over jobs of seconds left / jobs at a time, longest running job + one of each later kind)
 
 where
 
-    seconds a unit : mean of the stage's jobs in this run so far; for a stage that has not run yet ``COST``, scaled by
-                     the ratio of measured times to ``COST`` of the other stages
+    seconds left   : of a job, units left * seconds a unit, less what the unit at work has taken
+    seconds a unit : geometric mean over the jobs of this kind in this run, weighted by their units, also of what
+                     running ones have done; and over ``PRIOR`` units of ``COST`` times the usual ratio to ``COST``
     jobs at a time : seconds that jobs have worked / seconds since the first was started
-
-but not less than a running job needs for its other units, each as long as those so far.
 
 A job handles a batch of units and writes to its log which one it is at: ``stage: unit (3 of 50)``.
 
@@ -21,15 +20,16 @@ from __future__ import annotations
 
 import atexit
 import logging
+import math
 import os
 import re
 import shlex
 import sys
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING, TextIO
 
 from pipeline.errors import first
@@ -38,16 +38,20 @@ from pipeline.results_folder import jobs_at_work, take_run
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+# Relative seconds a unit, of gather a run: data/demo on two cores (``tests/demo_jobs.csv``); "fit effects": the stage
+# of this name, in a bench of three units. Diagnoses of one run differ by a factor of 40: their logarithms are averaged.
 COST = {
-    "ingest": 2.0,
-    "diagnose": 4.0,
-    "report": 2.0,
-    "summary": 0.1,
-}  # relative to the other stages, by benchmarks/fleet.py
+    "ingest": 1.0, "filter": 0.3, "fit": 0.4, "fit effects": 5.0, "validate": 0.35, "diagnose": 15.0,
+    "calibration": 0.85, "export": 0.2, "report": 0.85, "summary": 0.5, "gather": 4.0, "verdict": 0.0, "all": 0.0,
+}  # fmt: skip
+PRIOR = 40.0  # units that ``COST`` counts as
 PER_BATCH = (
-    "collect", "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report", "summary", "prior",
+    "collect", "ingest", "filter", "fit", "fit effects", "validate", "diagnose", "calibration", "export", "report",
+    "summary", "prior",
 )  # fmt: skip
 AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
+EFFECTS = "fit effects"
+SOON = 0.1  # of the usual time of a unit, or of what it has taken: what is left at least of one at work
 LAST_STAGE = "report"  # its units are counted as done
 NAMED_JOBS, NAMED = 2, 10
 INTERVAL = {True: 1.0, False: 30.0}  # s between lines, by whether it is a terminal
@@ -69,24 +73,29 @@ class Job:
     since: float
     seconds: float = 0.0
 
-    def at(self) -> tuple[str, int] | None:
-        """Return the unit that the job is at, and its number; None before the first."""
+    @property
+    def kind(self) -> str:
+        """Key of ``COST``."""
+        return EFFECTS if self.rule == "fit" and self.name.endswith("effects") else self.rule
+
+    def at(self) -> tuple[str, int, float] | None:
+        """Return the unit that the job is at, its number, and when it began with it; None before the first."""
         try:
             with self.log.open("rb") as stream:
                 stream.seek(max(os.fstat(stream.fileno()).st_size - 2000, 0))
                 found = AT_UNIT.findall(stream.read().decode(errors="replace"))
-            of_this_job = self.log.stat().st_mtime >= self.since - 1.0
+            began = self.log.stat().st_mtime
         except OSError:
             return None
-        return (found[-1][0], int(found[-1][1])) if found and of_this_job else None
+        return (found[-1][0], int(found[-1][1]), began) if found and began >= self.since - 1.0 else None
 
 
 @dataclass
 class Progress:
-    """The jobs of a run: units of each batch, jobs wanted of each rule, running, done, and s that failed ones took."""
+    """The jobs of a run: units of each batch, jobs wanted of each kind, running, done, and s that failed ones took."""
 
     batches: Mapping[str, int]
-    wanted: dict[str, int] = field(default_factory=dict)
+    wanted: Counter[str] = field(default_factory=Counter)
     running: dict[int, Job] = field(default_factory=dict)
     done: list[Job] = field(default_factory=list)
     lost: float = 0.0
@@ -111,37 +120,56 @@ class Progress:
 
     def text(self) -> str:
         """Return the state of the run in one line."""
-        jobs = list(self.running.values())
-        at = [(job, *where) for job in jobs if (where := job.at())]
         units_done = sum(job.units for job in self.done if job.rule == LAST_STAGE)
         units = round(self.wanted.get(LAST_STAGE, 0) * self._mean_batch())
         parts = [f"{len(self.done)} of {sum(self.wanted.values())} jobs"]
         parts += [f"{units_done} of {units} units done"] * bool(units)
-        for job, unit, number in sorted(at, key=lambda a: -a[0].since)[:NAMED_JOBS]:
+        at = [(job, where) for job in self.running.values() if (where := job.at())]
+        for job, (unit, number, _) in sorted(at, key=lambda a: -a[0].since)[:NAMED_JOBS]:
             parts.append(f"{job.name}: {unit} ({number} of {job.units})")
-        left = self._seconds_left(jobs, at)
+        left = self._seconds_left()
         return " | ".join([*parts, *([f"about {duration(left)} left"] if left else [])])
 
-    def _seconds_left(self, jobs: Sequence[Job], at: Sequence[tuple[Job, str, int]]) -> float | None:
+    def _seconds_left(self) -> float | None:
         """Return the time that the rest will take, s; None until two jobs are done."""
         if len(self.done) < 2:
             return None
-        done = {rule: [job for job in self.done if job.rule == rule] for rule in self.wanted}
-        mean = {rule: fmean(job.seconds / job.units for job in of) for rule, of in done.items() if of}
-        scale = sum(mean.values()) / sum(COST.get(rule, 1.0) for rule in mean)
-        left = 0.0
-        for rule, count in self.wanted.items():
-            size = self._mean_batch() if rule in PER_BATCH or count > 1 else 1.0
-            begun = sum(number - 1 for job, _, number in at if job.rule == rule)
-            units = count * size - begun - sum(job.units for job in done[rule])
-            left += max(units, 0.0) * mean.get(rule, scale * COST.get(rule, 1.0))
-        worked = self.lost + sum(job.seconds for job in self.done) + sum(time.time() - job.since for job in jobs)
-        jobs_at_a_time = worked / max(time.monotonic() - self.started, 1e-3)
-        at_least = [(job.units - number + 0.5) * (time.time() - job.since) / number for job, _, number in at]
-        return max([left / max(jobs_at_a_time, 1.0), *at_least])
+        now, measured = time.time(), [(job.kind, job.units, job.seconds) for job in self.done]
+        scale = sum(seconds for *_, seconds in measured) / sum(COST.get(kind, 1.0) * n for kind, n, _ in measured)
+        at_work, worked = [], self.lost + sum(job.seconds for job in self.done)
+        for job in self.running.values():
+            _, number, began = job.at() or ("", 1, job.since)
+            at_work.append((job.kind, job.units - number, now - began))
+            measured.append((job.kind, number - 1, began - job.since))
+            worked += now - job.since
+        usual = {kind: _usual(kind, scale, measured) for kind in {*self.wanted, *(kind for kind, *_ in at_work)}}
+        measured += [(kind, 1, seconds) for kind, _, seconds in at_work if seconds > usual[kind]]
+        usual = {kind: _usual(kind, scale, measured) for kind in usual}
+        running = [
+            after * usual[k] + max(usual[k] - seconds, SOON * max(usual[k], seconds)) for k, after, seconds in at_work
+        ]
+        to_come = self.wanted - Counter(job.kind for job in (*self.done, *self.running.values()))
+        a_job = {kind: usual[kind] * (self._mean_batch() if kind in PER_BATCH else 1.0) for kind in to_come}
+        whole = sum(running) + sum(a_job[kind] * count for kind, count in to_come.items())
+        jobs_at_a_time = max(worked / max(time.monotonic() - self.started, 1e-3), 1.0)
+        beside = {kind for kind, *_ in at_work}  # what other batches are at
+        in_turn = sum(a_job[kind] * self._in_turn(kind, count) for kind, count in to_come.items() if kind not in beside)
+        return max(whole / jobs_at_a_time, max(running, default=0.0) + in_turn)
+
+    def _in_turn(self, kind: str, count: int) -> int:
+        """Return how many of so many jobs come one after the other in a batch."""
+        return math.ceil(count / (len(self.batches) * (2 if kind.startswith("fit") else 1)))
 
     def _mean_batch(self) -> float:
         return sum(self.batches.values()) / max(len(self.batches), 1)
+
+
+def _usual(kind: str, scale: float, measured: Sequence[tuple[str, int, float]]) -> float:
+    """Return the seconds a unit of a kind of jobs, by units and seconds of some jobs."""
+    own = [(n, seconds / n) for of, n, seconds in measured if of == kind and n]
+    known = [(PRIOR, scale * COST.get(kind, 1.0)), *own]
+    logarithm = sum(n * math.log(max(seconds, 1e-3)) for n, seconds in known)
+    return math.exp(logarithm / sum(n for n, _ in known))
 
 
 def duration(seconds: float) -> str:
@@ -197,9 +225,10 @@ class Monitor(logging.Handler):
     not find in an editable installation.
     """
 
-    def __init__(self, results: Path, batches: Mapping[str, int], logger: logging.Logger) -> None:
+    def __init__(self, results: Path, batches: Mapping[str, int], effects: int, logger: logging.Logger) -> None:
         super().__init__()
         self.results = results
+        self.effects = effects  # stages ``effects`` of all batches and sensors
         self.progress = Progress(batches)
         self.logger = logger
         self.failed: list[tuple[str, Path]] = []
@@ -215,7 +244,9 @@ class Monitor(logging.Handler):
         """Note a record of Snakemake."""
         event, fields = _event(record), vars(record)
         if event == "RUN_INFO":
-            self.progress.wanted = {k: v for k, v in fields["stats"].items() if k != "total"}
+            wanted = Counter({k: v for k, v in fields["stats"].items() if k != "total"})
+            effects = min(self.effects, wanted["fit"])  # the last stage of its chain, so again where any is
+            self.progress.wanted = wanted + Counter({EFFECTS: effects}) - Counter({"fit": effects})
         elif event == "JOB_INFO":
             log = Path((fields["log"] or [os.devnull])[0])
             self.progress.start(fields["jobid"], fields["rule_name"], dict(fields["wildcards"] or {}), log)

@@ -83,7 +83,7 @@ def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
     still = scatter < max(STILL * float(np.quantile(scatter, 0.1)), SMALLEST_VARIANCE * size**2)
     noise = BLOCK_NOISE * float(np.sqrt(2.0 * np.quantile(scatter, 0.1) / width))
     slow = np.linalg.norm(np.diff(means, axis=0), axis=1) <= max(np.radians(LARGEST_STEP_DEG) * size, noise)
-    still &= np.append(slow, False) | np.append(False, slow)  # noqa: FBT003
+    still &= np.append(slow, False) | np.append(False, slow)
     edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
     found = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
     drift = max(np.radians(LARGEST_DRIFT_DEG) * size, noise)

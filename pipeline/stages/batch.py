@@ -7,6 +7,8 @@ stages after it copy that, and ``verdict`` turns it into the exit code.
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import sys
 import traceback
 from contextlib import suppress
@@ -41,7 +43,9 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "prior": ("ingest", "filter", "calibration", "validate", "diagnose", "report", "lots"),
     "gather": (),
 }
-OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last")}
+OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last", "code"), "diagnose": ("code",)}
+INPUTS_OF = ".inputs"  # member of a pack: what the files of a unit were computed from, and their names
+BY_INPUTS = ("fit", "diagnose")  # stages that take longest: a unit with unchanged inputs is taken from the last run
 
 
 @dataclass(frozen=True)
@@ -70,12 +74,67 @@ def main(stage: str, argv: Sequence[str]) -> int:
     if hasattr(module, f"{stage}_batch"):
         getattr(module, f"{stage}_batch")(job)
         return 0
+    last = last_output(job.output)
     with new_pack(job.output) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
-            add(_files_of(module, job, unit, settings))
+            inputs = _inputs_of(job, unit, settings) if stage in BY_INPUTS else ""
+            files = _unchanged(last, unit, inputs) if inputs else {}
+            if files:
+                print(f"{stage}: {unit} unchanged, taken from the last run", file=sys.stderr, flush=True)
+            else:
+                files = _files_of(module, job, unit, settings)
+            add(files)
+            if inputs and unit + FAILED not in files:
+                add({unit + INPUTS_OF: as_bytes({"sha256": inputs, "files": [*files]})})
+    if stage in BY_INPUTS:
+        _keep(job.output)
     record_output(job, job.output)
     return 0
+
+
+def last_output(output: Path) -> Path:
+    """Return a link to what a job wrote last: Snakemake deletes the output before it starts the job again."""
+    return output.with_name(f".{output.name}.last")
+
+
+def _keep(output: Path) -> None:
+    """Link what a job wrote; where the disk has no links, the next run computes every unit."""
+    last = last_output(output)
+    last.unlink(missing_ok=True)
+    with suppress(OSError):
+        last.hardlink_to(output)
+
+
+def forget_last_outputs(results: Path) -> None:
+    """Delete the links to what jobs wrote last, so that every unit is computed again."""
+    for last in (results / "batches").rglob(".*.last"):
+        last.unlink()
+
+
+def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:
+    """Return a digest of settings, code and files of earlier stages that a unit depends on, "" where one is damaged."""
+    packs = [*job.inputs.values(), *([Pack(Path(job.run["previous"]))] if job.run.get("previous") else [])]
+    run = {key: value for key, value in job.run.items() if key != "previous"}
+    found = hashlib.sha256(json.dumps([run, settings], sort_keys=True).encode())
+    own = (f"{unit}.", f"{unit}_")
+    try:
+        for pack in packs:
+            for name in (n for n in pack.names() if n.startswith(own) and not n.endswith(INPUTS_OF)):
+                found.update(name.encode() + pack.read(name))
+    except DamagedFileError:
+        return ""
+    return found.hexdigest()
+
+
+def _unchanged(last: Path, unit: str, inputs: str) -> dict[str, bytes]:
+    """Return the files of a unit as the last run wrote them, none where what they depend on has changed."""
+    name, pack = unit + INPUTS_OF, Pack(last)
+    try:
+        found = pack.json(name) if last.is_file() and name in pack else {}
+        return {file: pack.read(file) for file in found["files"]} if found.get("sha256") == inputs else {}
+    except DamagedFileError:
+        return {}
 
 
 def parse_job(stage: str, argv: Sequence[str]) -> Job:

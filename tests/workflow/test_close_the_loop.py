@@ -102,6 +102,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
     made.said["explain"] = made.bash("python -m pipeline explain 'my demo'")
     made.said["page"] = shown_on_the_page(made.results / "reports" / f"{HIDDEN}.html")[0]
     made.note("added", made.bash(made.said["page"]))
+    made.said["diagnose"] = next(made.results.glob("logs/*/diagnose.log")).read_text()
     made.note("removed", made.bash(made.said["page"].replace(" add ", " remove ")))
     return made
 
@@ -128,6 +129,8 @@ def test_the_held_out_error_falls_to_its_floor_and_the_other_unit_stays(loop: Lo
     assert (loop.directory / "my demo" / "units.csv").is_file()
     assert loop.other["added"] == loop.other["first"]
     assert len(loop.other["first"]) > 20
+    assert f"diagnose: {OTHER} unchanged, taken from the last run\n" in loop.said["diagnose"]
+    assert f"diagnose: {HIDDEN} unchanged" not in loop.said["diagnose"]
     assert "missing:" not in loop.said["added"]
     told = f"{HIDDEN}, gyroscope: + g_sensitivity; held-out error {before:.3g} -> {after:.3g} deg/s, "
     assert told + f"{after / floor_after:.3g} times the noise floor\n" in loop.said["added"]

@@ -27,6 +27,7 @@ from pipeline.outcome import outcome
 from pipeline.pack import STAGES as PUBLISHED_STAGES
 from pipeline.results_folder import finish_publishing, repetitions
 from pipeline.run_progress import Monitor
+from pipeline.stages.batch import forget_last_outputs
 from pipeline.stages.job_server import COMMAND, start_server
 
 RUNNING = not workflow.is_main_process
@@ -88,6 +89,7 @@ else:
     MONITOR = Monitor(
         CAMPAIGN.results,
         {batch: len(units) for batch, units in CAMPAIGN.batches.items()},
+        sum("effects" in s for chain in CAMPAIGN.chains.values() for s in chain.values()),
         logger,
     )
 # In a container the interpreter of this machine does not exist; elsewhere each machine parses this file with its own.
@@ -153,6 +155,8 @@ def begin_run():
             plain=output.verbose or output.printshellcmds,
         )
         RUNNING = True
+        if workflow.dag_settings.forceall or workflow.dag_settings.forcerun:
+            forget_last_outputs(CAMPAIGN.results)
         finish_publishing(CAMPAIGN.results)
         if workflow.local_exec:
             atexit.register(start_server())

@@ -20,5 +20,5 @@ rule fit:
         last=is_last_stage,
     shell:
         "{RUN} fit --config {input.settings:q} --sensor {wildcards.sensor} --stage {wildcards.stage}"
-        " --last {params.last} --ingest {input.ingest:q} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
+        " --last {params.last} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
         " > {log:q} 2>&1"

@@ -1,0 +1,63 @@
+"""What is taken from the last run: units whose settings, code and files of earlier stages are as they were."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from pipeline.pack import Pack, new_pack
+from pipeline.stages import batch
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HERE = {"ingest": {}, "filter": {}, "accelerometer": {}, "gyroscope": {}, "validate": {}}
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201
+    """Return a function that runs the diagnosis of two units, and returns the units that were computed."""
+    computed: list[str] = []
+
+    def diagnose(_: batch.Job, unit: str, settings: dict) -> dict:
+        computed.append(unit)
+        return {f"{unit}.json": {"found": settings["effects"]}}
+
+    monkeypatch.setattr("pipeline.stages.diagnose.diagnose_unit", diagnose)
+    monkeypatch.setattr(batch, "hold_as_job", lambda _: None)
+
+    def run_job(files: dict[str, dict[str, str]] = HERE, code: str = "a", **effects: int) -> list[str]:
+        output = tmp_path / "results" / "batches" / "b" / "diagnose.zip"
+        output.unlink(missing_ok=True)  # as Snakemake does
+        (tmp_path / "results" / "configs").mkdir(parents=True, exist_ok=True)
+        config = tmp_path / "results" / "configs" / "diagnose.json"
+        config.write_text(json.dumps({"units": {u: {"effects": effects.get(u, 0)} for u in ("U1", "U10")}}))
+        argv = ["--config", str(config), "--output", str(output), "--code", code]
+        for stage, changed in files.items():
+            with new_pack(tmp_path / f"{stage}.zip") as add:
+                add({f"{u}.json": changed.get(u, "x").encode() for u in ("U1", "U10")})
+            argv += [f"--{stage}", str(tmp_path / f"{stage}.zip")]
+        computed.clear()
+        batch.main("diagnose", argv)
+        assert [Pack(output).json(f"{u}.json")["found"] for u in ("U1", "U10")] == [
+            effects.get("U1", 0),
+            effects.get("U10", 0),
+        ]
+        return list(computed)
+
+    return run_job
+
+
+def test_only_units_whose_inputs_have_changed_are_computed(run, tmp_path: Path) -> None:  # noqa: ANN001
+    assert run() == ["U1", "U10"]
+    assert run() == []
+    assert run(U10=1) == ["U10"]
+    assert run(HERE | {"validate": {"U1": "y"}}, U10=1) == ["U1"]
+    assert run(code="b", U10=1) == ["U1", "U10"]
+    last = tmp_path / "results" / "batches" / "b" / ".diagnose.zip.last"
+    last.write_bytes(last.read_bytes()[:-30])
+    assert run(code="b", U10=1) == ["U1", "U10"]
+    batch.forget_last_outputs(tmp_path / "results")
+    assert run(code="b", U10=1) == ["U1", "U10"]
