@@ -98,8 +98,12 @@ def main(argv: Sequence[str]) -> int:
         if key and others:
             print(textwrap.fill(f"REFUSED as {first}: {', '.join(others)}", WIDTH, subsequent_indent="  ") + "\n")
     sys.stdout.flush()
+    equal: dict[tuple[str, str], list[str]] = {}
     for one in refused:
-        print(f"python -m pipeline check: {one.place}: refused ({one.code})", file=sys.stderr, flush=True)
+        equal.setdefault((one.code, one.message), []).append(one.place)
+    for (code, _), (place, *others) in equal.items():
+        where = f"{1 + len(others)} files, for example {place}" if others else place
+        print(f"python -m pipeline check: {where}: refused ({code})", file=sys.stderr, flush=True)
     unknown = [(r.reading, layout) for r in refused if r.reading for layout in _layouts(r.reading, r.code)]
     if unknown:
         sensor = unknown[0][0].settings["sensor"]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from pipeline.__main__ import main
 from pipeline.io.arrow import write_canonical_csv
@@ -171,7 +172,7 @@ def test_files_alike_share_one_proposal_which_is_printed_last(
     checked = Checked(capsys, *names)
     assert checked.out.count("REFUSED  ") == 1
     assert "REFUSED as log0.csv: log1.csv, log2.csv, log3.csv, log4.csv" in checked.out
-    assert checked.err.count("refused (missing_column)") == 5
+    assert checked.err == "python -m pipeline check: 5 files, for example log0.csv:1: refused (missing_column)\n"
     assert checked.words.count("read with the proposed profile") == 3
     assert "no column that the profile assigns to the gyroscope" in checked.words
     listed = ", ".join(names)
@@ -288,6 +289,67 @@ def test_a_unit_is_refused_for_what_its_recordings_show_together(
     assert checked.code == 0
     assert "a run needs more recordings of unit U" in checked.words
     assert Checked(capsys, "--campaign", linked, "--unit", "U").code == 2
+
+
+def test_equal_notes_of_recordings_are_one_and_others_are_told_apart(
+    linked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, shift, sign in (("gyro_y", 10.0, 1), ("gyro_z", 20.0, 1)):  # of the encoder
+        file = linked / "raw" / "U" / f"{name}.csv"
+        header, *rows = file.read_text().splitlines()
+        place = header.split(",").index("table_angle_deg")
+        cells = [row.split(",") for row in rows]
+        for row in cells:
+            row[place] = f"{sign * float(row[place]) + shift:.6f}"
+        file.unlink()
+        file.write_text("\ufeff" + "\n".join([header, *(",".join(row) for row in cells)]) + "\n", encoding="utf-8")
+    words = Checked(capsys, "--campaign", linked).words
+    assert re.search(r"N-BOM gyro_y: [^;]*; likewise gyro_z", words)
+    assert re.search(r"N-FOUND gyro_y: .*at a table angle of 10.0 deg, .*N-FOUND gyro_z: .*angle of 20.0 deg", words)
+
+
+def test_slow_full_turns_of_a_table_are_no_rests_and_no_contradiction(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng, rate, bias = np.random.default_rng(5), 125.0, np.array([0.04, -0.03, 0.02])
+    turned = np.concatenate([np.zeros(1000), np.cumsum(np.full(5625, 8.0 / rate)), np.full(1000, 360.0)])
+    angle, n = np.radians(turned), len(turned)
+    force = np.column_stack([np.cos(angle), -np.sin(angle), np.zeros(n)]) + bias + 3e-3 * rng.standard_normal((n, 3))
+    speed = np.gradient(turned, 1.0 / rate)
+    gyro = np.column_stack([np.zeros(n), np.zeros(n), speed]) + 0.04 * rng.standard_normal((n, 3))
+    slow = Recording("slow", "rests", None, 8_000_000 * np.arange(n), accelerometer=force, gyroscope=gyro)
+    write_canonical_csv(tmp_path / "slow.csv", slow)
+    words = Checked(capsys, tmp_path / "slow.csv").words
+    assert "no move between rests turns gravity" in words
+    assert re.search(r"rests 2, 7\.9\d* to 7\.9\d* s long", words)
+
+
+def test_a_wrong_unit_of_few_moves_and_swapped_axes_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng, rate = np.random.default_rng(6), 100.0
+    axes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]], float)
+    rotation, force, gyro = Rotation.identity(), [], []
+    for axis in axes / np.linalg.norm(axes, axis=1, keepdims=True):
+        for speed, samples in ((0.0, 200), (80.0, 100)):
+            for _ in range(samples):
+                force.append(rotation.inv().apply([0.0, 0.0, 1.0]))
+                gyro.append(speed * axis)
+                rotation *= Rotation.from_rotvec(np.radians(speed / rate) * axis)
+    force += [rotation.inv().apply([0.0, 0.0, 1.0])] * 200
+    f = np.array(force) + 2e-3 * rng.standard_normal((len(force), 3))
+    w = np.concatenate([gyro, np.zeros((200, 3))])
+
+    def words(rates: np.ndarray, rows: int) -> str:
+        times = 10_000_000 * np.arange(rows)
+        log = Recording("log", "rests", None, times, accelerometer=f[:rows], gyroscope=rates[:rows])
+        write_canonical_csv(tmp_path / "log.csv", log)
+        return Checked(capsys, tmp_path / "log.csv").words
+
+    w += 0.05 * rng.standard_normal(w.shape)
+    assert "gravity turns as the rates say, to within 0." in words(w, len(f))
+    assert "check the unit of the rates: multiplied by 57.3 they turn gravity to within" in words(w / 57.29578, 800)
+    assert "contradict each other" in words(w[:, [1, 0, 2]], len(f))
 
 
 def test_an_encoder_that_is_not_connected_is_told_and_refused_where_a_run_needs_it(
