@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.report.numbers import MINUS
+from pipeline.report.numbers import MINUS, typeset
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -129,4 +129,4 @@ class Axis:
         """Return the attributes from which the page's script knows the axis."""
         ticks = f' data-ticks="{escape("|".join(names))}"' if names else ""
         ends = f"{self.low:.9g},{self.high:.9g},{self.start:g},{self.stop:g}"
-        return f' data-scale="{ends},{self.kind},{escape(label)}"{ticks}'
+        return f' data-scale="{ends},{self.kind},{escape(typeset(label))}"{ticks}'

@@ -44,7 +44,7 @@ def render(
     comparisons: Sequence[JSON] = (),
     page: str | None = None,
     *,
-    twins: Sequence[Sequence[str]] = (),
+    twins: Sequence[tuple[Sequence[str], Sequence[Sequence[str]]]] = (),
     statistics: JSON | None = None,
     placed: Table | None = None,
     history: JSON | None = None,
@@ -55,10 +55,10 @@ def render(
 
     ``rows``: one a unit, as of ``summary_row``, in the order of ``units.csv``; ``failures``: ``unit, stage, code,
     message, file`` of each failed unit; ``comparisons``: as of ``comparison_section.section``; ``page``: name of a
-    further page; ``twins``: files of several units with the same content under different names; ``statistics``: as of
-    ``fleet_statistics``; ``placed``: of ``against_limits`` of all units; ``history``: as of
-    ``runs_data``; ``settings``: of the run, for the commands to continue with; ``published``: units that have a page
-    of their own where pages are published on request only, None: all.
+    further page; ``twins``: as of ``gather.same_files``; ``statistics``: as of ``fleet_statistics``; ``placed``: of
+    ``against_limits`` of all units; ``history``: as of ``runs_data``; ``settings``: of the run, for the commands to
+    continue with; ``published``: units that have a page of their own where pages are published on request only, None:
+    all.
     """
     findings = findings_of(rows)
     frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
@@ -159,19 +159,20 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Iterator[Told]:
         return
     many = count > MOST_DOTS
     complete = known & (frame[f"{sensor}_verdict"] == "nothing_missing").to_numpy(bool)
-    dotted = [(before, order > 0, 3, "before"), (floor, order > 0, 4, "noise floor")]
+    first, last = (before, order > 0, 3, "before"), (floor, order > 0, 4, "noise floor")  # the floor over the dots
     judged = [(after, complete, 2, "after, nothing missing"), (after, known & ~complete, 0, "after, any other verdict")]
+    dotted = [first, *judged, last]
     layers: list[Layer] = []
     legend, values = [], {}
     drawn = known
     if many:
-        for v, _, colour, name in [*dotted, (after, known, 5, "after")]:
+        for v, _, colour, name in (first, last, (after, known, 5, "after")):
             layers += _quantiles(order, v, colour)
             legend.append((f"c{colour}", name))
         drawn = np.zeros(len(frame), bool)
         drawn[np.argsort(-np.nan_to_num(after / floor))[:FARTHEST]] = True
-        dotted = []
-    for v, of, colour, name in [*dotted, *judged]:
+        dotted = judged
+    for v, of, colour, name in dotted:
         chosen = np.flatnonzero(of & drawn if v is after else of)
         if v is not after or len(chosen):
             layers.append(Dots(order[chosen], v[chosen], colour, units=tuple((chosen + 1).tolist()) if many else ()))

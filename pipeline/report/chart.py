@@ -22,6 +22,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.axis import SUBDIVISION, Axis
+from pipeline.report.numbers import typeset
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -58,13 +59,13 @@ class Figure:
 
     def drawn(self, description: str, height: float, content: str, attributes: str = "") -> Figure:
         """Return the figure with its ``svg`` element around drawn content; the description is for screen readers."""
-        name = escape(self.name)
+        name, finding = escape(self.name), typeset(self.finding)
         svg = Markup(  # noqa: S704  (every text in it is escaped where it is written)
             f'<svg class="chart" viewBox="0 0 {WIDTH} {height:g}" role="img" aria-labelledby="{name}-t {name}-d"'
-            f'{attributes}><title id="{name}-t">{escape(self.finding)}</title>'
-            f'<desc id="{name}-d">{escape(description)}</desc>{content}</svg>'
+            f'{attributes}><title id="{name}-t">{escape(finding)}</title>'
+            f'<desc id="{name}-d">{escape(typeset(description))}</desc>{content}</svg>'
         )
-        return replace(self, svg=svg)
+        return replace(self, svg=svg, finding=finding, caption=typeset(self.caption))
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ def chart(
 
 def text(x: float, y: float, content: str, kind: str = "") -> str:
     """Return a text element; ``kind`` is its CSS class (``e`` right-aligned, ``m`` centred, ``b`` bold)."""
-    return f'<text x="{x:.4g}" y="{y:.4g}" class="{kind}">{escape(content)}</text>'
+    return f'<text x="{x:.4g}" y="{y:.4g}" class="{kind}">{escape(typeset(content))}</text>'
 
 
 def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
@@ -197,7 +198,7 @@ def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
     return (
         f'<g class="panel"{y.attribute(panel.label, panel.rows)}><path class="grid" d="{grid}"/>'
         f'<g class="ticks">{labels}</g>'
-        f'<text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(panel.label)}</text>'
+        f'<text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(typeset(panel.label))}</text>'
         f'<g class="layers" transform="scale({1 / SUBDIVISION:g})">{drawn}</g>{names}</g>'
     )
 
@@ -229,7 +230,7 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
     at, path, room = x.units(layer.x[known]), "", LARGE_DOTS
     if layer.low is not None and layer.high is not None:
         low, high, room = y.units(layer.low[known]), y.units(layer.high[known]), LARGE_MEANS
-        path = f'<path class="strokes faint-strokes c{layer.colour}" d="{_path("M%d %dV%d", at, low, high)}"/>'
+        path = f'<path class="strokes interval c{layer.colour}" d="{_path("M%d %dV%d", at, low, high)}"/>'
     size = " large" * (len(layer.x) <= room)
     units = f' data-units="{" ".join(str(layer.units[i]) for i in known)}"' if layer.units else ""
     return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, y.units(layer.y[known]))}"{units}/>'

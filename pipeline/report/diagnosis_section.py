@@ -18,7 +18,7 @@ from pipeline.records import AXES, SENSOR_UNITS, Values
 from pipeline.report.axis import LINEAR_TO
 from pipeline.report.chart import Dots, Figure, Layer, Line, Panel, chart
 from pipeline.report.group_charts import Point, bars
-from pipeline.report.numbers import MINUS, measured, number, percent, plain, unit_text
+from pipeline.report.numbers import measured, number, percent, plain, unit_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -86,7 +86,7 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
         caption += f" {rest} more are lower, listed below." if rest > 0 else ""
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
     figure = Figure(f"{sensor}-limits", finding, caption)
-    return bars(figure, points, "upper limit over the data sheet's limit", levels={"data sheet": 1.0})
+    return bars(figure, points, "upper limit over the data sheet's limit", levels={"limit of the data sheet": 1.0})
 
 
 def ranking_rows(found: JSON) -> list[JSON]:
@@ -128,7 +128,7 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
     rows += [Point(f"{plain(h['effect'])}: not observable", None, note=h["reason"]) for h in hidden[:MOST_HIDDEN]]
     figure = Figure(f"{sensor}-ranking", _ranking_finding(entries, selected), caption, legend)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"
-    return bars(figure, rows, label, levels={"threshold": GATE}, kind="symlog", brackets=brackets)
+    return bars(figure, rows, label, levels={f"threshold {GATE:g}": GATE}, kind="symlog", brackets=brackets)
 
 
 def _evidence(entry: JSON) -> float:
@@ -259,7 +259,7 @@ def _unexplained(sensor: str, shown: JSON, entry: JSON) -> Figure:
             off.append(float(np.mean(((mean - np.interp(x, curve_x, curve)) / error) ** 2)))
         panels.append(Panel(layers, f"{panel['axis']}, {unit}", 76, {"": 0.0}))
     finding = f"The residual depends on {plain(shown['covariate'])}"
-    finding += f": {entry['shape']}".replace(" -", f" {MINUS}") if entry.get("shape") else ""
+    finding += f": {entry['shape']}" if entry.get("shape") else ""
     reaches = [f"{p['axis']} up to {number(float(np.abs(p['mean']).max()))} {unit}" for p in shown["panels"]]
     caption = "Residual in bins, with ±2 standard errors of white noise and the expected bias wander"
     if off:

@@ -80,14 +80,15 @@ def bars(
     drawn = [(top + ROW * i, row) for i, row in enumerate(rows) if row.value is not None]
     out += [_row(row, axis, at) for at, row in drawn]
     for words, value in levels.items():
-        at, said = axis.pixels(value), f"{words} {number(value)}"
-        half = LETTER / 2 * len(said)
+        at, half = axis.pixels(value), LETTER / 2 * len(words)
         beside = "".join(f"M{at:.1f} {place + 13}v14" for place, _ in drawn)  # labels are not crossed
         out.append(f'<path class="level" d="M{at:.1f} {top}v2{beside}"/>')
-        out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, said, "m"))
+        out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, words, "m"))
     for at, row in drawn:
         if row.value is not None and row.interval is None:
-            out.append(text(max(axis.pixels(0.0), axis.pixels(row.value)) + 4, at + 24, number(row.value), "value"))
+            said, left = number(row.value), max(axis.pixels(0.0), axis.pixels(row.value)) + 4
+            lines = [line for line in map(axis.pixels, levels.values()) if left < line < left + LETTER * len(said)]
+            out.append(text(max(lines, default=left - 4) + 4, at + 24, said, "value"))  # beside a line, not across it
     out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows) if row.value is None]
     for k, members in enumerate(brackets):
         at, heights = stop + RIGHT - 12 + BRACKET * k, {top + ROW * row + 20: said for row, said in members.items()}
@@ -96,7 +97,7 @@ def bars(
         out += [text(at + 3, y + 3.5, said) for y, said in heights.items() if said]
     out += [text(max(at, LEFT + 14), bottom + 13, tick, "m") for at, tick in ticks]
     out.append(text((axis.start + axis.stop) / 2, bottom + 27, label, "m"))
-    description = _description(rows) + "".join(f"; {words} {number(value)}" for words, value in levels.items())
+    description = _description(rows) + "".join(f"; {words}" for words in levels)
     return figure.drawn(f"{label}. {description}", bottom + 34, "".join(out))
 
 

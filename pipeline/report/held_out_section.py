@@ -77,7 +77,7 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
     caption = f"{whose} of the {kind} after each step; the line is the error that noise alone gives."
     figure = Figure(f"{sensor}-staircase-{kind}", finding, caption, (("c4", words),) if added else ())
     label = f"root mean square error, {unit} (logarithmic)"
-    return bars(figure, rows + added, label, levels={"noise floor": floor or 0.0})
+    return bars(figure, rows + added, label, levels={f"noise floor {number(floor)}": floor or 0.0})
 
 
 def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:

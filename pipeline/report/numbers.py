@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 NOTHING = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
+PRINTED = {"+-": "±", "delta BIC": "ΔBIC", "degC": "°C", "^2": "²", "^3": "³", "sqrt(Hz)": "√Hz", "sqrt(s)": "√s"}
 
 
 def number(value: object, digits: int = 3) -> str:
@@ -62,8 +63,10 @@ def probability(value: object) -> str:
 
 
 def typeset(sentence: str) -> str:
-    """Return a sentence as a terminal prints it with the signs of print: ``±``, the minus sign, ``ΔBIC``."""
-    signs = sentence.replace("+-", "±").replace("delta BIC", "ΔBIC")
+    """Return a sentence or a unit as a terminal prints it with the signs of print: ``±``, ``−``, ``ΔBIC``, ``°C``."""
+    signs = sentence
+    for told, sign in PRINTED.items():
+        signs = signs.replace(told, sign)
     return re.sub(r"(?<![\w.-])-(?=\d)|(?<=\de)-(?=\d)", MINUS, signs)
 
 
@@ -74,7 +77,7 @@ def plain(name: str) -> str:
 
 def unit_text(unit: object) -> str:
     """Return a unit as it stands behind a number: nothing for 1."""
-    return "" if unit in (None, "1") else str(unit)
+    return "" if unit in (None, "1") else typeset(str(unit))
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

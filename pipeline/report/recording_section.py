@@ -136,7 +136,7 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
             x = np.ravel(ends) + begin[r.name]
             layers.append(Line(x, np.full(len(x), float(y)), colour, "thick"))
     count, colours = sum(map(len, spans.values())), {c for of in spans.values() for *_, c in of}
-    finding = f"{count} rest{'s' if count != 1 else ''} in {len(drawn)} recordings"
+    finding = f"{count} rest{'s' if count != 1 else ''} in {len(drawn)} recording{'s' if len(drawn) != 1 else ''}"
     legend = tuple((f"c{c}", f"rest, {use}") for use, c in USES.items() if c in colours) or ((f"c{LOGGED}", "rest"),)
     names = [r.name if len(r.name) <= LETTERS else f"{r.name[: LETTERS - 1]}…" for r in lanes]
     return chart(

@@ -66,12 +66,12 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
     finding = f"{sensor.capitalize()}: in the last run the held-out error {change} {unit}{ratio}"
     caption = "Error on held-out motion after each run that changed the unit, and the effects that it added or removed."
     figure = Figure(f"history-{sensor}", finding, caption)
-    return bars(figure, rows, f"rms error, {unit} (logarithmic)", levels={"noise floor": floor or 0.0})
+    return bars(figure, rows, f"rms error, {unit} (logarithmic)", levels={f"noise floor {number(floor)}": floor or 0.0})
 
 
 def _row(entry: JSON, part: JSON, sensor: str) -> Point:
     change, floor = entry["change"], part["floor"]
-    words = change.words(sensor) or change.words() if change else part["effects"]
+    words = change.words(sensor) or ["effects of the other sensor"] if change else part["effects"]
     label = f"run {entry['run']}" + (f"{':' if change else ' with'} {plain(', '.join(words))}" if words else "")
     label = label if len(label) <= LABEL else f"{label[: LABEL - 1]}…"
     label += f", {number(part['error'] / floor)} × floor" if floor else ""

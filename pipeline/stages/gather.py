@@ -173,8 +173,8 @@ def publish_histories(new: Path, entries: Sequence[JSON], units: Iterable[str]) 
             write_atomically(page, with_history(page.read_text(encoding="utf-8"), history, times))
 
 
-def same_files(recordings: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
-    """Return the files of several units with the same content under different names.
+def same_files(recordings: Mapping[str, Mapping[str, str]]) -> list[tuple[list[str], list[list[str]]]]:
+    """Return the units that have files with the same content under different names, and these files.
 
     ``recordings``: unit to its files, each with a digest. One file that several units are calibrated from is not
     reported.
@@ -186,7 +186,10 @@ def same_files(recordings: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
             known, owner = first.setdefault(digest, (file, unit))
             if known != file:
                 same.setdefault(digest, {known: owner}).setdefault(file, unit)
-    return [[f"{unit}: {file}" for file, unit in found.items()] for found in same.values()]
+    shared: dict[tuple[str, ...], list[list[str]]] = {}
+    for found in same.values():
+        shared.setdefault(tuple(dict.fromkeys(found.values())), []).append(list(found))
+    return [(list(units), files) for units, files in shared.items()]
 
 
 def _link(source: Path, target: Path) -> None:

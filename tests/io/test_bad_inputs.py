@@ -163,9 +163,9 @@ def test_the_same_recording_in_two_units_is_noted_on_the_page_of_the_campaign() 
     recordings = {unit: {f"raw/{unit}/log.csv": "s"} for unit in ("U1", "U2")}
     recordings["U3"] = {"raw/U1/log.csv": "s", "raw/U3/a.csv": "t"}
     twins = same_files(recordings)
-    assert twins == [["U1: raw/U1/log.csv", "U2: raw/U2/log.csv"]]
+    assert twins == [(["U1", "U2"], [["raw/U1/log.csv", "raw/U2/log.csv"]])]
     page = render("campaign", [], [], twins=twins)
-    assert "U1: raw/U1/log.csv, U2: raw/U2/log.csv" in page
+    assert "raw/U1/log.csv and raw/U2/log.csv" in page
 
 
 def test_a_missing_file_is_an_error_of_its_own(tmp_path: Path) -> None:

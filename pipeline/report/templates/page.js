@@ -53,15 +53,17 @@ if (contents) {
   follow();
 }
 // On a phone, long parts are closed; a link into one opens it, and all are printed.
-const folds = [...document.querySelectorAll("details.fold")];
-if (matchMedia("(max-width: 700px)").matches) for (const part of folds) part.open = false;
+const narrow = matchMedia("screen and (max-width: 700px)"), folds = [...document.querySelectorAll("details.fold")];
+const fold = () => folds.forEach((part) => part.open = !narrow.matches);
+narrow.addEventListener("change", fold);
+fold();
 const unfold = () => { const part = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)))?.closest("details.fold"); if (part) part.open = true; };
 addEventListener("hashchange", unfold);
 addEventListener("beforeprint", () => folds.forEach((part) => part.open = true));
 unfold();
 // On a phone, a table that is too wide shows each row as a block (page.css). The names of the columns are rules of a style sheet, as
 // the rows of a list change.
-const narrow = matchMedia("(max-width: 700px)"), names_ = document.createElement("style");
+const names_ = document.createElement("style");
 const fit = new ResizeObserver((entries) => requestAnimationFrame(() => {
   for (const { target } of entries) {
     const table = target.firstElementChild;

@@ -4,7 +4,7 @@ const history_ = JSON.parse(document.querySelector("#history-data").textContent)
 const boxes = ["#run-a", "#run-b"].map((id) => document.querySelector(id));
 const published = JSON.parse(document.querySelector("#published")?.textContent ?? "null"); // null: every unit has a page
 const after = (states, run) => states.filter(([n]) => n <= run).pop()?.[1];
-const number = (v) => v === null || v === undefined ? "\u2013" : v === 0 ? "0" : v >= 1e-4 && v < 1e5 ? String(+v.toPrecision(3)) : v.toExponential(2);
+const number = (v) => v === null || v === undefined ? "\u2013" : v === 0 ? "0" : v >= 1e-4 && v < 1e5 ? v < 1000 ? v.toPrecision(3) : v.toFixed(0) : v.toExponential(2).replace("-", "\u2212");
 const words = (name) => (name ?? "").replaceAll("_", " ");
 function settings(a, b) {
   const keys = [...new Set([...Object.keys(a), ...Object.keys(b)])].filter((k) => a[k] !== b[k] && !k.startsWith("effects"));
