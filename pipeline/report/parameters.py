@@ -121,10 +121,8 @@ def _of_effect(p: Parameter) -> str:
 def stage_details(stage: JSON) -> list[str]:
     """Return the details of a stage of the fit that are one value each, in words."""
     details = {k: v for k, v in (stage.get("details") or {}).items() if isinstance(v, int | float | str | bool)}
-    texts = {
-        k: f"{plain(k)}: {number(v, 4) if isinstance(v, float) else f'{v:,}' if type(v) is int else v}"
-        for k, v in details.items()
-    }
+    shown = {k: number(v, 4) if isinstance(v, float) else f"{v:,}" if type(v) is int else v for k, v in details.items()}
+    texts = {k: f"{plain(k)}: {text}" for k, text in shown.items()}
     if details.get("samples_left_out"):
         texts["samples_left_out"] += f" ({LEFT_OUT})"
     return list(texts.values())

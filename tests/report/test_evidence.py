@@ -138,7 +138,7 @@ def test_the_unexplained_is_drawn_with_its_shape_and_says_where_the_points_leave
     for shown, follows in ((panels[:1], True), (panels, False)):
         pictures = [{"covariate": "temperature", "signal": "temperature", "unit": "g", "panels": shown}]
         (figure,) = unexplained("accelerometer", found | {"pictures": {"unexplained": pictures}})
-        assert figure.finding == f"The residual depends on temperature: {shape}"
+        assert figure.finding == f"The residual depends on temperature: {shape}".replace("degC", "°C")
         assert "temperature, degC" in figure.svg
         assert figure.svg.count('class="line c5 model"') == len(shown)
         assert ("do not follow" not in figure.caption) is follows
@@ -158,7 +158,7 @@ def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_
     assert figure is not None
     density = np.sqrt(np.mean([part["terms"]["white"]["value"] ** 2 for part in noise["axes"].values()]))
     assert density == pytest.approx(0.003 * np.sqrt(0.12), rel=0.05)
-    assert figure.finding == f"White noise N = {density:.5f} g/sqrt(Hz), as the data sheet says"
+    assert figure.finding == f"White noise N = {density:.5f} g/√Hz, as the data sheet says"
     assert "static, 108 s at rest, before any filter" in figure.caption
     assert (
         "needs a wander of 0.000900 g, correlation time 50.0 s, against 0.000100 expected: it is inflated"

@@ -338,12 +338,12 @@ def test_any_two_runs_are_compared_with_the_largest_change_first(browser: Browse
         return [r.split("\t") for r in page.locator("#runs-table tbody").inner_text().splitlines()]
 
     same = ["nothing missing", "nothing missing"]
-    assert rows() == [["U9", "gyroscope", "0.1", "0.2", "125", "250", *same, "− g sensitivity"]]
+    assert rows() == [["U9", "gyroscope", "0.100", "0.200", "125", "250", *same, "− g sensitivity"]]
     page.locator("#run-a").select_option("1")
     page.locator("#run-b").select_option("2")
     assert [(r[0], r[2], r[3], r[8]) for r in rows()] == [
-        ("U0", "0.1", "0.001", "+ g sensitivity"),
-        ("U9", "0.2", "0.1", "+ g sensitivity"),
+        ("U0", "0.100", "0.00100", "+ g sensitivity"),
+        ("U9", "0.200", "0.100", "+ g sensitivity"),
     ]
     page.locator("#run-b").select_option("1")
     assert page.locator("#runs-said").text_content() == "No unit differs between these runs."
