@@ -98,7 +98,8 @@ def render(
         first=FIRST,
         sections=comparisons,
         verdicts=VERDICTS,
-        sensors=SENSORS,
+        sensors=[s for s in SENSORS if frame[f"{s}_error_after"].notna().any()] or SENSORS,
+        units=SENSOR_UNITS,
         kept=sorted(set(frame) - set(COLUMNS)),
         beside=page,
     )

@@ -96,7 +96,7 @@ def remarks(noise: JSON | None) -> list[str]:
         if ranking and ranking[0]["probability"] < SURE and len(ranking) > 1:
             second = ", ".join(map(plain, ranking[1]["terms"]))
             best, next_best = (percent(r["probability"]) for r in ranking[:2])
-            lines.append(f"these terms have a probability of {best}; the next best set, {second}, of {next_best}")
+            lines.append(f"these terms have a probability of {best}, the next best set ({second}) {next_best}")
         terms = part["terms"] or {}
         reasons = {name: term["reason"] for name, term in terms.items() if isinstance(term, dict) and "reason" in term}
         for reason in dict.fromkeys(reasons.values()):

@@ -139,7 +139,7 @@ def test_the_unexplained_is_drawn_with_its_shape_and_says_where_the_points_leave
         pictures = [{"covariate": "temperature", "signal": "temperature", "unit": "g", "panels": shown}]
         (figure,) = unexplained("accelerometer", found | {"pictures": {"unexplained": pictures}})
         assert figure.finding == f"The residual depends on temperature: {shape}".replace("degC", "°C")
-        assert "temperature, degC" in figure.svg
+        assert "temperature, °C" in figure.svg
         assert figure.svg.count('class="line c5 model"') == len(shown)
         assert ("do not follow" not in figure.caption) is follows
 

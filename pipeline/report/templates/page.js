@@ -81,6 +81,7 @@ document.querySelectorAll(".scroll").forEach((box, i) => {
   box.firstElementChild.dataset.columns = i;
   [...last.cells].forEach((cell, k) => {
     const lines = [groups[k], [...cell.childNodes].map((node) => node.textContent).join(" ").trim()].filter(Boolean).map((line) => line.replace(/["\\\n]/g, " "));
+    if (groups[k]) cell.dataset.group = groups[k];
     if (k) names_.append(`[data-columns="${i}"].folded > tbody > tr > :nth-child(${k + 1})::before { content: "${lines.join(", ")}"; }\n`);
   });
   fit.observe(box);
