@@ -45,6 +45,7 @@ from pipeline.preprocessing.reference_scale import (
     check_intervals,
     check_scale_of_motion,
     check_scale_of_turn,
+    doubt_of_angle,
     doubt_of_scale,
 )
 from pipeline.records import Note
@@ -185,9 +186,8 @@ def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> 
     if phase is not None and recording.table_angle is not None:
         channels.append(of_gravity(recording, phase, channels))
     notes, delay = _compare(recording, channels, limits)
-    doubt = doubt_of_scale(recording, limits)
-    if doubt is not None:
-        ends = float(recording.time[0]), float(recording.time[-1])
+    ends = float(recording.time[0]), float(recording.time[-1])
+    for doubt in filter(None, (doubt_of_scale(recording, limits), doubt_of_angle(recording, limits))):
         notes.append(Note("N-REFERENCE", recording.samples, 0, 0, doubt, *ends))
     return notes, delay
 

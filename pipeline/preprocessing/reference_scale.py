@@ -15,6 +15,14 @@ the weighted median of their ratios. Gravity tells which of two that differ is w
 
 A gyroscope that is wrong alone is a matter of its scale factor. Biases of the accelerometer distort phi twice a turn at
 most, by some degrees.
+
+An encoder with a wrong number of counts a turn, or a gear of another ratio, gives angle and rate the same small error
+``s - 1``. No unit does that, and the gyroscope agrees with it; gravity does not:
+
+    f_k = c_k + A_k cos(s a) + B_k sin(s a) + r_k
+
+with table angle a, both axes k across the turn axis, one s for both, and in r what else depends on the motion: harmonics
+up to the third, what a delay (rate times the first harmonic) and a lever arm add, a drift.
 """
 
 from __future__ import annotations
@@ -74,6 +82,8 @@ ALIKE_SAMPLES = 64.0  # neighbours whose residuals go together, by which the var
 SIGNIFICANT = 6.0  # standard uncertainties, as in pipeline.signal.rests
 QUARTZ = 2e-4  # relative: two quartz clocks of +-100 ppm each
 CURVED_PHASE = 1e-2  # relative: clocks without quartz, and what lever arms leave of gravity's phase
+SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, what nonlinearities of an accelerometer leave of gravity's direction
+FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, ROUNDS = 200, 24, 4  # samples; blocks of a sandwich estimate; Gauss-Newton steps
 ALIKE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
 
 
@@ -170,6 +180,50 @@ def check_scale_of_motion(recording: Recording, size: Values | None, limits: Lim
         f"{limits.column(recording, 'table_rate')} and the gyroscope say",
         "is it the attitude of this recording, and is the time in s?",
     )
+
+
+def doubt_of_angle(recording: Recording, limits: Limits) -> str | None:
+    """Return a sentence where a turn's angle is not exactly as large as gravity's: an encoder's counts, a gear."""
+    found = _gear(recording)
+    if found is None:
+        return None
+    ratio, spread = found
+    assert recording.table_angle is not None  # noqa: S101
+    allowed = limits.rate_stated + limits.angle_stated_deg / float(np.ptp(recording.table_angle)) + SAME_ANGLE
+    if abs(ratio - 1.0) <= allowed + SIGNIFICANT * spread:
+        return None
+    return (
+        f"{limits.column(recording, 'table_angle')} turns {ratio:.6g} times as far as gravity does in the readings "
+        f"(standard uncertainty {spread:.2g}; the stated accuracy allows {allowed:.2g}): are the encoder's counts a "
+        "turn and the gear's ratio right? The matrix of the gyroscope is wrong by as much"
+    )
+
+
+def _gear(recording: Recording) -> tuple[float, float] | None:
+    """Return how many times as far the angle turns as gravity, and its standard uncertainty."""
+    angle, rate, force = recording.table_angle, recording.logged_rate, recording.accelerometer
+    if angle is None or rate is None or force is None or gravity_turned(recording) is None:
+        return None
+    keep = recording.valid
+    if np.count_nonzero(keep) < FEWEST_OF_A_GEAR or float(np.ptp(angle[keep])) < WHOLE_TURN_DEG:
+        return None
+    axis, w, t = axis_index(recording), np.radians(rate[keep]), recording.time[keep]
+    y = force[keep][:, [(axis + 1) % 3, (axis + 2) % 3]]
+    a = logged = np.radians(angle[keep] - float(np.mean(angle[keep])))
+    slope = np.gradient(w, t)
+    for _ in range(ROUNDS):
+        c, s = np.cos(a), np.sin(a)
+        columns = [np.ones_like(a), c, s, w * c, w * s, w * w, slope, t - t[0]]
+        columns += [f(k * a) for k in (2, 3) for f in (np.cos, np.sin)]
+        Q = np.linalg.qr(np.column_stack(columns))[0]
+        first = np.linalg.lstsq(np.column_stack(columns[:3]), y, rcond=None)[0]
+        d = a[:, None] * (np.outer(c, first[2]) - np.outer(s, first[1]))
+        d, e = d - Q @ (Q.T @ d), y - Q @ (Q.T @ y)
+        information = float(np.sum(d * d))
+        a = a * (1.0 + float(np.sum(d * e)) / information)
+    starts = np.linspace(0, len(t), BLOCKS_OF_A_GEAR, endpoint=False).astype(int)
+    scores = np.add.reduceat(np.sum(d * e, axis=1), starts)
+    return float(logged @ logged / (a @ logged)), float(np.linalg.norm(scores)) / information
 
 
 def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:

@@ -1,9 +1,10 @@
 """The table's rate where its log holds the angle alone, by the table's own clock where it has one.
 
-A fine angle is differentiated: by a cubic spline, or by central differences where it bends between two samples. An
-encoder of the resolution q hides a rate below the noise of that: then the angle A is smoothed,
+A fine angle is differentiated: by a cubic spline, or by central differences where it bends between two samples. Errors
+of the angle that are independent from sample to sample hide the rate: the resolution q of an encoder, its noise, or time
+stamps that scatter by s about the times of the samples while the table turns at w. Then the angle A is smoothed,
 
-    minimize  sum (y_i - A_i)^2 / R + sum (D^k A)_i^2 h / S,    R = q^2 / 12,
+    minimize  sum (y_i - A_i)^2 / R + sum (D^k A)_i^2 h / S,    R = q^2 / 12, or the variance that the log shows, (w s)^2
 
 where D^k is the k-th divided difference over times h apart. S is the density of a random acceleration (k = 2), jerk (3)
 or derivative of the jerk (4); k and S maximize the likelihood of the log. The covariance of A is
@@ -36,6 +37,8 @@ ORDERS = (2, 3, 4)  # a motor that ripples, a program of constant accelerations,
 EDGE = 5  # samples of rest at both ends of a motion, which say that it begins and ends at zero
 FEWEST_MOVED = 100  # changes of the angle: their autocorrelation is known to 0.1
 ROUNDED = -0.35  # autocorrelation, half way between that of rounding errors and that of ramps
+BEYOND = 1.5  # times the errors of rounding, above which errors are not rounding alone
+MOST, LEFT = 0.95, 0.759  # of the second differences, without the corners of ramps; their share of a normal variance
 AROUND = 9  # second differences over which an acceleration is taken as constant
 FEWEST = 6  # samples from which a rate and its derivative follow
 STEADY, MOSTLY = 0.05, 0.5  # of the median rate, within which a rate is steady; share of a motion that then judges it
@@ -65,9 +68,9 @@ def rate_by_angle(recording: Recording) -> EncoderRate | None:
 
 
 def _rate_of(time: Values, angle: Values) -> EncoderRate:
-    step = _resolution(angle)
-    if step / np.sqrt(6.0) > VAGUE_DPS * 2.0 * float(np.median(np.diff(time))):
-        return _smoothed(time, angle, step)
+    step, error = _errors(time, angle)
+    if np.sqrt(2.0) * error > VAGUE_DPS * 2.0 * float(np.median(np.diff(time))):
+        return _smoothed(time, angle, step, error)
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed without a rate log alone)
 
     spline, central = make_interp_spline(time, angle, k=3)(time, 1), np.gradient(angle, time)
@@ -79,38 +82,45 @@ def _rate_of(time: Values, angle: Values) -> EncoderRate:
     return EncoderRate(angle, np.where(bent | resting, central, spline), np.zeros(len(time)), vague)
 
 
-def _resolution(angle: Values) -> float:
-    """Return the step of an encoder whose rounding hides the rate, deg; else 0.
+def _errors(time: Values, angle: Values) -> tuple[float, float]:
+    """Return the step of an encoder whose rounding hides the rate, deg, else 0, and the angle's independent errors.
 
-    All changes are multiples of the step, and the second differences of a moving angle are those of rounding errors:
-    their autocorrelation at lag 1 is -2/3, where that of a program's ramps is positive. Their mean over neighbours, the
-    acceleration, is taken off.
+    The second differences of a moving angle are then those of independent errors: their autocorrelation at lag 1 is
+    -2/3, where that of a program's ramps is positive. Their mean over neighbours, the acceleration, is taken off.
+    Errors are rounding where all changes are multiples of a step and the second differences are not larger.
     """
     rounding = 1e-9 * max(float(np.abs(angle).max()), 1.0)
-    changes = np.abs(np.diff(angle))
+    changes, intervals = np.abs(np.diff(angle)), np.diff(time)
     if np.count_nonzero(changes > rounding) < FEWEST_MOVED:
-        return 0.0
-    apart = np.diff(np.unique(changes), prepend=0.0)
-    step = float(np.min(apart[apart > rounding]))
-    multiples = changes / step
-    if float(np.abs(multiples - np.rint(multiples)).max()) > WHOLE * max(1.0, float(multiples.max())):
-        return 0.0
-    bent = np.diff(angle, 2)
+        return 0.0, 0.0
+    usual = float(np.median(intervals))
+    apart = intervals > GAP * usual
+    bent = np.where(apart[1:] | apart[:-1], 0.0, np.diff(np.diff(angle) / intervals) * usual)
     bent -= np.convolve(bent, np.full(AROUND, 1.0 / AROUND), "same")
     power = float(bent @ bent)
-    return step if power > 0.0 and float(bent[1:] @ bent[:-1]) < ROUNDED * power else 0.0
+    if not (power > 0.0 and float(bent[1:] @ bent[:-1]) < ROUNDED * power):
+        return 0.0, 0.0
+    moving = (changes[1:] > rounding) & (changes[:-1] > rounding)
+    squares = np.sort(bent[moving] ** 2)[: max(int(MOST * np.count_nonzero(moving)), 1)]
+    error = float(np.sqrt(np.mean(squares) / (6.0 * LEFT))) if moving.any() else 0.0
+    distinct = np.diff(np.unique(changes), prepend=0.0)
+    step = float(np.min(distinct[distinct > rounding]))
+    multiples = changes / step
+    whole = float(np.abs(multiples - np.rint(multiples)).max()) <= WHOLE * max(1.0, float(multiples.max()))
+    return (step, step / np.sqrt(12.0)) if whole and error <= BEYOND * step / np.sqrt(12.0) else (0.0, error)
 
 
-def _smoothed(time: Values, angle: Values, step: float) -> EncoderRate:
-    """Return the smoothed log of a coarse encoder, stretch by stretch between rests: each has a motion of its own.
+def _smoothed(time: Values, angle: Values, step: float, error: float) -> EncoderRate:
+    """Return the smoothed log of an angle with errors, stretch by stretch between rests: each has a motion of its own.
 
-    The table rests where the angle stays the same for longer than a step takes at the rate that counts as rest.
+    The table rests where the angle stays the same for longer than a step takes at the rate that counts as rest, and
+    without a step for some samples. Each stretch then has errors of its own.
     """
-    n = len(time)
+    n, interval = len(time), float(np.median(np.diff(time)))
     smooth, rate, noise = angle.copy(), np.zeros(n), np.zeros(n)
     starts = np.flatnonzero(np.diff(angle, prepend=np.nan) != 0.0)
     lengths = np.diff(np.append(starts, n))
-    lasts = time[starts + lengths - 1] - time[starts] > step / RATE_AT_REST_DPS
+    lasts = time[starts + lengths - 1] - time[starts] > (step / RATE_AT_REST_DPS or EDGE * interval)
     moving = ~np.repeat(lasts, lengths)
     apart = np.flatnonzero(np.diff(time) > GAP * float(np.median(np.diff(time)))) + 1  # each begins behind a gap
     vague = np.zeros(n, bool)
@@ -120,15 +130,15 @@ def _smoothed(time: Values, angle: Values, step: float) -> EncoderRate:
         vague[first : first + EDGE * before] = vague[max(last - EDGE * after, first) : last] = before or after
         part, own = slice(first - around.start, last - around.start), slice(first, last)
         if around.stop - around.start <= 2 * EDGE:
-            rate[own], noise[own] = np.gradient(angle[around], time[around])[part], step / np.sqrt(6.0)
-            noise[own] /= 2.0 * float(np.median(np.diff(time)))
+            rate[own], noise[own] = np.gradient(angle[around], time[around])[part], np.sqrt(0.5) * error / interval
             continue
-        found, error = _stretch(time[around], angle[around], step)
+        size = error if step else (_errors(time[around], angle[around])[1] or error)
+        found, spread = _stretch(time[around], angle[around], size)
         slope = np.gradient(found, time[around])
         start, stop = _steady(slope)
         if stop - start >= MOSTLY * len(slope):
-            error = max(error, _stretch(time[around][start:stop], angle[around][start:stop], step)[1])
-        smooth[own], noise[own], rate[own] = found[part], error, slope[part]
+            spread = max(spread, _stretch(time[around][start:stop], angle[around][start:stop], size)[1])
+        smooth[own], noise[own], rate[own] = found[part], spread, slope[part]
     return EncoderRate(smooth, rate, noise, vague)
 
 
@@ -145,13 +155,13 @@ def _split(spans: list[tuple[int, int]], at: list[int]) -> list[tuple[int, int]]
     return [pair for cut in ends for pair in itertools.pairwise(cut)]
 
 
-def _stretch(time: Values, angle: Values, step: float) -> tuple[Values, float]:
+def _stretch(time: Values, angle: Values, error: float) -> tuple[Values, float]:
     """Return the smoothed angle of one motion, and the standard deviation of its central differences, deg/s."""
     from scipy.linalg import cho_solve_banded  # noqa: PLC0415  (needed for a coarse encoder alone)
     from scipy.optimize import minimize_scalar  # noqa: PLC0415
 
     start = angle[0]
-    smoothers = [_Smoother(time, angle - start, step**2 / 12.0, order) for order in ORDERS]
+    smoothers = [_Smoother(time, angle - start, error**2, order) for order in ORDERS]
     low, high = np.log(DENSITIES)
     fits = [minimize_scalar(s.loss, bounds=(low, high), method="bounded", options={"xatol": 0.1}) for s in smoothers]
     best = int(np.argmin([fit.fun for fit in fits]))

@@ -196,6 +196,11 @@ def cases() -> dict[str, Case]:
         "49 angle": Case(at("", of(angle, times(RADIAN))), scale, "table_angle_deg looks like rad declared as deg"),
         "49 angle alone": Case(at("", without(rate, of(angle, times(2.0)))), scale, "table_angle_deg is twice"),
         "49 rate by 2 %": Case(at("", of(rate, times(1.02))), note="table_rate_dps is 1.02 times", file="gyro_x.csv"),
+        "49 angle and rate by 0.5 %": Case(
+            at("gyro_x", both(of(rate, times(1.005)), of(angle, times(1.005)))),
+            note="table_angle_deg turns 1.005",
+            file="gyro_x.csv",
+        ),
         "50 ms": Case(at("", clock(1000)), "reference_time", "time_s looks like ms declared as s", "accel_x.csv"),
         "50 us of an angle": Case(at("", without(rate, clock(10**6))), "reference_time", "looks like us"),
         "50 ms of the rest": Case(

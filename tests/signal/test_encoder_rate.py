@@ -1,6 +1,7 @@
 """The rate by an encoder of coarse steps: right within the noise that it states, and only where the steps hide it."""
 
 import numpy as np
+import pytest
 from scipy.integrate import cumulative_trapezoid
 
 from pipeline.records import Recording
@@ -82,3 +83,21 @@ def test_the_samples_beside_a_gap_are_vague() -> None:
     assert not rate.vague[:1490].any()
     assert not rate.vague[1510:].any()
     assert np.abs(rate.rate - np.delete(true, np.arange(1500, 1560)))[~rate.vague][20:-20].max() < 0.2
+
+
+@pytest.mark.parametrize("stamps", ["scatter", "rounded", "true"])
+def test_time_stamps_off_the_samples_do_not_change_the_scale_of_the_rate(stamps: str) -> None:
+    rng = np.random.default_rng(6)
+    fine = np.arange(0.0, 60.0, 1e-3)
+    true = np.interp(fine, [0, 10, 10.6, 22, 22.6, 30, 31.2, 43, 44.2, 60], [0, 0, 120, 120, 0, 0, -60, -60, 0, 0])
+    angle = cumulative_trapezoid(true, fine, initial=0.0)
+    sampled = np.arange(1.0, 59.0, 1.0 / 181.0)
+    shown = {"scatter": sampled + 3e-4 * rng.normal(size=len(sampled)), "rounded": np.round(sampled, 3), "true": sampled}
+    time_ns = np.round(1e9 * shown[stamps]).astype(np.int64)
+    rate = rate_by_angle(Recording("turn", "gyroscope", "x", time_ns, table_angle=np.interp(sampled, fine, angle)))
+    assert rate is not None
+    known = ~rate.vague
+    reading = np.interp(sampled, fine, true)
+    assert np.count_nonzero(known & (np.abs(reading) > 50.0)) > 0.9 * np.count_nonzero(np.abs(reading) > 50.0)
+    assert np.polyfit(rate.rate[known], reading[known], 1)[0] == pytest.approx(1.0, abs=2e-4)
+    assert rate.noise.any() == (stamps != "true")
