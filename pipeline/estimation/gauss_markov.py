@@ -108,7 +108,7 @@ def selection_grid(
     A static recording pins them: its ratio, its half, double and fourfold with a log-normal weight, and random walks
     that look alike over the recording and keep growing after it. Otherwise they span the sensors of the field.
     """
-    pinned = noise is not None and noise.source == "static" and not _fast(noise)
+    pinned = noise is not None and noise.source == "static" and not fast(noise)
     if noise is not None and pinned and np.any(noise.wander > 0) and np.all(noise.white > 0):
         known = float(np.sqrt(np.mean((noise.wander / noise.white) ** 2)))
         factors = np.array([0.5, 1.0, 2.0, 4.0])
@@ -132,7 +132,7 @@ def random_walks(settings: Sequence[Setting]) -> list[Setting]:
     return [Setting(s.ratio * WALK_RATIO, s.time * WALK_TIME, s.prior + share) for s in found.values()]
 
 
-def _fast(noise: Noise | None) -> bool:
+def fast(noise: Noise | None) -> bool:
     """Return whether a static recording shows noise correlated over seconds: it then counts as fewer samples."""
     return noise is not None and noise.source == "static" and noise.correlation_time < FAST_S
 
@@ -142,7 +142,7 @@ def information(noise: Noise | None, interval: float) -> float:
 
     ``interval``: s, dt.
     """
-    if noise is None or not _fast(noise) or not np.all(noise.white > 0):
+    if noise is None or not fast(noise) or not np.all(noise.white > 0):
         return 1.0
     ratio = float(np.mean((noise.wander / noise.white) ** 2))
     return 1.0 / (1.0 + 2.0 * ratio * noise.correlation_time / interval)

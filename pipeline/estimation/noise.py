@@ -53,6 +53,7 @@ from pipeline.estimation.gauss_markov import (
     GaussMarkov,
     Prior,
     Setting,
+    fast,
     orthonormal,
     variance_of_average,
 )
@@ -122,6 +123,9 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
     uncertainty ``sqrt(tau / T)``. Where that is below ``SHARPEST_WIDTH``, the likelihood counts as that of a shorter
     rest: no sensor is a Gauss-Markov process that well. Above the likeliest wander, the likelihood is at least
     ``exp(-FARTHEST**2)`` of its maximum: the residuals of turns can show more wander than the rest (lack of fit).
+    Noise that is correlated over seconds (a filter in the sensor, values held between samples, chance in a short rest)
+    says nothing of a slow wander, and counts as white noise in the means of the blocks of a fit: then the prior is that
+    of the data sheet.
 
     ``settings``: section ``sensor``.
     """
@@ -133,7 +137,7 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
 def static_or_sheet(noise: Noise | None, sheet: Mapping[str, Any]) -> Prior:
     """Return the prior by the data sheet, and by a noise that a static recording tells (``prior_of``)."""
     stated = Prior(float(sheet.get("bias_wander") or 0.0), _wander_time(sheet))
-    if noise is None or noise.source != "static" or noise.seen is None:
+    if noise is None or noise.source != "static" or noise.seen is None or fast(noise):
         return stated
     width = np.sqrt(noise.correlation_time / noise.length)
     seen = noise.seen * min(1.0, float(width / SHARPEST_WIDTH) ** 2)
