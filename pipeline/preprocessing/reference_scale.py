@@ -21,8 +21,8 @@ An encoder with a wrong number of counts a turn, or a gear of another ratio, giv
 
     f_k = c_k + A_k cos(s a) + B_k sin(s a) + r_k
 
-with table angle a, both axes k across the turn axis, one s for both, and in r what else depends on the motion: harmonics
-up to the third, what a delay (rate times the first harmonic) and a lever arm add, a drift.
+with table angle a, both axes k across the turn axis, one s for both, and in r what else depends on the motion:
+harmonics up to the third, what a delay (rate times the first harmonic) and a lever arm add, a drift.
 """
 
 from __future__ import annotations

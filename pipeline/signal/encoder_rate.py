@@ -1,10 +1,10 @@
 """The table's rate where its log holds the angle alone, by the table's own clock where it has one.
 
 A fine angle is differentiated: by a cubic spline, or by central differences where it bends between two samples. Errors
-of the angle that are independent from sample to sample hide the rate: the resolution q of an encoder, its noise, or time
-stamps that scatter by s about the times of the samples while the table turns at w. Then the angle A is smoothed,
+of the angle that are independent from sample to sample hide the rate: the resolution q of an encoder, its noise, or
+time stamps that scatter about the times of the samples. Then the angle A is smoothed,
 
-    minimize  sum (y_i - A_i)^2 / R + sum (D^k A)_i^2 h / S,    R = q^2 / 12, or the variance that the log shows, (w s)^2
+    minimize  sum (y_i - A_i)^2 / R + sum (D^k A)_i^2 h / S,    R = q^2 / 12, or the variance that the log shows,
 
 where D^k is the k-th divided difference over times h apart. S is the density of a random acceleration (k = 2), jerk (3)
 or derivative of the jerk (4); k and S maximize the likelihood of the log. The covariance of A is

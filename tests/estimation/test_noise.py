@@ -19,8 +19,10 @@ from pipeline.estimation.gauss_markov import (
 )
 from pipeline.estimation.noise import estimate_noise, static_or_sheet
 from pipeline.estimation.noise_terms import allan_deviation
+from pipeline.estimation.reference_least_squares import fit
 from pipeline.records import Recording
 from pipeline.signal.filters import apply_filter, filter_autocovariance
+from pipeline.study.run import settings_of
 
 SHEET = {"noise_density": 4e-4, "bias_wander": 1e-4, "wander_time_s": 100.0}
 NO_WANDER = {"noise_density": 4e-4, "bias_wander": 0.0, "wander_time_s": 100.0}
@@ -90,6 +92,18 @@ def test_hypotheses_of_a_static_recording_predict_the_scatter_of_an_average() ->
 
 def scatter_of_average(wander: float, tau: float, length: float) -> float:
     return float(np.sqrt(WHITE**2 * DT / length + wander**2 * variance_of_average(np.array(length), tau)))
+
+
+def test_values_held_between_samples_do_not_hide_a_slow_wander_from_the_stated_uncertainty() -> None:
+    session = bench_session.Session(seed=3, static=True, interval=0.04)
+    sampled = [r for r in bench_session.record(session) if r.role != "validation"]
+    held = [replace(r, accelerometer=r.accelerometer[np.arange(r.samples) // 5 * 5]) for r in sampled]
+    assert estimate_noise("accelerometer", held, SHEET).correlation_time < 25.0
+    stated = [
+        np.array(fit("accelerometer", of_unit, None, settings_of("mpu6050")).to_json()["expanded_uncertainty"]["bias"])
+        for of_unit in (sampled, held)
+    ]
+    assert np.all(stated[1] > 0.7 * stated[0])
 
 
 def test_no_wander_is_invented_in_white_noise() -> None:

@@ -92,7 +92,11 @@ def test_time_stamps_off_the_samples_do_not_change_the_scale_of_the_rate(stamps:
     true = np.interp(fine, [0, 10, 10.6, 22, 22.6, 30, 31.2, 43, 44.2, 60], [0, 0, 120, 120, 0, 0, -60, -60, 0, 0])
     angle = cumulative_trapezoid(true, fine, initial=0.0)
     sampled = np.arange(1.0, 59.0, 1.0 / 181.0)
-    shown = {"scatter": sampled + 3e-4 * rng.normal(size=len(sampled)), "rounded": np.round(sampled, 3), "true": sampled}
+    shown = {
+        "scatter": sampled + 3e-4 * rng.normal(size=len(sampled)),
+        "rounded": np.round(sampled, 3),
+        "true": sampled,
+    }
     time_ns = np.round(1e9 * shown[stamps]).astype(np.int64)
     rate = rate_by_angle(Recording("turn", "gyroscope", "x", time_ns, table_angle=np.interp(sampled, fine, angle)))
     assert rate is not None
