@@ -75,7 +75,7 @@ class MissingInputError(InputError):
 
 
 class DamagedFileError(InputError):
-    """A file that an earlier stage of a run wrote is damaged or missing: the same command makes it again."""
+    """A file that an earlier stage of a run wrote is damaged or missing; the same command writes it anew."""
 
     code = "damaged_file"
 
@@ -105,5 +105,5 @@ class CannotCalibrateError(PipelineError):
 
 
 def first(names: Sequence[str], most: int, of: str = "") -> list[str]:
-    """Return the first ``most`` names or lines of a message, and in place of the others how many they are."""
+    """Return the first ``most`` names or lines of a message, and instead of the others how many they are."""
     return [*names[:most], *([f"and {len(names) - most} more {of}".rstrip()] if len(names) > most else [])]

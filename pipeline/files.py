@@ -22,6 +22,7 @@ _PACKAGE = Path(__file__).resolve().parent
 INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"
+WRITE_AGAIN = "run the same command again: snakemake writes the file anew"
 _encoded = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
 _flushed_at_end: list[Path] = []  # folders whose files are flushed together
 
@@ -58,7 +59,7 @@ def read_json(path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> An
     try:
         return json.loads(read(path))
     except (OSError, ValueError) as error:
-        reason = f"cannot be read, it is missing or damaged ({error}); the same command once more makes it again"
+        reason = f"cannot be read, it is missing or damaged ({error}); {WRITE_AGAIN}"
         raise DamagedFileError(reason, str(path)) from None
 
 

@@ -19,7 +19,7 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
 from pipeline.errors import DamagedFileError
-from pipeline.files import json_text
+from pipeline.files import WRITE_AGAIN, json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -70,7 +70,7 @@ class Pack:
             zlib.error,
         ) as error:
             what = f"{name or 'it'} cannot be read, it is missing or damaged ({error})"
-            raise DamagedFileError(f"{what}; the same command once more makes it again", str(self.path)) from None
+            raise DamagedFileError(f"{what}; {WRITE_AGAIN}", str(self.path)) from None
 
 
 @contextmanager

@@ -11,7 +11,7 @@ where
 
 A job handles a batch of units and writes to its log which one it is at: ``stage: unit (3 of 50)``.
 
-The line stands in place of Snakemake's blocks for each job (``--printshellcmds`` and ``--verbose`` keep those, and
+The line stands instead of Snakemake's blocks for each job (``--printshellcmds`` and ``--verbose`` keep those, and
 Snakemake's log file always has them). On a terminal it is redrawn each second; elsewhere it is printed each half
 minute, with ``--quiet`` not at all.
 """

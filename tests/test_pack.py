@@ -44,7 +44,10 @@ def test_a_changed_byte_is_refused_or_changes_nothing(
             assert pack.read(name) == as_bytes(was)
         except DamagedFileError as error:
             said.append(str(error))
-    assert all(text.startswith(str(path)) and "the same command once more makes it again" in text for text in said)
+    assert all(
+        text.startswith(str(path)) and "run the same command again: snakemake writes the file anew" in text
+        for text in said
+    )
 
 
 @pytest.mark.parametrize("left", [0.0, 0.3, 0.99])

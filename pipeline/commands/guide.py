@@ -166,7 +166,7 @@ def _complete_rows(file: Path, folder: Path) -> Path:
 
 
 class Advice(NamedTuple):
-    """What to tell of the recordings so far."""
+    """Return the messages on the recordings so far."""
 
     enough: bool
     rests: list[str]  # a line each
@@ -269,7 +269,7 @@ def _follow(source: Source, goals: Goals, dwell: float) -> None:
 
 
 def _new(advice: Advice, told: Advice) -> bool:
-    """Return whether there is something to tell beside rests: of faces and turns."""
+    """Return whether there are messages on faces and turns, beside those on rests."""
     return not advice.rests and advice.words != told.words
 
 

@@ -39,8 +39,9 @@ examples:
   python -m pipeline simulate /tmp/table --effect table_tilt=0.2 --both-directions --rate 20 60 100
   python -m pipeline simulate data/demo
 
-An effect is hidden in one sensor (accelerometer.NAME) or in both (NAME). Without a size it has the typical size of the
-sensor's configuration with random signs; one number is the size; several numbers are the values of its parameters.
+An effect is hidden in one sensor (accelerometer.NAME) or in both (NAME). Without a size, each parameter is half of its
+limit in the sensor file (or typical_share of the effect) times 0.7 to 1.3, with random signs. One number is the size of
+every parameter, with random signs; several numbers are the values of the parameters.
 NAME may be an effect of your own, DIR/effects/NAME.yaml (docs/effects_of_your_own.md).
 In simulation.yaml a unit may also have a formula that is no effect of the campaign, to test the diagnosis:
   effects: {gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: 0.03}}

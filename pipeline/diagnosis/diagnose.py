@@ -146,7 +146,7 @@ def evidence_of(
             return None
         try:
             error = last_error(fit(), recordings, case.noise, settings, other=found.other, smoothed=smoothed)
-        except ConvergenceError:  # the fit's effects cannot be taken off the held-out readings
+        except ConvergenceError:  # the fit's effects cannot be subtracted from the held-out readings
             return None
         return None if error is None else HeldOut(error[0], *error[1])
 

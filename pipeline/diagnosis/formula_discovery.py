@@ -1,7 +1,7 @@
 """The formula of physics that the catalogue does not hold, judged against catalogue and recordings, as an effect file.
 
 The search (``pipeline.diagnosis.functional_form_search``) is made in addition to the selected effects, and again
-without them, since they may have been selected in place of the form. With each form in the base, effects are selected
+without them, since they may have been selected instead of the form. With each form in the base, effects are selected
 again. Of these models, and that of the catalogue alone, the one with the least
 
     -2 log L + k log N + 2 C log 10
@@ -110,7 +110,7 @@ def discover(
 
 
 def _worth(selection: Selection, terms: Sequence[Scored]) -> float:
-    """Return 2 log L less the price of all parameters and of the formula."""
+    """Return 2 log L minus the price of all parameters and of the formula."""
     fitted = sum(len(term.values) for term in selection.fit.terms) + sum(term.form.scanned for term in terms)
     price = PRICE * sum(term.form.complexity for term in terms)
     return 2.0 * selection.fit.log_likelihood - fitted * float(np.log(3.0 * selection.observations.samples)) - price

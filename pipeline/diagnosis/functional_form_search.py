@@ -45,14 +45,14 @@ PROBED = 200  # rows at which two forms that are equal to 1e-9 are one
 
 @dataclass(frozen=True)
 class Scored:
-    """A form, what it gains, and that less the price of its complexity."""
+    """A form, what it gains, and that minus the price of its complexity."""
 
     form: Form
     gain: Gain
 
     @property
     def score(self) -> float:
-        """Delta BIC less the price of the form's complexity."""
+        """Delta BIC minus the price of the form's complexity."""
         return self.gain.delta_bic - PRICE * self.form.complexity
 
     @property

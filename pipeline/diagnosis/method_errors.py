@@ -191,7 +191,7 @@ class _Difference:
         return {"bias": np.broadcast_to(self.bias, u.shape), **of_matrix, "two_sided": two_sided}
 
     def _of_effects(self, motion: Motion) -> Values:
-        """Return what the method's effects add at the free fit's values, less what they add at the method's."""
+        """Return what the method's effects add at the free fit's values, minus what they add at the method's."""
         added = np.zeros((len(motion.time), 3))
         assert self.free is not None  # noqa: S101  (on a table)
         fitted = {term.effect.name: term.values for term in self.free.terms}

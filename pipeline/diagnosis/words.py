@@ -231,7 +231,7 @@ def _how_sure(part: Mapping[str, Any]) -> list[str]:
             head = IN_DOUBT if part["verdict"] in ("unexplained", "reference_in_doubt") else ANSWERS
             lines.append(f"{head}: {answers}.")
     if part.get("to_distinguish"):
-        lines.append(f"These recordings cannot distinguish them; this one would: {part['to_distinguish']}.")
+        lines.append(f"To distinguish {part['to_distinguish']}.")
     if part.get("upper_limit"):
         each = []
         for name, limits in part["upper_limit"].items():
@@ -251,15 +251,16 @@ def _answer(effects: Sequence[str]) -> str:
 
 
 def to_distinguish(sets: Sequence[Mapping[str, Any]], sensor: str, *, on_table: bool) -> str:
-    """Return the experiment that would distinguish the two most probable answers; empty where there is one."""
+    """Return the two most probable answers, and the experiment that distinguishes them; empty where there is one."""
     if len(sets) < 2:
         return ""
     first, second = (each["effects"] for each in sets[:2])
-    apart = [name for name in first if name not in second] or [name for name in second if name not in first]
-    if apart[0].startswith(OTHER):
+    answers = " from ".join(f"{_answer(each['effects'])} ({each['probability']:.2g})" for each in sets[:2])
+    different = [name for name in first if name not in second] or [name for name in second if name not in first]
+    if different[0].startswith(OTHER):
         own = "specific_force" if sensor == "accelerometer" else "rate"
-        return UNKNOWN[apart[0].removeprefix(OTHER).replace("input", own)]
-    return _experiment(apart[0], on_table=on_table)
+        return f"{answers}: {UNKNOWN[different[0].removeprefix(OTHER).replace('input', own)]}"
+    return f"{answers}: {_experiment(different[0], on_table=on_table)}"
 
 
 def _experiment(name: str, *, on_table: bool) -> str:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
     from pipeline.records import Motion, Recording, SensorCalibration, Values
 
-AUTO = "auto"  # in place of a list of effects: what the diagnosis selects
+AUTO = "auto"  # instead of a list of effects: what the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
 TILTS = ("d_x", "d_y")  # parameters of ``table_tilt``
 HELD_DEG = 1e-4  # standard deviation of a tilt that is held at 0: a hundredth of a good encoder's accuracy
@@ -241,8 +241,8 @@ def limits_or_noise(limits: Values | None, products: Values, samples: float) -> 
 def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
     """Return the change of columns to those of parameters over their limits, in the directions that are excited.
 
-    ``products``: (k, k), less the base. ``size``: (k,), norm of the columns with it. ``least``: share of it that must
-    be left.
+    ``products``: (k, k), with the base projected out. ``size``: (k,), norm of the columns with it. ``least``: share of
+    it that must be left.
     """
     values, vectors = np.linalg.eigh(products / np.outer(size, size))
     kept = vectors[:, values > least**2]
@@ -260,9 +260,9 @@ def over_limits(
 ) -> tuple[Values, dict[str, Values]]:
     """Return the products of columns of parameters over their limits, (t, p + 1, p + 1), and the limits.
 
-    ``places``: effect and columns, more than once for an effect of several versions. ``products``: less the base,
-    readings last, the first white noise. ``limits``: by the data sheet. ``size, samples, least``: of ``excited,
-    limits_or_noise``.
+    ``places``: effect and columns, more than once for an effect of several versions. ``products``: with the base
+    projected out, readings last, the first white noise. ``limits``: by the data sheet. ``size, samples, least``: of
+    ``excited, limits_or_noise``.
     """
     found: dict[str, Values] = {}
     changed = products.copy()

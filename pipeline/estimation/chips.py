@@ -217,7 +217,7 @@ def _errors(  # noqa: PLR0917  (what acts on the fits)
         found.append(Error("weak priors", "B", np.inf, pulled @ np.diag(weak) @ pulled.T, put, none))
 
     def response(of: str, E: Values, who: Sequence[int]) -> Values:
-        """Return what ``u + E u`` in place of the truths u of a sensor, in the axes of the reference, does."""
+        """Return what ``u + E u`` instead of the truths u of a sensor, in the axes of the reference, does."""
         return np.concatenate(
             [fit.map.of(_change(fit, of, E, R, signals, clear, who))[k] for fit, k in zip(fits, kept, strict=True)]
         )

@@ -163,7 +163,7 @@ class Design:
     """Products of base, terms and readings under noise settings.
 
     ``scale``: (3,). ``target``: (n, 3), what is to be explained; None: the readings. ``project``: take the base out of
-    the other columns first, so that products keep their digits. ``base``: (n, 3), regressors of K in place of the
+    the other columns first, so that products keep their digits. ``base``: (n, 3), regressors of K instead of the
     truth.
     """
 

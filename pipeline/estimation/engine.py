@@ -286,7 +286,7 @@ def assess_noise(
     spare = len(count) - design.shape[1]
     if spare < 1:
         raise NotObservableError(
-            f"{len(count)} samples determine {design.shape[1]} parameters and leave none to tell the noise by: "
+            f"{len(count)} samples determine {design.shape[1]} parameters and leave none to determine the noise: "
             "record more samples"
         )
     size = np.sqrt(np.mean(design**2, axis=0))

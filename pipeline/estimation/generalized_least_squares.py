@@ -6,7 +6,7 @@
 where
 
     u  : truth by the table, at the time t' that effects of timing lead to
-    J  : derivative of the model with respect to beta; r: readings less the model
+    J  : derivative of the model with respect to beta; r: readings minus the model
     C  : white noise plus a Gauss-Markov bias, ``pipeline.estimation.gauss_markov``
 
 Nearly everything is linear; time offsets, lags and time constants take a few Gauss-Newton rounds. The weights of the
@@ -27,7 +27,7 @@ from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, mo
 from pipeline.estimation.engine import AVERAGED_OUT, RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
-from pipeline.estimation.noise import static_or_sheet
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.observations import Observations, observe, weighted
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.uncertainty_budget import (
@@ -119,20 +119,20 @@ def _with_all_columns(start: Start, terms: Sequence[Term]) -> Start:
 
 
 def design_at(observations: Observations, at: Start) -> Design:
-    """Return the derivative of a model at some parameters, and its residual in place of the readings."""
+    """Return the derivative of a model at some parameters, and its residual instead of the readings."""
     residual, base = _residual(observations, at)
     scale = np.maximum(at.scale, 1e-300)
     return Design(observations, at.terms, at.K, scale, target=residual, base=base)
 
 
 def design_beside(observations: Observations, fit: Fit, terms: Sequence[Term]) -> Design:
-    """Return columns of further terms at a fit, its residual in place of the readings, and the base taken out."""
+    """Return columns of further terms at a fit, its residual instead of the readings, and the base taken out."""
     residual, base = _residual(observations, fit)
     return Design(observations, terms, fit.K, fit.scale, target=residual, base=base, project=True)
 
 
 def _residual(observations: Observations, at: Start) -> tuple[Values, Values]:
-    """Return the readings less the model, and what K acts on: the truth and the effects that the axes share."""
+    """Return the readings minus the model, and what K acts on: the truth and the effects that the axes share."""
     sensor, K = observations.sensor, at.K
     predicted, base = [], []
     for part in observations.parts:
@@ -362,7 +362,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     names = [term.effect.name for term in fit.terms]
     design = design_at(observations, fit)
     first = design.linear_map(fit.setting)
-    prior = static_or_sheet(noise, (settings.get("sensor") or {}).get(sensor) or {})
+    prior = wander_prior(noise, (settings.get("sensor") or {}).get(sensor) or {})
     whole = first.then(change)
     reference = Reference(sensor, [part.motion for part in observations.parts], whole, fit.K, settings["table"])
     errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))), reference)
@@ -393,7 +393,7 @@ def fit_in_mean_frame(fit: Fit) -> tuple[Fit, Values]:
 
 
 def with_matrix(values: Values) -> Values:
-    """Return (t, 12 + p) parameters with the matrix in place of K."""
+    """Return (t, 12 + p) parameters with the matrix instead of K."""
     K = values[:, 3:BASE].reshape(-1, 3, 3)
     matrix = np.linalg.solve(K, np.broadcast_to(np.eye(3), K.shape)).reshape(-1, 9)
     return np.concatenate([values[:, :3], matrix, values[:, BASE:]], axis=1)

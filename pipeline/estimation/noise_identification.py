@@ -148,7 +148,7 @@ def static_stretches(sensor: str, recording: Recording) -> list[Stretch]:
 
 def _rests(sensor: str, recording: Recording) -> list[Stretch]:
     """Return the rests of a recording that have ``SHORTEST`` samples."""
-    found = rest_readings(recording, sensor, everything=False)
+    found = rest_readings(recording, sensor, whole_recording=False)
     return [Stretch(time, reading) for time, reading in found if len(time) >= SHORTEST]
 
 

@@ -53,7 +53,7 @@ class Part:
     role: str
     motion: Motion
     reading: Values  # (m, 3), g or deg/s
-    # (m,); samples of each row, less what a filter's correlation takes from their information
+    # (m,); samples of each row, minus what a filter's correlation takes from their information
     weight: Values
     scatter: Values  # (3,); sum of squares about the means, weighted
     clock_shared: bool

@@ -93,7 +93,7 @@ class Search:
         return max(among or self.pool, key=lambda names: self.pool[names].score)
 
     def given(self, names: Set, but: Set = frozenset()) -> Given:
-        """Return the problem beside a set, less some of its members."""
+        """Return the problem beside a set without some of its members."""
         return Given(self.problem, [{n: pick for n, pick in self.pool[names].picks.items() if n not in but}])
 
     def _prune(self, seeds: Sequence[Set]) -> None:

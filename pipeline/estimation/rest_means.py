@@ -17,7 +17,7 @@ from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.turns import stop_and_go
 from pipeline.model.kinematics import table_motion
 from pipeline.signal.filters import filter_autocovariance, smooth_temperature, variance_of_mean
-from pipeline.signal.quiet_motion import believed_rates, creep_in
+from pipeline.signal.quiet_motion import creep_of_rest, posterior_creep_rates
 from pipeline.signal.rests import Rest, find_rests, rests_from_table, usable
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, An
             "duration_s": float(recording.time[rest.stop - 1] - recording.time[rest.start]),
             "creep_dps": 0.0  # where it does not stand out of the noise
             if recording.accelerometer is None
-            else float(np.linalg.norm(creep_in(recording, rest.start, rest.stop).rate)),
+            else float(np.linalg.norm(creep_of_rest(recording, rest.start, rest.stop).rate)),
             "reason": rest.reason,
         }
         for recording, rest in pairs
@@ -128,7 +128,7 @@ def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accel
     filled = counts > 0
     means[filled] = centre + sums[filled] / counts[filled, None]
     if sensor == "accelerometer" and recording.role in (ROLE, HELD_OUT) and recording.table_angle is None:
-        creeps = [creep_in(recording, rest.start, rest.stop) for rest in rests]
+        creeps = [creep_of_rest(recording, rest.start, rest.stop) for rest in rests]
         means *= 1.0 + np.array([creep.shortening for creep in creeps])[:, None]
     return means, counts
 
@@ -318,9 +318,11 @@ def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> d
     inside = [slice(a, b) for a, b in span]
     scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
     by_hand = recording.accelerometer is not None and recording.table_angle is None
-    creeps = [creep_in(recording, a, b) for a, b in span.tolist()] if by_hand else []
-    rate, error, about = believed_rates(creeps) if creeps else (np.zeros((len(span), 3)), np.zeros(len(span)), 0.0)
-    if sensor == "accelerometer" and by_hand:  # less the tilt of a unit that creeps
+    creeps = [creep_of_rest(recording, a, b) for a, b in span.tolist()] if by_hand else []
+    rate, error, about = (
+        posterior_creep_rates(creeps) if creeps else (np.zeros((len(span), 3)), np.zeros(len(span)), 0.0)
+    )
+    if sensor == "accelerometer" and by_hand:  # minus the tilt of a unit that creeps
         scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
     warmth = np.full(recording.samples, np.nan)
     if recording.temperature is not None:

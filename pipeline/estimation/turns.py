@@ -119,7 +119,7 @@ def settled(part: Part) -> Mask:
 
 
 def steady_turns(part: Part, memory: float) -> Mask:
-    """Return the samples in the steady parts of a turn about one axis, less a filter's memory of what was before.
+    """Return the samples in the steady parts of a turn about one axis, without a filter's memory of what was before.
 
     A turn that is shorter than the memory (s) keeps its middle: what the filter still lacks there is a small share of
     the turn, where the rest beside it would lack all.

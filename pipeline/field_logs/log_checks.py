@@ -241,7 +241,7 @@ class LogChecks:
         up = table["accelerometer"][at] / np.linalg.norm(table["accelerometer"][at], axis=1)[:, None]
         angle = np.degrees(np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0)))
         step = np.diff(table["time"], prepend=table["time"][0])
-        rate = table["gyroscope after"] - table["gyroscope after"][at].mean(axis=0)  # whatever is taken off as bias
+        rate = table["gyroscope after"] - table["gyroscope after"][at].mean(axis=0)  # whatever is subtracted as bias
         path = np.cumsum(np.linalg.norm(rate, axis=1) * np.clip(step, 0.0, None))[at]
         moved = angle > APART_DEG
         turned, integral = float(angle[moved].sum()), float(np.diff(path)[moved].sum())

@@ -93,7 +93,7 @@ class CsvLog:
             self.notes = [note.detail for note in log.notes]
 
     def write(self, block: Block, readings: Readings, _changed: set[str]) -> None:
-        """Write the block with calibrated numbers in place of the raw ones; missing ones stay as they were written."""
+        """Write the block with calibrated numbers instead of the raw ones; missing ones stay as they were written."""
         columns, quoted = block.content
         for sensor, values in readings.items():
             for k, i in enumerate(self.places[sensor]):

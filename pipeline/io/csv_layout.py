@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 NUMBER = re.compile(r"\s*[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?\s*")
 LISTED = 5  # lines named in a refusal
-LEAVE_A_GAP = "ingest.csv.bad_rows=drop leaves a gap in place of such rows"
+LEAVE_A_GAP = "ingest.csv.bad_rows=drop replaces such rows by a gap"
 PARTS = "if the logger was restarted, make each part a recording, by its key session (docs/troubleshooting.md)"
 HINTS = {
     "bad_row": LEAVE_A_GAP,
     "nul": LEAVE_A_GAP,
     "not_a_number": LEAVE_A_GAP,
-    "not_finite": "ingest.csv.nan=gap leaves a gap in place of such rows",
+    "not_finite": "ingest.csv.nan=gap replaces such rows by a gap",
     "decimal_comma": "set ingest.csv.decimal=',' and a delimiter that is none",
     "restarted": PARTS,
 }

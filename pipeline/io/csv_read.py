@@ -62,7 +62,7 @@ FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
 LONGEST_HEADER = 1 << 16  # bytes that are searched for the line of names
 LAST_VERSION = "1.3"
 LINES_BELOW, SEARCHED_BELOW = 60, 10_000  # lines, bytes after a header without the columns, searched for another
-LINES, EXACT = -1, -2  # in place of a column's index: numbers of the lines, times in ns
+LINES, EXACT = -1, -2  # instead of a column's index: numbers of the lines, times in ns
 MOST_REFUSED = 10_000  # bad lines after which the rest of the file is not searched for more
 
 

@@ -2,7 +2,7 @@
 
 A procedure names a recording's file without suffix; the first kind of file that exists is taken, in the order of
 ``SUFFIXES``. A name with a suffix is taken as it is. Where the ingest profile has ``parts`` (files of one
-logger, joined on time), these stand in place of the ``.csv``. Only regular files are opened: opening a FIFO would wait
+logger, joined on time), these stand instead of the ``.csv``. Only regular files are opened: opening a FIFO would wait
 forever.
 
 Only the standard library is imported here: the Snakefile asks for the files of thousands of units while it is parsed.

@@ -21,6 +21,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from pipeline.errors import DamagedFileError, InputError
+from pipeline.files import WRITE_AGAIN
 from pipeline.io.arrow import BLOCKS, SINGLES, columns_of, to_arrow, to_numpy
 from pipeline.io.units import CHANNELS
 from pipeline.records import Encoding, Note, Recording
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SCHEMA_VERSION = 2
-AGAIN = "the same command once more makes it again"
 ROW_GROUP = 1_000_000  # samples
 KEY, KEY_CRC = b"recordings", b"recordings_crc32"
 PLAIN = ("name", "role", "axis", "setup", "up", "sense", "source", "filter", "clock_shared")  # fields stored as JSON
@@ -137,7 +137,7 @@ class _StoredColumns:
 
     def damaged(self, reason: str) -> DamagedFileError:
         """Return the error of a damaged file."""
-        return DamagedFileError(f"the file is damaged: {reason}; {AGAIN}", self.path)
+        return DamagedFileError(f"the file is damaged: {reason}; {WRITE_AGAIN}", self.path)
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
@@ -146,7 +146,7 @@ class _StoredColumns:
             yield
         except Exception as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            what = f"cannot be read, it is missing or damaged ({reason}); {AGAIN}"
+            what = f"cannot be read, it is missing or damaged ({reason}); {WRITE_AGAIN}"
             raise DamagedFileError(what, self.path) from error
 
 
@@ -179,7 +179,7 @@ for _name, _channels in {**BLOCKS, **{name: (name,) for name in SINGLES}}.items(
 
 
 def _encode_counts(recordings: Sequence[Recording], stored: list[dict[str, NDArray[Any]]]) -> set[str]:
-    """Put counts in place of values in those columns that every recording can encode, and return their names."""
+    """Replace values by counts in those columns that every recording can encode, and return their names."""
     encoded = set()
     for channel in CHANNELS:
         holders = [(r, s) for r, s in zip(recordings, stored, strict=True) if channel in s]

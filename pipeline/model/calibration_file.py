@@ -257,7 +257,7 @@ FACTORS = {
     },
 }
 RANGES = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
-OF_BIAS = "an offset of raw counts that is not taken off, another column, or a damaged axis"
+OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
 OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
 OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
 

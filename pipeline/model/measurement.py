@@ -5,7 +5,7 @@
 
 The inverse is solved by fixed point, starting without the effects; each round gains about two digits, as effects are
 small. A sample that has settled is left alone, so that its result does not depend on the other samples. Only effects
-that belong to the sensor are taken off; those of a mounting, a table or one recording do not exist in another log. The
+that belong to the sensor are subtracted; those of a mounting, a table or one recording do not exist in another log. The
 two sensors are solved together: a gyroscope's g-sensitivity needs the specific force, an accelerometer's inner lever
 arms the angular rate.
 """
@@ -35,7 +35,7 @@ OUT_OF_REACH = 1e12  # g or deg/s: far beyond any reading, the fixed point runs 
 
 @dataclass(frozen=True)
 class Part:
-    """Effects with their values that are taken off the readings of a sensor, and K, the inverse of its matrix."""
+    """Effects with their values that are subtracted from the readings of a sensor, and K, the inverse of its matrix."""
 
     calibration: SensorCalibration
     effects: tuple[tuple[Effect, Values], ...]
@@ -43,7 +43,7 @@ class Part:
 
     @classmethod
     def of(cls, calibration: SensorCalibration, effects: Iterable[FittedEffect]) -> Self:
-        """Return the part that takes off the given effects of a calibration."""
+        """Return the part that subtracts the given effects of a calibration."""
         return cls(calibration, tuple((effect_of(e), e.values) for e in effects), inverse_of(calibration))
 
     def take_off(self, reading: Values, motion: Motion) -> Values:
@@ -73,7 +73,7 @@ def compensate(
 ) -> Values:
     """Return the truth by (n, 3) readings; the rest of the motion is known.
 
-    ``effects`` are taken off, by default all of the calibration that belong to the sensor. Errors as of ``solve``.
+    ``effects`` are subtracted, by default all of the calibration that belong to the sensor. Errors as of ``solve``.
     """
     sensor = calibration.sensor
     own = "specific_force" if sensor == "accelerometer" else "angular_rate"
@@ -151,6 +151,6 @@ def _complain(truths: Truths, readings: Truths) -> None:
     size = np.nan_to_num(np.abs(readings[sensor]).max(axis=1))
     row = int(np.argmax(size))
     raise ConvergenceError(
-        f"the fitted effects of the {sensor} cannot be taken off a reading of {size[row]:g} (sample {row + 1} of the "
-        "block): it is far outside the range that was calibrated; remove such readings from the log"
+        f"the fitted effects of the {sensor} cannot be subtracted from a reading of {size[row]:g} (sample {row + 1} of "
+        "the block): it is far outside the range that was calibrated; remove such readings from the log"
     )

@@ -113,7 +113,7 @@ def _by_hand(unit: UnitDescription, course: Course) -> Iterator[Change]:
         more = POSITIONS * course.positions
         yield _with(unit, f"rest in {more} positions", f"--positions {more}", positions=more)
     else:
-        what = f"in place of these, rest in {course.positions} positions, each with another inclination"
+        what = f"instead of these, rest in {course.positions} positions, each with another inclination"
         yield Change(what, "--procedure multi_position", replace(unit, procedure="multi_position"))
 
 
@@ -233,7 +233,7 @@ def readme(unit: UnitDescription, name: str) -> str:
 
 RECORD = """\
 In `{folder}/`, {minutes:.0f} min from power-on; {pause:g} s between recordings. Record from power-on, or note how long
-the unit had warmed up: its temperature is part of its bias. `.mcap` in place of `.csv` works for each, and so do the
+the unit had warmed up: its temperature is part of its bias. `.mcap` instead of `.csv` works for each, and so do the
 formats of docs/formats.md.
 
 Columns of a canonical CSV: {columns}, and optionally {optional}. Other columns, units and raw counts: `python -m

@@ -248,7 +248,7 @@ def _row(entry: Mapping[str, Any]) -> list[str]:
 
 
 def _note(entry: Mapping[str, Any]) -> str:
-    """Return up to which size another effect would be named in place of this one."""
+    """Return up to which size another effect would be named instead of this one."""
     named, smallest, taken = entry["named"], entry["smallest"], entry["taken_for"]
     limit = None if entry["share_of_limit"] is None else smallest / entry["share_of_limit"]
     never = named is None or (limit is not None and named > limit)

@@ -17,7 +17,7 @@ The mounting is found before any calibration. In a turn about a level axis the a
 where
 
 d : what goes with the rate r: lever arms (r^2), vibration (|r|), dependence on the rate (r), in a turn between rests;
-    taken off by least squares with 1, r, |r| and r^2
+    subtracted by least squares with 1, r, |r| and r^2
 A : table angle, counted right-handed about body axis a
 u : body axis that points up at A = 0
 K : inverse of the calibration matrix, the unit matrix to a few percent; b: bias
@@ -27,8 +27,8 @@ way turns the sign of q. The gyroscope's gain against the table's rate r in the 
 
     k = sum((w - mean w) (r - mean r)) / sum((r - mean r)^2)
 
-points along the turn axis as well. Means are taken off since a bias of some deg/s may exceed a slow table's rate; where
-the rate does not change, they stay, and only a rate beyond any bias tells something.
+points along the turn axis as well. Means are subtracted because a bias of some deg/s may exceed a slow table's rate;
+where the rate does not change, they stay, and only a rate beyond any bias tells something.
 """
 
 from __future__ import annotations

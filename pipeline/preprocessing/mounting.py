@@ -214,7 +214,7 @@ def _negated(turns: Sequence[Turn], tolerance: float) -> bool:
 
 
 def _as_found(turn: Turn, departure: _Departure | None, zeros: Mapping[str, float]) -> Turn:
-    """Return a turn with the mounting that is found in place of the stated one, its zero by all turns together."""
+    """Return a turn with the mounting that is found instead of the stated one, its zero by all turns together."""
     if departure is None or departure.bench is None:
         return turn
     bench = replace(departure.bench, zero_deg=zeros.get(turn.name, departure.bench.zero_deg))

@@ -239,7 +239,7 @@ def _gyroscope(
     parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: dict[str, Any]
 ) -> Guess:
     """Return the unit of the rates by the table, by gravity, or of counts by the sensor's configuration."""
-    moves, why_none = list[Move](), "no accelerometer beside it to tell the unit by"
+    moves, why_none = list[Move](), "no accelerometer beside it that determines the unit"
     if force is not None and not parts[0].steady:
         why_none = "the rows are not one series in time, so the turns of gravity cannot tell the unit"
     elif force is not None:

@@ -200,7 +200,7 @@ def _plateaus(values: Values) -> list[str]:
     """Return in words where a channel stays at its largest or smallest value, as one that is clipped does."""
     same = values[1:] == values[:-1]
     if same.mean() > 0.5 or equal_share(same) > 0.5:
-        return []  # too coarse or too quiet to tell
+        return []  # too coarse or too quiet to decide
     found = []
     for extreme in (values.max(), values.min()):
         at = values == extreme

@@ -169,31 +169,47 @@ class Recording:
 
 
 @dataclass(frozen=True)
+class WanderLikelihood:
+    """Log likelihood of a static recording at each wander tried, relative to that without wander."""
+
+    correlation_time: Values  # (t,), s
+    wander: Values  # (w,), standard deviation in the unit of the sensor
+    log_likelihood: Values  # (t, w)
+
+
+@dataclass(frozen=True)
 class Noise:
     """White noise of a sample (before any filter) and Gauss-Markov bias wander: (3,) standard deviations.
 
-    ``source``: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (of a fit) or ``data_sheet``.
-    ``length``, s, is that of the static rest, else 0; the relative uncertainty of the wander is about
-    ``sqrt(correlation_time / length)``. ``seen``: log likelihood of the static rest at each correlation time and wander
-    tried (``pipeline.estimation.noise``), where it tells any.
+    ``source``, ``wander_source``, ``time_source`` are those of the white noise, the wander and its correlation time:
+    ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in turns
+    about a local polynomial) or ``data_sheet`` (the sensor file). ``length``, s, is that of the static rest, else 0;
+    the relative uncertainty of its wander is about ``sqrt(correlation_time / length)``. ``likelihood``: None where no
+    static recording determines it.
     """
 
     white: Values
     wander: Values
     correlation_time: float
     source: str
+    wander_source: str = "data_sheet"
+    time_source: str = "data_sheet"
     length: float = 0.0
-    seen: Values | None = None
+    likelihood: WanderLikelihood | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the noise as JSON values."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
+        likelihood = self.likelihood and {k: v.tolist() for k, v in vars(self.likelihood).items()}
+        numbers = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
+        return numbers | {"likelihood": likelihood}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Read back what ``to_json`` wrote."""
-        known: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in data.items()}
-        return cls(**known)
+        values: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in data.items()}
+        if data["likelihood"] is not None:
+            values["likelihood"] = WanderLikelihood(**{k: np.array(v) for k, v in data["likelihood"].items()})
+        return cls(**values)
 
 
 def noise_of_steps(step: Values, axis: int = 0, *, keepdims: bool = False) -> Values:

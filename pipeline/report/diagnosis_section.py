@@ -198,7 +198,7 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
     slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
     x_unit = _column_unit(best["unit"], unit)
     caption = (
-        "Readings less what bias, matrix, other effects and bias wander explain, in bins with ±2 standard errors; the "
+        "Readings minus what bias, matrix, other effects and bias wander explain, in bins with ±2 standard errors; the "
         f"slope of the line is the parameter ({slopes}; ±: two standard uncertainties by the noise)."
     )
     return chart(
@@ -206,7 +206,7 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
         f"Added-variable plot of {effect}. Slopes: {slopes}. Mean square of the points about the line, in standard "
         f"errors: {', '.join(number(s, 2) for s in scatter)}.",
         panels,
-        f"column of {what}, less all other columns" + (f", {x_unit}" if x_unit else ""),
+        f"column of {what}, minus all other columns" + (f", {x_unit}" if x_unit else ""),
     )
 
 

@@ -32,7 +32,7 @@ LOWEST = -100.0  # value at which a bar on a symlog axis ends
 class Point:
     """One value; None has no bar.
 
-    ``interval``: low and high of a mean, drawn in place of the bar; ``units``: the values behind the mean; ``floor``:
+    ``interval``: low and high of a mean, drawn instead of the bar; ``units``: the values behind the mean; ``floor``:
     what noise alone gives in this row; ``x, series``: place in ``curves``, which joins the points of a series;
     ``note``: part of the description, drawn where there is no value.
     """

@@ -20,6 +20,12 @@ from pipeline.validation.samples import OTHER, samples_of_motion
 JSON = dict[str, Any]
 ALIKE = 1.2  # the diagnosis's held-out error may continue the validation's steps where both agree within this factor
 FAR = 3.0  # error over noise floor from which a unit is marked, and no verdict is shown as good
+SOURCES = {
+    "static": "the static recording",
+    "rests": "the rests",
+    "residual": "short windows of turns",
+    "data_sheet": "the sensor file",
+}
 BEFORE_AFTER = (("c3", "before"), ("c2", "after"))
 SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # errors are drawn, not weighted
 
@@ -75,9 +81,18 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
     words = "if it were added" + (" with the suggested shape" if found.get("suggested_effect") else "")
     whose = "Held-out error" if held_out.get("held_out", True) else "Error on the samples of the fit,"
     caption = f"{whose} of the {kind} after each step; the line is the error that noise alone gives."
+    caption += _sources(held_out["noise"]) if "noise" in held_out else ""
     figure = Figure(f"{sensor}-staircase-{kind}", finding, caption, (("c4", words),) if added else ())
     label = f"root mean square error, {unit} (logarithmic)"
     return bars(figure, rows + added, label, levels={f"noise floor {number(floor)}": floor or 0.0})
+
+
+def _sources(noise: JSON) -> str:
+    """Return a sentence on where the noise of the noise floor comes from."""
+    white, wander, time = (SOURCES[noise[key]] for key in ("source", "wander_source", "correlation_time_source"))
+    if white == wander == time:
+        return f" White noise and bias wander are those of {white}."
+    return f" White noise is that of {white}, bias wander that of {wander}, its correlation time that of {time}."
 
 
 def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:

@@ -34,7 +34,7 @@ LINE = "prior of the lot"
 LACK_OF_FIT = "lack of fit"  # a table's errors are part of it: no estimate shows whether siblings share it
 SHARED = f"{BENCH}, and {LACK_OF_FIT}"
 NONE = np.empty(0)
-MOST_FREEDOM = 1e12  # in place of infinitely many degrees of freedom, for which JSON has no number
+MOST_FREEDOM = 1e12  # instead of infinitely many degrees of freedom, for which JSON has no number
 DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: the uncertainty does not hold the error
 
 

@@ -23,7 +23,7 @@ MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/un
 SHOWN = 12  # runs that a chart has room for: the first, and the last ones
 LABEL = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
 STATES = 10_000  # of units in runs after the first that a campaign's page holds: 2 MB at 0.2 kB each
-SAME = 0.02  # relative change of an error that is too small to tell
+SAME = 0.02  # relative change of an error that is too small to be significant
 NEAR_FLOOR = 1.5  # of the noise floor, up to which a bar is green
 
 

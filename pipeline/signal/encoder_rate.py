@@ -86,7 +86,7 @@ def _errors(time: Values, angle: Values) -> tuple[float, float]:
     """Return the step of an encoder whose rounding hides the rate, deg, else 0, and the angle's independent errors.
 
     The second differences of a moving angle are then those of independent errors: their autocorrelation at lag 1 is
-    -2/3, where that of a program's ramps is positive. Their mean over neighbours, the acceleration, is taken off.
+    -2/3, where that of a program's ramps is positive. Their mean over neighbours, the acceleration, is subtracted.
     Errors are rounding where all changes are multiples of a step and the second differences are not larger.
     """
     rounding = 1e-9 * max(float(np.abs(angle).max()), 1.0)

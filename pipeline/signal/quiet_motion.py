@@ -8,7 +8,7 @@ two components of omega across gravity:
     omega_across = (du/dt) x u
 
 du/dt is the slope of the readings of a rest; with white noise s of a sample, n samples and a rest of T seconds its
-standard deviation is ``s sqrt(12 / n) / T`` on each axis. s follows from the readings less a parabola in time, so that
+standard deviation is ``s sqrt(12 / n) / T`` on each axis. s follows from the readings minus a parabola in time, so that
 creep does not count as noise. A mean over directions that spread by the variance v (rad^2, both axes together) is too
 short by the share v/2.
 
@@ -70,7 +70,7 @@ class Creep:
     freedom: int  # degrees of freedom of the squares, an axis
 
 
-def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
+def posterior_creep_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
     """Return the posterior rates across gravity in the rests of one recording.
 
     With the variance c^2 of a component between the rests, estimated from rates w of standard uncertainty e,
@@ -92,7 +92,7 @@ def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
     return w * share[:, None], np.where(known, e * np.sqrt(share), np.sqrt(variance)), float(np.sqrt(variance))
 
 
-def along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
+def component_along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
     """Return the readings of a rest along its mean, (n,) array, g, and whether the unit creeps in it.
 
     A tilt by theta changes the component along gravity by theta times the bias across it, which is not known yet: where
@@ -100,7 +100,7 @@ def along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
     """
     mean = force.mean(axis=0)
     along = force @ (mean / np.linalg.norm(mean))
-    creeps = bool(creep_of(time, force).rate.any())
+    creeps = bool(creep_of_readings(time, force).rate.any())
     if creeps:
         basis = _parabolas(time)[:, 1:]
         along = along - basis @ (basis.T @ along)
@@ -113,7 +113,7 @@ def _parabolas(time: Values) -> Values:
     return np.linalg.qr(np.polynomial.legendre.legvander(x, DEGREE))[0]
 
 
-def creep_in(recording: Recording, start: int, stop: int) -> Creep:
+def creep_of_rest(recording: Recording, start: int, stop: int) -> Creep:
     """Return how a unit tilts in the samples ``start <= n < stop`` of a recording, without marked or missing ones."""
     key = "creep", start, stop
     if key not in recording.cache:
@@ -122,12 +122,12 @@ def creep_in(recording: Recording, start: int, stop: int) -> Creep:
         good = (recording.valid[start:stop]) & np.isfinite(force[start:stop]).all(axis=1)
         count = np.array([max(int(good.sum()), 1)])
         share = float(variance_of_mean(filter_autocovariance(recording), count)[0])
-        recording.cache[key] = creep_of(recording.time[start:stop][good], force[start:stop][good], share)
+        recording.cache[key] = creep_of_readings(recording.time[start:stop][good], force[start:stop][good], share)
     found: Creep = recording.cache[key]
     return found
 
 
-def creep_of(time: Values, force: Values, share: float = 0.0) -> Creep:
+def creep_of_readings(time: Values, force: Values, share: float = 0.0) -> Creep:
     """Return how a unit tilts within a rest of n readings of the accelerometer, g.
 
     ``share`` is the variance of their mean by white noise over that of one; 0 stands for 1/n.

@@ -28,7 +28,7 @@ import numpy as np
 
 from pipeline.records import Integers, Mask, Recording, Values, median, noise_of_steps
 from pipeline.signal.filters import filter_autocovariance, stretch_starts
-from pipeline.signal.quiet_motion import RATE_LIMIT_DPS, counts_of, creep_in, quiet_pieces, windows
+from pipeline.signal.quiet_motion import RATE_LIMIT_DPS, counts_of, creep_of_rest, quiet_pieces, windows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -180,7 +180,7 @@ def _plateau(counts: Sequence[int]) -> int:
 
 def _scatter(recording: Recording, rest: Rest, noise_variance: float) -> str:
     assert recording.accelerometer is not None  # noqa: S101
-    creep = creep_in(recording, rest.start, rest.stop)
+    creep = creep_of_rest(recording, rest.start, rest.stop)
     variance = float(creep.squares.sum()) / max(creep.freedom, 1)
     ratio = np.sqrt(variance / max(noise_variance, SMALLEST_SCATTER_G2))
     if ratio <= SCATTER_LIMIT:
@@ -189,10 +189,10 @@ def _scatter(recording: Recording, rest: Rest, noise_variance: float) -> str:
 
 
 def _turn(recording: Recording, rest: Rest) -> str:
-    """Compare the directions of the rest's four quarters, where it creeps steadily less the straight line."""
+    """Compare the directions of the rest's four quarters, minus a straight line where it creeps steadily."""
     assert recording.accelerometer is not None  # noqa: S101
     force = recording.accelerometer[rest.start : rest.stop]
-    creep = creep_in(recording, rest.start, rest.stop)
+    creep = creep_of_rest(recording, rest.start, rest.stop)
     rate, span = float(np.linalg.norm(creep.rate)), float(recording.time[rest.stop - 1] - recording.time[rest.start])
     if 0.0 < rate <= CREEP_LIMIT_DPS and rate * span <= STEADY_LIMIT_DEG:
         steady = np.cross(force.mean(axis=0), np.radians(creep.rate))  # du/dt = -omega x u
@@ -249,12 +249,12 @@ def usable(recording: Recording, values: Values) -> Mask:
     return np.asarray(finite & recording.valid)
 
 
-def rest_readings(recording: Recording, sensor: str, *, everything: bool) -> list[tuple[Values, Values]]:
+def rest_readings(recording: Recording, sensor: str, *, whole_recording: bool) -> list[tuple[Values, Values]]:
     """Return the times and readings of each rest of a recording."""
     values = recording.reading(sensor)
     assert values is not None  # noqa: S101
     still = usable(recording, values)
-    if not everything:
+    if not whole_recording:
         found = rests_from_table(recording)
         if not found and recording.role == "rests":
             found = find_rests(recording)
@@ -265,7 +265,7 @@ def rest_readings(recording: Recording, sensor: str, *, everything: bool) -> lis
             first = rest.start + memory * (rest.start > 0)
             resting[first : rest.stop - ahead * (rest.stop < recording.samples)] = rest.accepted
         still &= resting
-    if everything:  # a gap does not end a static rest: the likelihood knows the times
+    if whole_recording:  # a gap does not end a static rest: the likelihood knows the times
         return [(recording.time[still], values[still])] if still.any() else []
     settled = _settled(recording, values, stretches_of(recording, still))
     return [(recording.time[a:b], values[a:b]) for a, b in settled if b - a > 2]

@@ -236,7 +236,7 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--dwell", dest="dwell_s", type=float, metavar="S", help="rest at each stop (1; without a table 4)")
     add("--step", dest="step_deg", type=float, metavar="DEG", help="of stop-and-go (5)")
     add("--accelerometer-rate", dest="accelerometer_rates_dps", type=float, nargs="+", metavar="DPS",
-        help="continuous turns for the accelerometer in place of stop-and-go")  # fmt: skip
+        help="continuous turns for the accelerometer instead of stop-and-go")  # fmt: skip
     add("--rate", "--rates", dest="rates_dps", type=float, nargs="+", metavar="DPS", help="gyroscope turns (60)")
     add("--both-directions", action="store_true", help="make each turn backwards too")
     add("--turns", type=int, metavar="N", help="whole turns at each rate (1)")

@@ -61,7 +61,7 @@ class Course:
 
     step_deg: float = 5.0  # of stop-and-go
     dwell_s: float = 1.0  # rest at each stop, orientation or position
-    accelerometer_rates_dps: tuple[float, ...] = ()  # continuous turns in place of stop-and-go
+    accelerometer_rates_dps: tuple[float, ...] = ()  # continuous turns instead of stop-and-go
     rates_dps: tuple[float, ...] = (60.0,)  # of the gyroscope's turns
     both_directions: bool = False  # each turn of the gyroscope and each continuous one is also made backwards
     turns: int = 1  # whole turns at each rate

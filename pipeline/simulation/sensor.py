@@ -192,7 +192,7 @@ def alter(scene: Scene, effects: Mapping[str, Values]) -> Scene:
 
 
 KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
-NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # in place of those of the data sheet
+NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # instead of those of the data sheet
 POSITIVE = {"time_constant", "tau"}  # parameters without a sign
 
 

@@ -231,7 +231,7 @@ MARGIN_S = 2.0  # by which a log of its own begins earlier and ends later than t
 LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a clock at random: the drift is a standard deviation, that of a quartz
 NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
 INGEST = "table_log"  # configs/ingest that reads a log of its own
-COMMENT = "# The table has no encoders: its program in place of its log. Written by python -m pipeline simulate.\n"
+COMMENT = "# The table has no encoders: its program instead of its log. Written by python -m pipeline simulate.\n"
 
 
 def with_table_log(

@@ -1,6 +1,6 @@
 """The command of a job: ``job_command.py STAGE ...`` runs a stage in a copy of the job server, else by itself.
 
-It imports two modules in C and nothing of the package, as it is started for every job: it takes 15 ms in place of 38 of
+It imports two modules in C and nothing of the package, as it is started for every job: it takes 15 ms instead of 38 of
 ``python -m pipeline``, which follows it where there is no server (a job on another machine, or not on Linux).
 """
 

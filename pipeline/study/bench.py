@@ -22,7 +22,7 @@ The signal of a hidden effect over the noise is
 
 where
 
-    s : what the effect adds to an axis' readings: the unit with it less the same unit, and the same noise, without it
+    s : what the effect adds to an axis' readings: the unit with it minus the same unit, and the same noise, without it
     C : covariance of the true white noise and bias wander (``pipeline.estimation.gauss_markov``)
     P : the projection, in the metric C^-1, onto bias, truth and what each other hidden effect adds
 

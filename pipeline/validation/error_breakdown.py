@@ -115,7 +115,7 @@ def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
 
 
 def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples) -> str | None:
-    """Say what the held-out recording lacks for an effect to be taken off, or None."""
+    """Say what the held-out recording lacks for an effect to be subtracted, or None."""
     found = effect_of(fitted)
     if samples.motion is not None or _elsewhere(fitted, samples):
         missing = [need for need in found.needs if samples.motion and getattr(samples.motion, need) is None]

@@ -1,9 +1,10 @@
 """The interval in which the held-out rms error lies with 99 % probability, if model, noise and uncertainties are right.
 
-A calibrated reading of held-out sample n is off by ``M w_n + M m_n + J_n d``, where M is the calibration's matrix, w
-white noise behind the filter, m bias wander (a Gauss-Markov process, and the slower drift that data sheet and residuals
-of the fit allow), d errors of the calibration's parameters and of the scale of the table's rate (once: in the
-covariance where its budget has such a line, else as a parameter of its own), and J the derivative with respect to d.
+The error of the calibrated reading of held-out sample n is ``M w_n + M m_n + J_n d``, where M is the calibration's
+matrix, w white noise after the filter, m bias wander (a Gauss-Markov process, and the slower drift that the sensor file
+and the residuals of the fit allow), d errors of the calibration's parameters and of the scale of the table's rate
+(once: in the covariance where its budget has such a line, else as a parameter of its own), and J the derivative with
+respect to d.
 
 The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.samples``); its mean over samples
 is a quadratic form in Gaussians, replaced by a shifted chi-square with the same cumulants (J. P. Imhof, Biometrika 48
@@ -48,11 +49,11 @@ TAIL = 0.005  # probability on each side of a 99 % interval
 LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
 WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
 BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time
-NARROWEST = 0.5  # s of a wander of minutes, which may be a random walk (blind study, family null_random_walk)
+SMALLEST_WIDTH = 0.5  # s of a wander of minutes, which may be a random walk (blind study, family null_random_walk)
 REST_SAMPLES = 300  # that determine the white noise where there is no static recording: a few rests of seconds
 EXACT_FREEDOM = 1e4  # degrees of freedom beyond which nu / chi^2(nu) is 1 to 1.4 %
 NORMAL_FREEDOM = 1e6  # beyond which a chi-square is normal to 1e-3
-ENOUGH = 2000  # samples of a recording that stand for all: its directions and rates change slowly
+REPRESENTATIVE_SAMPLES = 2000  # samples of a recording that stand for all: its directions and rates change slowly
 
 
 @dataclass(frozen=True)
@@ -60,12 +61,12 @@ class LinearizedSamples:
     """Held-out samples of one recording with the derivative of their calibrated readings."""
 
     time: Values  # (n,), s
-    white: Values  # (n, 3), variance of white noise per reading axis
-    wander: Values  # (n, 3), variance of wander
+    white_variance: Values  # (n, 3), of white noise per reading axis
+    wander_variance: Values  # (n, 3)
     truth: Values  # (n, 3), g or deg/s
     derivative: Values  # (n, 3, p): J, of the parameters of the calibration's covariance
     number: int  # samples of the recording, of which these are some
-    alike: float = 1.0  # samples that share one value of the white noise, by the filter
+    correlated_samples: float = 1.0  # as in ``Samples``
 
 
 def linearized(
@@ -78,26 +79,31 @@ def linearized(
     change of its magnitude counts along the truth with the opposite sign.
     ``truth`` is the (n, 3) reference, ``other`` the calibration of the other sensor.
     """
-    found = last_step(calibration, samples, other)
+    step_values = last_step(calibration, samples, other)
     known = np.flatnonzero(samples.known)
-    if found is None or len(known) == 0:
+    if step_values is None or len(known) == 0:
         return None
-    vector, magnitude, _ = found
-    shown = known[np.unique(np.linspace(0, len(known) - 1, ENOUGH).astype(int))]
-    along = truth[shown] / np.maximum(np.linalg.norm(truth[shown], axis=1, keepdims=True), 1e-300)
-    J = np.zeros((len(shown), 3, len(calibration.parameter_names())))
+    vector, magnitude, _ = step_values
+    chosen = known[np.unique(np.linspace(0, len(known) - 1, REPRESENTATIVE_SAMPLES).astype(int))]
+    along = truth[chosen] / np.maximum(np.linalg.norm(truth[chosen], axis=1, keepdims=True), 1e-300)
+    J = np.zeros((len(chosen), 3, len(calibration.parameter_names())))
     J[:, :, :3] = -calibration.matrix
-    before = vector[shown] @ inverse_of(calibration).T
+    before = vector[chosen] @ inverse_of(calibration).T
     for i in range(3):
         J[:, i, 3 + 3 * i : 6 + 3 * i] = before
     for column, changed, step in _changed_parameters(calibration):
         moved = last_step(changed, samples, other)
         assert moved is not None  # noqa: S101  (the same effects)
-        shift = along * (moved[1] - magnitude)[shown, None]
-        J[:, :, column] = (moved[0][shown] - vector[shown] - shift) / step
-    noise = samples.white[shown], samples.wander[shown]
+        shift = along * (moved[1] - magnitude)[chosen, None]
+        J[:, :, column] = (moved[0][chosen] - vector[chosen] - shift) / step
+    noise = samples.white_variance[chosen], samples.wander_variance[chosen]
     return LinearizedSamples(
-        samples.time[shown], *noise, truth[shown], np.nan_to_num(J), len(known), alike=samples.alike
+        samples.time[chosen],
+        *noise,
+        truth[chosen],
+        np.nan_to_num(J),
+        len(known),
+        correlated_samples=samples.correlated_samples,
     )
 
 
@@ -141,23 +147,23 @@ def expected_rms_error(
     (``rate_accuracy``) and ``sensor`` (``bias_wander, wander_time_s, counts_per_unit``), ``fitted_s`` is the length of
     the recordings of the fit.
     """
-    sheet = (settings.get("sensor") or {}).get(calibration.sensor) or {}
-    step = 1.0 / float(sheet["counts_per_unit"]) if sheet.get("counts_per_unit") else 0.0
-    found = [s.details["bias_wander"] for s in calibration.stages if "bias_wander" in s.details]
-    residual_wander = np.array(found[-1]) if found else None  # that the residuals of the fit show: (3,)
-    time = float(sheet.get("wander_time_s") or DEFAULT_TIME_S)
+    sensor_file = (settings.get("sensor") or {}).get(calibration.sensor) or {}
+    step = 1.0 / float(sensor_file["counts_per_unit"]) if sensor_file.get("counts_per_unit") else 0.0
+    wanders = [s.details["bias_wander"] for s in calibration.stages if "bias_wander" in s.details]
+    residual_wander = np.array(wanders[-1]) if wanders else None  # that the residuals of the fit show: (3,)
+    time = float(sensor_file.get("wander_time_s") or DEFAULT_TIME_S)
     uncertain = _Uncertain(
         _covariance(calibration, settings.get("table") or {}),
         noise,
         np.where(noise.white < DITHERED * step, step**2 / 12.0, 0.0),
-        _drift(residual_wander, noise, float(sheet.get("bias_wander") or 0.0), time),
+        _drift(residual_wander, noise, float(sensor_file.get("bias_wander") or 0.0), time),
         time,
     )
     form = _form(calibration.matrix, held_out, uncertain)
     if form.cumulants(np.ones((4, 1)))[0, 0] <= 0.0:
         return 0.0, 0.0
-    watched = noise.length + (fitted_s if residual_wander is not None else 0.0)
-    factors = [_factors(calibration, noise, watched, upper=upper) for upper in (False, True)]
+    observed_s = noise.length + (fitted_s if residual_wander is not None else 0.0)
+    factors = [_factors(calibration, noise, observed_s, upper=upper) for upper in (False, True)]
     low, high = (_quantile(form, *f, p) for f, p in zip(factors, (TAIL, 1.0 - TAIL), strict=True))
     return float(np.sqrt(low)), float(np.sqrt(high))
 
@@ -165,13 +171,13 @@ def expected_rms_error(
 def _drift(residual_wander: Values | None, noise: Noise, size: float, time: float) -> Values:
     """Return the variance of a drift in addition to the wander: (3,) array.
 
-    It is the data sheet's wander (``size``, ``time``) beyond the wander that was seen, and what the residuals of the
+    It is the sensor file's wander (``size``, ``time``) beyond that of the noise model, and what the residuals of the
     fit, which last longer than a rest, show beyond it. A residual may hold a missing effect, so at most ``INFLATED``
     times the expected wander counts.
     """
     slow = noise.wander**2 * min(1.0, noise.correlation_time / time)
-    most = INFLATED**2 * np.maximum(noise.wander**2, size**2)
-    fitted = noise.wander**2 if residual_wander is None else np.minimum(residual_wander**2, most)
+    limit = INFLATED**2 * np.maximum(noise.wander**2, size**2)
+    fitted = noise.wander**2 if residual_wander is None else np.minimum(residual_wander**2, limit)
     return np.asarray(np.maximum(size**2 - slow, 0.0) + np.maximum(fitted - noise.wander**2, 0.0))
 
 
@@ -236,9 +242,9 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
         across = np.swapaxes(np.add.reduceat(WJ, first, axis=0), 1, 2) @ M * share / n
         of_blocks.append((own, across, B, block_covariance(start, length, uncertain.drift_time)))
         size += 3 * count
-        Q = MWM * (each.white + uncertain.coarse)[:, None, :]
-        white = white + _traces_of(Q) * [share, share**2 * each.alike / each.number]
-        left = np.clip(each.wander - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
+        Q = MWM * (each.white_variance + uncertain.coarse)[:, None, :]
+        white = white + _traces_of(Q) * [share, share**2 * each.correlated_samples / each.number]
+        left = np.clip(each.wander_variance - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
         correlated = np.clip(noise.correlation_time / interval, 1.0, n / count) / n
         within = within + _traces_of(MWM * left[:, None, :]) * [share, share**2 * correlated]
     A, Q = np.zeros((size, size)), np.zeros((3, size, size))
@@ -275,7 +281,7 @@ def _traces_of(Q: Values) -> Values:
 def _weights(M: Values, each: LinearizedSamples, uncertain: _Uncertain) -> Values:
     """Return W of each sample: (n, 3, 3) array."""
     J, own = each.derivative, uncertain.covariance[:-1, :-1]
-    noise = each.white + each.wander + uncertain.drift + uncertain.coarse
+    noise = each.white_variance + each.wander_variance + uncertain.drift + uncertain.coarse
     of_parameters = np.einsum("nip,pq,njq->ij", J, own, J, optimize=True) / len(J)
     mean = np.einsum("ij,j,kj->ik", M, noise.mean(axis=0), M) + of_parameters
     size = np.linalg.norm(each.truth, axis=1)
@@ -284,19 +290,19 @@ def _weights(M: Values, each: LinearizedSamples, uncertain: _Uncertain) -> Value
     return np.asarray((1.0 - g) * u[:, :, None] * u[:, None, :] + g * np.eye(3))
 
 
-def _factors(calibration: SensorCalibration, noise: Noise, watched: float, *, upper: bool) -> tuple[Values, Values]:
+def _factors(calibration: SensorCalibration, noise: Noise, observed_s: float, *, upper: bool) -> tuple[Values, Values]:
     """Return the factors that are mixed, (4, k), and their probabilities (k,).
 
-    The lower end leaves out drift and errors of parameters, and takes the wander as the data sheet states it: none of
+    The lower end leaves out drift and errors of parameters, and takes the wander as the sensor file states it: none of
     these need have occurred in this recording.
     """
     from scipy.special import gammaincinv, ndtri  # noqa: PLC0415  (0.1 s that other stages do not pay)
 
     z = ndtri(LEVELS)
     width = SHEET_WIDTH
-    if upper and watched > 0.0:
+    if upper and observed_s > 0.0:
         minutes = min(1.0, noise.correlation_time / DEFAULT_TIME_S)
-        width = np.sqrt(max(noise.correlation_time / watched, NARROWEST**2 * minutes))
+        width = np.sqrt(max(noise.correlation_time / observed_s, SMALLEST_WIDTH**2 * minutes))
         width = float(np.clip(width, SHARPEST_WIDTH, SHEET_WIDTH))
     wander = np.exp(2.0 * width * z)
     drift = 2.0 * gammaincinv(0.5, LEVELS) if upper else np.zeros(len(z))

@@ -2,13 +2,14 @@
 
 Held out are the recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``). Where
 nothing is held out, the samples of the fit are judged, and the result says so. With t the truth, M the matrix, n the
-noise of a sample (white noise after the filter, and bias wander) and D its covariance, which is diagonal,
+noise of a sample (white noise after the filter, and bias wander) and V its covariance, which is diagonal,
 
-    noise_floor = sqrt(mean E(|t + M n| - |t|)^2),    vector_noise_floor = sqrt(mean tr(M D M^T))
+    noise_floor = sqrt(mean E(|t + M n| - |t|)^2),    vector_noise_floor = sqrt(mean tr(M V M^T))
 
-A calibration does harm where its squared errors less those of the raw readings, averaged over each of B stretches,
-have a Student's t of B - 1 degrees of freedom beyond that of probability ``LEVEL``, and its error is above the interval
-in which it is expected (``pipeline.validation.expected_error``).
+A calibration is worse than the raw readings where its error is above its expected interval
+(``pipeline.validation.expected_error``) and a t-test says so: per stretch of the recordings, the mean of its squared
+errors minus that of the raw readings' squared errors, over B stretches, with B - 1 degrees of freedom and the
+probability ``FALSE_REFUSALS``.
 """
 
 from __future__ import annotations
@@ -32,11 +33,12 @@ if TYPE_CHECKING:
     from pipeline.records import Noise, Recording, SensorCalibration, Values
     from pipeline.signal.rests import Rest
 
-LEVEL = 1e-3  # probability that a calibration as good as none is refused
-STRETCHES, FEWEST = 20, 5  # a stretch of a recording of minutes is longer than the correlation time of most wander
-WIDTH = 5.0  # degC of a bin; a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
-SWEPT = 2 * WIDTH  # degC: a range that fills two bins; a unit that warms up on the bench changes by less
-FEWEST_OF_BIN = 10  # samples of a bin that is shown
+FALSE_REFUSALS = 1e-3  # probability that a calibration as good as the raw readings is refused
+STRETCHES = 20  # a stretch of a recording of minutes is longer than the correlation time of most wander
+FEWEST_SAMPLES = 5  # of the t-test
+BIN_DEGC = 5.0  # a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
+SWEEP_DEGC = 2 * BIN_DEGC  # fills two bins; a unit that warms up on the bench changes by less
+FEWEST_IN_BIN = 10  # samples of a bin that is shown
 FIGURES = ("mean_abs_error", "sum_abs_error", "max_error", "min_error", "rms_error", "change_percent")
 
 
@@ -58,14 +60,14 @@ def validate(
     The part has ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor,
     vector_noise_floor, steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit),
     ``reason`` (why), ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why
-    the calibration does harm, or None), ``over_temperature`` (``residuals_over_temperature``; only where the
+    the calibration must not be used, or None), ``over_temperature`` (``residuals_over_temperature``; only where the
     temperature was swept), ``limits`` and ``pass``. ``vector_rms_error`` is the root of the mean squared length of the
     difference to the reference. Raises ``ConfigurationError`` if a limit's name is unknown.
     """
     sensor = calibration.sensor
     samples, reason = _choose(sensor, recordings, noise, settings)
     count = int(sum(s.known.sum() for s in samples))
-    nothing: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
+    no_figures: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
     part: dict[str, Any] = {
         "unit": unit_of(sensor),
         "held_out": reason is None,
@@ -76,11 +78,13 @@ def validate(
             "wander": noise.wander.tolist(),
             "correlation_time_s": noise.correlation_time,
             "source": noise.source,
+            "wander_source": noise.wander_source,
+            "correlation_time_source": noise.time_source,
         },
         "noise_floor": None,
         "vector_noise_floor": None,
         "reference_rms": None,
-        "steps": [{"name": name, **nothing} for name in ("raw", "calibrated")],
+        "steps": [{"name": name, **no_figures} for name in ("raw", "calibrated")],
         "notes": [],
         "expected_rms_error": None,
         "worse_than_raw": None,
@@ -89,18 +93,18 @@ def validate(
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
         part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
         part["steps"], part["notes"] = error_breakdown(calibration, samples, other)
-        expected, lack = _expected(calibration, recordings, samples, noise, settings, other=other)
+        expected, notes = _expected(calibration, recordings, samples, noise, settings, other=other)
         part["expected_rms_error"] = expected
-        part["notes"] += lack
+        part["notes"] += notes
         if part["held_out"] and expected is not None:
             part["worse_than_raw"] = _worse_than_raw(calibration, samples, expected[1], other)
-        swept = residuals_over_temperature(calibration, samples, other)
-        whose = "the held-out samples" if part["held_out"] else "the samples of the fit"
-        if swept is None and part["held_out"] and _is_swept(recordings):
+        bins = residuals_over_temperature(calibration, samples, other)
+        samples_of = "the held-out samples" if part["held_out"] else "the samples of the fit"
+        if bins is None and part["held_out"] and _is_swept(recordings):
             fitted, _ = _choose(sensor, recordings, noise, settings, of_fit=True)
-            swept, whose = residuals_over_temperature(calibration, fitted, other), "the samples of the fit"
-        if swept:
-            part["over_temperature"] = {"samples_of": whose, "bins": swept}
+            bins, samples_of = residuals_over_temperature(calibration, fitted, other), "the samples of the fit"
+        if bins:
+            part["over_temperature"] = {"samples_of": samples_of, "bins": bins}
     limits = (settings.get("limits") or {}).get(sensor) or {}
     part["limits"], part["pass"] = _check_limits(calibration, part["steps"][-1], limits)
     return part
@@ -112,7 +116,8 @@ def residuals_over_temperature(
     """Return the errors of the magnitude after the last step, in bins of the temperature of the sensor.
 
     The mean of a bin (``mean_error``, g or deg/s) shows what still depends on the temperature, ``rms_error`` what noise
-    adds; ``temperature_degc`` is a mean. None where the temperature is not recorded, or its range is below ``SWEPT``.
+    adds; ``temperature_degc`` is a mean. None where the temperature is not recorded, or its range is below
+    ``SWEEP_DEGC``.
     """
     temperatures, errors = [np.zeros(0)], [np.zeros(0)]
     for each in samples:
@@ -123,25 +128,25 @@ def residuals_over_temperature(
         temperatures.append(each.temperature[known])
         errors.append(error[known])
     warmth, error = np.concatenate(temperatures), np.concatenate(errors)
-    if len(warmth) == 0 or np.ptp(warmth) < SWEPT:
+    if len(warmth) == 0 or np.ptp(warmth) < SWEEP_DEGC:
         return None
-    place = np.floor(warmth / WIDTH)
+    number = np.floor(warmth / BIN_DEGC)
     return [
         {
-            "temperature_degc": float(warmth[here].mean()),
-            "mean_error": float(error[here].mean()),
-            "rms_error": float(np.sqrt(np.mean(error[here] ** 2))),
-            "samples": int(here.sum()),
+            "temperature_degc": float(warmth[in_bin].mean()),
+            "mean_error": float(error[in_bin].mean()),
+            "rms_error": float(np.sqrt(np.mean(error[in_bin] ** 2))),
+            "samples": int(in_bin.sum()),
         }
-        for number in np.unique(place)
-        if (here := place == number).sum() >= FEWEST_OF_BIN
+        for each in np.unique(number)
+        if (in_bin := number == each).sum() >= FEWEST_IN_BIN
     ]
 
 
 def _is_swept(recordings: Sequence[Recording]) -> bool:
-    """Return whether the temperature of the recordings may have been swept: it spans ``SWEPT`` in all of them."""
+    """Return whether the temperature of the recordings may have been swept: it spans ``SWEEP_DEGC`` in all of them."""
     warmth = [r.temperature[np.isfinite(r.temperature)] for r in recordings if r.temperature is not None]
-    return bool(np.ptp(np.concatenate([np.zeros(0), *warmth])) >= SWEPT) if any(map(len, warmth)) else False
+    return bool(np.ptp(np.concatenate([np.zeros(0), *warmth])) >= SWEEP_DEGC) if any(map(len, warmth)) else False
 
 
 def _expected(
@@ -158,13 +163,13 @@ def _expected(
     Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
     """
     parts = [linearized(calibration, s, _truth(calibration, s), other) for s in samples if s.known.any()]
-    known = [p for p in parts if p is not None]
-    if len(known) < len(parts):
-        lack = left_out(calibration, samples)
-        return None, [f"the expected error is not stated, because {lack} left out of the held-out error"]
-    own = [r for r in recordings if r.role in {calibration.sensor, "rests"} and r.samples]
-    fitted_s = sum(float(r.time[-1] - r.time[0]) for r in own if r.reading(calibration.sensor) is not None)
-    low, high = expected_rms_error(calibration, known, noise, settings, fitted_s)
+    complete = [p for p in parts if p is not None]
+    if len(complete) < len(parts):
+        effects = left_out(calibration, samples)
+        return None, [f"the expected error is not stated, because {effects} left out of the held-out error"]
+    fitted = [r for r in recordings if r.role in {calibration.sensor, "rests"} and r.samples]
+    fitted_s = sum(float(r.time[-1] - r.time[0]) for r in fitted if r.reading(calibration.sensor) is not None)
+    low, high = expected_rms_error(calibration, complete, noise, settings, fitted_s)
     if not any(s.earth_left_out for s in samples):
         return [low, high], []
     note = (
@@ -214,8 +219,8 @@ def _truth(calibration: SensorCalibration, samples: Samples) -> Values:
     reading = linear_truth(calibration, samples.reading)
     direction = reading
     if samples.motion is not None:
-        known = truth(samples.sensor, samples.motion)
-        direction = np.where(np.isfinite(known).all(axis=1, keepdims=True), known, reading)
+        reference = truth(samples.sensor, samples.motion)
+        direction = np.where(np.isfinite(reference).all(axis=1, keepdims=True), reference, reading)
     size = np.linalg.norm(direction, axis=1, keepdims=True)
     unit = np.where(size > 0, direction / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
     return np.asarray(samples.magnitude[:, None] * unit)
@@ -239,8 +244,8 @@ def _choose(
         if by_rests:  # hand-held: between its rests the specific force is not known
             logs = ("table_attitude", "table_rate", "table_angle")
             chosen = [r for r in chosen if any(getattr(r, log) is not None for log in logs)]
-        found = [samples_of_motion(sensor, r, noise, table, smoothed=smoothed) for r in chosen]
-        return [s for s in found if s is not None and np.isfinite(s.reading).all(axis=1).any()]
+        samples = [samples_of_motion(sensor, r, noise, table, smoothed=smoothed) for r in chosen]
+        return [s for s in samples if s is not None and np.isfinite(s.reading).all(axis=1).any()]
 
     def resting(rests: Mapping[str, Sequence[Rest]]) -> list[Samples]:
         chosen = [(r, rests[r.name]) for r in recordings if rests.get(r.name)]
@@ -254,35 +259,35 @@ def _choose(
         held_out = resting(held_out_rests(recordings, settings)) or resting(rests_of("validation"))
     if held_out:
         return held_out, None
-    lack = f"no held-out recording holds readings of the {sensor} and a reference for them"
+    reason = f"no held-out recording holds readings of the {sensor} and a reference for them"
     fitted = moving(sensor) or resting(rests_of("rests")) or resting(rests_of(sensor))
-    return fitted, lack + ("; judged on the samples of the fit" if fitted else "")
+    return fitted, reason + ("; judged on the samples of the fit" if fitted else "")
 
 
 def _worse_than_raw(
-    calibration: SensorCalibration, samples: Sequence[Samples], most: float, other: SensorCalibration | None
+    calibration: SensorCalibration, samples: Sequence[Samples], allowed: float, other: SensorCalibration | None
 ) -> str | None:
-    """Return why a calibration must not be used, as one sentence; None where it may: it leaves at most ``most``."""
-    found = [last_error_of_magnitude(calibration, s, other) for s in samples]
-    after = [error[s.known] for error, s in zip(found, samples, strict=True) if error is not None]
+    """Return why a calibration must not be used, as one sentence; None where it may: its error is ``allowed``."""
+    errors = [last_error_of_magnitude(calibration, s, other) for s in samples]
+    after = [error[s.known] for error, s in zip(errors, samples, strict=True) if error is not None]
     if len(after) < len(samples):
         return None
     raw = np.concatenate([(np.linalg.norm(s.reading, axis=1) - s.magnitude)[s.known] for s in samples])
-    left = np.concatenate(after)
-    sizes = [float(np.sqrt(np.mean(e**2))) for e in (raw, left)]
-    if sizes[1] <= max(sizes[0], most) or len(raw) < FEWEST:
+    calibrated = np.concatenate(after)
+    sizes = [float(np.sqrt(np.mean(e**2))) for e in (raw, calibrated)]
+    if sizes[1] <= max(sizes[0], allowed) or len(raw) < FEWEST_SAMPLES:
         return None
-    pieces = np.array_split(left**2 - raw**2, min(STRETCHES, len(raw)))
+    pieces = np.array_split(calibrated**2 - raw**2, min(STRETCHES, len(raw)))
     means = np.array([piece.mean() for piece in pieces])
-    from scipy.special import stdtrit  # noqa: PLC0415  (only where the calibration seems to do harm)
+    from scipy.special import stdtrit  # noqa: PLC0415  (only where the calibration seems to be worse)
 
-    limit = stdtrit(len(means) - 1, 1.0 - LEVEL) * float(means.std(ddof=1))
+    limit = stdtrit(len(means) - 1, 1.0 - FALSE_REFUSALS) * float(means.std(ddof=1))
     if means.mean() * np.sqrt(len(means)) <= limit:
         return None
     unit = unit_of(calibration.sensor)
     return (
         f"the calibration makes held-out motion worse: {sizes[0]:.3g} {unit} rms before it, {sizes[1]:.3g} {unit} "
-        f"after, where noise and stated uncertainties leave at most {most:.3g} {unit}. Check that fit and "
+        f"after, where noise and stated uncertainties leave at most {allowed:.3g} {unit}. Check that fit and "
         "held-out recordings are of this unit in the same mounting, and what the table logged"
     )
 
@@ -294,11 +299,11 @@ def _check_limits(
 
     A limit that is null is not checked; a figure that is not known does not pass.
     """
-    ends = [abs(v) for v in (last["max_error"], last["min_error"]) if v is not None]
+    extremes = [abs(v) for v in (last["max_error"], last["min_error"]) if v is not None]
     figures = {
         "held_out_rms_error": last["rms_error"],
         "held_out_mean_abs_error": last["mean_abs_error"],
-        "held_out_max_abs_error": max(ends, default=None),
+        "held_out_max_abs_error": max(extremes, default=None),
         "bias": float(np.max(np.abs(calibration.bias))),
         "scale_factor": float(np.max(np.abs(np.diag(calibration.matrix) - 1.0))),
     }
@@ -308,6 +313,6 @@ def _check_limits(
             raise ConfigurationError(f"limits.{calibration.sensor}.{name} is unknown; known: {', '.join(figures)}")
         if limit is not None:
             value = figures[name]
-            kept = value is not None and bool(value <= limit)
-            checks.append({"name": name, "limit": float(limit), "value": value, "pass": kept})
+            passes = value is not None and bool(value <= limit)
+            checks.append({"name": name, "limit": float(limit), "value": value, "pass": passes})
     return checks, (all(c["pass"] for c in checks) if checks else None)

@@ -1,4 +1,4 @@
-"""Held-out samples of a sensor, what is known of the truth there, and the noise that is in them.
+"""Held-out samples of a sensor, with the reference of each and the variance of its noise.
 
 The reference of a filtered recording is taken at ``time - delay``. Its magnitude is
 
@@ -6,13 +6,14 @@ The reference of a filtered recording is taken at ``time - delay``. Its magnitud
 
 where the table rate is that of the log, else that of the attitude's derivative, else that of the angle where the unit
 turns about one fixed axis; its error by the encoder's resolution counts as white noise. With Earth's rotation
-configured, the rate is changed by ``|omega + Omega| - |omega|``, which the gyroscope sees too.
+configured, ``|omega + Omega| - |omega|`` is added to the rate, because the gyroscope measures that too.
 
 The mean squared error of the magnitude of a vector t, given the covariance S of the vector's error x, is
 
-    E(|t + x| - |t|)^2 = tr(W S),    W = u u' + g (1 - u u'),    u = t/|t|,    g = 0 far from zero
+    E(|t + x| - |t|)^2 = tr(W S),    W = u u' + g (1 - u u'),    u = t/|t|
 
-Near zero (a gyroscope at rest) the norm is not linear in x, and the mean is ``2 |t|^2 + tr S - 2 |t| E|t + x|``,
+where |t| is beyond 30 standard deviations of x, the norm is linear in x and g = 0. Nearer to zero (a gyroscope at rest)
+g follows from the mean ``2 |t|^2 + tr S - 2 |t| E|t + x|``, with
 
     E|t + x| = 1/sqrt(pi) int_0^inf (1 - phi(v^2)) / v^2 dv
     phi(s) = prod_i (1 + 2 s l_i)^(-1/2) exp(-s t_i^2 / (1 + 2 s l_i))
@@ -36,7 +37,7 @@ from pipeline.model.effects.timing import shifted
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.encoder_rate import FEWEST, EncoderRate, rate_by_angle
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
-from pipeline.signal.quiet_motion import believed_rates, creep_in
+from pipeline.signal.quiet_motion import creep_of_rest, posterior_creep_rates
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -45,11 +46,11 @@ if TYPE_CHECKING:
     from pipeline.signal.rests import Rest
 
 OTHER = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
-RAW = 0.05  # by which scale and axes of sensors may differ before calibration: scale 3 %, cross-axis 2 % (data sheets)
-OFF_AXIS = 0.03  # of the rate about one axis: cross-axis sensitivity of data sheets, and effects, cause less off it
+UNCALIBRATED_ERROR = 0.05  # of scale and axes before calibration: scale 3 %, cross-axis 2 % (data sheets)
+OFF_AXIS_SHARE = 0.03  # of the rate about one axis; cross-axis sensitivity of data sheets, and effects, cause less
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(48)  # enough for the 0.4 % of a simulation (test_norm_error)
 THETA, STEP = np.pi / 4.0 * (NODES + 1.0), np.pi / 4.0 * NODE_WEIGHTS
-FAR = 30.0  # standard deviations from zero, beyond which the norm is linear to 1e-3
+LINEAR_FROM = 30.0  # standard deviations from zero, beyond which the norm is linear to 1e-3
 
 
 @dataclass(frozen=True)
@@ -60,20 +61,23 @@ class Samples:
     time: Values  # (n,), s
     reading: Values  # (n, 3), g or deg/s
     magnitude: Values  # (n,), that of the reference
-    white: Values  # (n, 3), variance of white noise behind the filter, per reading axis
-    wander: Values  # (n, 3), variance of wander
+    white_variance: Values  # (n, 3), of white noise after the filter, per reading axis; see ``variance``
+    wander_variance: Values  # (n, 3)
     motion: Motion | None  # by the reference, where the attitude is known
     other: Values | None  # (n, 3), readings of the other sensor
     temperature: Values | None  # (n,), degC
     resting: bool = False  # whether each sample is the mean of a rest
-    alike: float = 1.0  # samples that share one value of the white noise, by the filter: sum_l r_l^2 / r_0^2 over lags
+    correlated_samples: float = 1.0  # that count as one independent sample of the noise after the filter
     setup: str = ""  # session of the recording
     earth_left_out: bool = False  # whether Earth's rotation is configured, but without an attitude not in the magnitude
 
     @property
     def variance(self) -> Values:
-        """Of the noise of each sample, per reading axis: (n, 3) array, unit squared."""
-        return self.white + self.wander
+        """Of the noise of each sample, per reading axis: (n, 3) array, unit squared.
+
+        White noise contains the resolution of the encoder and, of rests, what is not known of their creep.
+        """
+        return self.white_variance + self.wander_variance
 
     @property
     def known(self) -> Mask:
@@ -100,10 +104,10 @@ def samples_of_motion(
     magnitude = np.full(recording.samples, gravity)
     by_angle = _rate_by_angle(recording) if sensor == "gyroscope" else None
     if sensor == "gyroscope":
-        known = _rate(recording, motion, earth, delay, by_angle)
-        if known is None:
+        rate = _rate(recording, motion, earth, delay, by_angle)
+        if rate is None:
             return None
-        magnitude = known
+        magnitude = rate
     if smoothed and motion is not None:
         magnitude = np.linalg.norm(truth(sensor, motion), axis=1)
     temperature = recording.temperature if motion is None else motion.temperature
@@ -115,11 +119,11 @@ def samples_of_motion(
         magnitude,
         np.broadcast_to((float(recording.filter.get("noise_gain", 1.0)) * noise.white) ** 2, (n, 3))
         + (0.0 if by_angle is None else by_angle.noise[:, None] ** 2),
-        np.broadcast_to(_wander_share(recording) * noise.wander**2, (n, 3)),
+        np.broadcast_to(_wander_gain(recording) * noise.wander**2, (n, 3)),
         motion,
         recording.reading(OTHER[sensor]),
         temperature,
-        alike=_alike(recording),
+        correlated_samples=_correlated_samples(recording),
         setup=recording.setup,
         earth_left_out=sensor == "gyroscope" and earth is not None and motion is None,
     )
@@ -130,8 +134,8 @@ def samples_of_rests(
 ) -> Samples | None:
     """Return the mean readings of rests, or None where there are none.
 
-    Of a gyroscope they are less the rate at which the unit creeps, as far as the accelerometer shows it; what it does
-    not show counts as noise of the rest (``pipeline.signal.quiet_motion``).
+    From those of a gyroscope the rate at which the unit creeps is subtracted, as far as the accelerometer shows it.
+    What it does not show counts as white noise of the rest (``pipeline.signal.quiet_motion``).
     """
     reading, counts = rest_means(recording, rests, sensor)
     rests = [rest for rest, count in zip(rests, counts, strict=False) if count]
@@ -145,7 +149,7 @@ def samples_of_rests(
     other, _ = rest_means(recording, rests, OTHER[sensor])
     share = variance_of_mean(filter_autocovariance(recording), counts)
     averaged = variance_of_average(counts.astype(np.float64) * recording.interval, noise.correlation_time)
-    wander = _wander_share(recording) * noise.wander**2
+    wander = _wander_gain(recording) * noise.wander**2
     gravity = float(table.get("gravity_g") or 1.0) if sensor == "accelerometer" else 0.0
     time = means(recording.time)
     assert time is not None  # noqa: S101
@@ -170,24 +174,26 @@ def samples_of_rests(
 
 def _creep(recording: Recording, rests: Sequence[Rest], force: Values) -> tuple[Values, Values]:
     """Return the rate at which the unit creeps in each rest, deg/s, and the variance of what is not known of it."""
-    every = {(r.start, r.stop): creep_in(recording, r.start, r.stop) for r in (*split_rests(recording, 0).used, *rests)}
-    rates, errors, about = believed_rates(list(every.values()))
-    chosen = [list(every).index((rest.start, rest.stop)) for rest in rests]
+    creeps = {
+        (r.start, r.stop): creep_of_rest(recording, r.start, r.stop) for r in (*split_rests(recording, 0).used, *rests)
+    }
+    rates, errors, about_gravity = posterior_creep_rates(list(creeps.values()))
+    chosen = [list(creeps).index((rest.start, rest.stop)) for rest in rests]
     rate, error = rates[chosen], errors[chosen]
     upward = (force / np.linalg.norm(force, axis=1, keepdims=True)) ** 2
-    seen = error**2 + RAW**2 * np.sum(rate**2, axis=1)
+    across = error**2 + UNCALIBRATED_ERROR**2 * np.sum(rate**2, axis=1)
     nearest = np.eye(3)[np.argmax(upward, axis=1)]  # one error: shared out to three axes it would count as several
-    return rate, seen[:, None] * (1.0 - upward) + about**2 * nearest
+    return rate, across[:, None] * (1.0 - upward) + about_gravity**2 * nearest
 
 
-def _wander_share(recording: Recording) -> float:
-    """Return how much of the variance of a slow wander passes the filter: 1, or 0 of a high-pass."""
+def _wander_gain(recording: Recording) -> float:
+    """Return the power gain of the filter at 0 Hz, from 0 (high-pass) to 1: the share of the wander's variance."""
     covariance = filter_autocovariance(recording)
     return float(np.clip(2.0 * covariance.sum() - covariance[0], 0.0, 1.0))
 
 
-def _alike(recording: Recording) -> float:
-    """Return ``sum_l r_l^2 / r_0^2`` of the filter's autocovariance r, over all lags."""
+def _correlated_samples(recording: Recording) -> float:
+    """Return ``sum_l r_l^2 / r_0^2`` of the filter's autocovariance r, over all lags l."""
     covariance = filter_autocovariance(recording) ** 2
     return float((2.0 * covariance.sum() - covariance[0]) / covariance[0])
 
@@ -195,14 +201,13 @@ def _alike(recording: Recording) -> float:
 def _rate(
     recording: Recording, motion: Motion | None, earth: Values | None, delay: float, by_angle: EncoderRate | None
 ) -> Values | None:
-    """Return the magnitude of the rate that the gyroscope should see: (n,) array, deg/s."""
-    seen = None if motion is None else np.linalg.norm(truth("gyroscope", motion), axis=1)
-    turned = seen
+    """Return the magnitude of the rate that the gyroscope should measure: (n,) array, deg/s."""
+    by_attitude = None if motion is None else np.linalg.norm(truth("gyroscope", motion), axis=1)
+    of_table = by_attitude
     if motion is not None and earth is not None and motion.level is not None:
-        of_table = motion.angular_rate - np.einsum("i,nij->nj", earth, motion.level)
-        turned = np.linalg.norm(of_table, axis=1)
-    if seen is not None and recording.table_rate is None:
-        return seen if by_angle is None else np.where(by_angle.vague, np.nan, seen)
+        of_table = np.linalg.norm(motion.angular_rate - np.einsum("i,nij->nj", earth, motion.level), axis=1)
+    if by_attitude is not None and recording.table_rate is None:
+        return by_attitude if by_angle is None else np.where(by_angle.vague, np.nan, by_attitude)
     logged = recording.table_rate
     if by_angle is not None:
         logged = np.where(by_angle.vague, np.nan, by_angle.rate)
@@ -211,21 +216,21 @@ def _rate(
     if delay:
         logged = np.interp(recording.time - delay, recording.time, logged)
     logged = np.abs(logged)
-    return logged if seen is None or turned is None else logged + (seen - turned)
+    return logged if by_attitude is None or of_table is None else logged + (by_attitude - of_table)
 
 
 def _rate_by_angle(recording: Recording) -> EncoderRate | None:
     """Return the rate by the table's angle, where the table logs nothing better and turns about one fixed axis."""
-    found = rate_by_angle(recording)
-    if found is None or recording.axis is not None:
-        return found
+    by_angle = rate_by_angle(recording)
+    if by_angle is None or recording.axis is not None:
+        return by_angle
     if recording.table_attitude is not None or recording.gyroscope is None:
         return None
-    known = recording.gyroscope[np.isfinite(recording.gyroscope).all(axis=1)]
-    if len(known) < FEWEST:
+    finite = recording.gyroscope[np.isfinite(recording.gyroscope).all(axis=1)]
+    if len(finite) < FEWEST:
         return None
-    spread = np.linalg.eigvalsh(np.cov(known.T))
-    return found if spread[1] <= OFF_AXIS**2 * spread[2] else None
+    spread = np.linalg.eigvalsh(np.cov(finite.T))
+    return by_angle if spread[1] <= OFF_AXIS_SHARE**2 * spread[2] else None
 
 
 def squared_norm_errors(truth: Values, matrix: Values, variance: Values) -> Values:
@@ -249,7 +254,7 @@ def mean_squares(truth: Values, S: Values) -> tuple[Values, Values]:
     u = truth / np.where(size > 0.0, size, 1.0)[:, None]
     along = np.einsum("ni,ij,nj->n", u, S, u)
     squares, g = along.copy(), np.zeros(len(truth))
-    near = (size <= FAR * np.sqrt(total)) & (total > 0.0)
+    near = (size <= LINEAR_FROM * np.sqrt(total)) & (total > 0.0)
     if near.any():
         squares[near] = _near_zero(truth[near], size[near], S)
         g[near] = np.clip((squares - along)[near] / np.maximum(total - along[near], 1e-12 * total), 0.0, 1.0)

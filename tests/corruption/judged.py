@@ -157,7 +157,7 @@ def _wrong_rate(copy: Copy, path: Path) -> str:
     match = re.search(r"update_rate: *([0-9.eE+-]+)", path.read_text(encoding="utf-8")) if path.is_file() else None
     if match is None or abs(float(match[1]) * copy.interval_s - 1.0) <= OF_RATE:
         return ""
-    return f"exported rate {match[1]} Hz in place of {1.0 / copy.interval_s:.4g} Hz"
+    return f"exported rate {match[1]} Hz instead of {1.0 / copy.interval_s:.4g} Hz"
 
 
 def _judged(  # noqa: PLR0917  (what a judgement is made of)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import bench_session
@@ -17,10 +18,10 @@ from pipeline.estimation.gauss_markov import (
     block_covariance,
     variance_of_average,
 )
-from pipeline.estimation.noise import estimate_noise, static_or_sheet
+from pipeline.estimation.noise import estimate_noise, wander_prior
 from pipeline.estimation.noise_terms import allan_deviation
 from pipeline.estimation.reference_least_squares import fit
-from pipeline.records import Recording
+from pipeline.records import Noise, Recording
 from pipeline.signal.filters import apply_filter, filter_autocovariance
 from pipeline.study.run import settings_of
 
@@ -72,7 +73,12 @@ def test_wander_is_recovered_from_a_static_recording(name: str, wander: float) -
     assert np.mean(rms) == pytest.approx(wander, rel=0.08)
     assert np.std(rms) < 0.25 * wander
     assert 50.0 <= np.median([n.correlation_time for n in noises]) <= 200.0
-    assert {n.source for n in noises} == {"static"}
+    assert {(n.source, n.wander_source) for n in noises} == {("static", "static")}
+    copy = Noise.from_json(json.loads(json.dumps(noises[0].to_json())))
+    for prior, again in zip(
+        wander_prior(noises[0], SHEET).grid(WHITE), wander_prior(copy, SHEET).grid(WHITE), strict=True
+    ):
+        assert prior == again
 
 
 def test_hypotheses_of_a_static_recording_predict_the_scatter_of_an_average() -> None:
@@ -81,7 +87,7 @@ def test_hypotheses_of_a_static_recording_predict_the_scatter_of_an_average() ->
         wander = SHEET["bias_wander"] * np.exp(SHEET_WIDTH * rng.standard_normal())
         tau = 100.0 * rng.choice(TIME_FACTORS, p=TIME_PRIOR)
         noise = estimate_noise("accelerometer", [rest(7500, wander, seed, tau=tau)], SHEET)
-        settings = static_or_sheet(noise, SHEET).grid(WHITE)
+        settings = wander_prior(noise, SHEET).grid(WHITE)
         weight = np.exp(np.array([s.prior for s in settings]) - max(s.prior for s in settings))
         sigma = np.array([scatter_of_average(WHITE * s.ratio, s.time, length) for s in settings])
         x = brentq(lambda x: weight @ (2.0 * norm.cdf(x / sigma) - 1.0) - 0.95 * weight.sum(), 0.0, 4.0 * sigma.max())  # noqa: B023
@@ -107,15 +113,20 @@ def test_values_held_between_samples_do_not_hide_a_slow_wander_from_the_stated_u
 
 
 def test_no_wander_is_invented_in_white_noise() -> None:
-    found = [estimate_noise("accelerometer", [rest(10000, 0.0, s)], SHEET).wander.max() for s in range(24)]
+    noises = [estimate_noise("accelerometer", [rest(10000, 0.0, s)], SHEET) for s in range(24)]
+    found = [noise.wander.max() for noise in noises]
     assert np.mean(np.array(found) == 0.0) > 0.85
     assert max(found) < 1e-4
+    assert {n.wander_source for n in noises if n.wander.max() == 0.0} == {
+        "static"
+    }  # the rest excludes the sensor file's
 
 
 def test_wander_that_a_short_rest_cannot_show_is_the_data_sheets() -> None:
     noise = estimate_noise("accelerometer", [rest(100, 0.0, 0)], SHEET)
     assert noise.wander.tolist() == [1e-4] * 3
     assert noise.correlation_time == 100.0
+    assert (noise.source, noise.wander_source, noise.time_source) == ("static", "data_sheet", "data_sheet")
 
 
 def test_warm_up_of_a_static_recording_does_not_pass_for_wander() -> None:

@@ -12,7 +12,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording
-from pipeline.signal.quiet_motion import believed_rates, creep_of
+from pipeline.signal.quiet_motion import creep_of_readings, posterior_creep_rates
 from pipeline.signal.rests import Rest, find_rests
 from pipeline.validation.heldout import validate
 
@@ -25,7 +25,7 @@ def test_the_rate_of_a_steady_tilt_is_told_across_gravity_alone() -> None:
     up = np.array([0.3, 0.5, np.sqrt(0.66)])
     angle = np.outer(time, rate)
     force = up - np.cross(angle, up) + 0.5 * np.cross(angle, np.cross(angle, up))  # du/dt = -omega x u
-    found = creep_of(time, force + 5e-4 * rng.standard_normal(force.shape))
+    found = creep_of_readings(time, force + 5e-4 * rng.standard_normal(force.shape))
     across = np.degrees(rate - (rate @ up) * up)
     assert found.uncertainty == pytest.approx(np.degrees(5e-4 * np.sqrt(12 / 500) / 4.99), rel=0.05)
     assert np.abs(found.rate - across).max() < 4.0 * found.uncertainty
@@ -36,9 +36,11 @@ def test_the_rate_of_a_steady_tilt_is_told_across_gravity_alone() -> None:
 
 def test_a_unit_that_stands_still_creeps_in_one_rest_of_a_thousand() -> None:
     rng, time = np.random.default_rng(5), np.arange(300) * 0.01
-    found = [creep_of(time, np.array([0.6, 0.0, 0.8]) + 2e-3 * rng.standard_normal((300, 3))) for _ in range(1000)]
+    found = [
+        creep_of_readings(time, np.array([0.6, 0.0, 0.8]) + 2e-3 * rng.standard_normal((300, 3))) for _ in range(1000)
+    ]
     assert sum(bool(c.rate.any()) for c in found) <= 3
-    rate, error, about = believed_rates(found)
+    rate, error, about = posterior_creep_rates(found)
     assert not (rate.any())
     assert not (error.any())
     assert not about

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import PipelineError
 from pipeline.estimation.gauss_markov import TIME_FACTORS, TIME_PRIOR
-from pipeline.estimation.noise import noise_of, static_or_sheet
+from pipeline.estimation.noise import noise_of, wander_prior
 from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.uncertainty_budget import with_stated
 from pipeline.model.effects import built_in
@@ -103,7 +103,7 @@ def drawn(
 
 def _drawn_wander(model: str, sensor: str, rng: np.random.Generator) -> dict[str, float]:
     """Return a bias wander of the prior that a fit takes from the data sheet."""
-    prior = static_or_sheet(None, read_config("sensor", model)[sensor])
+    prior = wander_prior(None, read_config("sensor", model)[sensor])
     return {
         "bias_wander": prior.wander * float(np.exp(prior.width * rng.standard_normal())),
         "wander_time_s": prior.time * float(rng.choice(TIME_FACTORS, p=TIME_PRIOR)),

@@ -41,7 +41,7 @@ def test_the_interval_holds_99_percent_of_units_whose_noise_is_known(size: float
     error = WHITE * rng.standard_normal((UNITS, SAMPLES, 3)) + wander_of(rng, wander)
     error += bias * rng.standard_normal((UNITS, 1, 3))
     rms = np.sqrt(np.mean((np.linalg.norm(truth + error, axis=2) - np.linalg.norm(truth, axis=1)) ** 2, axis=1))
-    low, high = interval(truth, Noise(np.full(3, WHITE), np.full(3, wander), TAU, "static", 1e9), bias)
+    low, high = interval(truth, Noise(np.full(3, WHITE), np.full(3, wander), TAU, "static", length=1e9), bias)
     assert np.mean(rms > high) < 0.01
     assert np.mean(rms < low) < 0.01
     assert high < 1.35 * np.quantile(rms, 0.995)  # what is known needs no wide interval
@@ -60,7 +60,7 @@ def interval(truth: np.ndarray, noise: Noise, bias: float, freedom: float = np.i
 
 def test_what_is_less_known_widens_the_interval() -> None:
     truth = truth_of(1.0)
-    noise = Noise(np.full(3, WHITE), np.full(3, 0.5 * WHITE), TAU, "static", 1e9)
+    noise = Noise(np.full(3, WHITE), np.full(3, 0.5 * WHITE), TAU, "static", length=1e9)
     known = interval(truth, noise, 0.0)
     for less in (replace(noise, length=60.0), replace(noise, source="rests", length=0.0)):
         low, high = interval(truth, less, 0.0)

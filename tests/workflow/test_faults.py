@@ -188,7 +188,7 @@ def test_the_same_command_makes_a_damaged_file_again_whose_size_and_time_are_as_
     said, code = disk.run(disk.turn())
     assert code != 0
     assert "ingest.zip: U1.parquet cannot be read, it is missing or damaged (" in said
-    assert "the same command once more makes it again [damaged_file in report]" in said
+    assert "run the same command again: snakemake writes the file anew [damaged_file in report]" in said
     said, code = disk.run(disk.place)
     assert code == 0, said
     assert disk.tree() == disk.trees[disk.place]

@@ -34,7 +34,7 @@ RUNNING = not workflow.is_main_process
 
 
 def without_braces(path):
-    """Return a path for Snakemake, which takes {name} for a wildcard: in place of one with braces, a link to it."""
+    """Return a path for Snakemake, which takes {name} for a wildcard: instead of one with braces, a link to it."""
     if "{" not in str(path):
         return str(path)
     link = Path(

@@ -15,8 +15,8 @@ one axis, or neither. The first two give, for each channel c,
     R_ic = sum rate (y_c - b_c) / sum rate^2   over the steady parts of the turns about axis i
 
 where y is the reading, deg/s, and the rate is signed, so that turns at several rates and in both directions count as
-one regression; Earth's rotation is taken off y first where the table's place and azimuth are set. Without a rest in
-these recordings the bias is that of the static recording. As printed, row i is the mean reading over the mean rate.
+one regression; Earth's rotation is subtracted from y first where the table's place and azimuth are set. Without a rest
+in these recordings the bias is that of the static recording. As printed, row i is the mean reading over the mean rate.
 """
 
 from __future__ import annotations

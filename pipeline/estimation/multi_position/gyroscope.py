@@ -8,7 +8,7 @@ where
     y, b, M : reading and bias, deg/s, and matrix
     z, p    : effects and their parameters, with the accelerometer's specific force, at rest and rotated along a move
     w       : rate at which a unit creeps in a rest, across gravity by the accelerometer (K = M^-1); the rate about
-              gravity is unknown and as large (``pipeline.signal.quiet_motion.believed_rates``)
+              gravity is unknown and as large (``pipeline.signal.quiet_motion.posterior_creep_rates``)
     u       : direction of gravity by the calibrated accelerometer (``gravity``); A_0 as in ``moves``
     E       : two directions across u_after; W whitens the integrated noise of the gyroscope, the uncertainty of the
               rate between samples, and the noise of the accelerometer

@@ -79,7 +79,7 @@ def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesi
     ``noise``: A static recording pins the bias instability. ``kinds``: of scatter: that of rests, and that of moves.
     """
     settings = selection_grid(noise)
-    if kinds > 1:  # two kinds of scatter leave nothing to tell of a bias far from that of a static recording
+    if kinds > 1:  # two kinds of scatter say nothing about a bias far from that of a static recording
         settings = [s for s in settings if s.prior > UNLIKELY]
     levels = list(product(*SELECTION_SCATTER[:kinds]))
     found = [NoiseHypothesis(s.ratio, s.time, level, s.prior) for s in settings for level in levels]
@@ -122,7 +122,7 @@ class ProjectedCandidates:
     orthonormal: list[Values]
     residual: Values  # (t, n)
     basis: Values  # (t, n, b); orthonormal, of the model's columns
-    log_determinant: Values  # (t,); log det C, less twice the prior
+    log_determinant: Values  # (t,); log det C, minus twice the prior
 
     def of_model(self) -> tuple[float, int]:
         """Return log L of the model, and the index of its best hypothesis."""
@@ -130,7 +130,7 @@ class ProjectedCandidates:
         return float(scores.max()), int(np.argmax(scores))
 
     def scores(self, explained: Values | float = 0.0) -> Values:
-        """Return log L under each hypothesis, less explained sums of squares: (t,) array."""
+        """Return log L under each hypothesis, minus explained sums of squares: (t,) array."""
         rss = np.sum(self.residual**2, axis=1) - explained
         return log_likelihood(rss, self.residual.shape[1], self.log_determinant)
 

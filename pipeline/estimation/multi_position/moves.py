@@ -27,7 +27,7 @@ The direction of gravity before and after every move, by the calibrated accelero
 where
 
     u_mean : direction of the rest's mean, T its length
-    w      : rate at which the unit creeps (``pipeline.signal.quiet_motion.believed_rates``)
+    w      : rate at which the unit creeps (``pipeline.signal.quiet_motion.posterior_creep_rates``)
     s      : standard deviation of the mean of the half second by white noise, across u
 
 A unit in a hand or on a soft support creeps after it was set down, not always steadily. The half second next to a move
@@ -161,7 +161,9 @@ def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Value
     bend = same & (place[:, :-1] % 2 == 0) & (last[:, :-1] < SMOOTH)
     left = (place == 2) & (last == 2)  # the third of three
     interval = np.max(weight, axis=1)[:, None]
-    shared = np.maximum(weight[:, :-1] + weight[:, 1:], 0.5 * interval)  # by the two samples that it is taken off
+    shared = np.maximum(
+        weight[:, :-1] + weight[:, 1:], 0.5 * interval
+    )  # of the two samples from which it is subtracted
     share = np.where(bend, 0.5 * interval * product / shared, 0.0) / np.maximum(np.sum(both**2, axis=2), 1e-300)
     rate = share[:, :, None] * both
     taken = np.zeros_like(reading)
@@ -174,7 +176,7 @@ def _regular_stamps(time: Values) -> Values | None:
     """Return the stamps that a regular clock gives the samples: (s,) array; None where one was dropped.
 
     Stamps by arrival are late, each by an amount of its own. A dropped sample makes all that follow late: then the
-    lower envelope of the stamps, less a straight line, has a step.
+    lower envelope of the stamps, minus a straight line, has a step.
     """
     n = np.arange(len(time)) - 0.5 * (len(time) - 1)
     line = time.mean() + n * float(n @ time) / float(n @ n)
@@ -193,9 +195,9 @@ def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values)
     """Return the time of each move's samples: as stamped, or regular where the readings are much smoother with that.
 
     The regular clock is that of the whole recording, or of each move where that one drifts or a sample was dropped.
-    Stamps that only a file's digits take off it are regular unless the readings contradict: a file that keeps six
-    digits of a clock that ticks every 9.999 ms holds steps of 10 ms and now and then one of 9 ms, over which 200 deg/s
-    would be integrated wrongly by 0.2 deg.
+    Stamps that depart from it by a file's digits alone are regular unless the readings contradict: a file that keeps
+    six digits of a clock that ticks every 9.999 ms holds steps of 10 ms and now and then one of 9 ms, over which 200
+    deg/s would be integrated wrongly by 0.2 deg.
 
     ``time``: (n,), s. ``rate``: (n, 3), deg/s. ``white``: (3,), deg/s, white noise of a sample.
     """
