@@ -3,6 +3,7 @@
 A test is one core, as a job is: linear algebra on small matrices is slower on several.
 """
 
+import gc
 import os
 
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -20,3 +21,8 @@ settings.load_profile("fixed")
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run whole campaigns first: a long file at the end would leave the other worker idle."""
     items.sort(key=lambda item: item.get_closest_marker("workflow") is None)
+
+
+def pytest_collection_finish() -> None:
+    """Let the search for garbage leave out what was imported: a seventh of the time of the tests."""
+    gc.freeze()

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.commands import simulate
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -53,7 +55,6 @@ class Bench:
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Raw recordings of one small unit."""
     directory = tmp_path_factory.mktemp("simulated") / "tiny"
-    command = [sys.executable, "-m", "pipeline", "simulate", str(directory), "--units", "1", "--sensor", "mpu6050"]
-    command += ["--step", "15", "--dwell", "1", "--rates", "60", "--validation", "60", "--seed", "4"]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    course = ["--step", "15", "--dwell", "1", "--rates", "60", "--validation", "60", "--seed", "4"]
+    assert simulate.main([str(directory), "--units", "1", "--sensor", "mpu6050", "--quiet", *course]) == 0
     return next((directory / "raw").iterdir())

@@ -108,6 +108,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
 
 
 def test_the_run_its_repetition_explain_and_the_page_show_the_same_command(loop: Loop) -> None:
+    assert "Nothing to be done" in loop.said["again"]
     command = f"python -m pipeline add 'my demo' {HIDDEN} gyroscope.g_sensitivity"
     assert loop.said["page"] == command
     for when in ("first", "again"):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from html import unescape
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +11,13 @@ import numpy as np
 import pytest
 from whole_run import run_campaign
 
+from pipeline.commands import apply, simulate
 from pipeline.config import load_campaign
 from pipeline.errors import ConfigurationError
 from pipeline.io.ros2_messages import write_mcap
 from pipeline.records import Recording
 
-from .conftest import ROOT, Bench
+from .conftest import Bench
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,18 +49,17 @@ def as_mcap(source: Path, target: Path) -> None:
     write_mcap(target, Recording("recording", "rests", None, time, force, None, rows["temperature_degc"]))
 
 
-def simulate(directory: Path, *options: str) -> Path:
-    command = [sys.executable, "-m", "pipeline", "simulate", str(directory), "--sensor", "mpu6050", "--quiet", *options]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+def simulated(directory: Path, *options: str) -> Path:
+    assert simulate.main([str(directory), "--sensor", "mpu6050", "--quiet", *options]) == 0
     return next((directory / "raw").iterdir())
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     directory = tmp_path_factory.mktemp("one_sensor")
-    hand = simulate(directory / "hand", "--procedure", "multi_position", "--table", "hand", "--positions", "24",
-                    "--static", "0", "--validation", "0")  # fmt: skip
-    table = simulate(directory / "table", "--step", "15", "--static", "0", "--validation", "30")
+    hand = simulated(directory / "hand", "--procedure", "multi_position", "--table", "hand", "--positions", "24",
+                     "--static", "0", "--validation", "0")  # fmt: skip
+    table = simulated(directory / "table", "--step", "15", "--static", "0", "--validation", "30")
     campaign = directory / "units"
     for unit in ("whole", "null"):
         shutil.copytree(hand, campaign / "raw" / unit)
@@ -111,8 +109,7 @@ def test_one_sensor_gets_the_same_numbers_as_beside_the_other(done: Bench, unit:
 def test_a_log_of_one_sensor_is_compensated(done: Bench) -> None:
     log, out = done.campaign / "raw" / "csv" / "recording.csv", done.directory / "out.csv"
     calibration = done.results / "calibrations" / "csv.json"
-    command = [sys.executable, "-m", "pipeline", "apply", "--calibration", str(calibration), str(log), "-o", str(out)]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    assert apply.main(["--calibration", str(calibration), str(log), "-o", str(out)]) == 0
     header, first = out.read_text().splitlines()[:2]
     assert header == log.read_text().splitlines()[0]
     assert first != log.read_text().splitlines()[1]

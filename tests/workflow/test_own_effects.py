@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,10 @@ import numpy as np
 import pytest
 from whole_run import run_campaign
 
-from .conftest import ROOT, Bench
+from pipeline.commands import apply, explain, simulate
+from pipeline.model.effects import forget
+
+from .conftest import Bench
 
 pytestmark = pytest.mark.workflow
 
@@ -43,11 +44,6 @@ SIMULATE = "--sensor mpu6050 --step 15 --dwell 1 --rates 20 60 --both-directions
 HIDDEN = {"gyroscope": "gear_mesh", "accelerometer": "loose_part"}
 
 
-def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "pipeline", *arguments]
-    return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
-
-
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     directory = tmp_path_factory.mktemp("own")
@@ -56,7 +52,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     (campaign / "effects" / "gear_mesh.yaml").write_text(GEAR)
     (campaign / "effects" / "loose_part.yaml").write_text(LOOSE)
     hide = ["--effect", "gyroscope.gear_mesh=0.03", "--effect", "accelerometer.loose_part=0.01"]
-    command("simulate", str(campaign), *SIMULATE.split(), *hide)
+    assert simulate.main([str(campaign), *SIMULATE.split(), *hide]) == 0
+    forget()  # the command is a process of its own
     (campaign / "raw" / "U001").rename(campaign / "raw" / "found")
     (campaign / "raw" / "known").symlink_to("found")
     (campaign / "units.csv").write_text(SHEET)
@@ -94,11 +91,12 @@ def test_the_hidden_size_is_found_within_its_uncertainty(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("run")
-def test_validation_words_page_and_exports_know_it(bench: Bench) -> None:
+def test_validation_words_page_and_exports_know_it(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     before, after = result(bench, "validations", "known")["accelerometer"]["steps"][-2:]
     assert after["name"] == "+ loose_part"
     assert after["vector_rms_error"] < 0.2 * before["vector_rms_error"]
-    words = command("explain", str(bench.results)).stdout
+    assert explain.main([str(bench.results)]) == 0
+    words = capsys.readouterr().out
     assert "The model of the accelerometer misses loose part." in words
     assert "A loose part of the sensor tips over with gravity." in words
     assert "loose_part" in (bench.results / "reports" / "known.html").read_text()
@@ -121,5 +119,5 @@ def test_the_calibration_alone_takes_the_sensors_formula_off_a_log(bench: Bench,
     log, out = tmp_path / "log.csv", tmp_path / "out.csv"
     rows = "\n".join(",".join(map(repr, map(float, row))) for row in reading)
     log.write_text(f"accel_x_g,accel_y_g,accel_z_g\n{rows}\n")
-    command("apply", "--calibration", str(file), str(log), "-o", str(out))
+    assert apply.main(["--calibration", str(file), str(log), "-o", str(out)]) == 0
     np.testing.assert_allclose(np.loadtxt(out, delimiter=",", skiprows=1), force, atol=1e-9)

@@ -1,12 +1,12 @@
 """A campaign whose run makes its recordings: they are among the results, and its directory stays as it is."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from .conftest import ROOT, Bench
+from pipeline.commands import simulate
+
+from .conftest import Bench
 
 pytestmark = pytest.mark.workflow
 
@@ -18,8 +18,7 @@ def simulated_bench(tmp_path: Path) -> Bench:
     description = "seed: 3\nunits: [{unit: A, count: 2, course: {step_deg: 30.0, validation_s: 60.0}}]\n"
     (campaign / "simulation.yaml").write_text(description)
     (campaign / "campaign.yaml").write_text("simulate: true\noverrides: [method.gyroscope=null]\n")
-    command = [sys.executable, "-m", "pipeline", "simulate", str(campaign), "--sheet-only"]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    assert simulate.main([str(campaign), "--sheet-only"]) == 0
     return Bench(tmp_path, campaign)
 
 

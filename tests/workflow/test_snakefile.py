@@ -149,12 +149,6 @@ def test_lint_finds_nothing_but_what_the_workflows_readme_justifies(bench: Bench
     assert not [finding for finding in found if finding.rstrip(".:") not in readme]
 
 
-def test_an_unchanged_second_run_does_nothing(bench: Bench) -> None:
-    run = bench.snakemake()
-    assert run.code == 0
-    assert "Nothing to be done" in run.output
-
-
 def after(batch: str) -> set[str]:
     return {f"{stage}/{batch}" for stage in ("validate", "diagnose", "calibration", "export", "report", "summary")}
 

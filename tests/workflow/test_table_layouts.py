@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 from whole_run import run_campaign
 
+from pipeline.commands import simulate
 from pipeline.pack import Pack
 from pipeline.stages.unit_files import recordings_of
 
-from .conftest import ROOT, Bench
+from .conftest import Bench
 
 pytestmark = pytest.mark.workflow
 
@@ -43,8 +42,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     campaign = directory / "layouts"
     campaign.mkdir()
     (campaign / "simulation.yaml").write_text(DESCRIPTION)
-    command = [sys.executable, "-m", "pipeline", "simulate", str(campaign)]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    assert simulate.main([str(campaign)]) == 0
     override = f"procedure.recordings.recording.windows=[{WINDOWS}]"
     assert run_campaign(campaign, unit_overrides={"windows": [override]})[1] == 0
     return Bench(directory, campaign)
