@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -52,6 +53,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from omegaconf import DictConfig
+
+Groups: TypeAlias = tuple[tuple[str, str], ...]  # group and option
 INSTANCE = "${ingest.instance}"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.effects.mounting)
@@ -82,7 +86,7 @@ class Composer:
         }
         self.user_effects: UserEffects = load_user_effects(campaign, [*self.searchpath, CONFIGS], python_effects)
         self.effects = {f.stem for f in (CONFIGS / "effect").glob("*.yaml")} | set(self.user_effects.effects)
-        self._bases: dict[tuple[tuple[str, str], ...], tuple[dict[str, Any], bool]] = {}
+        self._bases: dict[Groups, tuple[dict[str, Any], bool]] = {}
         self._checked_bases: dict[int, dict[str, Any]] = {}
         self._resolved: dict[str, dict[str, Any]] = {}
         self._valid_ingest: set[str] = set()
@@ -193,13 +197,8 @@ class Composer:
         """Return what Hydra composes of a choice of groups, and whether it holds references."""
         key = tuple(sorted(groups.items()))
         if key not in self._bases:
-            overrides = [f"{g}={o}" for g, o in key]
-            if self.searchpath:
-                overrides.append(f"hydra.searchpath=[{','.join(map(_quoted, self.searchpath))}]")
-            GlobalHydra.instance().clear()
             try:
-                with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-                    composed = compose("config", overrides)
+                composed = _with_own(key, self.searchpath) if self.searchpath else _shipped(key)
             except (HydraException, OmegaConfBaseException) as error:
                 cause = f" ({error.__cause__})" if error.__cause__ else ""
                 raise Problem(f"{str(error).splitlines()[0]}{cause}") from error
@@ -267,6 +266,19 @@ class Composer:
             raise Problem(
                 "table.latitude_deg and table.azimuth_deg: set both (Earth's rotation is modelled) or neither (null)"
             )
+
+
+def _with_own(groups: Groups, folders: Sequence[Path] = ()) -> DictConfig:
+    """Return what Hydra composes of a choice of groups, with the files of a campaign's own folders."""
+    overrides = [f"{group}={option}" for group, option in groups]
+    if folders:
+        overrides.append(f"hydra.searchpath=[{','.join(map(_quoted, folders))}]")
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose("config", overrides)
+
+
+_shipped = cache(_with_own)  # these files do not change; commands load a campaign several times
 
 
 def _without_need(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str, Any]:
