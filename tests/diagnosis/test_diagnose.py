@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -71,10 +72,16 @@ def diagnosed(sensor: str, recordings: list[Recording], configured: Any = ()) ->
     return diagnose(SensorCalibration(sensor), recordings, noise, settings(sensor, configured))
 
 
+@cache
 def hidden(sensor: str, *names: str, seed: int = 1, course: Course = STOP_AND_GO) -> list[Recording]:
     rng = np.random.default_rng(seed)
     effects = {name: values_of(sensor, name, rng) for name in names}
     return record(Session(seed, course, {sensor: effects}))
+
+
+@cache
+def named(sensor: str, *names: str) -> dict[str, Any]:
+    return diagnosed(sensor, hidden(sensor, *names))
 
 
 def reason_of(part: dict[str, Any], name: str) -> str:
@@ -83,7 +90,7 @@ def reason_of(part: dict[str, Any], name: str) -> str:
 
 @pytest.mark.parametrize(("sensor", "name"), FIRST)
 def test_an_effect_of_data_sheet_size_is_named_alone_and_mended(sensor: str, name: str) -> None:
-    part = diagnosed(sensor, hidden(sensor, name))
+    part = named(sensor, name)
     assert part["selected"] == [name]
     assert part["verdict"] == "missing_effect"
     best = part["ranking"][0]
@@ -128,7 +135,7 @@ def test_the_second_of_two_effects_is_named_beside_a_configured_one() -> None:
 
 
 def test_a_part_holds_every_field_and_is_json() -> None:
-    part = json.loads(json.dumps(diagnosed("accelerometer", hidden("accelerometer", "quadratic_nonlinearity"))))
+    part = json.loads(json.dumps(named("accelerometer", "quadratic_nonlinearity")))
     assert set(part) >= KEYS
     assert all(set(entry) == ENTRY for entry in part["ranking"])
     listed = {e["effect"] for e in part["ranking"]} | {e["effect"] for e in part["not_observable"]}
@@ -136,7 +143,7 @@ def test_a_part_holds_every_field_and_is_json() -> None:
 
 
 def test_squares_and_magnitudes_on_a_one_g_circle_are_printed_as_look_alikes() -> None:
-    part = diagnosed("accelerometer", hidden("accelerometer", "quadratic_nonlinearity"))
+    part = named("accelerometer", "quadratic_nonlinearity")
     alike = {a["effect"]: a["share"] for a in part["ranking"][0]["look_alikes"]}
     assert 0.9 < alike["scale_factor_asymmetry"] < 0.97
     assert "more than 1 g" in part["next_experiment"]
@@ -260,7 +267,7 @@ def test_units_do_not_change_what_is_selected() -> None:
 
 
 def test_words_say_verdict_size_and_what_to_do() -> None:
-    part = diagnosed("accelerometer", hidden("accelerometer", "quadratic_nonlinearity"))
+    part = named("accelerometer", "quadratic_nonlinearity")
     text = "\n".join(in_words(part, "accelerometer"))
     assert "misses quadratic nonlinearity" in text
     assert "K2_x = " in text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,12 @@ NAMED = [
 
 def reasons(part: dict[str, Any]) -> dict[str, str]:
     return {e["effect"]: e["reason"] for e in part["not_observable"]}
+
+
+@cache
+def of_quadratic() -> dict[str, Any]:
+    unit = hand_held("mpu6050", 11, {"accelerometer.quadratic_nonlinearity": None})
+    return unit.diagnosed("accelerometer")
 
 
 def with_readings(unit: Unit, change: Any) -> Unit:
@@ -148,14 +155,14 @@ def test_twenty_four_orientations_select_nothing_where_nothing_is_hidden() -> No
 
 
 def test_what_looks_alike_on_a_one_g_sphere_is_printed() -> None:
-    part = hand_held("mpu6050", 11, {"accelerometer.quadratic_nonlinearity": None}).diagnosed("accelerometer")
+    part = of_quadratic()
     alike = {a["effect"]: a["share"] for a in part["ranking"][0]["look_alikes"]}
     assert 0.85 < alike["scale_factor_asymmetry"] < 1.0
     assert "scale factor asymmetry" in part["next_experiment"]
 
 
 def test_the_added_variable_has_the_slope_that_was_fitted_a_point_a_rest() -> None:
-    part = hand_held("mpu6050", 11, {"accelerometer.quadratic_nonlinearity": None}).diagnosed("accelerometer")
+    part = of_quadratic()
     for panel in part["pictures"]["added_variable"]["panels"]:
         x, y = np.array(panel["x"]), np.array(panel["mean"])
         assert len(x) == 40
@@ -163,7 +170,7 @@ def test_the_added_variable_has_the_slope_that_was_fitted_a_point_a_rest() -> No
 
 
 def test_a_part_is_json_and_is_told_in_words() -> None:
-    part = hand_held("mpu6050", 11, {"accelerometer.quadratic_nonlinearity": None}).diagnosed("accelerometer")
+    part = of_quadratic()
     text = " ".join(in_words(json.loads(json.dumps(part)), "accelerometer"))
     assert "misses quadratic nonlinearity" in text
     assert "there is no table" in text
