@@ -50,32 +50,20 @@ def diagnose(
 ) -> dict[str, Any]:
     """Return a sensor's part of ``diagnoses/<unit>.json``.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-        Its effects are starts for those that are configured.
-    recordings : sequence of Recording
-        All of the unit; those of role ``validation`` judge, and take no part in the selection.
-    settings : mapping
-        Sections ``sensor``, ``table`` and ``effects``; ``procedure`` for recordings by hand.
-    accelerometer : SensorCalibration, optional
-        For the gyroscope by hand, which needs the direction of gravity; without it, it is calibrated again.
-    gravity : mapping, optional
-        Diagnosis of the accelerometer, for a gyroscope whose mountings it determines.
-    moves : mapping, optional
-        Part ``gravity_direction`` of ``validations/<unit>.json``, for a gyroscope by hand.
-    validation : mapping, optional
-        The sensor's part of ``validations/<unit>.json``; without it, a free fit stands for the calibration.
+    ``calibration``: its effects are starts for those that are configured. ``recordings``: all of the unit; those of
+    role ``validation`` judge, and take no part in the selection. ``settings``: sections ``sensor``, ``table`` and
+    ``effects``; ``procedure`` for recordings by hand. ``accelerometer``: for the gyroscope by hand, which needs the
+    direction of gravity; without it, it is calibrated again. ``gravity``: diagnosis of the accelerometer, for a
+    gyroscope whose mountings it determines. ``moves``: part ``gravity_direction`` of ``validations/<unit>.json``, for a
+    gyroscope by hand. ``validation``: the sensor's part of ``validations/<unit>.json``; without it, a free fit stands
+    for the calibration.
 
-    Returns
-    -------
-    dict
-        ``verdict, reason`` (``pipeline.diagnosis.verdict``), ``residual_over_noise, selected, ranking, probability,
-        answer_set, upper_limit`` (``pipeline.estimation.posterior``), ``to_distinguish, not_observable, unexplained,
-        next_experiment, override``; in addition ``configured, suggested_effect``
-        (``pipeline.diagnosis.functional_form_search``), ``wander`` (``ratio, time_s, standard_deviation, expected,
-        inflated``), ``pictures`` (``...residual_plots``), ``method_errors`` (``...method_errors``), on a table
-        ``held_out`` (``error_before, error_after, floor``), without one ``cross_validation``.
+    Returns ``verdict, reason`` (``pipeline.diagnosis.verdict``), ``residual_over_noise, selected, ranking, probability,
+    answer_set, upper_limit`` (``pipeline.estimation.posterior``), ``to_distinguish, not_observable, unexplained,
+    next_experiment, override``; in addition ``configured, suggested_effect``
+    (``pipeline.diagnosis.functional_form_search``), ``wander`` (``ratio, time_s, standard_deviation, expected,
+    inflated``), ``pictures`` (``...residual_plots``), ``method_errors`` (``...method_errors``), on a table ``held_out``
+    (``error_before, error_after, floor``), without one ``cross_validation``.
     """
     sensor = calibration.sensor
     by_hand = is_multi_position(sensor, recordings)

@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.diagnosis import functional_forms as forms
 from pipeline.diagnosis.functional_form_search import CLEARLY, PRICE, Forms, Scored, search, without_effects
 from pipeline.diagnosis.residual_dependence import dependences
-from pipeline.diagnosis.residual_regression import ProjectedCurves
+from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.diagnosis.words import listed
 from pipeline.estimation.design import Term
 from pipeline.estimation.generalized_least_squares import Fit, fit_terms
@@ -136,7 +136,7 @@ def _entry(selection: Selection, terms: Sequence[Scored]) -> dict[str, Any]:
     """Return a form as an entry of ``unexplained``: words, formulas, and the coefficients on each of its axes."""
     sensor, first = selection.observations.sensor, terms[0]
     texts = [text for term in terms for text in term.form.formulas]
-    projected = ProjectedCurves(selection, forms.columns_of(texts, sensor))
+    projected = ProjectedCurves(Scan(selection), forms.columns_of(texts, sensor))
     found = projected.coefficients(range(len(texts)), terms[-1].gain.setting)
     axes = sorted({axis for term in terms for axis in term.gain.axes})
     words, sizes, at = [], [], 0

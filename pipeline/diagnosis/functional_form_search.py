@@ -174,10 +174,10 @@ class Forms:
         own = "fz" if self.sensor == "accelerometer" else "wz"
         signal = "u" if span is None else span.signal
         texts = forms.powers(span or Span.of(self.selection.observations, own), signal)
-        projected = ProjectedCurves(self.selection, forms.columns_of(texts, self.sensor), self.explained)
+        projected = ProjectedCurves(self.scan, forms.columns_of(texts, self.sensor))
         kept = projected.independent(range(len(texts)))
-        drops = projected.drop(kept) if kept else np.zeros((*projected.left.shape, 1))
-        gains = [projected.gain(drops[:, :, k], k + 1) for k in range(drops.shape[2])]
+        drops = projected.drop(kept) if kept else np.zeros((*self.scan.left.shape, 1))
+        gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
         best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
         index = kept[: best + 1]
         formulas = tuple(texts[k] for k in index)

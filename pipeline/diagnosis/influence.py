@@ -26,17 +26,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.residual_dependence import bases_of, curves_of, smooth_tests
-from pipeline.diagnosis.residual_regression import ProjectedCurves, columns_of_fit, each_explains
+from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan, each_explains
 from pipeline.estimation.design import BASE, Design, Term, placed
-from pipeline.estimation.gauss_markov import GaussMarkov, Products
+from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import Fit, design_at
-from pipeline.estimation.observations import Observations, without_each_recording
+from pipeline.estimation.observations import without_each_recording
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import GATE_BIC, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.estimation.observations import Observations
     from pipeline.records import Index, Values
 
     JSON = dict[str, Any]
@@ -57,7 +58,10 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     own = placed(selection.fit.terms)
     design = design_at(selection.observations.weakened, selection.fit)
     whole = design.products([selection.fit.setting])[0]
-    without_each = _without_each(selection)
+    without_each = [
+        (design_at(rest, selection.fit).products([selection.fit.setting])[0], rest)
+        for rest in without_each_recording(selection.observations.weakened)
+    ]
     found = []
     for name in names:
         term, index = own[name][0], np.arange(own[name][1].start, own[name][1].stop)
@@ -98,21 +102,12 @@ def _gains_of_blocks(selection: Selection, design: Design, whole: Values, term: 
     return np.asarray(gains / total if total > 0.0 else gains * 0.0)
 
 
-def _without_each(selection: Selection) -> list[tuple[Values, float, float]]:
-    """Return for each recording the products of the fit without it, the scatter within rows, and the samples."""
-    found = []
-    for rest in without_each_recording(selection.observations.weakened):
-        products = design_at(rest, selection.fit).products([selection.fit.setting])[0]
-        found.append((products, float(np.sum(rest.scatter / selection.fit.scale**2)), 3.0 * rest.samples))
-    return found
-
-
 def _of_recordings(
     selection: Selection,
     whole: Values,
     own: Index,
     gains: Values,
-    without_each: Sequence[tuple[Values, float, float]],
+    without_each: Sequence[tuple[Values, Observations]],
 ) -> list[JSON]:
     """Return the share of each recording in an effect, and what is left of the effect without it."""
     fit, parts = selection.fit, selection.observations.parts
@@ -124,7 +119,7 @@ def _of_recordings(
         entry: JSON = {"recording": part.name, "share": float(gains[of_block == k].sum())}
         entry |= {"delta_bic_without": None, "change": None}
         if without_each:
-            entry |= _refitted(fit, own, least, without_each[k])
+            entry |= _refitted(fit, own, least, *without_each[k])
         found.append(entry)
     return sorted(found, key=lambda entry: -entry["share"])
 
@@ -136,10 +131,9 @@ def _weakest(products: Values, own: Index) -> float:
     return float(np.linalg.eigvalsh(without(products, others)[0][np.ix_(own, own)] / np.outer(size, size))[0])
 
 
-def _refitted(fit: Fit, own: Index, least: float, rest: tuple[Values, float, float]) -> JSON:
+def _refitted(fit: Fit, own: Index, least: float, products: Values, rest: Observations) -> JSON:
     """Return delta BIC of an effect without a recording, and the largest change of its parameters."""
-    products, within, samples = rest
-    p = products.shape[1] - 1
+    within, samples, p = float(np.sum(rest.scatter / fit.scale**2)), 3.0 * rest.samples, products.shape[1] - 1
     others = np.setdiff1d(np.arange(p), own)
     if _weakest(products, own) < DETERMINED * least:
         return {}
@@ -188,34 +182,29 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     """Return ``share_worse``, the share of simulations that fit worse, and ``simulations``, their number."""
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
-    bases, observations = bases_of(selection), selection.observations.weakened
-    curves = curves_of(bases)
-    fitted = ProjectedCurves(selection, curves)
-    draws = _draws(selection)
-    A, places = columns_of_fit(selection, curves)
-    parts = [
-        _projected(
-            observations,
-            fitted,
-            np.concatenate([A[:, [*model[:-1], *own]], A[:, model[-1:]] / fitted.scale[c], draws[c]], axis=1),
-            len(own),
-        )
-        for c, (model, own) in enumerate(places)
-    ]
-    within = np.append(fitted.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
-    left = sum(left for _, _, left in parts)  # (t, 1 + s)
+    bases, observations, scan = bases_of(selection), selection.observations.weakened, Scan(selection)
+    fitted = ProjectedCurves(scan, curves_of(bases))
+    within = np.append(scan.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
+    left, cross = np.zeros((len(scan.left), 1 + SIMULATIONS)), []
+    for c, drawn in enumerate(_draws(selection)):
+        draws = scan.whitened(scan.scale[c] * drawn)
+        left[:, 0] += scan.left[:, c]
+        left[:, 1:] += np.einsum("tss->ts", scan.beside(c, draws, draws))[1:]
+        own = scan.beside(c, fitted.columns[0], draws)[1:]
+        cross.append(np.concatenate([fitted.cross[:, c, :, None], own], axis=2))
 
     def likelihood(rss: Values) -> Values:
-        return np.asarray(fitted.log_likelihood(rss, within).max(axis=0))
+        return np.asarray(scan.log_likelihood(rss, within).max(axis=0))
 
-    error = fitted.error * fitted.scale[:, None]  # of the products in ``parts``, which hold no scale
-    before, least = likelihood(np.asarray(left)), np.ones(1 + SIMULATIONS)
+    before, least = likelihood(left), np.ones(1 + SIMULATIONS)
     for _, kept, fewest in smooth_tests(bases, fitted):
         drop = sum(
-            np.cumsum(each_explains(inner[:, kept][:, :, kept], cross[:, kept], error[:, c, kept])[0], axis=1)
-            for c, (inner, cross, _) in enumerate(parts)
+            np.cumsum(
+                each_explains(fitted.inner[:, c, kept][:, :, kept], own[:, kept], fitted.error[:, c, kept])[0], axis=1
+            )
+            for c, own in enumerate(cross)
         )
-        gain = 2.0 * (likelihood(np.asarray(left)[:, None] - drop) - before)
+        gain = 2.0 * (likelihood(left[:, None] - drop) - before)
         p = chdtrc(3 * np.arange(1, len(kept) + 1)[:, None], np.maximum(gain, 0.0))[fewest - 1 :].min(axis=0)
         least = np.minimum(least, p)
     return {"share_worse": float(np.mean(least[1:] <= least[0])), "simulations": SIMULATIONS}
@@ -232,16 +221,3 @@ def _draws(selection: Selection) -> Values:
         mean = blocks.sums(weight[:, None] * white) / blocks.weight[:, None]
         found.append(white + (noise.draw(rng, SIMULATIONS) - mean)[label])
     return np.stack(found)
-
-
-def _projected(
-    observations: Observations, fitted: ProjectedCurves, columns: Values, curves: int
-) -> tuple[Values, Values, Values]:
-    """Project base and effects out: inner (t, q, q), cross (t, q, 1 + s) and left (t, 1 + s) of an axis.
-
-    ``columns``: those of the model, q curves, the residual and s draws.
-    """
-    products = Products(observations.blocks, observations.weight, columns).products(fitted.settings)[0][1:]
-    k = columns.shape[1] - 1 - SIMULATIONS - curves
-    rest = without(products, np.arange(k))[:, k:, k:]
-    return rest[:, :curves, :curves], rest[:, :curves, curves:], np.einsum("tss->ts", rest[:, curves:, curves:])

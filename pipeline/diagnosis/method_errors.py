@@ -84,20 +84,10 @@ def method_errors(
 ) -> list[dict[str, Any]]:
     """Return what the method's approximations leave, the largest share first; nothing where its fit is free.
 
-    Parameters
-    ----------
-    selection : Selection
-        The free fit, with what was selected.
-    recordings : sequence of Recording
-        All of the unit, filtered.
-    settings : mapping
-        Sections ``table``, ``method`` and, for a given calibration, ``sensor``.
-
-    Returns
-    -------
-    list of dict
-        ``name, meaning, size, unit, share`` of the error on the method's own recordings; in addition ``rms`` (there,
-        unit of the sensor), ``held_out_share`` and ``held_out_magnitude_share`` (on held-out motion, or None).
+    ``selection``: the free fit, with what was selected. ``recordings``: all of the unit, filtered. ``settings``:
+    sections ``table``, ``method`` and, for a given calibration, ``sensor``. Returns ``name, meaning, size, unit,
+    share`` of each error on the method's own recordings; in addition ``rms`` (there, unit of the sensor),
+    ``held_out_share`` and ``held_out_magnitude_share`` (on held-out motion, or None).
     """
     stages = [stage.name for stage in calibration.stages]
     if not stages or stages[-1] in FREE:
@@ -105,22 +95,39 @@ def method_errors(
     difference = _difference_of(calibration, selection, settings)
     own = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == calibration.sensor])
     held_out = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == "validation"])
-    share, held = (_shares({name: e[0] for name, e in found.items()}) for found in (own, held_out))
-    magnitude = _shares({name: e[1] for name, e in held_out.items()})
-    sure = difference.certain(selection.names)
+    rms = {name: _rms(vector) for name, (vector, _) in own.items()}
+    held = _shares({name: _rms(vector) for name, (vector, _) in held_out.items()})
+    magnitude = _shares({name: _rms(error[:, None]) for name, (_, error) in held_out.items()})
     printed = bool((settings.get("method") or {}).get("as_printed"))
+
+    def meaning(name: str) -> str:
+        return _meaning(name, calibration.sensor, stages, recordings, printed=printed)
+
+    return _named(difference, rms, difference.certain(selection.names), recordings, meaning, held, magnitude)
+
+
+def _named(  # noqa: PLR0917  (what the entries hold)
+    difference: _Difference,
+    rms: Mapping[str, float],
+    sure: Mapping[str, bool],
+    recordings: Sequence[Recording],
+    meaning: Callable[[str], str],
+    held: Mapping[str, float],
+    magnitude: Mapping[str, float],
+) -> list[dict[str, Any]]:
+    """Return the errors that are worth naming, the largest share first."""
     found = [
         {
             "name": name,
-            "meaning": _meaning(name, calibration.sensor, stages, recordings, printed=printed),
-            **_size(name, difference, own[name][0], recordings),
-            "share": share[name],
-            "rms": _rms(own[name][0]),
+            "meaning": meaning(name),
+            **_size(name, difference, rms[name], recordings),
+            "share": share,
+            "rms": rms[name],
             "held_out_share": held.get(name),
             "held_out_magnitude_share": magnitude.get(name),
         }
-        for name in share
-        if max(share[name], magnitude.get(name, 0.0)) > LEAST_SHARE and sure.get(name, True)
+        for name, share in _shares(rms).items()
+        if max(share, magnitude.get(name, 0.0)) > LEAST_SHARE and sure.get(name, True)
     ]
     return sorted(found, key=lambda entry: -float(entry["share"]))
 
@@ -147,30 +154,25 @@ def given_differences(
         if covariance is not None:
             both = np.block([[M, np.zeros((3, 9))], [np.zeros((9, 3)), of_matrix]])
             variance += np.diag(both @ covariance[:12, :12] @ both.T)
-    E, d, uncertainty = M @ K - np.eye(3), M @ (free.bias - calibration.bias), np.sqrt(np.clip(variance, 0.0, None))
-    diagonal = np.diag(np.diag(E))
-    parts = {"scale_factor": diagonal, "non_orthogonality": 0.5 * (E + E.T) - diagonal}
+    d, uncertainty = M @ (free.bias - calibration.bias), np.sqrt(np.clip(variance, 0.0, None))
+    parts = _parts_of(M @ K - np.eye(3))
+    del parts["rotation"]
     difference = _Difference(calibration, d, parts, uncertainty, None)
-    sure = difference.certain([])
     rates = [np.sum(w**2, axis=1) for r in recordings if (w := r.reading("gyroscope")) is not None]
     size = 1.0 if sensor == "accelerometer" else float(np.sqrt(np.nanmean(np.concatenate(rates))))
     rms = {"bias": float(np.linalg.norm(d))}
     rms |= {name: size * float(np.linalg.norm(part)) / np.sqrt(3.0) for name, part in parts.items()}
-    total = sum(value**2 for value in rms.values())
-    found = [
-        {
-            "name": name,
-            "meaning": GIVEN,
-            **_size(name, difference, np.zeros((1, 3)), recordings),
-            "share": value**2 / total,
-            "rms": value,
-            "held_out_share": None,
-            "held_out_magnitude_share": None,
-        }
-        for name, value in rms.items()
-        if value**2 > LEAST_SHARE * total and sure[name]
-    ]
-    return sorted(found, key=lambda entry: -float(entry["share"]))
+    return _named(difference, rms, difference.certain([]), recordings, lambda _: GIVEN, {}, {})
+
+
+def _parts_of(E: Values) -> dict[str, Values]:
+    """Return the parts of ``M K - 1``, by name."""
+    diagonal = np.diag(np.diag(E))
+    return {
+        "scale_factor": diagonal,
+        "non_orthogonality": 0.5 * (E + E.T) - diagonal,
+        "rotation": 0.5 * (E - E.T),
+    }
 
 
 @dataclass(frozen=True)
@@ -239,13 +241,7 @@ def _difference_of(calibration: SensorCalibration, selection: Selection, setting
     of_free[3:, 3:], of_method[3:, 3:] = np.kron(M, np.eye(3)), np.kron(np.eye(3), free.K.T)
     covariance = of_free @ free.covariance[:12, :12] @ of_free.T + of_method @ own @ of_method.T
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    E = M @ free.K - np.eye(3)
-    diagonal = np.diag(np.diag(E))
-    parts = {
-        "scale_factor": diagonal,
-        "non_orthogonality": 0.5 * (E + E.T) - diagonal,
-        "rotation": 0.5 * (E - E.T),
-    }
+    parts = _parts_of(M @ free.K - np.eye(3))
     return _Difference(calibration, M @ (free.bias - calibration.bias), parts, uncertainty, free)
 
 
@@ -278,17 +274,16 @@ def _together(found: Sequence[Errors]) -> Errors:
     }
 
 
-def _shares(parts: Mapping[str, Values]) -> dict[str, float]:
-    squares = {name: float(np.mean(part**2)) for name, part in parts.items()}
-    total = sum(squares.values())
-    return {name: square / total for name, square in squares.items()} if total > 0.0 else {}
+def _shares(rms: Mapping[str, float]) -> dict[str, float]:
+    total = sum(size**2 for size in rms.values())
+    return {name: size**2 / total for name, size in rms.items()} if total > 0.0 else {}
 
 
 def _rms(values: Values) -> float:
     return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
 
 
-def _size(name: str, difference: _Difference, own: Values, recordings: Sequence[Recording]) -> dict[str, Any]:
+def _size(name: str, difference: _Difference, rms: float, recordings: Sequence[Recording]) -> dict[str, Any]:
     """Return the size of an error in its usual unit."""
     sensor = difference.method.sensor
     if name == "bias":
@@ -301,7 +296,7 @@ def _size(name: str, difference: _Difference, own: Values, recordings: Sequence[
     if name == "filter_delay":
         turns = [r for r in recordings if r.role == sensor]
         return {"size": max(_fastest(r) * float(r.filter.get("delay_s", 0.0)) for r in turns), "unit": "deg"}
-    return {"size": _rms(own), "unit": unit_of(sensor)}
+    return {"size": rms, "unit": unit_of(sensor)}
 
 
 def _fastest(recording: Recording) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 
 from pipeline.diagnosis.functional_forms import Span, signals_of
-from pipeline.diagnosis.residual_regression import Curves, ProjectedCurves
+from pipeline.diagnosis.residual_regression import Curves, ProjectedCurves, Scan
 from pipeline.estimation.gauss_markov import selection_grid
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import effect
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     Block = tuple[Sequence[int], int]
     Basis = tuple[str, Curves, list[Block]]
-    Tests = tuple[list[str], Values, Index, float]
+    Tests = tuple[list[str], Values, Index]
 
 GATE_P = 1e-3  # probability of naming a covariate of a complete model, over all tests (Bonferroni)
 DEGREE = 5  # up to four turning points over the span; faster changes are steps
@@ -66,35 +66,36 @@ def _significant(selection: Selection, explained: Curves | None) -> dict[str, tu
     """Return delta BIC and p-value of the best test in each covariate that passes the gate."""
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
-    tests = [_smooth_tests(selection, explained)]
+    scan = Scan(selection, explained)
+    tests = [_smooth_tests(selection, scan)]
     if selection.names or selection.fit.residual_rms > ABOVE * float(np.sqrt(np.mean(selection.start.scale**2))):
-        tests.append(_step_tests(selection, explained))
-    count = sum(len(names) for names, _, _, _ in tests)
+        tests.append(_step_tests(selection, scan))
+    count = sum(len(names) for names, _, _ in tests)
     found: dict[str, tuple[float, float]] = {}
-    for names, delta, parameters, samples in tests:
-        p = chdtrc(parameters, np.maximum(delta + parameters * np.log(samples), 0.0))
+    for names, delta, parameters in tests:
+        p = chdtrc(parameters, np.maximum(delta + parameters * np.log(scan.samples), 0.0))
         for k in np.argsort(delta):
             if delta[k] > GATE_BIC and p[k] * count < GATE_P and delta[k] > found.get(names[k], (0.0, 0.0))[0]:
                 found[names[k]] = (float(delta[k]), float(p[k]))
     return found
 
 
-def _smooth_tests(selection: Selection, explained: Curves | None) -> Tests:
-    """Return covariate, delta BIC and number of parameters of each test with smooth curves, and the samples."""
+def _smooth_tests(selection: Selection, scan: Scan) -> Tests:
+    """Return covariate, delta BIC and number of parameters of each test with smooth curves."""
     bases = bases_of(selection)
-    projected = ProjectedCurves(selection, curves_of(bases), explained)
+    projected = ProjectedCurves(scan, curves_of(bases))
     names: list[str] = []
     counts: list[int] = []
-    drops = [np.zeros((*projected.left.shape, 0))]
+    drops = [np.zeros((*scan.left.shape, 0))]
     for covariate, kept, least in smooth_tests(bases, projected):
         drops.append(projected.drop(kept)[:, :, least - 1 :])
         counts += range(least, len(kept) + 1)
         names += [covariate] * (len(kept) + 1 - least)
     parameters = 3 * np.array(counts, int)
-    return names, projected.gains(np.concatenate(drops, axis=2), parameters), parameters, projected.samples
+    return names, scan.gains(np.concatenate(drops, axis=2), parameters), parameters
 
 
-def _step_tests(selection: Selection, explained: Curves | None) -> Tests:
+def _step_tests(selection: Selection, scan: Scan) -> Tests:
     """Return the same of the tests with steps and ripples."""
     observations = selection.observations
     held = [name for name, _, _ in bases_of(selection)]
@@ -119,13 +120,13 @@ def _step_tests(selection: Selection, explained: Curves | None) -> Tests:
             columns.append(rate[:, None] * _harmonics(motion, LEAST_RIPPLE))
         return np.concatenate(columns, axis=1)
 
-    projected = ProjectedCurves(selection, curves, explained)
-    weights = np.eye(steps + 2 * ripples)[:, :steps]
-    pairs = [projected.independent((steps + j, steps + ripples + j)) for j in range(ripples)]
-    drops = [projected.drops(weights), *(projected.drop(pair)[:, :, -1:] for pair in pairs if pair)]
-    names += ["angle"] * (len(drops) - 1)
-    parameters = np.append(np.full(steps, 4), [3 * len(pair) for pair in pairs if pair]).astype(int)
-    return names, projected.gains(np.concatenate(drops, axis=2), parameters), parameters, projected.samples
+    values = scan.values(curves)[:, 0]
+    pairs = values[:, steps:].reshape(len(values), 2, ripples).swapaxes(1, 2)  # cosine and sine of each
+    of_pairs = scan.drops(pairs)
+    of_pairs = of_pairs[:, :, np.any(of_pairs, axis=(0, 1))]
+    drops = np.concatenate([scan.drops(values[:, :steps, None]), of_pairs], axis=2)
+    parameters = np.repeat([4, 6], [steps, of_pairs.shape[2]])
+    return names + ["angle"] * of_pairs.shape[2], scan.gains(drops, parameters), parameters
 
 
 def curves_of(bases: Sequence[Basis]) -> Curves:

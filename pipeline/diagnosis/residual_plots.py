@@ -26,6 +26,7 @@ from pipeline.estimation.design import BASE, Term, placed
 from pipeline.estimation.gauss_markov import Blocks, Products, Setting
 from pipeline.estimation.generalized_least_squares import design_at
 from pipeline.estimation.multi_position.fit import solve
+from pipeline.estimation.ranking import projection
 from pipeline.model.effects.base import Layout, truth, unit_of
 from pipeline.model.formula import parse
 
@@ -39,8 +40,7 @@ if TYPE_CHECKING:
     JSON = dict[str, Any]
 
 OWN = 4  # columns of the base on each axis
-RANK = 1e-11  # of singular values: columns that are the same to rounding
-RANK_OF_RESTS = 1e-8  # the same of the whitened columns themselves
+RANK_OF_RESTS = 1e-8  # of singular values: columns that are the same to rounding
 BINS = 40  # points that a plot shows apart
 DIGITS = 5  # more than a plot shows
 CURVE = 60  # points of a suggested form
@@ -55,20 +55,12 @@ def plots(
 ) -> JSON:
     """Return the points of a diagnosis's plots, few enough to be kept in its document.
 
-    Parameters
-    ----------
-    unexplained : sequence of mapping
-        Entries of the diagnosis, of ``selection``: ``covariate``, and ``axes, formulas, coefficients`` of the form.
-    reported : Selection
-        The one that the diagnosis reports: with the suggested form in its base where there is one.
-
-    Returns
-    -------
-    dict
-        ``added_variable`` (of the first selected effect, or None) and ``unexplained``, a list. Each has ``panels``,
-        one an axis, with the binned ``x, mean, standard_error``; those of an added variable the ``parameter`` that is
-        the slope, with ``unit, value, standard_uncertainty``; those of the unexplained, where a form is suggested,
-        ``curve_x, curve``.
+    ``unexplained``: entries of the diagnosis, of ``selection``: ``covariate``, and ``axes, formulas, coefficients`` of
+    the form. ``reported``: the selection that the diagnosis reports: with the suggested form in its base where there is
+    one. Returns ``added_variable`` (of the first selected effect, or None) and ``unexplained``, a list. Each has
+    ``panels``, one an axis, with the binned ``x, mean, standard_error``; those of an added variable the ``parameter``
+    that is the slope, with ``unit, value, standard_uncertainty``; those of the unexplained, where a form is suggested,
+    ``curve_x, curve``.
     """
     shown = [entry for entry in unexplained if not entry.get("explained_by")][:MOST]
     regression = _Columns(selection) if shown else None
@@ -247,25 +239,17 @@ class _Columns:
     def left_of_column(self, c: int, own: int, products: Values) -> Values:
         """Return x~ on axis c of a parameter, from the products of all parameters' columns: (n,) array."""
         places = self.design.places(c)[1][:-1]
-        others = np.arange(len(products)) != own
-        delta = np.zeros(len(products))
-        delta[others] = _solved(products[np.ix_(others, others)], products[others, own])
+        others, delta = np.flatnonzero(np.arange(len(products)) != own), np.zeros(len(products))
+        delta[others] = projection(products[None], others)[0][:, own]
         left: Values = self.columns[c][:, own - BASE + OWN] - self.columns[c] @ delta[places]
         return left
 
     def left_of(self, c: int, values: Values, setting: Setting) -> Values:
         """Return what base and effects, free on this axis, leave of values of (n,): (n,) array."""
         columns = np.column_stack([self.columns[c], values])
-        products = Products(self.observations.blocks, self.weight, columns).products([setting])[0][0]
-        left: Values = values - self.columns[c] @ _solved(products[:-1, :-1], products[:-1, -1])
-        return left
-
-
-def _solved(gram: Values, cross: Values) -> Values:
-    """Return the smallest solution of the normal equations, columns scaled to unit norm."""
-    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    found: Values = np.linalg.lstsq(gram / np.outer(size, size), cross / size, rcond=RANK)[0] / size
-    return found
+        products = Products(self.observations.blocks, self.weight, columns).products([setting])[0]
+        known = projection(products, np.arange(columns.shape[1] - 1))[0]
+        return np.asarray(values - self.columns[c] @ known[:, -1])
 
 
 @dataclass(frozen=True)

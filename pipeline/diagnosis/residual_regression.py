@@ -1,10 +1,10 @@
 """What further columns explain of the residual that base, configured and selected effects leave.
 
-    y_c = X_c beta_c + Z gamma_c + noise,    drop(W, c) = b^T (W^T G W)^-1 b,    b = W^T Z^T M C^-1 y_c
-    G = Z^T M C^-1 Z,    M = 1 - C^-1 X_c (X_c^T C^-1 X_c)^-1 X_c^T
+    y_c = X_c beta_c + Z gamma_c + noise,    drop(Z, c) = b^T G^-1 b
+    b = Z^T M C^-1 y_c,    G = Z^T M C^-1 Z,    M = 1 - C^-1 X_c (X_c^T C^-1 X_c)^-1 X_c^T
 
     X_c  : columns of the model on axis c: 1, what K acts on, and every parameter of every effect
-    Z    : (n, q) further columns, such as curves in a covariate;  W : (q, r), combinations of them: a functional form
+    Z    : (n, r) further columns, such as curves in a covariate or the columns of a functional form
     C    : white noise plus bias wander, ``pipeline.estimation.gauss_markov``
     drop : by how much they lower the whitened sum of squares
 
@@ -17,14 +17,14 @@ known to ``e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2``; a column that leaves les
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from pipeline.estimation.design import true_motion
-from pipeline.estimation.gauss_markov import WHITE, GaussMarkov, Products
+from pipeline.estimation.gauss_markov import WHITE, GaussMarkov
 from pipeline.estimation.generalized_least_squares import design_at
-from pipeline.estimation.ranking import LEFT, RIDGE, projection, without
+from pipeline.estimation.ranking import LEFT, RIDGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -48,23 +48,75 @@ class Gain:
     setting: int  # index of its best noise setting
 
 
-class _Evidence:
-    """The likelihood of a fit under every noise setting, by what further columns explain of its residual."""
+class Whitened(NamedTuple):
+    """Columns about the means of their blocks, (n, q), and these means under each noise, (t, q, m)."""
 
-    def __init__(self, selection: Selection) -> None:
+    inside: Values
+    means: Values
+
+    def times(self, other: Whitened) -> Values:
+        """Return the products with other columns: (t, q, p) array."""
+        return np.asarray(self.means @ other.means.transpose(0, 2, 1) + self.inside.T @ other.inside)
+
+
+class Scan:
+    """The residual of a selection's fit under every noise setting, and what further columns explain of it.
+
+    ``explained``: motion to curves that count as explained, (n, q), or (n, 3, q) where each axis has its own.
+    """
+
+    def __init__(self, selection: Selection, explained: Curves | None = None) -> None:
         self.scale = selection.start.scale
-        self.observations = selection.observations.weakened
-        self.samples = 3.0 * self.observations.samples
-        self.within = float(np.sum(self.observations.scatter / self.scale**2))
-        self.settings = [WHITE, *selection.settings]
-        self.left: Values = np.zeros((len(selection.settings), 3))
-        self.penalty: Values = np.zeros(len(selection.settings))
-
-    def _set(self, left: Values, logarithms: Values) -> None:
-        """Set what base and effects leave, (t, 3), and log det C of one channel, white noise alone first."""
-        self.left = left
-        self.penalty = 1.5 * logarithms[1:] - np.array([setting.prior for setting in self.settings[1:]])
+        observations = selection.observations.weakened
+        self.samples = 3.0 * observations.samples
+        self.within = float(np.sum(observations.scatter / self.scale**2))
+        self._motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
+        self._blocks, self._weight = observations.blocks, observations.weight
+        self._label = self._blocks.label(len(self._weight))
+        self._noise = GaussMarkov(self._blocks, [WHITE, *selection.settings])
+        self._unit = float(ROUNDING * np.sqrt(observations.samples)) ** 0.5
+        design = design_at(observations, selection.fit)
+        A, places = design.columns.columns, [design.places(c)[0] for c in range(3)]
+        if explained is not None:
+            values, first = self.values(explained), A.shape[1]
+            n, versions, q = values.shape
+            A = np.concatenate([A, values.reshape(n, -1)], axis=1)
+            places = [np.append(first + c % versions * q + np.arange(q), place) for c, place in enumerate(places)]
+        self._every = self.whitened(A)  # model, explained curves and readings of all axes
+        self._among = self._every.times(self._every)
+        self._fitted: list[tuple[Index, int, Values]] = []  # of each axis: model, residual, inverse of its products
+        left = []
+        for c, (*known, target) in enumerate(places):
+            products = self._among[:, np.array(known)[:, None], known]
+            size = np.sqrt(np.einsum("tpp->tp", products))
+            size = np.where(size > 0.0, size, 1.0)
+            over = size[:, :, None] * size[:, None, :]
+            inverse = np.linalg.inv(products / over + RIDGE * np.eye(len(known))) / over
+            self._fitted.append((np.array(known), target, inverse))
+            cross = self._among[:, known, target]
+            taken = np.einsum("tp,tpq,tq->t", cross, inverse, cross)
+            left.append((self._among[:, target, target] - taken)[1:] / self.scale[c] ** 2)
+        logarithms = self._noise.log_determinant[1:] + np.sum(np.log(self._blocks.weight))
+        self._penalty: Values = 1.5 * logarithms - np.array([setting.prior for setting in selection.settings])
+        self.left: Values = np.stack(left, axis=1)
         self.before = float(self.log_likelihood(self.left.sum(axis=1)).max())
+
+    def values(self, curves: Curves) -> Values:
+        """Return the values of curves at all rows: (n, 3, q) array, or (n, 1, q) where the axes have the same."""
+        values = np.concatenate([curves(motion) for motion in self._motions])
+        return values[:, None] if values.ndim == 2 else values
+
+    def whitened(self, columns: Values) -> Whitened:
+        """Return (n, q) columns, whitened."""
+        means = self._blocks.sums(self._weight[:, None] * columns) / self._blocks.weight[:, None]
+        inside = np.sqrt(self._weight)[:, None] * (columns - means[self._label])
+        return Whitened(inside, self._noise.whitened(means))
+
+    def beside(self, c: int, one: Whitened, other: Whitened) -> Values:
+        """Return the products of columns on an axis after the model is projected out, white noise first: (t, q, p)."""
+        known, _, inverse = self._fitted[c]
+        taken = one.times(self._every)[:, :, known] @ inverse @ self._every.times(other)[:, known]
+        return np.asarray((one.times(other) - taken) / self.scale[c] ** 2)
 
     def log_likelihood(self, rss: Values, within: Values | None = None) -> Values:
         """Return the log likelihood under each noise setting, (t, ...), of whitened sums of squares.
@@ -72,7 +124,7 @@ class _Evidence:
         ``within``: scatter within rows, of the shape of the last axes of ``rss``; without it that of the readings.
         """
         total = np.maximum(rss + (self.within if within is None else within), 1e-300)
-        penalty = self.penalty.reshape(-1, *[1] * (rss.ndim - 1))
+        penalty = self._penalty.reshape(-1, *[1] * (rss.ndim - 1))
         found: Values = -0.5 * self.samples * np.log(total / self.samples) - penalty
         return found
 
@@ -83,7 +135,7 @@ class _Evidence:
         found: Values = 2.0 * (best - self.before) - parameters * float(np.log(self.samples))
         return found
 
-    def best_axes(self, drops: Values, columns: int, scanned: int | Index = 0) -> list[Gain]:
+    def best_axes(self, drops: Values, columns: int | Index, scanned: int | Index = 0) -> list[Gain]:
         """Return what each form explains, on the axes that it improves.
 
         Their (t, 3, m) ``drops`` are those of so many columns on each axis; ``scanned`` counts parameters such as a
@@ -103,54 +155,62 @@ class _Evidence:
             for m, a in enumerate(best.tolist())
         ]
 
-    def gain(self, drop: Values, columns: int, scanned: int = 0) -> Gain:
-        """Return what one form explains, on the axes that it improves; ``drop`` as for ``best_axes``, (t, 3)."""
-        return self.best_axes(drop[:, :, None], columns, scanned)[0]
+    def drops(self, columns: Values) -> Values:
+        """Return what forms explain under each noise on each axis: (t, 3, m) array.
+
+        ``columns``: (n, m, r) of m forms with r coefficients, or (n, 3, m, r) where each axis has its own.
+        """
+        n, *_, m, r = columns.shape
+        values = columns.reshape(n, 1 if columns.ndim == 3 else 3, m * r)
+        inner, cross, error = self.products([self.whitened(values[:, k]) for k in range(values.shape[1])], r)
+        explained, new = each_explains(inner, cross[..., None], error)
+        new &= new[0]
+        return np.asarray(np.where(new.all(axis=3), explained[..., 0].sum(axis=3), 0.0)[1:])
+
+    def products(self, versions: Sequence[Whitened], r: int) -> tuple[Values, Values, Values]:
+        """Return the products of forms of r columns each beside the model: inner, cross and the error e of each column.
+
+        (t, 3, m, r, r), (t, 3, m, r) and (t, 3, m, r) arrays, white noise first. Where white noise leaves less than
+        ``NEW`` of a column, or another noise nothing but rounding, the error is larger than what is left.
+        ``versions``: of each axis, or one for all.
+        """
+
+        def split(values: Values) -> Values:
+            return values.reshape(*values.shape[:-2], -1, r, values.shape[-1])
+
+        grams, acrosses = [], [version.times(self._every) for version in versions]
+        for version in versions:
+            means, inside = split(version.means), split(version.inside.T)
+            grams.append(means @ means.swapaxes(-1, -2) + inside @ inside.swapaxes(-1, -2))
+        sizes, found = np.sqrt(np.einsum("pp->p", self._among[0])), []
+        for c, (known, target, inverse) in enumerate(self._fitted):
+            gram, across = grams[c % len(versions)], acrosses[c % len(versions)]
+            taken, own = across[:, :, known] @ inverse, np.einsum("tmrr->tmr", gram)
+            inner = gram - split(taken) @ split(across[:, :, known]).swapaxes(-1, -2)
+            cross = across[:, :, target] - (taken @ self._among[:, known, target, None])[:, :, 0]
+            hidden = self._unit * (np.sqrt(own[0]) + (np.abs(taken) @ sizes[known]).reshape(own.shape))
+            error = np.maximum(hidden, np.sqrt(LEFT * own))
+            error[0] = np.maximum(error[0], NEW * np.sqrt(own[0]))
+            scale = self.scale[c]
+            found.append((inner / scale**2, cross.reshape(own.shape) / scale**2, error / scale))
+        inner, cross, error = (np.stack(each, axis=1) for each in zip(*found, strict=True))
+        return inner, cross, error
 
 
-class ProjectedCurves(_Evidence):
-    """Products of curves and residual after base and effects are projected out of them.
+class ProjectedCurves:
+    """Products of q curves and the residual of a scan after model and explained curves are projected out of them.
 
-    Parameters
-    ----------
-    selection : Selection
-        Its fit holds base and effects.
-    curves : callable
-        Motion to (n, q) curves that act on every axis, or to (n, 3, q) where each axis has its own.
-    explained : callable, optional
-        Motion to further curves, of the same shapes, that are projected out too.
+    ``curves``: motion to (n, q), or to (n, 3, q) where each axis has its own. Of the products, white noise is left out.
     """
 
-    def __init__(self, selection: Selection, curves: Curves, explained: Curves | None = None) -> None:
-        super().__init__(selection)
-        observations, (A, places) = self.observations, columns_of_fit(selection, explained, curves)
-        self.size = np.sqrt(np.einsum("i,ij,ij->j", observations.weight, A, A))[places[0][-1]]
-        stacked, logarithms = Products(observations.blocks, observations.weight, A).products(self.settings)
-        self._project(stacked, places)
-        self._set(self.left, logarithms)
-
-    def _project(self, products: Values, places: Sequence[Sequence[Index]]) -> None:
-        """Project base and effects out of curves and residual: products inner, cross and left, by noise and axis."""
-        q = len(places[0][-1])
-        white = np.sqrt(np.maximum(np.einsum("ii->i", products[0]), 0.0))
-        unit = (ROUNDING * np.sqrt(self.samples / 3.0)) ** 0.5
-        inner, cross, left, error = [], [], [], []
-        for model, *explained, own in places:
-            known = np.concatenate([model[:-1], *explained])
-            k, index = len(known), np.concatenate([known, own, model[-1:]])
-            among = products[:, index[:, None], index]
-            taken = projection(among, np.arange(k))
-            rest = without(among, np.arange(k), taken)[:, k:, k:]
-            inner.append(rest[:, :q, :q])
-            cross.append(rest[:, :q, q])
-            left.append(rest[:, q, q])
-            error.append(unit * (white[own] + white[known] @ np.abs(taken[:, :, k : k + q])))
-        over = self.scale[None, :] ** -2
-        self.white: Values = np.mean([axis[0] for axis in inner], axis=0)
-        self.inner: Values = np.stack(inner, axis=1)[1:] * over[:, :, None, None]
-        self.cross: Values = np.stack(cross, axis=1)[1:] * over[:, :, None]
-        self.left: Values = np.stack(left, axis=1)[1:] * over
-        self.error: Values = np.stack(error, axis=1)[1:] / self.scale[:, None]
+    def __init__(self, scan: Scan, curves: Curves) -> None:
+        values = scan.values(curves)
+        self.columns = [scan.whitened(values[:, k]) for k in range(values.shape[1])]
+        inner, cross, error = (each[:, :, 0] for each in scan.products(self.columns, values.shape[2]))
+        self.inner, self.cross, self.error = inner[1:], cross[1:], error[1:]
+        first = self.columns[0]
+        self.size = np.sqrt(np.sum(first.means[0] ** 2, axis=1) + np.sum(first.inside**2, axis=0))
+        self.white: Values = np.mean(inner[0] * scan.scale[:, None, None] ** 2, axis=0)
 
     def independent(self, index: Iterable[int]) -> list[int]:
         """Return the curves of ``index`` that are independent of base, effects and the curves before them."""
@@ -160,15 +220,6 @@ class ProjectedCurves(_Evidence):
                 kept.append(int(j))
                 rest -= np.outer(rest[:, j], rest[j]) / rest[j, j]
         return kept
-
-    def drops(self, weights: Values) -> Values:
-        """Return what forms, the columns of (q, m) weights, explain under each noise on each axis: (t, 3, m) array."""
-        inner = np.einsum("qm,tcqm->tcm", weights, self.inner @ weights)
-        cross = self.cross @ weights
-        left = np.einsum("qm,qm->m", weights, self.white @ weights)
-        new = left > NEW**2 * np.sum((self.size[:, None] * weights) ** 2, axis=0)
-        new = new & (inner > (self.error @ np.abs(weights)) ** 2)
-        return np.where(new, cross**2 / np.where(new, inner, 1.0), 0.0)
 
     def drop(self, index: Sequence[int]) -> Values:
         """Return what several curves explain together, by the number of them from the first on: (t, 3, r) array."""
@@ -195,76 +246,6 @@ class ProjectedCurves(_Evidence):
         return found
 
 
-class Scan(_Evidence):
-    """What each of many forms explains by itself, without the products between forms; arguments as above."""
-
-    def __init__(self, selection: Selection, explained: Curves | None = None) -> None:
-        super().__init__(selection)
-        observations, (A, places) = self.observations, columns_of_fit(selection, explained)
-        self.blocks, self.weight = observations.blocks, observations.weight
-        self._label = self.blocks.label(len(self.weight))
-        self._noise = GaussMarkov(self.blocks, self.settings)
-        self._model = []
-        left = []
-        for index in places:
-            order = np.concatenate([index[0][:-1], *index[1:], index[0][-1:]])
-            inside, means = self._whitened(A[:, order])
-            products = means @ means.transpose(0, 2, 1) + inside.T @ inside
-            k = len(order) - 1
-            size = np.sqrt(np.einsum("tpp->tp", products[:, :k, :k]))
-            size = np.where(size > 0.0, size, 1.0)
-            scaled = products[:, :k, :k] / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(k)
-            inverse = np.linalg.inv(scaled) / (size[:, :, None] * size[:, None, :])
-            target = products[:, :k, k]
-            left.append(products[:, k, k] - np.einsum("tp,tpq,tq->t", target, inverse, target))
-            self._model.append((inside, means, inverse, products))
-        logarithms = self._noise.log_determinant + np.sum(np.log(self.blocks.weight))
-        self._set(np.stack(left, axis=1)[1:] / self.scale**2, logarithms)
-
-    def _whitened(self, columns: Values) -> tuple[Values, Values]:
-        """Return (n, q) columns about the means of their blocks, and these, whitened: (n, q) and (t, q, m) arrays."""
-        means = self.blocks.sums(self.weight[:, None] * columns) / self.blocks.weight[:, None]
-        return np.sqrt(self.weight)[:, None] * (columns - means[self._label]), self._noise.whitened(means)
-
-    def drops(self, columns: Values) -> Values:
-        """Return what forms explain under each noise on each axis: (t, 3, m) array.
-
-        ``columns``: (n, m, r) of m forms with r coefficients, or (n, 3, m, r) where each axis has its own.
-        """
-        *_, m, r = columns.shape
-        found = np.zeros((len(self.left), 3, m))
-        each = [columns] if columns.ndim == 3 else [columns[:, c] for c in range(3)]
-        whitened = [self._whitened(z.reshape(len(z), m * r)) for z in each]
-        for c in range(3):
-            found[:, c] = self._explained(*whitened[c % len(whitened)], c, r) / self.scale[c] ** 2
-        return found
-
-    def _explained(self, inside: Values, means: Values, c: int, r: int) -> Values:
-        """Return what forms of r whitened columns each explain on an axis: (t, m) array."""
-        own_inside, own_means, inverse, products = self._model[c]
-        t, q, _ = means.shape
-        k = len(inverse[0])
-        across = means @ own_means.transpose(0, 2, 1) + inside.T @ own_inside
-        taken = across[:, :, :k] @ inverse
-        cross = (across[:, :, k] - np.einsum("tqp,tp->tq", taken, products[:, :k, k])).reshape(t, q // r, r)
-        inner = np.empty((t, q // r, r, r))
-        for i in range(r):
-            for j in range(r):
-                both = np.sum(means[:, i::r] * means[:, j::r], axis=2)
-                both += np.sum(inside[:, i::r] * inside[:, j::r], axis=0)
-                inner[:, :, i, j] = both - np.sum(taken[:, i::r] * across[:, j::r, :k], axis=2)
-        size = np.sqrt(np.maximum(np.sum(means[0] ** 2, axis=1) + np.sum(inside**2, axis=0), 0.0))
-        known = np.sqrt(np.einsum("pp->p", products[0, :k, :k]))
-        unit = (ROUNDING * np.sqrt(self.samples / 3.0)) ** 0.5
-        error = (unit * (size + np.abs(taken) @ known)).reshape(t, q // r, r)
-        own = np.sum(means**2, axis=2) + np.sum(inside**2, axis=0)
-        error = np.maximum(error, np.sqrt(LEFT * own).reshape(error.shape))
-        error[0] = np.maximum(error[0], NEW * size.reshape(q // r, r))  # the first is white noise
-        explained, new = each_explains(inner, cross[..., None], error)
-        new &= new[0]
-        return np.asarray(np.where(new.all(axis=2), explained[..., 0].sum(axis=2), 0.0)[1:])
-
-
 def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, Mask]:
     """Return what each of r curves adds to those before it, (..., r, s), and whether it is independent of them.
 
@@ -282,17 +263,3 @@ def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, 
         inner = inner - taken[..., None] * inner[..., j, None, :]
         error = error + np.abs(taken) * error[..., j, None]
     return explained, independent
-
-
-def columns_of_fit(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[Index]]]:
-    """Return the columns of a selection's fit, its residual and those of curves, and where those of each axis lie."""
-    design = design_at(selection.observations.weakened, selection.fit)
-    motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
-    columns, places = [design.columns.columns], [[design.places(c)[0]] for c in range(3)]
-    for curves in filter(None, further):
-        values = np.concatenate([curves(motion) for motion in motions])
-        first, apart = sum(c.shape[1] for c in columns), values.shape[2] if values.ndim == 3 else 0
-        for c in range(3):
-            places[c].append(first + c * apart + np.arange(values.shape[-1]))
-        columns.append(values.reshape(len(values), -1))
-    return np.concatenate(columns, axis=1), places

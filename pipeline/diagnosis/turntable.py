@@ -43,10 +43,7 @@ CLOSE = 1.1  # mean square of a residual over that of noise, under which there i
 def findings(case: Case) -> Findings:
     """Return what the selection finds in turns on a table.
 
-    Raises
-    ------
-    NotObservableError
-        If the recordings do not determine bias and matrix.
+    Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
     """
     observations = observe(case.sensor, case.recordings, case.settings["table"])
     given = case.configured, case.noise, case.sheet

@@ -234,10 +234,10 @@ def test_a_scan_of_single_forms_finds_what_the_products_of_all_curves_say() -> N
     for texts in tried:
         columns = columns_of(texts, "gyroscope")
         values = np.concatenate([columns(motion) for motion in motions])
-        expected = ProjectedCurves(selection, columns).drop([0, 1])[:, :, -1]
-        found = scan.drops(values[..., None, :])[:, :, 0]
+        expected = ProjectedCurves(scan, columns).drop([0, 1])[:, :, -1:]
+        found = scan.drops(np.stack([values, 2.0 * values + 1.0], axis=-2))[:, :, :1]
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
-        one, other = scan.gain(found, 2), ProjectedCurves(selection, columns).gain(expected, 2)
+        one, other = scan.best_axes(found, 2)[0], scan.best_axes(expected, 2)[0]
         assert (one.axes, one.setting) == (other.axes, other.setting)
         assert one.delta_bic == pytest.approx(other.delta_bic, rel=1e-5)
 
@@ -257,27 +257,30 @@ def test_a_shape_gains_what_a_joint_fit_with_it_gains() -> None:
     terms = [*selection.fit.terms, Term(effect_from(definition, "test"), np.zeros(6))]
     fit = fit_terms(selection.observations, terms, selection.start, selection.settings)
     formulas = harmonic(5).texts
-    projected = ProjectedCurves(selection, columns_of(formulas, "gyroscope"))
-    drop = projected.drop([0, 1])[:, :, -1]
-    expected = 2.0 * (fit.log_likelihood - selection.fit.log_likelihood) - 6.0 * np.log(projected.samples)
-    assert projected.gains(drop[:, :, None], 6)[0] == pytest.approx(expected, abs=0.5)
+    scan = Scan(selection)
+    projected = ProjectedCurves(scan, columns_of(formulas, "gyroscope"))
+    drop = projected.drop([0, 1])[:, :, -1:]
+    expected = 2.0 * (fit.log_likelihood - selection.fit.log_likelihood) - 6.0 * np.log(scan.samples)
+    assert scan.gains(drop, 6)[0] == pytest.approx(expected, abs=0.5)
     values = fit.terms[-1].values.reshape(3, 2)
-    assert projected.coefficients([0, 1], projected.gain(drop, 2).setting) == pytest.approx(values, rel=0.02, abs=2e-6)
+    setting = scan.best_axes(drop, 2)[0].setting
+    assert projected.coefficients([0, 1], setting) == pytest.approx(values, rel=0.02, abs=2e-6)
 
 
 def test_a_power_that_the_base_holds_already_says_nothing_new() -> None:
     selection = selection_of("accelerometer", record(Session(2, SHORT)))
-    projected = ProjectedCurves(
-        selection, columns_of(["fx", "fx ** 2", "2 * fx ** 2 + 3 * fy", "cos(radians(angle))"], "accelerometer")
-    )
-    assert projected.independent([0, 1, 2]) == [1]
-    assert projected.drops(np.eye(4))[:, :, 0].max() == 0.0
+    scan = Scan(selection)
+    curves = columns_of(["fx", "fx ** 2", "2 * fx ** 2 + 3 * fy", "cos(radians(angle))"], "accelerometer")
+    assert ProjectedCurves(scan, curves).independent([0, 1, 2]) == [1]
+    drops = scan.drops(scan.values(curves)[:, 0, :, None])
+    assert drops[:, :, 0].max() == 0.0
+    assert drops[:, :, 1].max() > 0.0
 
 
 def test_a_curve_that_rounding_hides_explains_nothing() -> None:
     selection = replace(selection_of("gyroscope", record(Session(2, SHORT))), settings=[Setting(4.4, 800.0)])
     formulas = ["time", "exp(-time / 30000)", "time ** 2", "time + 1e-8 * time ** 2"]
-    projected = ProjectedCurves(selection, columns_of(formulas, "gyroscope"))
+    projected = ProjectedCurves(Scan(selection), columns_of(formulas, "gyroscope"))
     explained = projected.drop(range(4))
     assert np.all(explained[:, :, 1] > explained[:, :, 0])
     assert np.all(explained[:, :, 1:] == explained[:, :, 1:2])
