@@ -30,8 +30,10 @@ from pipeline.diagnosis.words import listed, plain
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import Term
+from pipeline.estimation.gauss_markov import WHITE, Setting
+from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import Fit, fit
-from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
+from pipeline.estimation.multi_position.likelihood import NEW, NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
 from pipeline.estimation.multi_position.selection import FAR, Selection, posterior
 from pipeline.estimation.selection import GATE_BIC
@@ -55,13 +57,7 @@ FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a w
 
 
 def findings(case: Case) -> Findings:
-    """Return what the selection finds in rests and moves by hand.
-
-    Raises
-    ------
-    NotObservableError
-        If there are no rests, or they do not determine bias and matrix.
-    """
+    """Return what the selection finds in rests and moves by hand; as ``require_model``."""
     model, calibration = _model_of_all_rests(case), case.calibration
     given = calibration, case.configured, case.noise, case.sheet
     selection = Selection(model, *given)
@@ -106,7 +102,9 @@ def findings(case: Case) -> Findings:
         unknown=unknown,
         over_noise=over,
         left_over_noise=left_over,
-        noises=[(h.ratio, h.time, score) for h, score in zip(selection.hypotheses, likely.tolist(), strict=True)],
+        noises=[
+            (h.bias.ratio, h.bias.time, score) for h, score in zip(selection.hypotheses, likely.tolist(), strict=True)
+        ],
         white=float(np.sqrt(np.mean(model.white**2))),
         expected_wander=None if expected is None else float(np.sqrt(np.mean(expected.wander**2))),
         advice=advice,
@@ -162,10 +160,7 @@ def require_model(
 ) -> Model:
     """Return the model of rests and moves; see ``pipeline.estimation.multi_position.result.model_of``.
 
-    Raises
-    ------
-    NotObservableError
-        If there are no rests, or they do not determine bias and matrix.
+    Raises ``NotObservableError`` if there are no rests, or they do not determine bias and matrix.
     """
     try:
         model = model_of(recordings, calibration, noise, settings, accelerometer)
@@ -202,9 +197,9 @@ def _expected(selection: Selection, noise: Noise | None) -> NoiseHypothesis:
     """Return the noise without scatter of the rests, with the wander that is expected."""
     nothing = (0.0,) * selection.model.kinds
     if noise is None:
-        return NoiseHypothesis(0.0, 1.0, nothing, 0.0)
+        return NoiseHypothesis(WHITE, nothing)
     ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
-    return NoiseHypothesis(ratio, noise.correlation_time, nothing, 0.0)
+    return NoiseHypothesis(Setting(ratio, noise.correlation_time), nothing)
 
 
 def _chi(selection: Selection, fit: Fit, noise: Noise | None) -> float:
@@ -216,10 +211,12 @@ def _chi(selection: Selection, fit: Fit, noise: Noise | None) -> float:
 
 def _over_noise(selection: Selection, fit: Fit, noise: Noise | None) -> float:
     """Return the rms residual of the rests, of a fit, over that of noise alone."""
-    at_rest = selection.model.equations(fit.state).rows(selection.model.rests_equations)
-    found = project_out(at_rest, [_expected(selection, noise)])
-    spare = max(len(at_rest.residual) - float(np.sum(found.basis[0] ** 2)), 1.0)
-    return float(np.sqrt(np.sum(found.residual**2) / spare))
+    equations, rests = selection.model.equations(fit.state), slice(selection.model.rests_equations)
+    L = np.linalg.cholesky(equations.covariance(_expected(selection, noise))[rests, rests])
+    columns, residual = (np.linalg.solve(L, v[rests]) for v in (equations.columns, equations.residual))
+    factors = ScaledColumns.of(columns, NEW)
+    left = residual - columns @ factors.solve(residual)
+    return float(np.sqrt(left @ left / max(len(left) - factors.rank, 1)))
 
 
 def _held_out_errors(selection: Selection) -> list[float | None]:

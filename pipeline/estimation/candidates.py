@@ -231,51 +231,6 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
             )
 
 
-def limits_or_noise(limits: Values | None, products: Values, samples: float) -> Values:
-    """Return the limits of an effect's parameters; where there is none, the size that adds as much as white noise."""
-    power = np.maximum(np.diag(products), 1e-300)
-    noise = np.sqrt(samples / power)
-    return noise if limits is None else np.where(np.isfinite(limits[: len(power)]), limits[: len(power)], noise)
-
-
-def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
-    """Return the change of columns to those of parameters over their limits, in the directions that are excited.
-
-    ``products``: (k, k), with the base projected out. ``size``: (k,), norm of the columns with it. ``least``: share of
-    it that must be left.
-    """
-    values, vectors = np.linalg.eigh(products / np.outer(size, size))
-    kept = vectors[:, values > least**2]
-    return np.asarray((kept @ kept.T) * limit / size[:, None] * size)
-
-
-def over_limits(
-    places: Sequence[tuple[str, slice]],
-    products: Values,
-    size: Values,
-    limits: Mapping[str, Values],
-    *,
-    samples: float,
-    least: float,
-) -> tuple[Values, dict[str, Values]]:
-    """Return the products of columns of parameters over their limits, (t, p + 1, p + 1), and the limits.
-
-    ``places``: effect and columns, more than once for an effect of several versions. ``products``: with the base
-    projected out, readings last, the first white noise. ``limits``: by the data sheet. ``size, samples, least``: of
-    ``excited, limits_or_noise``.
-    """
-    found: dict[str, Values] = {}
-    changed = products.copy()
-    for name, own in places:
-        inner = products[0, own, own]
-        if name not in found:
-            found[name] = limits_or_noise(limits.get(name), inner, samples)
-        change = excited(inner, size[own], found[name], least)
-        changed[:, :, own] = changed[:, :, own] @ change
-        changed[:, own] = change.T @ changed[:, own]
-    return changed, found
-
-
 def time_constants(
     this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None, *, between: bool = True
 ) -> list[tuple[Term, float]]:

@@ -215,14 +215,4 @@ def blocks_of(times: Sequence[Values]) -> Blocks:
     """Return stretches of time in which the difference of the biases is taken as constant, of each recording."""
     span = sum(float(np.ptp(t)) for t in times)
     length = max(min(BLOCK_S, span / 12.0), span / MOST_BLOCKS)
-    first, centre, count, clock, row = [], [], [], [], 0
-    for number, time in enumerate(times):
-        start = np.flatnonzero(np.diff(np.floor((time - time[0]) / length), prepend=-1.0))
-        rows = np.diff(np.append(start, len(time)))
-        first.append(row + start)
-        count.append(rows.astype(float))
-        centre.append(np.add.reduceat(time, start) / rows)
-        clock.append(np.full(len(start), number))
-        row += len(time)
-    middle = np.concatenate(centre)
-    return Blocks(np.concatenate(first), np.concatenate(count), middle, np.zeros(len(middle)), np.concatenate(clock))
+    return Blocks.of_rows([(t, np.ones(len(t))) for t in times], range(len(times)), length)

@@ -26,6 +26,7 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Products, Setting
+from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.model.effects.base import Effect, Layout, truth
 
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 BASE = 12  # bias and matrix
 REMEMBERED = 4  # motions of a part after effects of timing: base and as many terms without themselves
+WEAKEST_DIRECTION, PART_OF_IT = 1e-3, 0.1  # share of unit columns that counts as determined; of such a direction
 BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
 
 
@@ -125,7 +127,6 @@ def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
 
     Raises ``NotObservableError`` if the motion does not determine them.
     """
-    names = [f"column {b} of the matrix" for b in "xyz"]
     if not observations.parts:
         raise NotObservableError(
             f"no recording holds the {observations.sensor} together with the motion of a table; "
@@ -133,30 +134,22 @@ def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
         )
     u = np.concatenate([truth(observations.sensor, part.motion) for part in observations.parts])
     root = np.sqrt(observations.weight)[:, None]
-    X = root * np.column_stack([np.ones(len(u)), u])
-    size = np.linalg.norm(X, axis=0)
-    if len(u) < 4 or np.any(size == 0):
-        idle = [name for name, s in zip(names, size[1:], strict=True) if s == 0]
-        raise NotObservableError(_undetermined(observations.sensor, idle or names))
-    U, s, Vt = np.linalg.svd(X / size, full_matrices=False)
-    if s[-1] < 1e-3 * s[0]:
-        weak = [name for name, part in zip(names, Vt[-1, 1:], strict=True) if abs(part) > 0.1]
-        raise NotObservableError(_undetermined(observations.sensor, weak or ["bias"]))
-    y = root * observations.reading
-    beta = (Vt.T / s) @ (U.T @ y) / size[:, None]
+    X, y = root * np.column_stack([np.ones(len(u)), u]), root * observations.reading
+    factors = ScaledColumns.of(X, WEAKEST_DIRECTION)
+    weak = factors.undetermined(["bias", *(f"column {b} of the matrix" for b in "xyz")], PART_OF_IT)
+    if weak:
+        named = [name for name in weak if name != "bias"]
+        raise NotObservableError(
+            f"the recordings of the {observations.sensor} do not determine {', '.join(named or weak)}: "
+            "the table's motion must excite all three axes; record turns about each of them"
+        )
+    beta = factors.solve(y)
     residual = y - X @ beta
     scale = np.sqrt((np.sum(residual**2, axis=0) + observations.scatter) / max(observations.samples - 4.0, 1.0))
     if noise is not None and np.all(np.isfinite(noise.white)) and np.all(noise.white > 0):
         scale = noise.white
     largest = max(float(scale.max()), float(np.abs(observations.reading).max()) * 1e-12, 1e-300)
     return Start(beta[0], beta[1:].T, np.maximum(scale, 1e-6 * largest))
-
-
-def _undetermined(sensor: str, names: Sequence[str]) -> str:
-    return (
-        f"the recordings of the {sensor} do not determine {', '.join(names)}: "
-        "the table's motion must excite all three axes; record turns about each of them"
-    )
 
 
 class Design:

@@ -23,7 +23,7 @@ the estimator does not fit (consider parameters; Schmidt 1966), and so add ``J A
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -291,24 +291,23 @@ def assess_noise(
         )
     size = np.sqrt(np.mean(design**2, axis=0))
     scaled = np.sqrt(count) * (blocks.sums(design) / count / np.where(size > 0, size, 1.0))
-    U, s, _ = np.linalg.svd(scaled, full_matrices=disturbance is not None)
-    rank = int(np.sum(s > AVERAGED_OUT * s[0]))
     means = blocks.sums(residuals) / count
-    if disturbance is None:
-        settings = prior.grid(float(np.sqrt(np.mean(residuals**2))))
-        logarithm, squares = GaussMarkov(blocks, settings).restricted(U[:, :rank] / np.sqrt(count), means)
-        free = len(count) - rank
-        variance = np.maximum(squares / free, np.finfo(float).tiny)
-        found = ResidualNoise.of(blocks, settings, 3.0 * logarithm, variance, free)
-        return ResidualNoise(blocks, found.settings, found.weight, found.white_variance, spare)
-    white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
-    settings = prior.grid(float(np.sqrt(np.mean(white**2))))
-    complement = np.asarray(np.kron(np.eye(3), U[:, rank:]), np.float64)
-    return noise_beside(complement, means, blocks, settings, white, disturbance)
+    if disturbance is not None:
+        white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
+        settings = prior.grid(float(np.sqrt(np.mean(white**2))))
+        columns = np.asarray(np.kron(np.eye(3), scaled).reshape(3, len(count), -1), np.float64)
+        return noise_beside(columns, means, blocks, settings, white, disturbance)
+    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    basis = U[:, s > AVERAGED_OUT * s[0]]
+    settings = prior.grid(float(np.sqrt(np.mean(residuals**2))))
+    logarithm, squares = GaussMarkov(blocks, settings).restricted(basis / np.sqrt(count), means)
+    free = len(count) - basis.shape[1]
+    variance = np.maximum(squares / free, np.finfo(float).tiny)
+    return replace(ResidualNoise.of(blocks, settings, 3.0 * logarithm, variance, free), spare=spare)
 
 
 def noise_beside(  # noqa: PLR0917  (what a restricted likelihood beside known errors is)
-    complement: Values,
+    columns: Values,
     means: Values,
     blocks: Blocks,
     settings: Sequence[Setting],
@@ -318,20 +317,21 @@ def noise_beside(  # noqa: PLR0917  (what a restricted likelihood beside known e
 ) -> ResidualNoise:
     """Weight hypotheses about the noise by the residuals' block means in the directions that known errors leave free.
 
-    ``complement``: (3 m, r), orthonormal directions beside the fitted columns, in means times ``sqrt(samples) /
-    white``, channel by channel. ``means``: (m, 3). ``white``: (3,), noise of a sample. ``disturbance``: see
-    ``assess_noise``; directions in which it exceeds white noise are left out. ``row_weight``: (n,), samples of each
-    row.
+    ``columns``: (3, m, p), those that were fitted, in means times ``sqrt(samples) / white``, over the norm of the
+    samples. ``means``: (m, 3). ``white``: (3,), noise of a sample. ``disturbance``: see ``assess_noise``; directions in
+    which it exceeds white noise are left out. ``row_weight``: (n,), samples of each row.
     """
     count = blocks.weight[:, None]
     scale = np.outer(white, np.sqrt(count)).ravel()
-    variances, directions = np.linalg.eigh(complement.T @ (disturbance / np.outer(scale, scale)) @ complement)
-    basis = complement @ directions[:, : max(int(np.sum(variances <= 1.0)), 1)]
+    U, s, _ = np.linalg.svd(columns.reshape(len(scale), -1))
+    basis = U[:, int(np.sum(s > AVERAGED_OUT * s[0])) :]
+    variances, directions = np.linalg.eigh(basis.T @ (disturbance / np.outer(scale, scale)) @ basis)
+    basis = basis @ directions[:, : max(int(np.sum(variances <= 1.0)), 1)]
     z = basis.T @ (np.sqrt(count) * means / white).T.ravel()
     logarithm, squares = _in_subspace(basis, z, blocks, settings)
     variance = np.maximum(squares / len(z), np.finfo(float).tiny)[:, None]
-    found = ResidualNoise.of(blocks, settings, logarithm, variance, len(z))
-    return ResidualNoise(blocks, found.settings, found.weight, found.white_variance * white**2, len(z), row_weight)
+    found = ResidualNoise.of(blocks, settings, logarithm, variance, len(z), row_weight)
+    return replace(found, white_variance=found.white_variance * white**2)
 
 
 def _in_subspace(basis: Values, z: Values, blocks: Blocks, settings: Sequence[Setting]) -> tuple[Values, Values]:

@@ -74,9 +74,64 @@ class Problem:
         """Return sigma^2 by sums of squares of all."""
         return np.maximum(total / self.free, self.least)
 
-    def under(self, kept: Values) -> Problem:
+    def under(self, kept: Values | slice) -> Problem:
         """Return the problem under some of the hypotheses."""
         return replace(self, products=self.products[kept], prior=self.prior[kept])
+
+
+def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
+    """Return the change of columns to those of parameters over their limits, in the directions that are excited.
+
+    ``products``: (k, k), with the base projected out. ``size``: (k,), norm of the columns with it. ``least``: share of
+    it that must be left.
+    """
+    values, vectors = np.linalg.eigh(products / np.outer(size, size))
+    kept = vectors[:, values > least**2]
+    return np.asarray((kept @ kept.T) * limit / size[:, None] * size)
+
+
+def linear_problem(  # noqa: PLR0917  (they are the problem)
+    columns: Sequence[tuple[str, float, slice]],
+    products: Values,
+    size: Values,
+    prior: Values,
+    known: tuple[Mapping[str, Values], Mapping[str, Values]],
+    excluded: Mapping[str, Set],
+    *,
+    samples: float,
+    free: float,
+    new: float,
+    within: float = 0.0,
+    least: float = 0.0,
+) -> Problem:
+    """Return the problem of candidates at a fit.
+
+    ``columns``: effect, log weight and place of the columns of each version, the fitted one first. ``products``: (t, p
+    + 1, p + 1), of columns and the fit's residual without the base, white noise first. ``size``: (p + 1,), norm of the
+    columns with the base. ``known``: values of fitted effects, whose columns times them are added to the residual; and
+    limits by the data sheet. Where there is none, the unit is the parameter that adds as much as the noise of all
+    ``samples``. ``new``: share of a column's norm below which the base explains it. Others: of ``Problem``.
+    """
+    (fitted, stated), values = known, np.zeros(products.shape[1])
+    versions: dict[str, list[Version]] = {}
+    limits: dict[str, Values] = {}
+    for name, weight, at in columns:
+        if name in fitted and name not in versions:
+            values[at] = fitted[name][: at.stop - at.start]
+        versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
+    products[:, :, -1] += products @ values
+    products[:, -1] += values @ products
+    changed = products.copy()
+    for name, _, at in columns:
+        inner = products[0, at, at]
+        if name not in limits:
+            noise = np.sqrt(samples / np.maximum(np.diag(inner), 1e-300))
+            limit = stated.get(name, noise)[: len(noise)]
+            limits[name] = np.where(np.isfinite(limit), limit, noise)
+        change = excited(inner, size[at], limits[name], new)
+        changed[:, :, at] = changed[:, :, at] @ change
+        changed[:, at] = change.T @ changed[:, at]
+    return Problem(changed, prior, within, free, versions, limits, excluded, least)
 
 
 class Given:

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from pipeline.records import Index, Integers, Noise, Values
 
@@ -122,14 +122,14 @@ def selection_grid(
     return [WHITE] + [Setting(ratio, time) for ratio in ratios for time in times]
 
 
-def random_walks(settings: Sequence[Setting]) -> list[Setting]:
-    """Return random walks with the short differences of some settings: for each ratio, of its shortest time."""
+def random_walks(settings: Iterable[Setting]) -> dict[Setting, Setting]:
+    """Return for each ratio the setting of its shortest time, and a random walk with the same short differences."""
     found: dict[float, Setting] = {}
     for s in settings:
         if s.ratio > 0.0 and (s.ratio not in found or s.time < found[s.ratio].time):
             found[s.ratio] = s
     share = float(np.log(WALK_SHARE))
-    return [Setting(s.ratio * WALK_RATIO, s.time * WALK_TIME, s.prior + share) for s in found.values()]
+    return {s: Setting(s.ratio * WALK_RATIO, s.time * WALK_TIME, s.prior + share) for s in found.values()}
 
 
 def fast(noise: Noise | None) -> bool:
@@ -181,6 +181,24 @@ class Blocks:
     start: Values
     length: Values
     clock: Integers  # (m,); blocks of the same number have a known distance in time
+
+    @classmethod
+    def of_rows(cls, rows: Sequence[tuple[Values, Values]], clocks: Sequence[int], length: float) -> Blocks:
+        """Return stretches of time in which the bias is taken as constant, new ones for each recording.
+
+        ``rows``: times (n,), s, and samples (n,) of the rows of each recording. ``clocks``: of each recording.
+        ``length``: s.
+        """
+        first, start, weight, clock, row = [], [], [], [], 0
+        for (time, samples), number in zip(rows, clocks, strict=True):
+            own = np.flatnonzero(np.diff(np.floor((time - time[0]) / length), prepend=-1.0))
+            first.append(own + row)
+            weight.append(np.add.reduceat(samples, own))
+            start.append(np.add.reduceat(samples * time, own) / weight[-1])
+            clock.append(np.full(len(own), number))
+            row += len(time)
+        middle = np.concatenate(start)
+        return cls(np.concatenate(first), np.concatenate(weight), middle, np.zeros(len(middle)), np.concatenate(clock))
 
     @cached_property
     def order(self) -> Index:

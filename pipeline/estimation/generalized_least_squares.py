@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import HELD, TILT, is_held, parameter_names, require_available, starts_of
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base, placed, stepped
-from pipeline.estimation.engine import AVERAGED_OUT, RANK, Posterior, ResidualNoise, noise_beside
+from pipeline.estimation.engine import RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.noise import wander_prior
@@ -39,7 +39,7 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.model.effects.base import Layout, truth
 from pipeline.model.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-from pipeline.records import NORMAL, Contribution, Mask, Noise, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import NORMAL, Contribution, Noise, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -164,6 +164,9 @@ class _Solved:
     cosine: float
     left: float
     rank: int
+    # each (g,); of every setting: log det C + log det(X^T C^-1 X), and the weighted sum of squared residuals
+    logarithms: Values
+    squares: Values
 
 
 def _solve(design: Design, observations: Observations, settings: Sequence[Setting]) -> _Solved:
@@ -175,7 +178,11 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     spare = max(n - design.count, 1.0)
     products, logarithms = design.products(settings)
     gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
-    values, kept, unit, half = _roots(gram)
+    unit = np.sqrt(np.maximum(np.einsum("gpp->gp", gram), 1e-30))
+    values, vectors = np.linalg.eigh(gram / (unit[:, :, None] * unit[:, None, :]))
+    kept = values > RANK * values[:, -1:]
+    half = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :] / unit[:, :, None]
+    determinants = np.sum(np.log(np.where(kept, values, 1.0)), axis=1) + 2.0 * np.sum(np.log(unit), axis=1)
     steps = np.einsum("gpi,gqi,gq->gp", half, half, rhs, optimize=True)
     rss = np.maximum(np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within, 1e-300)
     scores = -0.5 * n * np.log(rss / n) - 0.5 * logarithms + np.array([s.prior for s in settings])
@@ -194,16 +201,9 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
         float(np.max(np.abs(rhs[best]) / norm)),
         float(np.max(np.abs(left) / norm)),
         int(kept[best].sum()),
+        logarithms + determinants,
+        rss,
     )
-
-
-def _roots(gram: Values) -> tuple[Values, Mask, Values, Values]:
-    """Return the pseudo-inverse of (g, p, p) products of columns: eigenvalues, those above 0, column sizes, a root."""
-    unit = np.sqrt(np.maximum(np.einsum("gpp->gp", gram), 1e-30))
-    values, vectors = np.linalg.eigh(gram / (unit[:, :, None] * unit[:, None, :]))
-    kept = values > RANK * values[:, -1:]
-    half = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :] / unit[:, :, None]
-    return values, kept, unit, half
 
 
 def _residual_noise(
@@ -216,24 +216,12 @@ def _residual_noise(
         columns = np.zeros((3, len(blocks.weight), design.count + 1))
         for c in range(3):
             columns[c][:, design.places(c)[1]] = blocks.sums(weight[:, None] * design.of_axis(c))
-        means = columns[:, :, -1].T / blocks.weight[:, None]
-        columns /= (np.sqrt(blocks.weight) * white[:, None])[:, :, None]
-        X = columns[:, :, :-1].reshape(-1, design.count)
-        U, s, _ = np.linalg.svd(X / np.maximum(np.linalg.norm(X, axis=0), 1e-300))
-        rank = int(np.sum(s > AVERAGED_OUT * s[0]))
-        return noise_beside(U[:, rank:], means, blocks, settings, white, disturbed, weight)
-    size = np.where(design.sizes()[:-1] > 0, design.sizes()[:-1], 1.0)
-    products, logarithms = design.products(settings)
-    gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
-    gram += (np.einsum("gpp->gp", gram) <= RANK)[:, :, None] * np.eye(len(size))  # columns of zeros
-    values, kept, unit, half = _roots(gram)
-    steps = np.einsum("gpi,gqi,gq->gp", half, half, rhs, optimize=True)
-    determinants = np.sum(np.log(np.where(kept, values, 1.0)), axis=1) + 2.0 * np.sum(np.log(unit), axis=1)
-    within = float(np.sum(observations.scatter / design.scale**2))
-    rss = np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within
-    free = max(3.0 * observations.samples - design.count, 1.0)
-    variance = np.maximum(rss / free, np.finfo(float).tiny)[:, None]
-    found = ResidualNoise.of(blocks, settings, logarithms + determinants, variance, free, weight)
+        columns /= blocks.weight[:, None]
+        X = columns[:, :, :-1] * (np.sqrt(blocks.weight) / white[:, None])[:, :, None]
+        X /= np.maximum(np.linalg.norm(X, axis=(0, 1)), 1e-300)
+        return noise_beside(X, columns[:, :, -1].T, blocks, settings, white, disturbed, weight)
+    solved, free = _solve(design, observations, settings), max(3.0 * observations.samples - design.count, 1.0)
+    found = ResidualNoise.of(blocks, settings, solved.logarithms, solved.squares[:, None] / free, free, weight)
     return replace(found, white_variance=found.white_variance * design.scale**2)
 
 
@@ -364,7 +352,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     first = design.linear_map(fit.setting)
     prior = wander_prior(noise, (settings.get("sensor") or {}).get(sensor) or {})
     whole = first.then(change)
-    reference = Reference(sensor, [part.motion for part in observations.parts], whole, fit.K, settings["table"])
+    reference = Reference(sensor, [part.motion for part in observations.parts], fit.K, settings["table"])
     errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))), reference)
     values = np.concatenate([fit.bias, fit.K.ravel(), *(term.values for term in fit.terms)])
     of_channels = np.concatenate(first.derivative, axis=1)
@@ -377,7 +365,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
         remark = HELD if name == TILT and not observations.levelling_deg else ""
         own, never = change @ prior_part @ change.T, np.full(len(change), np.inf)
         lines.append(Contribution(name.replace("_", " "), "B", NORMAL, own, never, remark=remark))
-    return budgeted(found, reference, errors, lines, settings, results, names)
+    return budgeted(found, reference, whole, errors, lines, settings, results, names)
 
 
 def fit_in_mean_frame(fit: Fit) -> tuple[Fit, Values]:

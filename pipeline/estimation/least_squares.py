@@ -86,66 +86,19 @@ class ScaledColumns:
         half: Values = self.Vt[keep].T / self.singular[keep] / self.scale[:, None]
         return half @ half.T
 
-    def require_full_rank(self, names: Sequence[str] | None = None) -> None:
+    def undetermined(self, names: Sequence[str], share: float = PART_OF_NULL_SPACE) -> list[str]:
+        """Return the names of the parameters with at least a share in combinations that are not determined."""
+        parts = np.linalg.norm(self.Vt[self.rank :], axis=0)
+        return [name for name, part in zip(names, parts, strict=True) if part > share]
+
+    def require_full_rank(self, names: Sequence[str]) -> None:
         """Raise ``NotObservableError`` with the names of the parameters that the data do not determine."""
-        p = len(self.scale)
-        if self.rank < p:
-            share = np.linalg.norm(self.Vt[self.rank :], axis=0)
-            missing = [
-                name
-                for name, part in zip(names or [f"x[{j}]" for j in range(p)], share, strict=True)
-                if part > PART_OF_NULL_SPACE
-            ]
+        if self.rank < len(self.scale):
             raise NotObservableError(
-                f"the data determine {self.rank} of {p} parameters; not determined, or only in combination with each "
-                f"other: {', '.join(missing)}. Record motion that changes these independently, or fix some of them"
+                f"the data determine {self.rank} of {len(self.scale)} parameters; not determined, or only in "
+                f"combination with each other: {', '.join(self.undetermined(names))}. Record motion that changes these "
+                "independently, or fix some of them"
             )
-
-
-@dataclass(frozen=True)
-class LeastSquaresResult:
-    """The outcome of a least-squares problem with n residuals and p parameters."""
-
-    x: Values  # (p,)
-    covariance: Values  # (p, p)
-    residual: Values  # (n,); as minimised, that is weighted where weights were given
-    degrees_of_freedom: int  # n - p
-    rank: int
-    condition: float  # condition number of the Jacobian with its columns scaled to unit norm
-    cosine: float  # largest |cosine| between the residual and a column of the Jacobian
-    converged: bool  # whether the residual is orthogonal to the columns, or the next step is below the rounding of x
-
-    @classmethod
-    def of(cls, x: Values, r: Values, J: Values, factors: ScaledColumns, sigma: float | None) -> LeastSquaresResult:
-        """Return the outcome at x with the residuals r and their columns J; ``sigma`` as in ``solve_linear``."""
-        norm, dof = float(np.linalg.norm(r)), len(r) - len(x)
-        cosine = float(np.max(np.abs(J.T @ r) / factors.scale) / norm) if norm > 0 else 0.0
-        small = bool(np.all(np.abs(factors.solve(r)) <= STEP_AT_MINIMUM * np.abs(x)))
-        if sigma is None:
-            sigma = norm / np.sqrt(dof) if dof > 0 else 0.0
-        converged = small or cosine <= COSINE_AT_MINIMUM
-        return cls(x, sigma**2 * factors.covariance(), r, dof, factors.rank, factors.condition, cosine, converged)
-
-    @property
-    def standard_uncertainty(self) -> Values:
-        """Standard uncertainty of each parameter: (p,) array."""
-        return np.sqrt(np.diag(self.covariance))
-
-
-def solve_linear(
-    A: Values, y: Values, sigma: float | None = None, names: Sequence[str] | None = None
-) -> LeastSquaresResult:
-    """Solve ``min |y - A x|``.
-
-    ``A``: (n, p). ``y``: (n,). ``sigma``: standard deviation of one residual; None estimates it from the residuals.
-    ``names``: names of the parameters, for the message where they are not determined. Raises ``NotObservableError`` if
-    the columns are linearly dependent or fewer equations than parameters are given.
-    """
-    factors = ScaledColumns.of(A)
-    factors.require_full_rank(names)
-    x = factors.solve(y)
-    x += factors.solve(y - A @ x)  # one refinement recovers the digits that ill-conditioned columns cost
-    return LeastSquaresResult.of(x, y - A @ x, A, factors, sigma)
 
 
 def gauss_newton(  # noqa: PLR0917  (what an iteration is)

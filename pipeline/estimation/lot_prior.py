@@ -74,17 +74,10 @@ class WithPrior(NamedTuple):
 def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tuple[Index, Index]) -> LotPrior:
     """Return the prior of each unit of a lot, from siblings that are no outliers.
 
-    Parameters
-    ----------
-    x : (n, p) array
-        Estimates.
-    own : (n, p, p) array
-        A_i; the degrees of freedom of its diagonals are ``freedom``, (n, p).
-    able : (n,) array
-        Whether a unit may be a sibling.
-    numbers : (n,) and (p,) arrays
-        Of the device of each unit: of several calibrations of a device the first counts, and none for the others.
-        Of the kind of each parameter: the tau of one kind are alike.
+    ``x``: (n, p), estimates. ``own``: (n, p, p), A_i; the degrees of freedom of its diagonals are ``freedom``, (n, p).
+    ``able``: (n,), whether a unit may be a sibling. ``numbers``: (n,) of the device of each unit: of several
+    calibrations of a device the first counts, and none for the others; (p,) of the kind of each parameter: the tau of
+    one kind are alike.
     """
     device, kind = numbers
     _, first = np.unique(np.where(able, device, -1), return_index=True)

@@ -47,9 +47,7 @@ class Distribution:
     # each (n,)
     estimate: Values
     standard_uncertainty: Values
-    # each (n, 2); coverage intervals: with as much outside on either side, and the shortest (7.7, 5.3.4)
-    symmetric: Values
-    shortest: Values
+    symmetric: Values  # (n, 2); coverage intervals with as much outside on either side (7.7)
 
 
 @dataclass(frozen=True)
@@ -68,16 +66,13 @@ class Comparison:
 
 
 def distribution_of(results: ArrayLike, probability: float = 0.95) -> Distribution:
-    """Return estimate, standard uncertainty and coverage intervals of (M, n) drawn results."""
+    """Return estimate, standard uncertainty and coverage interval of (M, n) drawn results."""
     values = np.sort(np.asarray(results, float), axis=0)
     M = len(values)
     inside = round(probability * M)
     low = (M - inside) // 2
-    last = np.minimum(np.arange(M - inside) + inside, M - 1)
-    at, column = np.argmin(values[last] - values[: M - inside], axis=0), np.arange(values.shape[1])
-    shortest = np.stack([values[at, column], values[np.minimum(at + inside, M - 1), column]], axis=1)
     symmetric = np.stack([values[low], values[min(low + inside, M - 1)]], axis=1)
-    return Distribution(values.mean(axis=0), values.std(axis=0, ddof=1), symmetric, shortest)
+    return Distribution(values.mean(axis=0), values.std(axis=0, ddof=1), symmetric)
 
 
 def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Values:
@@ -89,20 +84,14 @@ def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Val
 
 
 def compare(
-    estimate: ArrayLike,
-    expanded_uncertainty: ArrayLike,
-    found: Distribution,
-    *,
-    digits: int = 2,
-    shortest: bool = False,
+    estimate: ArrayLike, expanded_uncertainty: ArrayLike, found: Distribution, *, digits: int = 2
 ) -> Comparison:
     """Compare ``y +- U`` by the law of propagation with the interval of a Monte Carlo run of the same probability."""
     y, U = np.atleast_1d(np.asarray(estimate, float)), np.atleast_1d(np.asarray(expanded_uncertainty, float))
-    interval = found.shortest if shortest else found.symmetric
     return Comparison(
         numerical_tolerance(found.standard_uncertainty, digits),
-        np.abs(y - U - interval[:, 0]),
-        np.abs(y + U - interval[:, 1]),
+        np.abs(y - U - found.symmetric[:, 0]),
+        np.abs(y + U - found.symmetric[:, 1]),
     )
 
 

@@ -42,23 +42,14 @@ Composition = tuple[int, ...]  # kinds of the stochastic terms, in rising order
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Coefficients of the axes in bins of frequency.
+    """Coefficients of the axes in b bins of frequency."""
 
-    Attributes
-    ----------
-    omega, count : (b,) arrays
-        Mean of w in rad a sample, and coefficients, of each bin.
-    products : (a, b, c, c) array
-        Sums over each bin of the products of y and the deterministic columns, in this order, of each of a axes.
-    interval, length : float, s
-        Between samples, and of the longest stretch without a gap.
-    """
-
+    # each (b,); mean of w in rad a sample, and coefficients, of each bin
     omega: Values
     count: Values
-    products: Values
-    interval: float
-    length: float
+    products: Values  # (a, b, c, c); sums over each bin of y and the deterministic columns, in this order, of a axes
+    interval: float  # s; between samples
+    length: float  # s; of the longest stretch without a gap
 
     @cached_property
     def shapes(self) -> Values:
@@ -105,32 +96,19 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True)
 class Fits:
-    """g sums of up to J terms, fitted side by side.
+    """g sums of up to J terms, fitted side by side."""
 
-    Attributes
-    ----------
-    axis : (g,) array of int
-    kinds : (g, J) array of int
-        Of ``noise_terms.STOCHASTIC``; -1 for none.
-    columns : (g, d) array of bool
-        Which of the deterministic columns are fitted.
-    parameters : (g, 2 J) array
-        Logarithms of the squared coefficients, then of the correlation times.
-    deviance, unrestricted : (g,) arrays
-        -2 log L with and without the determinant of the deterministic columns.
-    beta, beta_covariance : (g, d), (g, d, d) arrays
-        Of the deterministic columns; zeros of those that are not fitted.
-    """
-
-    axis: Integers
-    kinds: Integers
-    columns: Mask
-    parameters: Values
+    axis: Integers  # (g,)
+    kinds: Integers  # (g, J); of ``noise_terms.STOCHASTIC``, -1 for none
+    columns: Mask  # (g, d); which of the deterministic columns are fitted
+    parameters: Values  # (g, 2 J); logarithms of the squared coefficients, then of the correlation times
+    # each (g,); -2 log L with and without the determinant of the deterministic columns
     deviance: Values
     unrestricted: Values
     total: Values  # (g, b), S
     power: Values  # (g, b), its estimate by the data times ``count``
     slopes: Values  # (g, 2 J, b), of log S by each parameter
+    # (g, d) and (g, d, d); of the deterministic columns, zeros of those that are not fitted
     beta: Values
     beta_covariance: Values
 

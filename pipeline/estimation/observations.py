@@ -119,22 +119,11 @@ class Observations:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """Short stretches of time in which the bias is taken as constant, new ones for each recording."""
+        """Short stretches of time in which the bias is taken as constant."""
         span = sum(float(np.ptp(part.motion.time)) for part in self.parts)
-        length = max(SHORTEST_BLOCK_S, span / BLOCKS)
-        first, times, weights, clocks, row, clock = [], [], [], [], 0, 0
-        for before, part in zip([None, *self.parts], self.parts, strict=False):
-            block = np.floor((part.motion.time - part.motion.time[0]) / length)
-            start = np.flatnonzero(np.concatenate([[True], np.diff(block) != 0]))
-            weight = np.add.reduceat(part.weight, start)
-            clock += not _follows(before, part)
-            first.append(start + row)
-            times.append(np.add.reduceat(part.weight * part.motion.time, start) / weight)
-            weights.append(weight)
-            clocks.append(np.full(len(start), clock))
-            row += len(part.motion.time)
-        time = np.concatenate(times)
-        return Blocks(np.concatenate(first), np.concatenate(weights), time, np.zeros(len(time)), np.concatenate(clocks))
+        apart = [not _follows(before, part) for before, part in zip([None, *self.parts], self.parts, strict=False)]
+        rows = [(part.motion.time, part.weight) for part in self.parts]
+        return Blocks.of_rows(rows, np.cumsum(apart).tolist(), max(SHORTEST_BLOCK_S, span / BLOCKS))
 
     @property
     def clock_shared(self) -> bool:

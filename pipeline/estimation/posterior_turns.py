@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import SECOND, SECOND_SHARE, over_limits, time_constants
+from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
 from pipeline.estimation.design import BASE, Design, Term, placed
-from pipeline.estimation.evidence import Problem, Version
+from pipeline.estimation.evidence import Problem, linear_problem
 from pipeline.estimation.gauss_markov import WHITE, random_walks
 from pipeline.estimation.generalized_least_squares import Fit, design_beside, fit_terms
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
@@ -111,7 +111,7 @@ def _products(
     The places are those of the listed terms. Where nothing is fitted beside the base, the products are those of the
     selection's ranking. ``known``: columns of the base.
     """
-    ranking, walks = selection.ranking, random_walks(selection.settings)
+    ranking, walks = selection.ranking, [*random_walks(selection.settings).values()]
     places = {
         (term.effect.name, term.values.tobytes()): at
         for term, at in zip(ranking.candidates, ranking.design.slices, strict=False)
@@ -135,7 +135,7 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
     """Return the linear problem at a fit."""
     observations = selection.observations
     configured = fit.terms[: len(selection.base.terms)]
-    fitted = {t.effect.name: t for t in fit.terms[len(configured) :]}
+    fitted = {t.effect.name: t.values for t in fit.terms[len(configured) :]}
     listed = [
         (name, term, weight)
         for name, candidate in candidates.items()
@@ -143,30 +143,22 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
     ]
     known = BASE + sum(len(term.values) for term in configured)
     design, base, products, logarithms, places = _products(selection, fit, listed, known)
-    settings = [WHITE, *selection.settings, *random_walks(selection.settings)]
+    settings = [WHITE, *selection.settings, *random_walks(selection.settings).values()]
     size = np.where(design.sizes() > 0.0, design.sizes(), 1.0)
     base = base / np.outer(size[:known], size[:known])
     prior = np.array([s.prior for s in settings]) - 0.5 * (logarithms + np.linalg.slogdet(base)[1])
-    own = [(name, slice(at.start - known, at.stop - known)) for (name, _, _), at in zip(listed, places, strict=True)]
+    pairs = zip(listed, places, strict=True)
+    own = [(name, weight, slice(at.start - known, at.stop - known)) for (name, _, weight), at in pairs]
     samples = 3.0 * observations.samples
-    versions: dict[str, list[Version]] = {}
-    values = np.zeros(products.shape[1])
-    for (name, at), (_, _, weight) in zip(own, listed, strict=True):
-        if name in fitted and name not in versions:
-            values[at] = fitted[name].values[: at.stop - at.start]
-        versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
-    if fitted:
-        products[:, :, -1] += products @ values
-        products[:, -1] += values @ products
-    changed, limits = over_limits(own, products, size[known:], selection.limits, samples=samples, least=EXCITED)
-    free = samples - known
-    within = float(np.sum(observations.scatter / fit.scale**2))
-    return Problem(
-        changed[1:],
-        prior[1:],
-        within,
-        free,
-        versions,
-        limits,
+    return linear_problem(
+        own,
+        products,
+        size[known:],
+        prior,
+        (fitted, selection.limits),
         excluded([term.effect for term in candidates.values()]),
-    )
+        samples=samples,
+        free=samples - known,
+        new=EXCITED,
+        within=float(np.sum(observations.scatter / fit.scale**2)),
+    ).under(slice(1, None))

@@ -31,11 +31,11 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.candidates import bench_effects
-from pipeline.estimation.engine import LinearMap, assess_noise
+from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.generalized_least_squares import fit_joint, with_matrix
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.noise import noise_of, prior_of
-from pipeline.estimation.table_errors import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import Part, blocks_of_samples, parts_of, settled
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.model.effects import stated_priors
@@ -80,8 +80,8 @@ def fit(
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
     fit = _linear_map(factors.weights(), matrix)
     motions = [part.motion.select(part.keep) for part in parts]
-    reference = Reference(sensor, motions, fit, K, settings["table"])
-    noise = assess_noise(residuals, X, blocks, prior, disturbance(reference, residuals, blocks))
+    reference = Reference(sensor, motions, K, settings["table"])
+    noise = noise_on_table(reference, residuals, X, blocks, prior)
     contributions = [noise_contribution(noise, fit, prior)]
     result = StageResult(
         name=NAME,
@@ -111,7 +111,7 @@ def fit(
     own = bench_effects(sensor, settings, recordings)
     if own and not stated_priors(settings["table"]):  # else by the stage ``effects``
         return fit_joint(sensor, recordings, own, noise_of(sensor, recordings, settings), settings, found)
-    return budgeted(found, reference, noise, contributions, settings, results)
+    return budgeted(found, reference, fit, noise, contributions, settings, results)
 
 
 def of_channels(values: Values) -> Values:

@@ -177,12 +177,6 @@ class Rests:
         """Degrees of freedom of the scatter within the rests."""
         return float(3 * np.sum(self.count - 1))
 
-    @property
-    def joined(self) -> Mask:
-        """Whether the time from each rest to each other is known: (m, m) array."""
-        same: Mask = self.recording[:, None] == self.recording
-        return np.ones_like(same) if self.clock_shared else same
-
 
 def is_multi_position(sensor: str, recordings: Sequence[Recording]) -> bool:
     """Return whether a sensor was recorded in rests and moves, without the motion of a table."""

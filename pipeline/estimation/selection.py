@@ -26,6 +26,7 @@ import numpy as np
 
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
 from pipeline.estimation.design import Start, Term, ordinary_base, placed
+from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gauss_markov import Setting, selection_grid
 from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms
 from pipeline.estimation.observations import Observations, weighted
@@ -289,12 +290,8 @@ class Selection:
             if name not in self.names or term.effect.moves:
                 continue
             covariance = self.fit.covariance[block, block]
-            size = np.sqrt(np.diag(covariance))
-            known = size > 0
-            z = (term.values / np.where(known, size, 1.0))[known]
-            correlation = (covariance / np.outer(*[np.where(known, size, 1.0)] * 2))[np.ix_(known, known)]
-            wald = float(z @ np.linalg.lstsq(correlation, z, rcond=1e-9)[0])
-            if wald < len(z) * float(np.log(self.ranking.samples)):
+            wald = float(term.values @ scaled_inverse(covariance) @ term.values)
+            if wald < np.count_nonzero(np.diag(covariance) > 0.0) * float(np.log(self.ranking.samples)):
                 refuted.append(name)
         self._forget(refuted)
         if refuted:

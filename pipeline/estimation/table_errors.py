@@ -18,12 +18,13 @@ An attitude log has no stops: its angle errors are three constant turns of each 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.engine import LinearMap
+from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import ABOUT, earth_rate
@@ -33,7 +34,7 @@ from pipeline.signal.rests import RATE_AT_REST_DPS
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.gauss_markov import Blocks
+    from pipeline.estimation.gauss_markov import Blocks, Prior
 
 ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
@@ -53,26 +54,25 @@ CLOCK_OF_TABLE = (
 
 @dataclass(frozen=True)
 class Reference:
-    """The motion at the rows of a fit, recording by recording, and its linear map."""
+    """The motion at the rows of a fit, recording by recording, by a table of stated accuracies."""
 
     sensor: str
-    motions: Sequence[Motion]  # their samples, one after the other, are the columns of the map's weights
-    fit: LinearMap
+    motions: Sequence[Motion]  # their samples, one after the other, are the columns of a fit's weights
     K: Values  # (3, 3)
     table: Mapping[str, Any]
 
-    def summed(self, change: Callable[[Motion], Values | None], inputs: int) -> Values:
+    def summed(self, fit: LinearMap, change: Callable[[Motion], Values | None], inputs: int) -> Values:
         """Return what inputs do to the parameters, each by a change of the truth: (p, inputs) array.
 
         ``change``: motion to (n, 3, inputs), or None where they do nothing.
         """
-        total, row = np.zeros((self.fit.parameters, inputs)), 0
+        total, row = np.zeros((fit.parameters, inputs)), 0
         for motion in self.motions:
             rows = slice(row, row + len(motion.time))
             row = rows.stop
             du = change(motion)
             if du is not None:
-                here = self.fit.rows(rows)
+                here = fit.rows(rows)
                 total += np.stack([here.of(du[:, :, j] @ self.K.T) for j in range(inputs)], axis=1)
         return total
 
@@ -87,13 +87,15 @@ def type_b(  # noqa: PLR0917  (the columns of a budget's line)
     return Contribution(source, "B", distribution, covariance, freedom, u, unit, effect.shape[1], remark=remark)
 
 
-def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[list[Contribution], dict[str, str]]:
-    """Return each stated accuracy with its effect, and why the others are not included.
+def table_errors(
+    reference: Reference, fit: LinearMap, estimated: Sequence[str] = ()
+) -> tuple[list[Contribution], dict[str, str]]:
+    """Return each stated accuracy with its effect on the parameters of a fit, and why the others are not included.
 
     ``estimated``: effects of the fit: what one of them estimates is no input any more.
     """
     found, missing = [], {}
-    for source, key, unit, sensors, replaced_by, change in ACCURACIES:
+    for source, key, unit, sensors, replaced_by, inputs, change in ACCURACIES:
         if reference.sensor not in sensors:
             continue
         u = reference.table.get(key)
@@ -104,7 +106,8 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
         if reason:
             missing[source] = reason
         elif u:
-            found.append(type_b(source, NORMAL, float(u), unit, change(reference)))
+            does = reference.summed(fit, partial(change, reference), inputs) if change else _angle(reference, fit)
+            found.append(type_b(source, NORMAL, float(u), unit, does))
     return found, missing
 
 
@@ -113,7 +116,7 @@ def disturbance(
 ) -> Values | None:
     """Return the covariance that the stated accuracies give the sums over blocks, or None where noise hides it.
 
-    ``reference``: its linear map is not used. ``residuals``: (n, 3). ``weight``: (n,), samples of each row; None: rows
+    ``residuals``: (n, 3). ``weight``: (n,), samples of each row; None: rows
     are samples. ``white``: (3,), noise of a sample; None: as the residuals show it. The covariance is (3 b, 3 b),
     channel by channel.
     """
@@ -123,8 +126,15 @@ def disturbance(
         return None
     sums = np.zeros((len(blocks.weight), len(residuals)))
     sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0 if weight is None else weight
-    errors, _ = table_errors(replace(reference, fit=LinearMap((sums, sums, sums), (sums, sums, sums)).first()))
+    errors, _ = table_errors(reference, LinearMap((sums, sums, sums), (sums, sums, sums)).first())
     return np.sum([e.covariance for e in errors], axis=0) if errors else None
+
+
+def noise_on_table(
+    reference: Reference, residuals: Values, design: Values, blocks: Blocks, prior: Prior
+) -> ResidualNoise:
+    """Weight the hypotheses of a prior by the residuals of a fit on a table; arguments as of ``assess_noise``."""
+    return assess_noise(residuals, design, blocks, prior, disturbance(reference, residuals, blocks))
 
 
 def _largest(reference: Reference) -> float:
@@ -156,16 +166,15 @@ def _without(source: str, key: str, reference: Reference) -> str:
     return f"table.{key} is not stated" if table.get(key) is None else ""
 
 
-def _angle(reference: Reference) -> Values:
+def _angle(reference: Reference, fit: LinearMap) -> Values:
     """Return what an error of each stop's angle does: (p, stops) array."""
     left, right, group, count = errors_of_stops(reference.sensor, reference.motions, reference.K)
-    fit = reference.fit
     at_stops = fit.of_groups(left, group, count + 1)
     at_stops += fit.of_groups(right, group + 1, count + 1)
     attitudes = [m for m in reference.motions if m.axis is None and m.level is not None]
     if not attitudes:
         return at_stops
-    return np.concatenate([at_stops, *(_turned(reference, motion) for motion in attitudes)], axis=1)
+    return np.concatenate([at_stops, *(_turned(reference, fit, motion) for motion in attitudes)], axis=1)
 
 
 def errors_of_stops(sensor: str, motions: Sequence[Motion], K: Values) -> tuple[Values, Values, Index, int]:
@@ -214,7 +223,7 @@ def between_stops(angle: Values, rate: Values) -> tuple[Index, Values, Values, i
     return stop, np.where(moving, (angle - at[stop]) / safe, 0.0), np.where(moving, 1.0 / safe, 0.0), len(at)
 
 
-def _turned(reference: Reference, motion: Motion) -> Values:
+def _turned(reference: Reference, fit: LinearMap, motion: Motion) -> Values:
     """Return what a turn of one recording about each body axis does, per deg: (p, 3) array."""
 
     def change(other: Motion) -> Values | None:
@@ -223,96 +232,84 @@ def _turned(reference: Reference, motion: Motion) -> Values:
         u = truth(reference.sensor, motion)
         return np.stack([-np.radians(u @ about.T) for about in ABOUT], axis=2)
 
-    return reference.summed(change, 3)
+    return reference.summed(fit, change, 3)
 
 
-def _rate(reference: Reference) -> Values:
-    """Return what a relative error of the rate about each axis does: (p, 3) array."""
-
-    def change(motion: Motion) -> Values | None:
-        if motion.axis is None or motion.rate is None or motion.angle is None:
-            return None
-        du = np.zeros((len(motion.time), 3, 3))
-        if reference.sensor == "gyroscope":
-            du[:, motion.axis, motion.axis] = motion.rate
-        elif between_stops(motion.angle, motion.rate)[3] <= COUNTED_STOPS:
-            travelled = np.concatenate([[0.0], np.cumsum(np.diff(motion.angle))])[:, None]
-            du[:, :, motion.axis] = -np.radians(travelled * (motion.specific_force @ ABOUT[motion.axis].T))
-        return du
-
-    return reference.summed(change, 3)
+def _rate(reference: Reference, motion: Motion) -> Values | None:
+    """Return a relative error of the rate about each axis."""
+    if motion.axis is None or motion.rate is None or motion.angle is None:
+        return None
+    du = np.zeros((len(motion.time), 3, 3))
+    if reference.sensor == "gyroscope":
+        du[:, motion.axis, motion.axis] = motion.rate
+    elif between_stops(motion.angle, motion.rate)[3] <= COUNTED_STOPS:
+        travelled = np.concatenate([[0.0], np.cumsum(np.diff(motion.angle))])[:, None]
+        du[:, :, motion.axis] = -np.radians(travelled * (motion.specific_force @ ABOUT[motion.axis].T))
+    return du
 
 
-def _orthogonality(reference: Reference) -> Values:
-    """Return what a lean of each axis, per deg, does: (p, 6) array."""
-    lean, unit = effect("table_axis_nonorthogonality"), np.eye(3)
-    nothing = np.zeros(6)
-    return reference.summed(
-        lambda m: None if m.axis is None else lean.regressors(reference.sensor, m, unit, nothing), 6
-    )
+def _orthogonality(reference: Reference, motion: Motion) -> Values | None:
+    """Return a lean of each axis, per deg."""
+    lean = effect("table_axis_nonorthogonality")
+    return None if motion.axis is None else lean.regressors(reference.sensor, motion, np.eye(3), np.zeros(6))
 
 
-def _wobble(reference: Reference) -> Values:
-    """Return what cosine and sine of a wobble about both other axes do, per deg: (p, 12) array."""
-
-    def change(motion: Motion) -> Values | None:
-        if motion.axis is None or motion.angle is None or motion.rate is None:
-            return None
-        a, angle = motion.axis, np.radians(motion.angle)
-        du = np.zeros((len(angle), 3, 12))
-        for j, wave in enumerate((np.cos(angle), np.sin(angle))):
-            slope = (-np.sin(angle), np.cos(angle))[j]
-            for k in (1, 2):
-                about = np.radians(1.0) * np.eye(3)[(a + k) % 3]
-                turned = np.cross(truth(reference.sensor, motion), about) * wave[:, None]
-                if reference.sensor == "gyroscope":
-                    turned = turned + about * (slope * motion.rate)[:, None]
-                du[:, :, 4 * a + 2 * j + k - 1] = turned
-        return du
-
-    return reference.summed(change, 12)
+def _wobble(reference: Reference, motion: Motion) -> Values | None:
+    """Return cosine and sine of a wobble about both other axes, per deg."""
+    if motion.axis is None or motion.angle is None or motion.rate is None:
+        return None
+    a, angle = motion.axis, np.radians(motion.angle)
+    du = np.zeros((len(angle), 3, 12))
+    for j, (wave, slope) in enumerate(((np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle)))):
+        for k in (1, 2):
+            about = np.radians(1.0) * np.eye(3)[(a + k) % 3]
+            turned = np.cross(truth(reference.sensor, motion), about) * wave[:, None]
+            if reference.sensor == "gyroscope":
+                turned = turned + about * (slope * motion.rate)[:, None]
+            du[:, :, 4 * a + 2 * j + k - 1] = turned
+    return du
 
 
-def _levelling(reference: Reference) -> Values:
-    """Return what a tilt about level x and y, per deg, does: (p, 2) array."""
-    tilt, unit, nothing = effect("table_tilt"), np.eye(3), np.zeros(2)
-    return reference.summed(
-        lambda m: None if m.level is None else tilt.regressors(reference.sensor, m, unit, nothing), 2
-    )
+def _levelling(reference: Reference, motion: Motion) -> Values | None:
+    """Return a tilt about level x and y, per deg."""
+    tilt = effect("table_tilt")
+    return None if motion.level is None else tilt.regressors(reference.sensor, motion, np.eye(3), np.zeros(2))
 
 
-def _gravity(reference: Reference) -> Values:
-    """Return what a g more of gravity does: (p, 1) array."""
-    gravity = float(reference.table.get("gravity_g") or 1.0)
-    return reference.summed(lambda m: m.specific_force[:, :, None] / gravity, 1)
+def _gravity(reference: Reference, motion: Motion) -> Values:
+    """Return a g more of gravity."""
+    return motion.specific_force[:, :, None] / float(reference.table.get("gravity_g") or 1.0)
 
 
-def _azimuth(reference: Reference) -> Values:
-    """Return what a turn of the table about the vertical, per deg, does to Earth's rotation: (p, 1) array."""
-    table = reference.table
-    earth = earth_rate(float(table["latitude_deg"]), float(table["azimuth_deg"]))
+def _azimuth(reference: Reference, motion: Motion) -> Values | None:
+    """Return a turn of the table about the vertical, per deg, by its effect on Earth's rotation."""
+    if motion.level is None:
+        return None
+    earth = earth_rate(float(reference.table["latitude_deg"]), float(reference.table["azimuth_deg"]))
     change = np.radians(np.array([-earth[1], earth[0], 0.0]))
-    return reference.summed(
-        lambda m: None if m.level is None else np.einsum("i,nij->nj", change, m.level)[:, :, None], 1
-    )
+    return np.asarray(np.einsum("i,nij->nj", change, motion.level)[:, :, None])
 
 
-def _clock(reference: Reference) -> Values:
-    """Return what an error of the sensor's clock, per ppm, does to rates that follow from it: (p, 1) array."""
-    return reference.summed(lambda m: 1e-6 * m.angular_rate[:, :, None] if m.timed_by == "sensor" else None, 1)
+def _clock(reference: Reference, motion: Motion) -> Values | None:
+    """Return an error of the sensor's clock, per ppm, where rates follow from it."""
+    del reference
+    return 1e-6 * motion.angular_rate[:, :, None] if motion.timed_by == "sensor" else None
 
 
-# Source, setting of the table, unit, sensors whose readings it changes, effects that estimate it, what it does.
-ACCURACIES = (
-    ("table angle", "angle_accuracy_deg", "deg", SENSORS, (), _angle),
-    ("table rate", "rate_accuracy", "1", SENSORS, (), _rate),
+# Source, setting of the table, unit, sensors whose readings it changes, effects that estimate it, number of inputs, and
+# the change of the truth by them, (n, 3, inputs); that of the angle at the stops is ``_angle``.
+ACCURACIES: tuple[
+    tuple[str, str, str, Sequence[str], Sequence[str], int, Callable[[Reference, Motion], Values | None] | None], ...
+] = (
+    ("table angle", "angle_accuracy_deg", "deg", SENSORS, (), 0, None),
+    ("table rate", "rate_accuracy", "1", SENSORS, (), 3, _rate),
     (
         "orthogonality of the table's axes", "orthogonality_deg", "deg", SENSORS,
-        ("table_axis_nonorthogonality", "mounting"), _orthogonality,
+        ("table_axis_nonorthogonality", "mounting"), 6, _orthogonality,
     ),
-    ("wobble of the table's axes", "wobble_deg", "deg", SENSORS, (), _wobble),
-    ("levelling", "levelling_deg", "deg", ("accelerometer",), ("table_tilt",), _levelling),
-    ("local gravity", "gravity_accuracy_g", "g", ("accelerometer",), (), _gravity),
-    ("Earth's rotation", "azimuth_accuracy_deg", "deg", ("gyroscope",), ("earth_rotation",), _azimuth),
-    (TIME_BASE, "clock_accuracy_ppm", "ppm", SENSORS, (), _clock),
+    ("wobble of the table's axes", "wobble_deg", "deg", SENSORS, (), 12, _wobble),
+    ("levelling", "levelling_deg", "deg", ("accelerometer",), ("table_tilt",), 2, _levelling),
+    ("local gravity", "gravity_accuracy_g", "g", ("accelerometer",), (), 1, _gravity),
+    ("Earth's rotation", "azimuth_accuracy_deg", "deg", ("gyroscope",), ("earth_rotation",), 1, _azimuth),
+    (TIME_BASE, "clock_accuracy_ppm", "ppm", SENSORS, (), 1, _clock),
 )  # fmt: skip

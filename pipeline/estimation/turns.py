@@ -53,18 +53,6 @@ MEAN_S = 1.0  # a mean hides no motion at rest, and keeps the readings' change w
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
 SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
 BEND_DPS, BEND_SHARE = 0.05, 1e-3  # see ``reference_valid``
-ARRAYS = (
-    "time",
-    "specific_force",
-    "angular_rate",
-    "angular_acceleration",
-    "specific_force_rate",
-    "temperature",
-    "angle",
-    "rate",
-    "level",
-    "direction",
-)
 
 
 @dataclass(frozen=True)
@@ -277,7 +265,8 @@ class Rows:
 
     def motion(self, motion: Motion) -> Motion:
         """Return the motion at the rows."""
-        means: dict[str, Any] = {name: self.means(v) for name in ARRAYS if (v := getattr(motion, name)) is not None}
+        arrays = {name: v for name, v in vars(motion).items() if isinstance(v, np.ndarray) and v.dtype != bool}
+        means: dict[str, Any] = {name: self.means(v) for name, v in arrays.items()}
         trajectory = motion.at_offset
         return replace(
             motion,

@@ -157,6 +157,7 @@ def combined(
 def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     calibration: SensorCalibration,
     reference: Reference,
+    fit: LinearMap,
     noise: ResidualNoise,
     contributions: Sequence[Contribution],
     settings: Mapping[str, Any],
@@ -172,12 +173,12 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     """
     sensor = calibration.sensor
     counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
-    found, absent = table_errors(reference, estimated)
+    found, absent = table_errors(reference, fit, estimated)
     if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
         absent["levelling"] = ACROSS
     lines, missing = list(contributions), {"temperature": TEMPERATURE}
     if noise.row_weight is None:
-        rounded = _quantisation(noise, reference.fit, counts, SENSOR_UNITS[sensor])
+        rounded = _quantisation(noise, fit, counts, SENSOR_UNITS[sensor])
     else:
         rounded = f"contained in the {NOISE}"
     if isinstance(rounded, str):
@@ -188,8 +189,8 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     trials = trials_of(settings)
     if not trials:
         return complete
-    first = reference.fit.first()
-    stated, _ = table_errors(replace(reference, fit=first), estimated)
+    first = fit.first()
+    stated, _ = table_errors(reference, first, estimated)
     again = None if isinstance(rounded, str) else _quantisation(noise, first, counts, SENSOR_UNITS[sensor])
     covariances = [c.covariance for c in (*stated, again) if isinstance(c, Contribution)]
     draw = through(noise.posterior(first), covariances, results)

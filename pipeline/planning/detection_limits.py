@@ -268,7 +268,7 @@ class RestLimits(DetectionLimits):
         super().__init__(model.sensor, terms, selection.limits)
         equations = model.equations(replace(selection.fits[0].state, terms=()), terms)
         ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
-        C = equations.covariance(NoiseHypothesis(ratio, noise.correlation_time, (0.0,) * model.kinds, 0.0))
+        C = equations.covariance(NoiseHypothesis(Setting(ratio, noise.correlation_time), (0.0,) * model.kinds))
         drawn = np.linalg.cholesky(C) @ np.random.default_rng(0).standard_normal((len(C), DRAWS))
         together = replace(equations, candidates=[*equations.candidates, drawn])
         self.projected = project_out(together, selection.hypotheses)

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.least_squares import LeastSquaresResult, ScaledColumns, gauss_newton
+from pipeline.estimation.least_squares import (
+    COSINE_AT_MINIMUM,
+    STEP_AT_MINIMUM,
+    ScaledColumns,
+    certificate,
+    gauss_newton,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,12 +32,52 @@ def jacobian_of(function: Function) -> Function:
     return jacobian
 
 
-def solve_nonlinear(residuals: Function, start: np.ndarray, jacobian: Function, steps: int = 50) -> LeastSquaresResult:
-    """Return the minimum of ``|residuals(x)|`` near a start, and what it determines."""
+@dataclass(frozen=True)
+class Solved:
+    """Parameters, the columns and residuals there, and what these say."""
+
+    x: np.ndarray[Any, Any]
+    columns: np.ndarray[Any, Any]
+    residual: np.ndarray[Any, Any]
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Residuals less parameters."""
+        return len(self.residual) - len(self.x)
+
+    @property
+    def covariance(self) -> np.ndarray[Any, Any]:
+        """Covariance of the parameters by the scatter of the residuals."""
+        variance = self.residual @ self.residual / self.degrees_of_freedom
+        return np.asarray(variance * ScaledColumns.of(self.columns).covariance())
+
+    @property
+    def standard_uncertainty(self) -> np.ndarray[Any, Any]:
+        """Standard uncertainties of the parameters."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def cosine(self) -> float:
+        """Largest cosine between the residual and a column."""
+        return float(certificate(self.columns, self.residual, 1.0, len(self.x))["cosine"])
+
+    @property
+    def converged(self) -> bool:
+        """Whether the residual is orthogonal to the columns, or the next step below the rounding of x."""
+        step = ScaledColumns.of(self.columns).solve(self.residual)
+        return self.cosine <= COSINE_AT_MINIMUM or bool(np.all(np.abs(step) <= STEP_AT_MINIMUM * np.abs(self.x)))
+
+
+def solve_linear(A: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> Solved:
+    """Return the minimum of ``|y - A x|``."""
+    x = ScaledColumns.of(A).solve(y)
+    return Solved(x, A, y - A @ x)
+
+
+def solve_nonlinear(residuals: Function, start: np.ndarray, jacobian: Function, steps: int = 50) -> Solved:
+    """Return the minimum of ``|residuals(x)|`` near a start."""
     with np.errstate(all="ignore"):  # steps that overflow do not lower the sum of squares
         x, (r, J), _ = gauss_newton(
             lambda x: (residuals(x), jacobian(x)), np.array(start, float), lambda x, step: (x + step, step), None, steps
         )
-    factors = ScaledColumns.of(J)
-    factors.require_full_rank()
-    return LeastSquaresResult.of(x, r, J, factors, None)
+    return Solved(x, J, r)

@@ -11,8 +11,8 @@ import pytest
 from scipy.linalg import null_space
 from scipy.special import logsumexp
 
-from pipeline.estimation.candidates import excited, time_constants
-from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Given, Problem, Version
+from pipeline.estimation.candidates import time_constants
+from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Given, Problem, Version, excited
 from pipeline.estimation.free_curves import BEND, free_curves
 from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantiles
 from pipeline.estimation.ranking import without

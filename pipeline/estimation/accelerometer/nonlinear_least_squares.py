@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
-from pipeline.estimation.gauss_markov import Prior
-from pipeline.estimation.least_squares import ScaledColumns, solve_linear
+from pipeline.estimation.engine import LinearMap, ResidualNoise
+from pipeline.estimation.gauss_markov import WHITE, Prior
+from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.monte_carlo import KEY, beside_trials, quadratic_results, through, trials_of
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.fit import Fit
@@ -42,7 +42,7 @@ from pipeline.estimation.multi_position.result import (
 )
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
-from pipeline.estimation.table_errors import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import blocks_of_samples
 from pipeline.estimation.uncertainty_budget import combined, gravity_contribution, noise_contribution
 from pipeline.model.kinematics import table_motion
@@ -238,9 +238,9 @@ def _fitted(rows: Orientations, gravity_g: float, prior: Prior, free: Mask) -> _
     known = Prior(0.0, prior.time) if not rows.by_hand else prior
     noises = prior_hypotheses(known, float(np.mean(model.white)), model.kinds)
     if known.wander == 0.0:  # on a table the wander follows from all readings
-        noises = [noise for noise in noises if noise.ratio == 0.0]
+        noises = [noise for noise in noises if noise.bias.ratio == 0.0]
     if spare <= 1:  # too few rows to show a scatter of their own: what is believed of the bias wander stands in
-        noises = [NoiseHypothesis(0.0, prior.time, (prior.wander / float(np.median(equations.error)),), 0.0)]
+        noises = [NoiseHypothesis(WHITE, (prior.wander / float(np.median(equations.error)),))]
     noises = [replace(noise, known=True) for noise in noises]  # by the scatter within the rests
     found = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
     equations = model.equations(found.state)
@@ -254,10 +254,10 @@ def _start(y: Values, gravity_g: float, free: Mask) -> Values:
     tilted = bool(free[MISALIGNMENT].all())
     products = 2.0 * y[:, [0, 0, 1]] * y[:, [1, 2, 2]]
     columns = [y**2, products, 2.0 * y] if tilted else [y**2, 2.0 * y]
-    try:
-        p = solve_linear(np.concatenate(columns, axis=1), np.ones(len(y)), sigma=1.0).x
-    except NotObservableError:
+    factors = ScaledColumns.of(np.concatenate(columns, axis=1))
+    if factors.rank < len(factors.scale):
         return IDEAL
+    p = factors.solve(np.ones(len(y)))
     xy, xz, yz = p[3:6] if tilted else np.zeros(3)
     Q = np.array([[p[0], xy, xz], [xy, p[1], yz], [xz, yz, p[2]]])
     if np.min(np.linalg.eigvalsh(Q)) <= 0:
@@ -356,11 +356,9 @@ def _table_noise(parts: Sequence[tuple[Recording, Mask]], prior: Prior, table: M
     u = np.concatenate([motion.specific_force for motion in motions])
     X = np.column_stack([np.ones(len(u)), u])
     reading = np.concatenate([np.asarray(recording.accelerometer)[keep] for recording, keep in parts])
-    factors, blocks = ScaledColumns.of(X), blocks_of_samples(parts)
-    beta, A, every = factors.solve(reading), factors.weights(), np.eye(4)
-    residuals = reading - X @ beta
-    reference = Reference("accelerometer", motions, LinearMap((A, A, A), (every, every, every)), beta[1:].T, table)
-    return assess_noise(residuals, X, blocks, prior, disturbance(reference, residuals, blocks))
+    beta = ScaledColumns.of(X).solve(reading)
+    reference = Reference("accelerometer", motions, beta[1:].T, table)
+    return noise_on_table(reference, reading - X @ beta, X, blocks_of_samples(parts), prior)
 
 
 def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]]:

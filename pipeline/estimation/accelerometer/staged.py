@@ -36,11 +36,11 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     sinusoids_of,
     turns_of,
 )
-from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
+from pipeline.estimation.engine import LinearMap, ResidualNoise
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before, two_sided
-from pipeline.estimation.table_errors import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import Sinusoid, blocks_of_samples, parts_of
 from pipeline.estimation.uncertainty_budget import (
     budgeted,
@@ -267,7 +267,7 @@ def fit(
     extremes = extremes_of_samples(turns, gravity_g) if as_printed else by_sinusoids
     found = follow(extremes, [name], Corrected.of(previous))
     map_ = _linear_map(sinusoids, theta, chain)
-    noise = _noise(turns, map_, prior, settings["table"])
+    noise = _noise(turns, prior, settings["table"])
     if as_printed:
         scatter = _resampled(turns, sinusoids, noise, gravity_g, [*before, name])
     else:
@@ -296,15 +296,15 @@ def fit(
     if as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
     motions = [motion for turn in turns for motion in turn.motions]
-    reference = Reference("accelerometer", motions, map_.results(kept), np.diag(found.k), settings["table"])
+    reference = Reference("accelerometer", motions, np.diag(found.k), settings["table"])
 
     def results(errors: Values) -> Values:
         return np.array([chain(theta + e).vector()[kept] for e in errors])
 
-    return budgeted(calibration, reference, noise, [scatter.of(kept)], settings, results)
+    return budgeted(calibration, reference, map_.results(kept), noise, [scatter.of(kept)], settings, results)
 
 
-def _noise(turns: Sequence[Turn], map_: LinearMap, prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
+def _noise(turns: Sequence[Turn], prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
     """Return the noise that all turns together show, by the residuals of ``y = b + K u + C |u|``.
 
     A sinusoid of its own for each turn and channel would take up the bias from turn to turn.
@@ -315,9 +315,8 @@ def _noise(turns: Sequence[Turn], map_: LinearMap, prior: Prior, table: Mapping[
     X = np.column_stack([np.ones(len(u)), u, np.abs(u)])
     blocks = blocks_of_samples([used for turn in turns for used in turn.used])
     beta = ScaledColumns.of(X).solve(reading)
-    residuals = reading - X @ beta
-    disturbed = disturbance(Reference("accelerometer", motions, map_, beta[1:4].T, table), residuals, blocks)
-    return assess_noise(residuals, X, blocks, prior, disturbed)
+    reference = Reference("accelerometer", motions, beta[1:4].T, table)
+    return noise_on_table(reference, reading - X @ beta, X, blocks, prior)
 
 
 def _linear_map(

@@ -37,13 +37,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.engine import LinearMap, assess_noise, derivative
+from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.generalized_least_squares import with_matrix
-from pipeline.estimation.least_squares import certified, solve_linear
+from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import of_channels
-from pipeline.estimation.table_errors import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import Part, blocks_of_samples, parts_of
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
 from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, StageResult, Values
@@ -87,16 +87,16 @@ def fit(
     turns = turns_of(parts_of(recordings, "gyroscope", settings["table"], "the Cholesky and LU method"))
     Y, U = turns.integral(turns.reading - previous.bias), turns.integral(turns.rate)
     require_turns(U)
-    solved = [solve_linear(U, Y[:, channel], sigma=1.0) for channel in range(3)]
-    A = np.array([row.x for row in solved])
+    columns = ScaledColumns.of(U)
+    A = columns.solve(Y).T
     as_printed = bool(settings["method"].get("as_printed", False))
     factors = factorise(A)
     residuals = turns.reading - previous.bias - turns.rate @ A.T
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
     prior = prior_of("gyroscope", recordings, settings)
     fit, given = _linear_map(turns, A, previous, as_printed=as_printed)
-    reference, blocks = Reference("gyroscope", turns.motions, fit, A, settings["table"]), blocks_of_samples(turns.parts)
-    noise = assess_noise(residuals, design, blocks, prior, disturbance(reference, residuals, blocks))
+    reference = Reference("gyroscope", turns.motions, A, settings["table"])
+    noise = noise_on_table(reference, residuals, design, blocks_of_samples(turns.parts), prior)
     scatter = noise_contribution(noise, fit, prior)
     matrix = _matrix(A, as_printed=as_printed)
     after = (turns.reading - previous.bias) @ matrix.T
@@ -117,16 +117,14 @@ def fit(
             "degrees_of_freedom": float(scatter.degrees_of_freedom.min()),
         },
     )
-    cosine, condition = max(row.cosine for row in solved), solved[0].condition
     found = SensorCalibration(
         sensor="gyroscope",
         bias=previous.bias,
         matrix=matrix,
         stages=(*previous.stages, result),
-        convergence=certified(cosine, condition, solved[0].rank, 3),
+        convergence=certificate(U, Y - U @ A.T, columns.condition, columns.rank),
     )
     kept = slice(0, 12)
-    reference = Reference("gyroscope", turns.motions, fit.results(kept), A, settings["table"])
     lines = [scatter.of(kept)]
     if np.any(given):
         before = np.inf if previous.freedom is None else float(previous.freedom[:3].min())
@@ -137,7 +135,7 @@ def fit(
         plain = of_channels(theta.ravel() + errors)
         return plain if as_printed else with_matrix(plain)
 
-    return budgeted(found, reference, noise, lines, settings, results)
+    return budgeted(found, reference, fit.results(kept), noise, lines, settings, results)
 
 
 def factorise(A: Values) -> _Factors:
@@ -156,9 +154,7 @@ def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_prin
 
     Without a rest in the turns' recordings the bias is that of another recording, with a covariance of its own.
     """
-    U = turns.integral(turns.rate)
-    scale = np.linalg.norm(U, axis=0)
-    inverse = np.linalg.pinv(U / scale) / scale[:, None]
+    inverse = ScaledColumns.of(turns.integral(turns.rate)).weights()
     inside = turns.turn >= 0
     weights = np.zeros((4, len(turns.reading)))
     weights[1:, inside] = inverse[:, turns.turn[inside]] * turns.weight[inside]
@@ -220,8 +216,7 @@ class Turns:
 
 def turns_of(parts: Sequence[Part]) -> Turns:
     """Stack the samples at rest and in turns of some recordings."""
-    readings, rates, rests, weights, turns, chosen, motions = [], [], [], [], [], [], []
-    found = left_out = 0
+    columns, chosen, motions, found, left_out = [], [], [], 0, 0
     for part in parts:
         weight, turn = np.zeros(part.recording.samples), np.full(part.recording.samples, -1, np.intp)
         for start, stop in _moves(part):
@@ -233,23 +228,12 @@ def turns_of(parts: Sequence[Part]) -> Turns:
             found += 1
         rest = part.motion.still & part.keep & (turn < 0)
         keep = rest | (turn >= 0)
-        readings.append(np.asarray(part.recording.gyroscope)[keep])
-        rates.append(part.motion.angular_rate[keep])
-        rests.append(rest[keep])
-        weights.append(weight[keep])
-        turns.append(turn[keep])
+        each = np.asarray(part.recording.gyroscope), part.motion.angular_rate, rest, weight, turn
+        columns.append([values[keep] for values in each])
         chosen.append((part.recording, keep))
         motions.append(part.motion.select(keep))
-    return Turns(
-        np.concatenate(readings),
-        np.concatenate(rates),
-        np.concatenate(rests),
-        np.concatenate(weights),
-        np.concatenate(turns),
-        tuple(chosen),
-        left_out,
-        tuple(motions),
-    )
+    reading, rate, rest, weight, turn = (np.concatenate(own) for own in zip(*columns, strict=True))
+    return Turns(reading, rate, rest, weight, turn, tuple(chosen), left_out, tuple(motions))
 
 
 def _moves(part: Part) -> list[tuple[int, int]]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.design import BASE_NAMES
+from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
 from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, model_of
@@ -108,9 +109,7 @@ def _require_known(covariance: Values, moves: int) -> None:
 
 
 def _require_determined(base: Values) -> None:
-    size = np.linalg.norm(base, axis=0)
-    s = np.linalg.svd(base / np.where(size > 0.0, size, 1.0), compute_uv=False)
-    if s[-1] < NEW * s[0]:
+    if ScaledColumns.of(base, NEW).rank < base.shape[1]:
         raise NotObservableError(
             f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {ADVICE}"
         )

@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.engine import LinearMap, assess_noise, derivative
+from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before
-from pipeline.estimation.table_errors import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import Part, blocks_of_samples, parts_of, steady_turns
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
 from pipeline.records import AXES, Mask, Motion, Recording, SensorCalibration, Values, motion_at_rest
@@ -171,9 +171,8 @@ def fit(
     found = follow(response(at), [name], correction.get("steps", []))
     x, y, z = np.split(derivative(chain, at, np.full(12, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
-    reference = Reference("gyroscope", samples.motions, map_, theta[1:].T, settings["table"])
-    disturbed = disturbance(reference, residuals, samples.blocks)
-    noise = assess_noise(residuals, design, samples.blocks, prior, disturbed)
+    reference = Reference("gyroscope", samples.motions, theta[1:].T, settings["table"])
+    noise = noise_on_table(reference, residuals, design, samples.blocks, prior)
     scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
@@ -196,12 +195,12 @@ def fit(
         convergence=certified(0.0, condition, columns, columns) | {"closed_form": True},
     )
     kept, K = slice(0, 12), np.asarray(np.linalg.solve(matrix, np.eye(3)))
-    reference = Reference("gyroscope", samples.motions, map_.results(kept), K, settings["table"])
 
     def results(errors: Values) -> Values:
         return np.array([chain(at + e)[kept] for e in errors])
 
-    return budgeted(calibration, reference, noise, [scatter.of(kept)], settings, results)
+    reference = replace(reference, K=K)
+    return budgeted(calibration, reference, map_.results(kept), noise, [scatter.of(kept)], settings, results)
 
 
 @dataclass(frozen=True)

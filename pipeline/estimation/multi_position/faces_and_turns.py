@@ -196,7 +196,7 @@ def turns_of(
     ]
     spans = [(index, span) for index, span in spans if sound_span(recordings[index], span)]
     angle_deg, bias = float(turns["angle_deg"]), np.average(rests.reading, axis=0, weights=rests.count)
-    moves, chosen, stated = [], [], []
+    moves, chosen, angles = [], [], []
     for index, span in spans:
         recording = recordings[index]
         angle = np.asarray(
@@ -206,16 +206,10 @@ def turns_of(
         moves.append((recording, float(recording.time[span.start]), angle))
         if count:
             chosen.append((recording, span))
-            stated.append(count * angle_deg * np.eye(3)[axis])
-    return (_padded(chosen, np.array(stated), accelerometer, turns) if chosen else None), moves
-
-
-def _padded(
-    chosen: Sequence[tuple[Recording, slice]],
-    stated: Values,
-    accelerometer: SensorCalibration,
-    turns: Mapping[str, Any],
-) -> Turns:
+            angles.append(count * angle_deg * np.eye(3)[axis])
+    if not chosen:
+        return None, moves
+    stated = np.array(angles)
     shape = (len(chosen), max(span.stop - span.start for _, span in chosen))
     reading, force = np.zeros((*shape, 3)), np.zeros((*shape, 3))
     time, temperature, weight = np.zeros(shape), np.full(shape, np.nan), np.zeros(shape)
@@ -231,17 +225,18 @@ def _padded(
             temperature[k] = recording.temperature[at]
         weight[k] = trapezoids(time[k])
     rows, value, error = [], [], []
-    for k, axis in zip(*np.nonzero(stated), strict=True):
-        rows.append(np.outer(np.eye(len(chosen))[k], np.eye(3)[axis]))
-        value.append(stated[k, axis])
+    for k, about in zip(*np.nonzero(stated), strict=True):
+        rows.append(np.outer(np.eye(len(chosen))[k], np.eye(3)[about]))
+        value.append(stated[k, about])
         error.append(float(turns["accuracy_deg"]))
-    for axis in np.flatnonzero(np.any(stated, axis=0)):
-        share = np.degrees(np.sign(stated[:, axis]) / np.sum(np.abs(stated[:, axis])))
-        rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != axis]
+    for about in np.flatnonzero(np.any(stated, axis=0)):
+        share = np.degrees(np.sign(stated[:, about]) / np.sum(np.abs(stated[:, about])))
+        rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != about]
         value += [0.0, 0.0]
         error += 2 * [float(turns["axis_accuracy_deg"])]
     samples = reading, force, time, temperature, weight
-    return Turns(tuple(r.name for r, _ in chosen), stated, *samples, np.array(rows), np.array(value), np.array(error))
+    names = tuple(r.name for r, _ in chosen)
+    return Turns(names, stated, *samples, np.array(rows), np.array(value), np.array(error)), moves
 
 
 def require_turns(

@@ -140,7 +140,30 @@ def fit(
         rounds += more
     uncertainty = np.sqrt(np.diag(solved.covariance))
     converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
-    return _assessed(state, equations, hypotheses, prior, (rounds, converged), freedom)
+    levels, likelihood = refined(equations, hypotheses, prior)
+    every = [solve(equations, noise, *prior) for noise in levels]
+    solved = max(every, key=lambda s: s.log_likelihood)
+    restricted = np.array([s.restricted for s in every])
+    weight = np.exp(restricted - restricted.max())
+    weight /= weight.sum()
+    spare = max(len(equations.residual) - solved.rank, 1) if freedom is None else freedom
+    covariance, degrees = Posterior(weight, np.array([s.covariance for s in every]), spare).averaged()
+    return Fit(
+        state,
+        covariance,
+        likelihood,
+        next(noise for noise, s in zip(levels, every, strict=True) if s is solved),
+        degrees,
+        equations.residual,
+        equations.error,
+        solved.rank,
+        rounds,
+        converged,
+        solved.condition,
+        solved.cosine,
+        tuple((noise, float(w), s.scale) for noise, w, s in zip(levels, weight, every, strict=True)),
+        prior[0],
+    )
 
 
 def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
@@ -153,39 +176,6 @@ def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
         precision.append(np.where(nonlinear, 0.0, (2.0 / limit) ** 2))
         values.append(term.values)
     return np.concatenate(precision), np.concatenate(values)
-
-
-def _assessed(  # noqa: PLR0917  (they are the problem)
-    state: State,
-    equations: Equations,
-    hypotheses: Sequence[NoiseHypothesis],
-    prior: tuple[Values, Values],
-    how: tuple[int, bool],
-    freedom: float | None,
-) -> Fit:
-    hypotheses, likelihood = refined(equations, hypotheses, prior)
-    every = [solve(equations, noise, *prior) for noise in hypotheses]
-    best = int(np.argmax([s.log_likelihood for s in every]))
-    restricted = np.array([s.restricted for s in every])
-    weight = np.exp(restricted - restricted.max())
-    weight /= weight.sum()
-    spare = max(len(equations.residual) - every[best].rank, 1) if freedom is None else freedom
-    covariance, degrees = Posterior(weight, np.array([s.covariance for s in every]), spare).averaged()
-    return Fit(
-        state,
-        covariance,
-        likelihood,
-        hypotheses[best],
-        degrees,
-        equations.residual,
-        equations.error,
-        every[best].rank,
-        *how,
-        every[best].condition,
-        every[best].cosine,
-        tuple((noise, float(w), s.scale) for noise, w, s in zip(hypotheses, weight, every, strict=True)),
-        prior[0],
-    )
 
 
 def refined(
@@ -225,7 +215,7 @@ def refined(
             if bend > SHARP**-2:
                 own = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
         levels.append(own)
-    kinds = {(n.ratio, n.time): n for n in near}.values()
+    kinds = {n.bias: n for n in near}.values()
     return [n.at(level) for n in kinds for level in product(*levels)], float(scores.max())
 
 

@@ -23,6 +23,7 @@ Source: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -118,7 +119,7 @@ class GyroscopeModel:
 
     def with_excess(self, variance: Values) -> GyroscopeModel:
         """Return the model with an error of its own for each move, of a variance in deg^2: (k,) array."""
-        out = GyroscopeModel(self.every, self.moves, **self.known)
+        out = copy(self)
         out.excess = variance
         return out
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.gauss_markov import SURE, Prior, selection_grid
+from pipeline.estimation.gauss_markov import SURE, Prior, Setting, selection_grid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,10 +41,8 @@ SELECTION_SCATTER = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and o
 class NoiseHypothesis:
     """One noise."""
 
-    ratio: float  # q, bias over white noise
-    time: float  # s; correlation time of the bias
+    bias: Setting  # q, bias over white noise, and its time
     scatter: tuple[float, ...]  # the a_j: of rests, and of moves
-    belief: float  # prior log weight of the bias
     direction: float = 0.0  # c
     none: float = 0.0  # prior log weight of each kind without scatter
     known: bool = False  # whether the white noise is known, so that a scatter beyond it is one of the levels
@@ -52,7 +50,7 @@ class NoiseHypothesis:
     @property
     def prior(self) -> float:
         """Prior log weight."""
-        return self.belief + self.none * self.scatter.count(0.0)
+        return self.bias.prior + self.none * self.scatter.count(0.0)
 
     @property
     def levels(self) -> tuple[float, ...]:
@@ -82,7 +80,7 @@ def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesi
     if kinds > 1:  # two kinds of scatter say nothing about a bias far from that of a static recording
         settings = [s for s in settings if s.prior > UNLIKELY]
     levels = list(product(*SELECTION_SCATTER[:kinds]))
-    found = [NoiseHypothesis(s.ratio, s.time, level, s.prior) for s in settings for level in levels]
+    found = [NoiseHypothesis(s, level) for s in settings for level in levels]
     without = [h for h in found if kinds > 1 and h.scatter[1] == 0.0]
     return found + [replace(h, direction=c) for h in without for c in SELECTION_SCATTER[1][1:]]
 
@@ -97,7 +95,7 @@ def prior_hypotheses(prior: Prior, white: float, kinds: int) -> list[NoiseHypoth
     none = float(np.log(SURE * (len(SCATTER) - 1)))  # nobody states a scatter: none at all is believed first
     levels = list(product(SCATTER, repeat=kinds))
     found = [
-        NoiseHypothesis(ratio, prior.time, level, belief, none=none)
+        NoiseHypothesis(Setting(ratio, prior.time, belief), level, none=none)
         for ratio, belief in pairs
         if np.isfinite(belief)
         for level in levels

@@ -24,7 +24,7 @@ Both sensors' models have: ``kinds`` of scatter (1: rests; 2: rests and moves), 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -87,22 +87,6 @@ class Equations:
         """Columns of the model: (n, b + p) array."""
         return np.concatenate([self.base, *self.effects], axis=1)
 
-    def rows(self, count: int) -> Equations:
-        """Return the first equations alone."""
-        return replace(
-            self,
-            residual=self.residual[:count],
-            base=self.base[:count],
-            effects=[columns[:count] for columns in self.effects],
-            candidates=[columns[:count] for columns in self.candidates],
-            scatter=self.scatter[:, :count],
-            bias=self.bias[:, :count],
-            error=self.error[:count],
-            common=None if self.common is None else self.common[:count, :count],
-            direction=None if self.direction is None else self.direction[:count, :count],
-            _kernels={},
-        )
-
     def variance(self, noise: NoiseHypothesis) -> Values:
         """Return the diagonal of C by white noise and scatter: (n,) array."""
         return np.asarray(1.0 + np.square(noise.scatter) @ self.scatter)
@@ -114,7 +98,7 @@ class Equations:
             C += self.common
         if self.direction is not None and noise.direction:
             C += noise.direction**2 * self.direction
-        return C + noise.ratio**2 * self._kernel(noise.time) if noise.ratio else C
+        return C + noise.bias.ratio**2 * self._kernel(noise.bias.time) if noise.bias.ratio else C
 
     def _kernel(self, time: float) -> Values:
         """Return ``H R H^T`` for a correlation time: (n, n) array."""
@@ -127,7 +111,7 @@ class Equations:
         """Return (n, p) values with ``L^-1`` applied, where ``L L^T = C``, and log det C."""
         from scipy.linalg.lapack import dpotrf, dtrtrs  # noqa: PLC0415  (0.1 s that only fits pay)
 
-        if self.common is None and not noise.direction and not noise.ratio:
+        if self.common is None and not noise.direction and not noise.bias.ratio:
             variance = self.variance(noise)
             return values / np.sqrt(variance)[:, None], float(np.sum(np.log(variance)))
         L, failed = dpotrf(self.covariance(noise), lower=1)

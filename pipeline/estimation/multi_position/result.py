@@ -119,8 +119,8 @@ def calibration_of(
         "equations": len(found.residual),
         "rounds": found.rounds,
         "condition": found.condition if np.isfinite(found.condition) else None,
-        "wander_ratio": float(found.noise.ratio),
-        "wander_time_s": float(found.noise.time),
+        "wander_ratio": float(found.noise.bias.ratio),
+        "wander_time_s": float(found.noise.bias.time),
         "scatter_over_noise": list(found.noise.scatter),
     }
     return after_stage(before, "effects", details, model, found, settings)

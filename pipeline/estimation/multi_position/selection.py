@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import over_limits, starts_of, time_constants
+from pipeline.estimation.candidates import starts_of, time_constants
 from pipeline.estimation.design import Term
-from pipeline.estimation.evidence import Problem, Version
-from pipeline.estimation.gauss_markov import WALK_RATIO, WALK_SHARE, WALK_TIME
+from pipeline.estimation.evidence import Problem, linear_problem
+from pipeline.estimation.gauss_markov import random_walks
 from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.likelihood import (
     NEW,
@@ -295,23 +295,19 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     model, state = selection.model, selection.fits[-1].state
     held = len(selection.fits[0].state.terms)
     fitted = {term.effect.name: term for term in state.terms[held:]}
-    listed: list[tuple[str, Term, float]] = []
-    for name, this in effects.items():
-        width = None  # of a fitted time constant: as wide as the steps of the grid
-        terms = time_constants(this, model.sensor, fitted.get(name), width)
-        listed += [(name, term, weight) for term, weight in terms]
+    listed = [
+        (name, term, weight)
+        for name, this in effects.items()
+        for term, weight in time_constants(this, model.sensor, fitted.get(name))
+    ]
     equations = model.equations(state, [term for _, term, _ in listed])
     base = np.concatenate([equations.base, *equations.effects[:held]], axis=1)
-    columns = []
-    for (_, term, _), Z in zip(listed, equations.candidates, strict=True):
-        columns.append(Z[:, ~_nonlinear(term.effect, model.sensor)])
-    readings = equations.residual + sum(
-        Z @ fitted[name].values[: Z.shape[1]]
-        for (name, term, _), Z in zip(listed, columns, strict=True)
-        if name in fitted and term is fitted[name]
-    )
-    hypotheses = [*selection.hypotheses, *_random_walks(selection.hypotheses)]
-    together = np.concatenate([base, *columns, readings[:, None]], axis=1)
+    pairs = zip(listed, equations.candidates, strict=True)
+    columns = [Z[:, ~_nonlinear(term.effect, model.sensor)] for (_, term, _), Z in pairs]
+    walks = random_walks(h.bias for h in selection.hypotheses)
+    hypotheses = [*selection.hypotheses]
+    hypotheses += [replace(h, bias=walks[h.bias]) for h in selection.hypotheses if h.bias in walks]
+    together = np.concatenate([base, *columns, equations.residual[:, None]], axis=1)
     whitened = [equations.whitened(noise, together) for noise in hypotheses]
     known = base.shape[1]
     stacked = np.array([white.T @ white for white, _ in whitened])
@@ -325,24 +321,16 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     prior = np.array([h.prior for h in hypotheses]) - 0.5 * (np.array([log for _, log in whitened]) + logarithm)
     products = without(stacked, np.arange(known))[:, known:, known:]
     ends = np.cumsum([0, *(Z.shape[1] for Z in columns)]).tolist()
-    places = [(name, slice(*span)) for (name, _, _), span in zip(listed, pairwise(ends), strict=True)]
-    samples = len(readings)
-    products, limits = over_limits(places, products, size[0, known:], selection.limits, samples=samples, least=NEW)
-    versions: dict[str, list[Version]] = {}
-    for (name, at), (_, _, weight) in zip(places, listed, strict=True):
-        versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
-    free = float(max(samples - kept, 1))
-    return Problem(products, prior, 0.0, free, versions, limits, excluded([*effects.values()]), 1.0)
-
-
-def _random_walks(hypotheses: Sequence[NoiseHypothesis]) -> list[NoiseHypothesis]:
-    """Return the hypotheses with a bias that never settles; see ``pipeline.estimation.gauss_markov.random_walks``."""
-    shortest: dict[float, float] = {}
-    for h in hypotheses:
-        shortest[h.ratio] = min(h.time, shortest.get(h.ratio, h.time))
-    share = float(np.log(WALK_SHARE))
-    return [
-        replace(h, ratio=h.ratio * WALK_RATIO, time=h.time * WALK_TIME, belief=h.belief + share)
-        for h in hypotheses
-        if h.ratio > 0.0 and h.time == shortest[h.ratio]
-    ]
+    samples = len(equations.residual)
+    return linear_problem(
+        [(name, weight, slice(*span)) for (name, _, weight), span in zip(listed, pairwise(ends), strict=True)],
+        products,
+        size[0, known:],
+        prior,
+        ({name: term.values for name, term in fitted.items()}, selection.limits),
+        excluded([*effects.values()]),
+        samples=samples,
+        free=float(max(samples - kept, 1)),
+        new=NEW,
+        least=1.0,
+    )

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc, fdtrc
 
+from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.model import Equations
 
-WHITE = [NoiseHypothesis(0.0, 1.0, (0.0,), 0.0)]
+WHITE = [NoiseHypothesis(Setting(0.0, 1.0), (0.0,))]
 
 
 def equations_of(residual: np.ndarray, base: np.ndarray, candidate: np.ndarray) -> Equations:
