@@ -76,13 +76,13 @@ def bars(
     top = 16 if levels else 4
     bottom = top + ROW * len(rows)
     ticks = axis.ticks(5)
-    out = [f'<path class="grid" d="{"".join(f"M{at:.1f} {top}V{bottom}" for at, _ in ticks)}"/>']
     drawn = [(top + ROW * i, row) for i, row in enumerate(rows) if row.value is not None]
+    beside = "".join(f"M{{0:.1f}} {place + 13}v14" for place, _ in drawn)  # lines beside bars do not cross labels
+    out = [f'<path class="grid" d="{"".join(f"{beside}M{{0:.1f}} {bottom}v3".format(at) for at, _ in ticks)}"/>']
     out += [_row(row, axis, at) for at, row in drawn]
     for words, value in levels.items():
         at, half = axis.pixels(value), LETTER / 2 * len(words)
-        beside = "".join(f"M{at:.1f} {place + 13}v14" for place, _ in drawn)  # labels are not crossed
-        out.append(f'<path class="level" d="M{at:.1f} {top}v2{beside}"/>')
+        out.append(f'<path class="level" d="M{at:.1f} {top}v2{beside.format(at)}"/>')
         out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, words, "m"))
     for at, row in drawn:
         if row.value is not None and row.interval is None:
@@ -133,7 +133,7 @@ def _row(row: Point, axis: Axis, top: int) -> str:
     out += f'<path class="strokes c{row.colour}" d="{ends}"/>'
     out += f'<path class="mean-dot c{row.colour}" d="M{end:.1f} {middle}h0"/></g>'
     if row.floor:
-        out += f'<path class="level" d="M{axis.pixels(row.floor):.1f} {top + 13}v16"/>'
+        out += f'<path class="level" d="M{axis.pixels(row.floor):.1f} {top + 15}v12"/>'
     return out
 
 

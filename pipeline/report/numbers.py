@@ -14,7 +14,16 @@ if TYPE_CHECKING:
 
 NOTHING = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
-PRINTED = {"+-": "±", "delta BIC": "ΔBIC", "degC": "°C", "^2": "²", "^3": "³", "sqrt(Hz)": "√Hz", "sqrt(s)": "√s"}
+PRINTED = {
+    "+-": "±",
+    "delta BIC": "ΔBIC",
+    "degC": "°C",
+    "^2": "²",
+    "^3": "³",
+    "sqrt(Hz)": "√Hz",
+    "sqrt(s)": "√s",
+    "gauss markov": "Gauss-Markov",
+}
 
 
 def number(value: object, digits: int = 3) -> str:
