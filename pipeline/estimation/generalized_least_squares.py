@@ -228,7 +228,11 @@ def _residual_noise(
 def fit_best(
     observations: Observations, combinations: Sequence[Sequence[Term]], start: Start, settings: Sequence[Setting]
 ) -> Fit:
-    """Fit from the combination of starts under which the readings are most likely after one linear step."""
+    """Fit from the combination of starts under which the readings are most likely after one linear step.
+
+    Effects of timing are fitted to the base alone first: far from their values, where a linear step is of no use, other
+    effects would take their signal.
+    """
     chosen = combinations[0]
     if len(combinations) > 1:
         scores = []
@@ -236,6 +240,11 @@ def fit_best(
             design = design_at(observations, _with_all_columns(start, terms))
             scores.append(_solve(design, observations, settings).log_likelihood)
         chosen = combinations[int(np.argmax(scores))]
+    timing = [term for term in chosen if term.effect.moves and not np.any(term.values)]
+    if timing and len(timing) < len(chosen):
+        start = fit_terms(observations, timing, start, settings)
+        fitted = {term.effect.name: term.values for term in start.terms}
+        chosen = [replace(term, values=fitted.get(term.effect.name, term.values)) for term in chosen]
     return fit_terms(observations, chosen, start, settings)
 
 

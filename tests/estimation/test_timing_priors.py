@@ -16,6 +16,8 @@ from pipeline.model.effects import bench_priors
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.study.bench import recordings_of
+from pipeline.study.cases import draw
 from pipeline.study.run import settings_of
 from pipeline.validation.heldout import validate
 
@@ -70,6 +72,17 @@ def test_stated_timing_is_estimated_whatever_the_table_logs(sensor: str, rate: b
         said = diagnose(found, checked, settings["noise"][sensor], settings, None, validation=held)
         assert said["verdict"] == "nothing_missing"
         assert not set(HIDDEN) & {entry["effect"] for entry in said["ranking"]}
+
+
+def test_a_slow_clock_is_found_beside_effects_that_could_take_its_signal() -> None:
+    """At 1400 s the clock is wrong by 0.36 s, longer than the ramps of the turns: one linear step is of no use."""
+    case = draw("pairs_wander", 5, 84)
+    assert set(case.hidden) == {"clock_rate", "table_rate_ripple"}
+    settings = settings_of(case.model, "reference_least_squares")
+    settings["effects"] = {**settings["effects"], "gyroscope": [*case.hidden, "scale_factor_temperature"]}
+    found = {e.name: e.values for e in fitted("gyroscope", recordings_of(case), settings).effects}
+    assert found["clock_rate"] == pytest.approx(case.hidden["clock_rate"], abs=0.1)
+    assert found["table_rate_ripple"][:4] == pytest.approx(case.hidden["table_rate_ripple"][:4], abs=2e-5)
 
 
 def test_rests_leave_the_offset_as_uncertain_as_its_prior() -> None:
