@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import math
 import os
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +24,7 @@ INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"
 WRITE_AGAIN = "run the same command again: snakemake writes the file anew"
-_encoded = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
+_encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 _flushed_at_end: list[Path] = []  # folders whose files are flushed together
 
 
@@ -63,8 +64,28 @@ def read_json(path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> An
         raise DamagedFileError(reason, str(path)) from None
 
 
+def _encoded(value: Any) -> str:  # noqa: ANN401
+    try:
+        return _encoder.encode(value)
+    except ValueError as error:
+        raise ValueError(f"{error}: {', '.join(_not_finite(value))}") from None
+
+
+def _not_finite(value: Any, place: str = "value") -> Iterator[str]:  # noqa: ANN401
+    """Yield the places of numbers that are not finite, with the texts beside them, which say of what they are."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield f"{place} is {value}"
+    elif isinstance(value, dict):
+        names = " ".join(v for v in value.values() if isinstance(v, str))
+        for key, member in value.items():
+            yield from _not_finite(member, f"{place}.{key}{f' ({names})' * bool(names)}")
+    elif isinstance(value, list | tuple):
+        for number, member in enumerate(value):
+            yield from _not_finite(member, f"{place}[{number}]")
+
+
 def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: ANN401
-    """Return a value as JSON; raises ``ValueError`` for a number that is not finite.
+    """Return a value as JSON; raises ``ValueError``, with its place, for a number that is not finite.
 
     Down to some levels, containers of containers are indented. The others stand on one line each: that is read well,
     and written by C.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import pytest
 
-from pipeline.files import write_atomically, write_json
+from pipeline.files import json_text, write_atomically, write_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,3 +34,10 @@ def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypatc
     with pytest.raises(OSError, match="No space"):
         write_atomically(path, "second\n")
     assert path.read_text(encoding="utf-8") == "first\n"
+
+
+def test_a_number_that_is_not_finite_is_refused_with_its_place() -> None:
+    with pytest.raises(ValueError, match=r"not JSON compliant.*: value\.z \(gyroscope_bias_x U1\) is nan"):
+        json_text({"far": [{"parameter": "gyroscope_bias_x", "name": "U1", "z": float("nan")}]})
+    with pytest.raises(ValueError, match=r"value\[1\] is inf"):
+        json_text([1.0, float("inf")])

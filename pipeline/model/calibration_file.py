@@ -356,11 +356,11 @@ def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:
     for entry in inputs or []:
         name, rate, rows = entry.get("recording") or entry.get("file"), entry.get("rate_hz"), entry.get("rows")
         counts: dict[str, list[int]] = {}
+        if missing := entry.get("missing_s"):
+            found.append(f"{name}: {missing / entry['duration_s']:.3%} of the time is missing")
         for note in entry.get("notes") or []:
             if note["code"] in LEFT_OUT:
                 counts.setdefault(note["code"], []).append(note["count"])
-            elif note["code"] == "N-GAP":
-                found.append(f"{name}: {note['detail'].rpartition(', ')[2]}")
         for code, each_note in counts.items():
             several = code == "N-CLIP" and len(each_note) > 1  # a note for each channel, some for the same rows
             count = max(each_note) if several else sum(each_note)

@@ -74,8 +74,8 @@ def _placed(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recor
     wrong = table.get("gravity_g") == 1.0 and abs(gravity - 1.0) >= SAME_GRAVITY_G
     detail = (
         f"table.gravity_g is 1, its default; at latitude {latitude:g} deg gravity is {gravity:.5f} g at sea level, and "
-        f"0.000315 g less for each km of height: set table.gravity_g={gravity:.5f}, else the scale of the "
-        f"accelerometer is wrong by {abs(gravity - 1.0):.3%}"
+        f"0.000315 g less for each km of height. Scale and bias of the accelerometer are then in units of local "
+        f"gravity, {abs(gravity - 1.0):.3%} off standard g: set table.gravity_g={gravity:.5f} for standard g"
     )
     k = next((k for k, r in enumerate(recordings) if r.accelerometer is not None), None)
     notes = [(k, Note("N-GRAVITY", 1, 0, 0, detail))] if wrong and k is not None else []

@@ -91,8 +91,9 @@ def _in_json(text: str) -> str:
 
 
 def script_data(value: object) -> Markup:
-    """Return a value as JSON that may stand within a script element."""
-    return Markup(json.dumps(value, ensure_ascii=False).replace("<", "\\u003c"))  # noqa: S704  (no tag can begin)
+    """Return a value as JSON that may stand within a script element; ``ValueError``: a number is not finite."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    return Markup(text.replace("<", "\\u003c"))  # noqa: S704  (no tag can begin)
 
 
 def failure_page(unit: str, failure: Mapping[str, Any]) -> str:

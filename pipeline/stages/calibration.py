@@ -19,6 +19,7 @@ from pipeline.estimation.chip_document import chip_document
 from pipeline.estimation.chip_rows import Chip
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.channel_table import axis_maps
+from pipeline.io.quality_flags import GAP
 from pipeline.model.calibration_file import implausible
 from pipeline.pack import FAILED, Files
 from pipeline.records import SENSORS, Recording, SensorCalibration
@@ -139,6 +140,13 @@ def _software() -> dict[str, str]:
     return {"imu-calibration": __version__, "python": platform.python_version(), **libraries}
 
 
+def _missing_s(recording: Recording) -> float:
+    """Return the time in gaps of a recording, s."""
+    rows = np.flatnonzero(recording.flags & GAP) if recording.flags is not None else np.zeros(0, int)
+    rows = rows[rows > 0]
+    return round(float(np.sum(recording.time[rows] - recording.time[rows - 1] - recording.interval)), 6)
+
+
 def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
     """Return file, hash, rows and notes of each input of a unit."""
     return [
@@ -150,6 +158,7 @@ def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
             "rows": r.source.get("rows"),
             "rate_hz": round(1.0 / r.interval, 6) if r.interval > 0 else None,
             "duration_s": round(float(r.time[-1] - r.time[0]), 6) if r.samples else 0.0,
+            "missing_s": _missing_s(r),
             "notes": [vars(n) for n in r.notes],
         }
         for r in recordings

@@ -75,6 +75,7 @@ def gather_batch(job: Job) -> None:
 def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
     """Publish the files of a unit and return its summary; one whose files cannot be gathered has failed."""
     found: JSON = {}
+    document: JSON | None = None
     try:
         found = _shared(batch.packs["summary"].json(f"{unit}.json"))
         failure = batch.failure(unit)
@@ -84,7 +85,7 @@ def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
         document, page = failed_files(batch.packs["calibration"], unit, failure).values()
         files = {f"calibrations/{unit}.json": as_bytes(document), f"reports/{unit}.html": as_bytes(page)}
     if failure and failure != found.get("failure"):  # it fails after its summary was made
-        document = failed_files(batch.packs["calibration"], unit, failure)[f"{unit}.calibration.json"]
+        document = document or failed_files(batch.packs["calibration"], unit, failure)[f"{unit}.calibration.json"]
         found = failed_summary(found, failure, document)
     for name, content in files.items():
         write_atomically(new / name, content)

@@ -16,7 +16,7 @@ from whole_run import run_campaign, run_jobs
 
 import pipeline
 from pipeline import results_folder
-from pipeline.commands import add, apply, explain, unpack
+from pipeline.commands import add, apply, convert, explain, unpack
 from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.campaign import Campaign
 from pipeline.errors import ConfigurationError, DamagedFileError, InputError
@@ -249,7 +249,7 @@ def check_commands(packed: Path, ordinary: Path, folder: Path, capsys: pytest.Ca
         assert explain.main([str(calibration)]) == 0
         assert explain.main([str(exported)]) == 0
         assert apply.main(["--calibration", str(calibration), str(log), "-o", str(made / "applied.csv")]) == 0
-        assert explain.convert([str(calibration), str(made / "px4.params")]) == 0
+        assert convert.main([str(calibration), str(made / "px4.params")]) == 0
         with pytest.raises(ConfigurationError, match="suggests no formula"):
             add.main([str(bench), "good", "--suggested", "--results", str(results.parent)])
         with pytest.raises(InputError, match="failed"):
