@@ -23,7 +23,7 @@ from pipeline.model.data_sheet import settings_of_ranges
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.profile_text import as_yaml, not_found
 from pipeline.profile_detection.proposal import propose
-from pipeline.profile_detection.recording_facts import as_text, facts, topic_lines, topics_of
+from pipeline.profile_detection.recording_facts import as_text, counted, facts, topic_lines, topics_of
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.run_progress import Countdown
 
@@ -233,7 +233,10 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
         lines += [("notes" if i == 0 else "", text) for i, text in enumerate(texts)]
         told.append(
             "\n".join(
-                [f"unit {unit}: {len(trial.recordings)} recordings, no refusal", *([as_text(lines)] if lines else [])]
+                [
+                    f"unit {unit}: {counted(len(trial.recordings), 'recording')}, no refusal",
+                    *([as_text(lines)] if lines else []),
+                ]
             )
         )
     return "\n\n".join([*told, *([missing] if missing else [])]), refused

@@ -325,9 +325,9 @@ def _what(unit: UnitDescription, planned: Planned) -> str:
 def _held_out(procedure: Mapping[str, Any]) -> str:
     """Return what judges a calibration by hand."""
     every, turns = procedure["holdout_every"], procedure.get("turns")
-    without = f"every {every}. rest is held out" if every else "nothing is held out, and no error is published"
+    without = f"one of {every} rests is held out" if every else "nothing is held out, and no error is published"
     if turns:
-        without = f"every {turns['holdout_every']}. turn about an axis is held out, between rests of 4 s and more"
+        without = f"one of {turns['holdout_every']} turns about an axis is held out, between rests of 4 s and more"
     return f"other rests{' or turns' if turns else ''}, held out of every fit; without this file {without}"
 
 

@@ -24,14 +24,18 @@ LINEAR_TO = 10.0  # value to which a symlog axis is linear: delta BIC of strong 
 Tick = tuple[float, str]
 
 
-def round_ticks(low: float, high: float, count: int = 5, *, angle: bool = False) -> list[Tick]:
-    """Return about ``count`` round values from ``low`` to ``high`` with their text; angles (deg) at parts of a turn."""
-    coarse = (high - low) / count
-    if angle and coarse > 5.0:
+def round_ticks(low: float, high: float, count: int = 5, kind: str = "") -> list[Tick]:
+    """Return about ``count`` round values from ``low`` to ``high`` with their text.
+
+    ``kind``: "angle" (deg) at parts of a turn, "count" at whole numbers.
+    """
+    coarse = max((high - low) / count, 1.0 if kind == "count" else 0.0)
+    if kind == "angle" and coarse > 5.0:
         step = min(ANGLE_STEPS, key=lambda s: abs(math.log(s / coarse)))
     else:
         power = 10.0 ** math.floor(math.log10(coarse))
-        step = power * next(s for s in (1.0, 2.0, 2.5, 5.0, 10.0) if s * power >= coarse * 0.999)
+        steps = (1.0, 2.0, 5.0, 10.0) if kind == "count" else (1.0, 2.0, 2.5, 5.0, 10.0)
+        step = power * next(s for s in steps if s * power >= coarse * 0.999)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [(n * step, tick_label(n * step, step)) for n in range(first, last + 1)]
 
@@ -84,7 +88,7 @@ class Axis:
     high: float
     start: float
     stop: float
-    kind: str = ""  # "", "angle" (deg), "log" or "symlog"
+    kind: str = ""  # "", "angle" (deg), "count" (whole numbers), "log" or "symlog"
 
     @classmethod
     def over(cls, arrays: Iterable[Values], start: float, stop: float, kind: str = "", margin: float = 0.04) -> Axis:
@@ -120,7 +124,7 @@ class Axis:
             values = [v for v in (0.0, *decades) if self.low <= scaled(v, self.kind) <= self.high]
             found = [(v, tick_label(v, LINEAR_TO)) for v in values]
         else:
-            found = round_ticks(self.low, self.high, count, angle=self.kind == "angle")
+            found = round_ticks(self.low, self.high, count, self.kind)
             if len(found) < 2:
                 found = round_ticks(self.low, self.high, count + 2)
         return [(self.pixels(value), label) for value, label in found]

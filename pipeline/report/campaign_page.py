@@ -193,6 +193,7 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Iterator[Told]:
             f"{middle[2]}. {words}",
             [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
             "unit, in the order of units.csv",
+            kind="count",
             margin=0.03,
             units="units",
         ),

@@ -153,8 +153,8 @@ def chart(
     """Return a figure, whose texts are given, with its chart: panels that share the axis x.
 
     ``description``: what the chart shows, for screen readers; ``x_label, kind, margin``: of the axis x, its label, "",
-    "angle" (deg) or "log", and by which share of their range it exceeds the values; ``left``: room for the ticks of
-    the axes y, px; ``columns``: names of x = 1, 2, ...; ``units``: list of the page's script that names them.
+    "angle" (deg), "count" or "log", and by which share of their range it exceeds the values; ``left``: room for the
+    ticks of the axes y, px; ``columns``: names of x = 1, 2, ...; ``units``: list of the page's script that names them.
     """
     values = {id(layer.x): layer.x for p in panels for layer in p.layers if layer.x is not None}
     x = Axis.over(values.values(), left, WIDTH - RIGHT, kind, margin)

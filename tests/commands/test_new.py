@@ -74,9 +74,9 @@ def test_the_readme_says_how_to_mount_and_record_and_what_stays_unseen(tmp_path:
     [
         (
             ["--procedure", "multi_position"],
-            ["python -m pipeline guide raw/U1/recording.csv --follow", "every 3. rest"],
+            ["python -m pipeline guide raw/U1/recording.csv --follow", "one of 3 rests"],
         ),
-        (["--procedure", "ferraris"], ["six faces", "every 2. turn about an axis is held out"]),
+        (["--procedure", "ferraris"], ["six faces", "one of 2 turns about an axis is held out"]),
         (["--procedure", "six_positions"], ["nothing is held out"]),
         (["--table", "single_axis"], ["Mount the unit anew for each turn axis, to 2 deg", "askew on the turn axis"]),
         (["--table", "mark2"], ["does not log its motion"]),

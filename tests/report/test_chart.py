@@ -32,8 +32,13 @@ def test_ticks_are_round_values(low: float, high: float, expected: list[float]) 
 
 
 def test_an_axis_of_angles_is_divided_by_parts_of_a_turn() -> None:
-    assert values(round_ticks(0.0, 360.0, 6, angle=True)) == [45.0 * k for k in range(9)]
-    assert values(round_ticks(-720.0, 720.0, 6, angle=True))[:2] == [-720.0, -540.0]
+    assert values(round_ticks(0.0, 360.0, 6, "angle")) == [45.0 * k for k in range(9)]
+    assert values(round_ticks(-720.0, 720.0, 6, "angle"))[:2] == [-720.0, -540.0]
+
+
+def test_ticks_of_counts_are_whole() -> None:
+    assert round_ticks(0.94, 3.06, 6, "count") == [(1.0, "1"), (2.0, "2"), (3.0, "3")]
+    assert values(round_ticks(0.6, 16.4, 6, "count")) == [5.0, 10.0, 15.0]
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ function ticksOf(axis, count) {
       for (const m of high - low > 2 ? [1] : [1, 2, 5]) out.push(k + Math.log10(m));
     return out.filter((v) => v >= low && v <= high).map((v) => [v, say(axis, v)]);
   }
-  const coarse = (high - low) / count, power = 10 ** Math.floor(Math.log10(coarse));
+  const coarse = Math.max((high - low) / count, axis.kind === "count" ? 1 : 0), power = 10 ** Math.floor(Math.log10(coarse));
   const whole = axis.kind === "angle" && coarse > 2;
   const step = whole ? [5, 10, 15, 30, 45, 90, 180, 360, 720].find((s) => s >= coarse) ?? 3600 : power * [1, 2, 5, 10].find((s) => s * power >= coarse * 0.999);
   const decimals = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
