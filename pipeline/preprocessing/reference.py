@@ -48,13 +48,13 @@ from pipeline.preprocessing.reference_scale import (
     doubt_of_angle,
     doubt_of_scale,
 )
-from pipeline.records import Note
+from pipeline.records import Note, median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.preprocessing.evidence import Channel
-    from pipeline.records import Recording, Values
+    from pipeline.records import Mask, Recording, Values
 
 
 FEWEST = 32  # samples, two short stretches
@@ -65,6 +65,7 @@ SAME = 0.1  # relative: gains of two turns that are of one gyroscope
 FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
 FINEST_S = 0.05  # step in which delays are tried; a parabola finds what lies between
 CLOCKS = 4001  # rates of the clock that are tried: 5 us in 1 s where it may be off by 1 %
+RESTING = 0.01  # of the fastest rate of a turn, below which the table rests
 QUARTER = 0.25  # of an interval, within which a delay between samples is known
 BETTER = 0.5  # share of its power that a signal has to keep where it is no other's
 NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
@@ -116,8 +117,10 @@ def check_motion(
     each other, or a recording is late otherwise than all others.
     """
     limits, gyroscope = Limits.of(settings), _Gyroscope(_turns(recordings))
-    moved = [r for r in recordings if r.samples >= FEWEST and r.role != "static" and r.axis is None]
-    moved = [r for r in moved if not (r.table_rate is None and r.table_attitude is None)]
+    logged = [r for r in recordings if r.samples >= FEWEST and r.role != "static"]
+    moved = [r for r in logged if r.axis is None and not (r.table_rate is None and r.table_attitude is None)]
+    for turn in (r for r in logged if r.axis is not None and r.table_angle is None and r.table_rate is None):
+        _check_attitude_of_turn(turn, limits)
     found = {r.name: _check_motion(r, gyroscope, limits) for r in moved}
     late = {**delays, **{name: delay for name, (_, delay) in found.items() if delay is not None}}
     check_delays([(r, late[r.name]) for r in recordings if r.name in late], limits)
@@ -222,12 +225,26 @@ def _compare(recording: Recording, channels: Sequence[Channel], limits: Limits) 
     return notes, delay
 
 
-def _check_directions(recording: Recording, attitude: Values, vector: Values, limits: Limits) -> None:
+def _check_attitude_of_turn(recording: Recording, limits: Limits) -> None:
+    """Compare a turn of which the table logs the attitude alone with the gyroscope, less its readings at rest."""
+    if recording.table_attitude is None or recording.gyroscope is None:
+        return
+    speed = np.linalg.norm(spin(recording.table_attitude), axis=1) / np.diff(recording.time)
+    fastest = float(quantiles(speed, 0.99)[0])
+    moving, resting = speed > HALF * fastest, speed < RESTING * fastest
+    if min(np.count_nonzero(moving), np.count_nonzero(resting)) >= FEWEST:
+        vector = recording.gyroscope - median(recording.gyroscope[1:][resting])
+        _check_directions(recording, recording.table_attitude, vector, limits, moving)
+
+
+def _check_directions(
+    recording: Recording, attitude: Values, vector: Values, limits: Limits, where: Mask | slice = slice(None)
+) -> None:
     """Refuse an attitude whose rotation has another direction in the body than the gyroscope's."""
-    turned = spin(attitude) / np.diff(recording.time)[:, None]
-    seen = 0.5 * (vector[1:] + vector[:-1])
+    turned = (spin(attitude) / np.diff(recording.time)[:, None])[where]
+    seen = 0.5 * (vector[1:] + vector[:-1])[where]
     off, size = np.linalg.norm(turned - seen, axis=1), np.linalg.norm(seen, axis=1)
-    change = np.linalg.norm(np.diff(vector, axis=0), axis=1) / recording.interval
+    change = np.linalg.norm(np.diff(vector, axis=0), axis=1)[where] / recording.interval
     allowed = (limits.gain + limits.rate) * size + limits.late_s * change + limits.offset_dps
     usual_off, usual_size = float(np.median(off)), float(np.median(size))
     if usual_off > float(np.median(allowed)) + 0.5 * usual_size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from bad_units import SETTINGS, cases, sound
+from scipy.spatial.transform import Rotation
 
 from pipeline.diagnosis.diagnose import doubts_of
 from pipeline.errors import IngestError
 from pipeline.preprocessing.at_rest import check_static
 from pipeline.preprocessing.checks import check_recordings
+from pipeline.preprocessing.reference import check_motion
 from pipeline.records import Recording
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_config, read_description
@@ -149,3 +152,26 @@ def test_a_turn_about_another_axis_is_not_told_as_a_wrong_unit_of_the_angle() ->
     (found,) = check_recordings([recording], SETTINGS | {"table": SETTINGS["table"] | {"seat_deg": 2.0}})
     assert found.axis == "y"
     assert [n.code for n in found.notes] == ["N-FOUND"]
+
+
+@pytest.mark.parametrize(
+    ("axis", "kind"), [*itertools.product(range(3), ["body to level", "level to body"]), (1, "scalar last")]
+)
+def test_the_attitude_of_a_turn_is_compared_with_the_gyroscope(axis: int, kind: str) -> None:
+    along = np.eye(3)[axis]
+    rate = np.concatenate([np.zeros(200), np.full(400, 45.0), np.zeros(100), np.full(200, -90.0), np.zeros(100)])
+    angle, rng = np.cumsum(rate) / 50.0, np.random.default_rng(axis)
+    start = Rotation.from_rotvec([0.3, -1.1, 0.7])  # of the body at angle 0 against level
+    rotation = start * Rotation.from_rotvec(np.radians(angle)[:, None] * along)
+    down = -rotation.inv().apply([0.0, 0.0, 1.0])
+    q = (rotation.inv() if kind == "level to body" else rotation).as_quat(scalar_first=kind != "scalar last")
+    gyroscope = np.outer(rate, along) + [1.0, -2.0, 0.5] + 0.05 * rng.standard_normal((len(rate), 3))
+    source, ns = {"file": "turn.csv"}, 20_000_000 * np.arange(len(rate))
+    name = "gyro_" + "xyz"[axis]
+    turn = Recording(name, "gyroscope", "xyz"[axis], ns, -down, gyroscope, table_attitude=q, source=source)
+    if kind == "body to level":
+        assert not check_motion([turn], {}, SETTINGS)[0].notes
+        return
+    with pytest.raises(IngestError, match="other body axes") as caught:
+        check_motion([turn], {}, SETTINGS)
+    assert caught.value.code == "reference_contradiction"
