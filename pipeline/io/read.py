@@ -183,9 +183,6 @@ def to_recording(
         hint = "one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]"
         raise IngestError(message, table.path, code="gcsv", hint=hint)
     table = to_body_axes(table, maps)
-    if entry.get("axis") is None and ATTITUDE[0] in table.values and "table_rate" not in table.values:
-        attitude = np.column_stack([table.values[c] for c in ATTITUDE])
-        table.values["table_rate"] = rate_of_attitude((table.time_ns - table.time_ns[0]) / 1e9, attitude)
     values = table.values
     for lacking in (s for s, triad in TRIADS.items() if triad[0] not in values):
         detail = f"the file has no column that the profile assigns to the {lacking}: it cannot calibrate this sensor"
@@ -207,6 +204,9 @@ def to_recording(
         notes=(*table.notes, *notes),
         encodings=table.encodings,
     )
+    if recording.axis is None and recording.table_attitude is not None and recording.table_rate is None:
+        rate = rate_of_attitude(recording.time * recording.table_seconds, recording.table_attitude)
+        recording = replace(recording, table_rate=rate)
     if checks.disturbed_rows:
         recording = leave_out_shaken_rests(recording, table.note)
     return leave_out_disturbances(recording, table.note, checks.disturbed_rows)

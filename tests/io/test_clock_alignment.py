@@ -12,9 +12,11 @@ from test_mcap_logs import header, imu, write_ros2
 
 from pipeline.errors import IngestError, InputError
 from pipeline.io.encoder_log import align
-from pipeline.io.read import read_recordings
+from pipeline.io.ingest_settings import Checks
+from pipeline.io.read import read_recordings, to_recording
 from pipeline.io.ros2_messages import IMU, JOINT_STATE
 from pipeline.model.kinematics import reference_motion
+from pipeline.records import rate_of_attitude
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,6 +61,15 @@ def test_the_log_is_at_the_sensors_times_then() -> None:
     assert twin is not None
     turn = 2.0 * np.degrees(np.arccos(np.clip(np.abs(np.sum(q * twin, axis=1)), 0.0, 1.0)))
     assert float(turn.max()) < 0.05
+
+
+def test_the_rate_of_held_out_motion_is_that_of_its_attitude_by_the_tables_own_clock() -> None:
+    sensor = aligned(beside_a_table(1, drift_ppm=8000.0)[0], "validation")
+    q = np.column_stack([sensor.values[f"table_q{c}"] for c in "wxyz"])
+    by_sensor = rate_of_attitude(sensor.time_ns / 1e9, q)
+    found = to_recording("validation", {"role": "validation"}, sensor, {}, Checks()).table_rate
+    assert found is not None
+    assert float(np.sum(found) / np.sum(by_sensor)) == pytest.approx(1.0 / 1.008, abs=1e-4)
 
 
 def rows_of(seed: int) -> list[Recording]:
