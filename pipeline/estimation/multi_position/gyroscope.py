@@ -161,7 +161,7 @@ class GyroscopeModel:
         held = np.asarray(block.bias)
         S = S + ratio**2 * np.einsum("cnk,cmk->nm", held, held)
         rng = np.random.default_rng(0)
-        drawn = draw_normal(rng, S, DRAWS)
+        drawn = rng.standard_normal((DRAWS, n)) @ np.linalg.cholesky(S).T  # continuous in S, as eigenvectors are not
         errors = draw_normal(rng, covariance[:12, :12], DRAWS)
         for own in (slice(0, 3), slice(3, 12)):  # the wander makes those of the bias fewer
             few = min(float(freedom[own].min()), MANY)
