@@ -6,7 +6,7 @@ A unit is drawn by the product's own simulator (MPU-6050, quantised), recorded, 
 stage ``effects``; then the truth of each parameter lies within its expanded uncertainty or not. Conditions:
 
     white   white noise alone, and a data sheet that states no bias wander
-    wander  with the data sheet's bias wander; in both, a table without errors, which states none
+    wander  with the sensor file's bias wander; in both, a table without errors, which states none
     table   with wander and with a table whose errors have the sizes that its configuration states
 
 The truth of the staged method, which is an approximation by design, is its own output without noise and table errors.

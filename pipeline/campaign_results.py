@@ -105,7 +105,7 @@ class CampaignResults:
         and ``coverage_factor`` (k; the standard uncertainty is expanded_uncertainty / k).
 
         Parameters of ``truth = matrix (reading - bias - effects)``: ``bias_x``, ``matrix_xy``, ``<effect>.<symbol>``.
-        Elements of ``K = matrix^-1``, which a data sheet states: ``scale_factor_error_x`` (``K_xx - 1``) and
+        Elements of ``K = matrix^-1``, which a sensor file states: ``scale_factor_error_x`` (``K_xx - 1``) and
         ``cross_axis_xy`` (what axis x reads of a truth along y).
         """
         rows = (
@@ -150,8 +150,8 @@ class CampaignResults:
 
         Columns: ``unit, sensor, effect, delta_bic`` (above 10: strong evidence), ``p_value, explained_share`` (of the
         residual above the noise), ``held_out_error_before, held_out_error_after`` (rms of the vector, g or deg/s),
-        ``plausible`` (within the data sheet), ``selected`` (bool), ``look_alikes`` (effects with much the same signal,
-        joined by ";").
+        ``plausible`` (within the sensor file's limits), ``selected`` (bool), ``look_alikes`` (effects with much the
+        same signal, joined by ";").
         """
         rows = (
             about

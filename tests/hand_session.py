@@ -78,7 +78,7 @@ def hand_held(
     holdout_every: int = 3,
     **other: Any,
 ) -> Unit:
-    """Return a unit; ``effects`` maps ``sensor.effect`` to None for a size of the data sheet, at random."""
+    """Return a unit; ``effects`` maps ``sensor.effect`` to None for a size of the sensor file, at random."""
     parts = (tuple((effects or {}).items()), tuple((temperature or {}).items()), tuple(other.items()))
     recordings, truth = _simulated(model, seed, procedure, *parts)
     settings = {

@@ -63,7 +63,7 @@ def test_figures_of_the_blind_study_are_those_of_its_table() -> None:
         )
     null = counts["nothing hidden"]
     stated = {
-        "one": counts["one effect at its data sheet's size"][0],
+        "one": counts["one effect at the sensor file's size"][0],
         "two": counts["two effects"][0],
         "wander": counts["two effects"][1],
         "removed": counts["taken out of the catalogue"][0],

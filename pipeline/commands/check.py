@@ -19,7 +19,7 @@ from pipeline.errors import ConfigurationError, IngestError, PipelineError
 from pipeline.files import write_atomically
 from pipeline.io.files import SUFFIXES, recording_files
 from pipeline.model.calibration_file import LEFT_OUT
-from pipeline.model.data_sheet import settings_of_ranges
+from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.profile_text import as_yaml, not_found
 from pipeline.profile_detection.proposal import propose
@@ -169,8 +169,8 @@ def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Name
         ranges = settings_of_ranges(config["sensor"], arguments.range)
         config = config_of_log(files[0], profile, sensor, ranges, campaign)
     said = f"ingest={config['ingest']['name']}" + (f", sensor={sensor}" if sensor else "")
-    ingest, sheet = config["ingest"], config["sensor"] if sensor else {}
-    return [Reading.alone(group, ingest, sheet, said) for group in grouped(files, ingest)]
+    ingest, sensor_config = config["ingest"], config["sensor"] if sensor else {}
+    return [Reading.alone(group, ingest, sensor_config, said) for group in grouped(files, ingest)]
 
 
 def _logs_of_campaign(files: Sequence[Path], campaign: Campaign, units: Sequence[str]) -> list[Reading]:

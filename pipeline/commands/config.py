@@ -17,7 +17,7 @@ from pipeline.config.options import GROUPS, Problem, default_option, nearest, pa
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
-from pipeline.model.data_sheet import NEEDED, range_settings
+from pipeline.model.sensor_file import NEEDED, range_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -41,9 +41,9 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     directory, unit = find_campaign(arguments.campaign), arguments.unit
     composer, all_layers = read_layers(directory, {"overrides": arguments.overrides, PYTHON: arguments.python_effect})
-    if unit not in all_layers.sheet.rows:
+    if unit not in all_layers.units_table.rows:
         raise ConfigurationError(
-            f"no unit {unit!r}{nearest(unit, all_layers.sheet.rows)}", str(directory / "units.csv")
+            f"no unit {unit!r}{nearest(unit, all_layers.units_table.rows)}", str(directory / "units.csv")
         )
     layers = all_layers.of(unit)
     try:

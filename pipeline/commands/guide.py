@@ -88,8 +88,8 @@ def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline guide RECORDING...``."""
     arguments = _parser().parse_args(argv)
     source = _source(arguments)
-    sheet = source.config["sensor"]["accelerometer"]
-    goal = 1e-3 * arguments.goal if arguments.goal is not None else WANDERS * float(sheet["bias_wander"])
+    sensor_config = source.config["sensor"]["accelerometer"]
+    goal = 1e-3 * arguments.goal if arguments.goal is not None else WANDERS * float(sensor_config["bias_wander"])
     goals = Goals(goal, arguments.gyroscope_goal)
     if not arguments.follow:
         missing = [str(f) for f in source.files if not f.exists()]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.files import CONFIGS
-from pipeline.model.data_sheet import settings_of_ranges
+from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.outcome import run_command
 from pipeline.planning.changes import readme
 from pipeline.simulation.description import UnitDescription, read_option
@@ -51,9 +51,9 @@ def main(argv: Sequence[str]) -> int:
     add("--table", metavar="NAME", help="rate table, a name in configs/table (default: that of the procedure)")
     add("--unit", default="U1", metavar="NAME", help="name of the first unit (default: U1)")
     arguments = parser.parse_args(argv)
-    sheet = arguments.directory / "units.csv"
-    if sheet.exists():
-        raise InputError("exists already; choose a directory without a campaign", str(sheet))
+    units_table = arguments.directory / "units.csv"
+    if units_table.exists():
+        raise InputError("exists already; choose a directory without a campaign", str(units_table))
     sensor_name = _chosen("sensor", arguments.sensor, "generic")
     sensor = read_option("sensor", sensor_name)
     ranges = _chosen_ranges(sensor, arguments.range)
@@ -78,8 +78,8 @@ def main(argv: Sequence[str]) -> int:
         SETTINGS + _ranges(sensor_name, sensor, ranges) + _options(), encoding="utf-8"
     )
     row = f"{arguments.unit},,,,{sensor_name},{table_name},{procedure_name},"
-    sheet.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
-    print(f"{sheet}: one row for each unit; put the recordings into {folder}")
+    units_table.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
+    print(f"{units_table}: one row for each unit; put the recordings into {folder}")
     print(f"{arguments.directory / 'README.md'}: how to mount and record this bench, and what the recordings determine")
     print(_accuracy(table_name, table))
     print(f"then: {run_command({'campaign': str(arguments.directory)})}")
@@ -127,22 +127,27 @@ def _ranges_of(sensor: dict[str, Any]) -> list[float]:
 
 def _ranges(name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
     """Return the settings of the ranges, as comments where they are those of the sensor's file."""
-    sheets = [sensor[s] for s in UNITS if sensor.get(s)]
+    sensor_configs = [sensor[s] for s in UNITS if sensor.get(s)]
     held = ", ".join(f"{s} +-{sensor[s]['full_scale']:g} {UNITS[s]}" for s in UNITS if sensor.get(s))
-    other = [None if value == float(h["full_scale"]) else value for h, value in zip(sheets, wanted, strict=False)]
+    other = [
+        None if value == float(h["full_scale"]) else value for h, value in zip(sensor_configs, wanted, strict=False)
+    ]
     settings = settings_of_ranges(sensor, [*other, *wanted[len(other) :]])
     mark = "" if settings else "# "
     lines = ["", f"# The file of the sensor {name} states the ranges {held}."]
     lines += [] if settings else ["# Example for larger ones:"]
     lines += [f"{mark}models:", f"{mark}  {name}:"]
-    lines += [f"{mark}    - {s}" for s in settings or settings_of_ranges(sensor, [_larger(sheet) for sheet in sheets])]
+    lines += [
+        f"{mark}    - {s}"
+        for s in settings or settings_of_ranges(sensor, [_larger(sensor_config) for sensor_config in sensor_configs])
+    ]
     return "\n".join(lines) + "\n"
 
 
-def _larger(sheet: dict[str, Any]) -> float:
+def _larger(sensor_config: dict[str, Any]) -> float:
     """Return the next larger range of a sensor, or twice that of its file."""
-    full_scale = float(sheet["full_scale"])
-    listed = [float(r) for r in sheet.get("ranges") or ()] or [2.0 * full_scale]
+    full_scale = float(sensor_config["full_scale"])
+    listed = [float(r) for r in sensor_config.get("ranges") or ()] or [2.0 * full_scale]
     return min((r for r in listed if r > full_scale), default=full_scale)
 
 

@@ -43,8 +43,8 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigurationError(f"-o is {target.name}, which is no format of noise; expected {listed}")
     log: Path = arguments.log
     config = config_of_log(log, arguments.ingest, arguments.sensor)
-    ingest, sheet = config["ingest"], config["sensor"] if arguments.sensor else {}
-    recording = Reading.alone([log], ingest, sheet, role="static").checked()
+    ingest, sensor_config = config["ingest"], config["sensor"] if arguments.sensor else {}
+    recording = Reading.alone([log], ingest, sensor_config, role="static").checked()
     found = identify_noise([recording])
     print("\n\n".join(_told(sensor, found[sensor]) for sensor in SENSORS).replace(MINUS, "-"))
     if target is None:

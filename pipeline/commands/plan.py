@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FILE = "simulation.yaml"
 EPILOG = """\
 For each effect the plan states the smallest size that the diagnosis would find in half of the units, at the noise of
-the sensor's data sheet; its share of the data sheet's limit; effects with a similar signal; and up to which size one of
+the sensor file; its share of the sensor file's limit; effects with a similar signal; and up to which size one of
 these would be named instead.
 
 examples:

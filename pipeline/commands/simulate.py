@@ -11,8 +11,8 @@ import yaml
 
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
-from pipeline.model.data_sheet import assumed_figures
 from pipeline.model.effects import read_effect_files, register
+from pipeline.model.sensor_file import assumed_figures
 from pipeline.outcome import run_command
 from pipeline.run_progress import Countdown
 from pipeline.simulation.campaign import write_campaign

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from pipeline.config.comparisons import resolve_comparisons
 from pipeline.config.compose import Composer
-from pipeline.config.layers import as_list, load_layers, read_sheet
+from pipeline.config.layers import as_list, load_layers, read_units_table
 from pipeline.config.options import RUN_SETTINGS, Problem, mapping_of, nearest, parse
 from pipeline.config.schema import OF_BENCH, RunSettings
 from pipeline.config.stage_settings import config_sha256
@@ -89,7 +89,7 @@ class Campaign:
 
     @cached_property
     def boards(self) -> dict[str, list[str]]:
-        """The chips of each board, in the order of the sheet: units with the same ``board``, the reference first."""
+        """The units of each board, in the order of the units table, the reference first."""
         return boards_of(self.units)
 
     @property
@@ -140,7 +140,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     composer, layers = read_layers(directory, settings)
     units: dict[str, UnitRow] = {}
     problems: dict[str, list[str]] = {}
-    for name, row in layers.sheet.rows.items():
+    for name, row in layers.units_table.rows.items():
         try:
             texts = [text for _, text in layers.of(name)]
             overrides = {text.partition("=")[0].strip(): text.partition("=")[2].strip() for text in texts}
@@ -163,9 +163,11 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
 
 
 def read_layers(directory: Path, settings: Mapping[str, Any]) -> tuple[Composer, Layers]:
-    """Read the options, the sheet and the overrides of a campaign and of the command line."""
+    """Read the options, the units table and the overrides of a campaign and of the command line."""
     composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "a list of paths of Python files"))
-    return composer, load_layers(directory, settings, read_sheet(directory / "units.csv"), composer.options["sensor"])
+    return composer, load_layers(
+        directory, settings, read_units_table(directory / "units.csv"), composer.options["sensor"]
+    )
 
 
 def find_campaign(name: str) -> Path:
@@ -196,7 +198,7 @@ def run_settings(overrides: Sequence[str]) -> RunSettings:
 def cut_batches(
     units: Mapping[str, UnitRow], size: int | None
 ) -> tuple[dict[str, list[str]], dict[str, dict[str, list[str]]]]:
-    """Cut units of one chain of stages into batches, in the order of the sheet.
+    """Cut units of one chain of stages into batches, in the order of the units table.
 
     Appending units touches the last batch of their chain only. Whether effects are fitted does not cut batches anew:
     a batch has the stage if any of its units asks for it. Without a size, a batch is as large as all before it, from 25
@@ -240,7 +242,7 @@ def boards_of(units: Mapping[str, UnitRow]) -> dict[str, list[str]]:
     return {board: chips for board, chips in found.items() if len(chips) > 1}
 
 
-def _check_boards(boards: Mapping[str, Sequence[str]], batches: Mapping[str, Sequence[str]], sheet: str) -> None:
+def _check_boards(boards: Mapping[str, Sequence[str]], batches: Mapping[str, Sequence[str]], units_table: str) -> None:
     """Refuse boards whose chips are not in one batch; raises ``ConfigurationError``."""
     batch_of = {unit: batch for batch, units in batches.items() for unit in units}
     split = [b for b, chips in boards.items() if len({batch_of[chip] for chip in chips}) > 1] if boards else []
@@ -248,7 +250,7 @@ def _check_boards(boards: Mapping[str, Sequence[str]], batches: Mapping[str, Seq
         raise ConfigurationError(
             f"column board: the chips of {_few(split)} are estimated together; expected consecutive rows with the same "
             "method",
-            sheet,
+            units_table,
         )
 
 

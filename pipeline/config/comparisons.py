@@ -146,7 +146,7 @@ def _groups(entry: JSON, columns: _Columns) -> list[JSON]:
 
 
 def _by(names: list[str], x: str, among: list[str], columns: _Columns) -> list[JSON]:
-    """Return a group for each combination of values, in the order of the sheet."""
+    """Return a group for each combination of values, in the order of the units table."""
     along = names.index(x) if x in names else len(names) - 1
     found: dict[tuple[str, ...], list[str]] = {}
     for unit in among:
@@ -179,6 +179,6 @@ def _group(name: str, units: list[str]) -> JSON:
 
 
 def _names(value: Any) -> list[str]:  # noqa: ANN401  (the user's)
-    """Return one value or a list of them as texts, as a sheet holds them."""
+    """Return one value or a list of them as texts, as the units table holds them."""
     values = value if isinstance(value, list) else [value]
     return [str(v) for v in values]

@@ -47,7 +47,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
 from pipeline.io.ingest_settings import check_ingest
-from pipeline.model.data_sheet import completed, range_settings, without_overridden
+from pipeline.model.sensor_file import completed, range_settings, without_overridden
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -89,13 +89,13 @@ def edit_effects(
 
 def _file(unit: str, layers: Layers, directory: Path) -> Path:
     """Return the device file of a unit, which must exist and share its name with no serial of another."""
-    rows, sheet = layers.sheet.rows, str(directory / "units.csv")
+    rows, units_table = layers.units_table.rows, str(directory / "units.csv")
     if unit not in rows:
-        raise ConfigurationError(f"no unit {unit!r}{nearest(unit, rows)}", sheet)
+        raise ConfigurationError(f"no unit {unit!r}{nearest(unit, rows)}", units_table)
     others = [u for u, row in rows.items() if row.get("serial") == unit and u != unit]
     if others:
         both = f"{DEVICES}/{unit}.yaml would concern {', '.join(others)} too, whose serial is {unit}"
-        raise ConfigurationError(f"{both}: give the unit or the serial another name", sheet)
+        raise ConfigurationError(f"{both}: give the unit or the serial another name", units_table)
     return directory / DEVICES / f"{unit}.yaml"
 
 

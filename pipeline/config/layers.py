@@ -47,13 +47,13 @@ LARGEST_BYTES = 100_000_000  # a million units of 100 characters each
 
 
 @dataclass(frozen=True)
-class Sheet:
+class UnitsTable:
     """The rows of ``units.csv``.
 
     Attributes
     ----------
     rows : dict of str to dict
-        Unit to its cells by column, in the order of the sheet.
+        Unit to its cells by column, in the order of the units table.
     lines : dict of str to int
         Unit to the line of the file on which its row ends.
     """
@@ -62,7 +62,7 @@ class Sheet:
     lines: dict[str, int]
 
 
-def read_sheet(path: Path) -> Sheet:
+def read_units_table(path: Path) -> UnitsTable:
     """Read ``units.csv``; refuses bad names, duplicates and ragged rows, all in one message.
 
     Raises ``ConfigurationError``.
@@ -107,7 +107,7 @@ def read_sheet(path: Path) -> Sheet:
     if problems:
         more = [f"and {len(problems) - 20} more"] * (len(problems) > 20)
         raise ConfigurationError("; ".join([*problems[:20], *more]), str(path))
-    return Sheet(found, lines)
+    return UnitsTable(found, lines)
 
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str | Any, Any]]]]:
@@ -117,7 +117,7 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str | Any, Any]]
         if other:
             raise ConfigurationError(other, str(path))
         if path.stat().st_size > LARGEST_BYTES:
-            raise ConfigurationError(f"is larger than {LARGEST_BYTES} bytes, the limit for a sheet", str(path))
+            raise ConfigurationError(f"is larger than {LARGEST_BYTES} bytes, the limit for a units table", str(path))
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.DictReader(stream, strict=True)
             columns = [c.strip() for c in reader.fieldnames or []]
@@ -222,7 +222,7 @@ class Layers:
         The description from which the run makes the recordings; None where they are recorded.
     """
 
-    sheet: Sheet
+    units_table: UnitsTable
     campaign: CampaignFile
     of_run: list[str]
     devices: dict[str, list[str]]
@@ -232,7 +232,7 @@ class Layers:
 
     def of(self, unit: str) -> list[Layer]:
         """Return a unit's overrides, weakest first."""
-        row, line = self.sheet.rows[unit], f"units.csv line {self.sheet.lines[unit]}"
+        row, line = self.units_table.rows[unit], f"units.csv line {self.units_table.lines[unit]}"
         own = [o for o in map(str.strip, BETWEEN_OVERRIDES.split(row.get("overrides", ""))) if o]
         lot = row.get("lot", "")
         below = _layers("campaign.yaml", self.campaign.overrides)
@@ -250,7 +250,9 @@ class Layers:
         return [*below, *above]
 
 
-def load_layers(directory: Path, settings: Mapping[str, Any], sheet: Sheet, sensors: Iterable[str]) -> Layers:
+def load_layers(
+    directory: Path, settings: Mapping[str, Any], units_table: UnitsTable, sensors: Iterable[str]
+) -> Layers:
     """Read the overrides of a campaign and of the command line.
 
     Raises ``ConfigurationError`` naming the file and the key.
@@ -259,7 +261,7 @@ def load_layers(directory: Path, settings: Mapping[str, Any], sheet: Sheet, sens
     """
     path = directory / "campaign.yaml"
     file = _read(path, CampaignFile) if os.path.lexists(path) else CampaignFile()
-    _check_models_and_lots(file, sheet, set(sensors), str(path))
+    _check_models_and_lots(file, units_table, set(sensors), str(path))
     in_file, units = _split(file.overrides)
     on_command_line, command = _split(as_list(settings.get("overrides", []), "overrides"))
     simulation = path.with_name(SIMULATION) if file.simulate else None
@@ -271,9 +273,9 @@ def load_layers(directory: Path, settings: Mapping[str, Any], sheet: Sheet, sens
     if problem:
         raise ConfigurationError(problem, str(simulation))
     campaign = file.model_copy(update={"overrides": units})
-    per_unit = _unit_overrides(settings.get("unit_overrides", {}), sheet.rows)
+    per_unit = _unit_overrides(settings.get("unit_overrides", {}), units_table.rows)
     of_run = [*in_file, *on_command_line]
-    return Layers(sheet, campaign, of_run, _read_devices(directory, sheet), command, per_unit, simulation)
+    return Layers(units_table, campaign, of_run, _read_devices(directory, units_table), command, per_unit, simulation)
 
 
 def as_list(value: Any, where: str, what: str = LIST) -> list[str]:  # noqa: ANN401  (the user's)
@@ -319,9 +321,9 @@ def _read(path: Path, model: type[File]) -> File:
     raise ConfigurationError(f"{key}: {model.model_fields[str(key)].description} is expected, got {value!r}", str(path))
 
 
-def _read_devices(directory: Path, sheet: Sheet) -> dict[str, list[str]]:
+def _read_devices(directory: Path, units_table: UnitsTable) -> dict[str, list[str]]:
     """Read ``devices/*.yaml``: serial or unit to overrides; all files that are refused are named in one message."""
-    known = set(sheet.rows) | {row["serial"] for row in sheet.rows.values() if row.get("serial")}
+    known = set(units_table.rows) | {row["serial"] for row in units_table.rows.values() if row.get("serial")}
     found, problems = {}, []
     for file in sorted((directory / DEVICES).glob("*.yaml")):
         if file.stem not in known:
@@ -340,9 +342,9 @@ def _read_devices(directory: Path, sheet: Sheet) -> dict[str, list[str]]:
     return found
 
 
-def _check_models_and_lots(campaign: CampaignFile, sheet: Sheet, sensors: set[str], file: str) -> None:
+def _check_models_and_lots(campaign: CampaignFile, units_table: UnitsTable, sensors: set[str], file: str) -> None:
     """Refuse overrides of models and lots that do not exist, of the run, and models that choose another model."""
-    lots = {row["lot"] for row in sheet.rows.values() if row.get("lot")}
+    lots = {row["lot"] for row in units_table.rows.values() if row.get("lot")}
     for key, what, named, known in (
         ("models", "sensor config", campaign.models, sensors),
         ("lots", "lot of units.csv", campaign.lots, lots),

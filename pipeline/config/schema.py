@@ -26,7 +26,7 @@ class Section(BaseModel):
 
 
 class DataSheet(Section):
-    """One sensor's data sheet."""
+    """The figures of one sensor: accelerometer or gyroscope."""
 
     full_scale: Positive
     counts_per_unit: Positive

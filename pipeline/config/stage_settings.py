@@ -112,7 +112,7 @@ def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> 
         for step in branch:
             source = source[step]
             target = target.setdefault(step, {})
-        if leaf in source or (branch[-1:] != ["effects"] and leaf != "given"):  # a data sheet limits some effects
+        if leaf in source or (branch[-1:] != ["effects"] and leaf != "given"):  # a sensor file limits some effects
             target[leaf] = source[leaf]
     return out
 

@@ -53,13 +53,13 @@ class UserEffects:
         formulas = [e.definition for name, e in self.effects.items() if name not in self.python]
         return {"user_effects": {"formulas": formulas, "python": list(self.python.values())}}
 
-    def add_limits(self, sheets: dict[str, Any]) -> None:
-        """Add the effects' limits to those of the data sheets, which take precedence."""
+    def add_limits(self, sensor_configs: dict[str, Any]) -> None:
+        """Add the effects' limits to those of the sensor files, which take precedence."""
         for each in self.effects.values():
             for sensor in each.sensors:
-                given = sheets[sensor]["effects"]
+                given = sensor_configs[sensor]["effects"]
                 if each.name not in given:
-                    sheets[sensor]["effects"] = {**each.limits(sensor), **given}
+                    sensor_configs[sensor]["effects"] = {**each.limits(sensor), **given}
 
 
 def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[str]) -> UserEffects:

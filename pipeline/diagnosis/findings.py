@@ -1,7 +1,7 @@
 """What a selection found, in the same terms for turns on a table and for rests and moves by hand, as a document.
 
 A noise model with bias wander can take up a missing effect. So the fitted wander, ``sigma = q s`` with its ratio q to
-the white noise s, is compared with that of the rests or the data sheet:
+the white noise s, is compared with that of the rests or the sensor file:
 
     inflated:   sigma > 3 sigma_expected   and   log L(best) - max {log L(q, tau): q s <= 3 sigma_expected} > 5
 """
@@ -47,7 +47,7 @@ class Case:
         return self.calibration.sensor
 
     @property
-    def sheet(self) -> Mapping[str, Any]:
+    def sensor_config(self) -> Mapping[str, Any]:
         """Its section of the settings."""
         found: Mapping[str, Any] = self.settings["sensor"][self.sensor]
         return found

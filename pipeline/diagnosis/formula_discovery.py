@@ -78,7 +78,7 @@ def discover(
     unknown: list[dict[str, Any]],
     configured: Sequence[str],
     noise: Noise | None,
-    sheet: Mapping[str, Any],
+    sensor_config: Mapping[str, Any],
     *,
     accelerometer: SensorCalibration | None = None,
 ) -> Discovery:
@@ -101,7 +101,7 @@ def discover(
             continue
         with _registered(form):
             names = [*configured, definition["name"]]
-            again = select(context.observations, names, noise, sheet, accelerometer=accelerometer)
+            again = select(context.observations, names, noise, sensor_config, accelerometer=accelerometer)
         if _worth(again, terms) <= least:
             continue
         least = _worth(again, terms)

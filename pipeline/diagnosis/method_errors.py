@@ -218,7 +218,7 @@ class _Difference:
 def _own_covariance(calibration: SensorCalibration, settings: Mapping[str, Any]) -> Values:
     """Return the covariance of bias and matrix: (12, 12).
 
-    Where a given calibration states none, its bias has at least the wander that the sensor's data sheet states.
+    Where a given calibration states none, its bias has at least the wander that the sensor file states.
     """
     own = np.zeros((12, 12)) if calibration.covariance is None else calibration.covariance[:12, :12]
     if own.any() or [stage.name for stage in calibration.stages] != ["given"]:

@@ -59,9 +59,9 @@ FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a w
 def findings(case: Case) -> Findings:
     """Return what the selection finds in rests and moves by hand; as ``require_model``."""
     model, calibration = _model_of_all_rests(case), case.calibration
-    given = calibration, case.configured, case.noise, case.sheet
+    given = calibration, case.configured, case.noise, case.sensor_config
     selection = Selection(model, *given)
-    expected = _without_creep(case.noise, case.sheet)
+    expected = _without_creep(case.noise, case.sensor_config)
     hidden, unknown = not_observable_by_hand(selection, case.configured), dependences(selection)
     chi = [_chi(selection, fit, expected) for fit in selection.fits]
     over, left_over = (_over_noise(selection, selection.fits[k], expected) for k in (0, -1))
@@ -171,15 +171,17 @@ def require_model(
     return model
 
 
-def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | None:
-    """Return the noise with the data sheet's wander, where only rests by hand determine one.
+def _without_creep(noise: Noise | None, sensor_config: Mapping[str, Any]) -> Noise | None:
+    """Return the noise with the sensor file's wander, where only rests by hand determine one.
 
     A unit that creeps from its attitude moves gravity from one axis to another, which is no wander of a bias.
     """
     if noise is None or noise.source == "static":
         return noise
-    wander = np.full(3, float(sheet.get("bias_wander") or 0.0))
-    return replace(noise, wander=wander, correlation_time=float(sheet.get("wander_time_s") or noise.correlation_time))
+    wander = np.full(3, float(sensor_config.get("bias_wander") or 0.0))
+    return replace(
+        noise, wander=wander, correlation_time=float(sensor_config.get("wander_time_s") or noise.correlation_time)
+    )
 
 
 def _shares(selection: Selection, name: str) -> dict[str, float]:

@@ -46,7 +46,7 @@ def findings(case: Case) -> Findings:
     Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
     """
     observations = observe(case.sensor, case.recordings, case.settings["table"])
-    given = case.configured, case.noise, case.sheet
+    given = case.configured, case.noise, case.sensor_config
     selection = select(observations, *given, case.calibration, accelerometer=case.accelerometer)
     unknown = dependent(selection)
 

@@ -161,9 +161,9 @@ def _beyond(e: Evidence) -> str:
         return ""
     beyond = listed([plain(name) for name in e.implausible])
     return (
-        f"To explain the residual, {beyond} would have to exceed the limits of the sensor's data sheet. Possible "
+        f"To explain the residual, {beyond} would have to exceed the limits of the sensor file. Possible "
         "causes: a recording of another unit, a wrong range, an effect that is not in the catalogue. If the sensor is "
-        f"known to exceed its data sheet, set sensor.{e.sensor}.accept_implausible=true."
+        f"known to exceed these limits, set sensor.{e.sensor}.accept_implausible=true."
     )
 
 

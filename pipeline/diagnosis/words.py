@@ -114,7 +114,7 @@ def _selected(entry: Mapping[str, Any], sensor: str, most_values: int | None, *,
     bic = f"(delta BIC {entry['delta_bic']:.0f})"
     lines = [f"{head} It explains {share:.0f} % of the excess over the noise {bic}."]
     if not entry["plausible"]:
-        lines.append("That exceeds the limit of the sensor's data sheet; the cause may be another, similar effect.")
+        lines.append("That exceeds the limit of the sensor file; the cause may be another, similar effect.")
     if entry["look_alikes"]:
         alike = ", ".join(f"{plain(a['effect'])} ({100 * a['share']:.0f} %)" for a in entry["look_alikes"])
         lines.append(f"Its signal is similar to that of {alike}.")

@@ -163,13 +163,13 @@ def is_held(name: str, parameter: Mapping[str, Any]) -> bool:
     return is_tilt and u < 10.0 * HELD_DEG and abs(parameter["value"]) < 0.01 * HELD_DEG
 
 
-def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, Values]:
+def limits_of(sensor: str, sensor_config: Mapping[str, Any]) -> dict[str, Values]:
     """Return the limits of plausibility of every effect's parameters, absolute values.
 
-    ``sheet``: ``effects`` of the sensor's data sheet: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
+    ``sensor_config``: ``effects`` of the sensor file: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
     one or, without the axis, for some of them.
     """
-    given = sheet.get("effects") or {}
+    given = sensor_config.get("effects") or {}
     found = {}
     for name, this in catalogue().items():
         limits = parameter_limits(this, sensor, given) if sensor in this.sensors else np.array([np.inf])

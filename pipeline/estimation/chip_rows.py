@@ -41,11 +41,11 @@ class Chip:
     unit: str
     recordings: Sequence[Recording]
     calibrations: Mapping[str, SensorCalibration | None]
-    sheet: Mapping[str, Any]
+    sensor_config: Mapping[str, Any]
 
     def prior(self, sensor: str) -> Prior:
         """Return what is known of the wander of its bias."""
-        return prior_of(sensor, self.recordings, {"sensor": self.sheet})
+        return prior_of(sensor, self.recordings, {"sensor": self.sensor_config})
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,8 @@ def fit(
         observations = observe(sensor, recordings, settings["table"])
         if not observations.parts:
             return before
-        sheet = settings["sensor"][sensor]
-        names += select(observations, names, noise, sheet, accelerometer=accelerometer).names
+        sensor_config = settings["sensor"][sensor]
+        names += select(observations, names, noise, sensor_config, accelerometer=accelerometer).names
     if not names:
         return before
     return fit_joint(sensor, recordings, names, noise, settings, before, accelerometer)

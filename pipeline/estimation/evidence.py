@@ -4,7 +4,7 @@
 
 where
 
-S     : a set of effects, Z their columns, each times the limit of its parameter by the data sheet
+S     : a set of effects, Z their columns, each times the limit of its parameter by the sensor file
 s     : a scale for each effect of S; its parameters over their limits are N(0, sigma^2 s^2), and D = diag(s)
 theta : a hypothesis about the noise, covariance sigma^2 C, with log pi(sigma) = -log sigma; X: columns of the base
 G     : Z^T M Z with ``M = C^-1 - C^-1 X (X^T C^-1 X)^-1 X^T C^-1``
@@ -28,7 +28,7 @@ Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
 Set: TypeAlias = frozenset[str]
 
 # The prior was chosen on 738 simulated sensors: docs/blind_study.md.
-SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the data sheet's limits
+SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the sensor file's limits
 SCALE_PRIOR = np.log([0.2375, 0.2375, 0.2375, 0.2375, 0.03, 0.02])
 NEGLIGIBLE = 1e-4  # weight of a hypothesis or of a part of a mixture that is left out
 READINGS, ZEROS = -2, -1  # columns of the padded products

@@ -5,7 +5,7 @@
     other_input       : sum over n = 2 to 5 of c_n P_n(x), x the axis' own input over its largest value
     other_angle       : sum over n = 1 to 8 of a_n cos(n A) + b_n sin(n A), A the table's angle
 
-with Legendre polynomials P_n and coefficients for each axis. A curve has no limit by the data sheet: its coefficients
+with Legendre polynomials P_n and coefficients for each axis. A curve has no limit by the sensor file: its coefficients
 have the size of the noise, times the scales of ``pipeline.estimation.evidence``. That many coefficients cost evidence,
 so that a curve is more probable than an effect only where that effect leaves more than noise. An effect that follows
 the time looks like a bend of the temperature. So ``other_temperature`` has a second form beside slow effects, with one

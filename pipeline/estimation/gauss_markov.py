@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Index, Integers, Noise, Values
 
-DEFAULT_TIME_S = 100.0  # correlation time where the data sheet gives none: of MEMS sensors, by IEEE Std 952 examples
-SHEET_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a data sheet gives: a factor of three
+DEFAULT_TIME_S = 100.0  # correlation time where the sensor file gives none: of MEMS sensors, by IEEE Std 952 examples
+STATED_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a sensor file gives: a factor of three
 SHARPEST_WIDTH = 0.15  # of the same logarithm, however long the static recording
 STATIC_WIDTH = (0.35, 1.1)  # the same for the coarse grid of ``selection_grid``, whose steps are factors of two
 FARTHEST = 3.0  # widths of the prior beyond which the residuals alone decide
@@ -70,7 +70,7 @@ class Prior:
 
     wander: float = 0.0  # unit of the sensor; its standard deviation; 0 where nothing is known
     time: float = DEFAULT_TIME_S  # s; its correlation time
-    width: float = SHEET_WIDTH  # standard deviation of the logarithm of ``wander``
+    width: float = STATED_WIDTH  # standard deviation of the logarithm of ``wander``
     stated: Prior | None = None  # what is known beside the static recording, where ``seen`` holds what that tells
     # wanders tried, (w,), and the log likelihood of a static recording at them, (t, w), by ``TIME_FACTORS``
     seen: tuple[Values, Values] | None = None

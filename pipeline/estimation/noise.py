@@ -15,7 +15,7 @@ the noise:
    projection that removes the polynomial and R the autocovariance of the filter, ``median(|P y|^2) = white^2 tr(P R)
    (1 - 2/(9 nu))^3``, where ``nu = tr(P R)^2 / tr(P R P R)`` (Satterthwaite 1946; by the median, windows over a ramp do
    not count).
-4. ``data_sheet``: the figures of the sensor file, ``white = noise_density sqrt(1 / (2 dt))``.
+4. ``sensor_file``: the figures of the sensor file, ``white = noise_density sqrt(1 / (2 dt))``.
 
 ``white`` is that of a raw sample: the effect of a filter is removed by its exact autocovariance, from its impulse
 response. Where the recordings do not show wander, it is that of the sensor file if they allow it, else 0
@@ -52,7 +52,7 @@ from pipeline.estimation.gauss_markov import (
     DEFAULT_TIME_S,
     FARTHEST,
     SHARPEST_WIDTH,
-    SHEET_WIDTH,
+    STATED_WIDTH,
     TIME_FACTORS,
     Blocks,
     GaussMarkov,
@@ -152,7 +152,7 @@ def wander_prior(noise: Noise | None, sensor_file: Mapping[str, Any]) -> Prior:
     return Prior(
         float(np.sqrt(np.mean(noise.wander**2))),
         noise.correlation_time,
-        float(np.clip(width, SHARPEST_WIDTH, SHEET_WIDTH)),
+        float(np.clip(width, SHARPEST_WIDTH, STATED_WIDTH)),
         stated,
         (noise.likelihood.wander, log_likelihood),
     )

@@ -1,12 +1,19 @@
 """The noise of a sensor at rest, identified: the part ``noise`` of ``calibrations/<unit>.json``.
 
-For each axis, the terms of ``noise_terms`` with 95 % intervals, null with a reason and an upper limit where the
-recording does not show a term; the compositions by probability (``noise_search``); and how well the best one fits. The
-readings are those of the static recording before any filter, else those of the rests. A ramp, sinusoids and, where it
-changed, the temperature are regressed out (``noise_regression``).
+The part states for each axis
 
-That the fit holds is tested by the bins of the spectrum: the cube root of a chi-square variable over its degrees of
-freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty, PNAS 17, 1931).
+- each term of ``noise_terms`` with its 95 % interval; null with a reason and an upper limit where the recording does
+not
+  show it,
+- the sets of terms by probability (``noise_search``),
+- how well the most probable set fits.
+
+The readings are those of the static recording before any filter, else those of the rests. A ramp, sinusoids and the
+temperature, where it changed, are regressed out (``noise_regression``).
+
+A fit is in doubt where the power of its spectrum in bins of frequency departs from the model: the cube root of a
+chi-square variable over its degrees of freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty,
+PNAS 17, 1931).
 """
 
 from __future__ import annotations
@@ -41,17 +48,21 @@ if TYPE_CHECKING:
 
     JSON = dict[str, Any]
 
-FEWEST = 60  # samples, which tell white noise to a tenth
-SHORTEST = 16  # samples of a stretch
-GAP = 1.5  # intervals from which a step of time is a gap
-UNEVEN = 0.5  # rms scatter of the sampling intervals, relative, above which averages over equal times mean nothing
-ALIKE = 0.02  # by which the sampling intervals of rests may differ; those of other rates are left out
-FILLED = 10  # samples that are missing or marked in a row, up to which a straight line takes their place
-IMPLAUSIBLE = 1e-4  # probability of the bins under the fit, below which the composition is in doubt
-COARSE = 0.4  # standard deviation, in counts, below which rounding is no longer white noise (Widrow & Kollar 2008)
-SHOWN = 0.25  # longest averaging time that the Allan deviation shows with some confidence, in lengths of the recording
-PER_DECADE = 8  # averaging times
-STEP = 1.01  # of a correlation time, for a derivative
+FEWEST_SAMPLES = 60  # determine the white noise to a tenth
+SHORTEST_STRETCH = 16  # samples of a stretch
+GAP_INTERVALS = 1.5  # intervals; a longer step of time is a gap
+MOST_JITTER = 0.5  # rms scatter of the sampling intervals, relative, above which averages over equal times mean nothing
+INTERVAL_TOLERANCE = 0.02  # by which the sampling intervals of rests may differ; those of other rates are left out
+LONGEST_FILL = 10  # samples that are missing or marked in a row, up to which a straight line replaces them
+LEAST_FIT_PROBABILITY = 1e-4  # probability of the bins under the fit, below which the composition is in doubt
+COARSE_COUNTS = (
+    0.4  # standard deviation, in counts, below which rounding is no longer white noise (Widrow & Kollar 2008)
+)
+LONGEST_AVERAGE_SHARE = (
+    0.25  # longest averaging time that the Allan deviation shows with some confidence, in lengths of the recording
+)
+AVERAGES_PER_DECADE = 8  # averaging times
+DERIVATIVE_STEP = 1.01  # of a correlation time, for a derivative
 SLOW = ("bias_instability", "random_walk", "gauss_markov", "ramp", "temperature")
 STILL = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
 OF_RESTS = "no static recording: what is slower than a rest is not seen, and in rests by hand the unit moves"
@@ -88,22 +99,22 @@ def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[St
     empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
     if not known:
         return empty | {"reason": f"the recordings hold no readings of the {sensor}"}, []
-    even = [r for r in known if _scatter_of_intervals(r) <= UNEVEN]
+    even = [r for r in known if _scatter_of_intervals(r) <= MOST_JITTER]
     if not even:
-        reason = (
-            f"the sampling intervals scatter by more than {UNEVEN:.0%}: equal numbers of samples are no equal times"
-        )
-        return empty | {"reason": reason}, []
+        reason = f"the sampling intervals scatter by more than {MOST_JITTER:.0%}"
+        return empty | {"reason": f"{reason}: equal counts of samples are not equal times"}, []
     static, others = ([r for r in even if (r.role == "static") == is_static] for is_static in (True, False))
     source, chosen, stretches = "static", static, [s for r in static for s in static_stretches(sensor, r)]
-    if _samples(stretches) < FEWEST and others:
+    if _samples(stretches) < FEWEST_SAMPLES and others:
         source, chosen, stretches = "rests", others, [s for r in others for s in _rests(sensor, r)]
-    if _samples(stretches) < FEWEST:
-        reason = f"the rests hold {_samples(stretches)} evenly sampled readings; {FEWEST} are needed: record static"
+    if _samples(stretches) < FEWEST_SAMPLES:
+        reason = (
+            f"the rests hold {_samples(stretches)} evenly sampled readings; {FEWEST_SAMPLES} are needed: record static"
+        )
         return empty | {"reason": reason}, []
     rates = np.array([(s.time[-1] - s.time[0]) / (len(s.time) - 1) for s in stretches])
     interval = float(np.median(rates))
-    stretches = [s for s, rate in zip(stretches, rates, strict=True) if abs(rate / interval - 1.0) < ALIKE]
+    stretches = [s for s, rate in zip(stretches, rates, strict=True) if abs(rate / interval - 1.0) < INTERVAL_TOLERANCE]
     told = empty | {
         "source": source,
         "recordings": [r.name for r in chosen],
@@ -118,7 +129,7 @@ def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[St
 def _scatter_of_intervals(recording: Recording) -> float:
     """Return the rms scatter of the sampling intervals without gaps, relative."""
     steps = np.diff(recording.time_ns) / (1e9 * recording.interval)
-    return float(np.sqrt(np.mean((steps[steps <= GAP] - 1.0) ** 2)))
+    return float(np.sqrt(np.mean((steps[steps <= GAP_INTERVALS] - 1.0) ** 2)))
 
 
 def _samples(stretches: Sequence[Stretch]) -> int:
@@ -126,17 +137,17 @@ def _samples(stretches: Sequence[Stretch]) -> int:
 
 
 def static_stretches(sensor: str, recording: Recording) -> list[Stretch]:
-    """Return the evenly sampled stretches of a static recording; a straight line fills gaps of up to ``FILLED``."""
+    """Return the evenly sampled stretches of a static recording; straight lines fill gaps of up to ``LONGEST_FILL``."""
     values = recording.reading(sensor)
     assert values is not None  # noqa: S101
     good = np.flatnonzero(usable(recording, values))
     warm = recording.temperature
     warm = temperature_of(recording) if warm is not None and np.isfinite(warm).all() else None
     step = np.diff(recording.time[good]) / recording.interval
-    steps = np.where(step > GAP, np.rint(step), 1).astype(int)
+    steps = np.where(step > GAP_INTERVALS, np.rint(step), 1).astype(int)
     out = []
-    for index in np.split(np.arange(len(good)), np.flatnonzero(steps > FILLED) + 1):
-        if len(index) < SHORTEST:
+    for index in np.split(np.arange(len(good)), np.flatnonzero(steps > LONGEST_FILL) + 1):
+        if len(index) < SHORTEST_STRETCH:
             continue
         place = np.concatenate([[0], np.cumsum(steps[index[:-1]])])
         grid, rows = np.arange(place[-1] + 1), good[index]
@@ -147,9 +158,9 @@ def static_stretches(sensor: str, recording: Recording) -> list[Stretch]:
 
 
 def _rests(sensor: str, recording: Recording) -> list[Stretch]:
-    """Return the rests of a recording that have ``SHORTEST`` samples."""
+    """Return the rests of a recording that have ``SHORTEST_STRETCH`` samples."""
     found = rest_readings(recording, sensor, whole_recording=False)
-    return [Stretch(time, reading) for time, reading in found if len(time) >= SHORTEST]
+    return [Stretch(time, reading) for time, reading in found if len(time) >= SHORTEST_STRETCH]
 
 
 def _axes(regressions: Sequence[Regression]) -> list[JSON]:
@@ -163,8 +174,8 @@ def _axes(regressions: Sequence[Regression]) -> list[JSON]:
     best = solved(spectrum, at_once([best_of(s, r.required(), range(1, 1 + len(r.optional))) for s, r in pairs]))
     bounds = solved(spectrum, at_once([limits(spectrum, candidate) for candidate in best]))
     longest = [max(r.stretches, key=lambda s: len(s.time)).reading[:, r.column] for r in regressions]
-    tau, measured = allan_deviation(np.stack(longest, axis=1), spectrum.interval, PER_DECADE)
-    shown = tau <= SHOWN * len(longest[0]) * spectrum.interval
+    tau, measured = allan_deviation(np.stack(longest, axis=1), spectrum.interval, AVERAGES_PER_DECADE)
+    shown = tau <= LONGEST_AVERAGE_SHARE * len(longest[0]) * spectrum.interval
     return [
         _axis(r, s, candidate, bound, (tau[shown], curve[shown]))
         for (s, r), candidate, bound, curve in zip(pairs, best, bounds, measured.T, strict=True)
@@ -182,9 +193,9 @@ def _axis(
     spectrum, unit = search.spectrum, regression.unit
     p_value = _p_value(spectrum, best.fit)
     doubts = []
-    if p_value < IMPLAUSIBLE:
+    if p_value < LEAST_FIT_PROBABILITY:
         doubts.append(f"no composition fits the spectrum (p = {p_value:.1g}): a filter, vibration or a disturbance")
-    if regression.scale < COARSE * regression.count:
+    if regression.scale < COARSE_COUNTS * regression.count:
         doubts.append(f"the readings are rounded to {regression.count:.3g} {unit}, which is coarser than their noise")
     terms = _terms(spectrum, best, bounds, regression) | regression.terms(best, spectrum)
     return {
@@ -215,9 +226,9 @@ def _allan(tau: Values, measured: Values, terms: JSON, best: Candidate, spectrum
     for j in np.argsort(times, kind="stable"):
         term, by_size[j] = waiting[kinds[j]].pop(0)
         if kinds[j] == MARKOV:
-            longer = {"value": STEP * term["correlation_time_s"]["value"]}
+            longer = {"value": DERIVATIVE_STEP * term["correlation_time_s"]["value"]}
             changed = allan_variance(STOCHASTIC[MARKOV], {**term, "correlation_time_s": longer}, tau)
-            by_time[j] = (changed - by_size[j]) / np.log(STEP)
+            by_time[j] = (changed - by_size[j]) / np.log(DERIVATIVE_STEP)
     jacobian = np.concatenate([by_size, by_time]) / total
     covariance = best.fit.covariance(spectrum.count)[0]
     variance = np.maximum(np.einsum("it,ij,jt->t", jacobian, covariance, jacobian), 0.0)
@@ -296,5 +307,5 @@ def _reason(kind: int, names: Sequence[str], spectrum: Spectrum) -> str:
         return f"not seen beside {' and '.join(others)}"
     return (
         f"the recording is too short: over its {spectrum.length:.3g} s the Allan deviation falls like that of white "
-        f"noise up to averaging times of {SHOWN * spectrum.length:.3g} s"
+        f"noise up to averaging times of {LONGEST_AVERAGE_SHARE * spectrum.length:.3g} s"
     )

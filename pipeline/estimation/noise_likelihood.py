@@ -1,4 +1,4 @@
-"""The likelihood of a sum of noise terms, from the cosine transform of evenly sampled readings at rest.
+"""The likelihood of a sum of noise terms (``noise_terms``), from the cosine transform of evenly sampled rest readings.
 
 The orthonormal cosine transform (DCT-II) of n samples diagonalises the covariance of white noise plus a random walk of
 unknown start exactly, and that of the other terms up to the ends of the recording. With the coefficients y_k, k > 0,
@@ -6,11 +6,14 @@ unknown start exactly, and that of the other terms up to the ends of the recordi
     y_k = sum_d beta_d z_dk + sqrt(S(w_k)) e_k,   w_k = pi k / n,   S = sum_j exp(theta_j) s_j(w)
     -2 log L = sum_k (log S_k + (y_k - z_k beta)^2 / S_k) + log det(sum_k z_k z_k^T / S_k)
 
-where z are the transforms of what is deterministic (ramp, sinusoids, temperature), beta follows by generalised least
-squares, and the last term makes the likelihood a restricted one. The mean is k = 0 and drops out. Sums over the
-coefficients are formed once, in bins of equal ratio ``RATIO`` of frequency. Fits of all axes, compositions and columns
-run side by side, by Fisher scoring with the damping of Levenberg and Marquardt: a search is a generator that yields the
-``Trial``s it needs next and receives their ``Fits``; ``at_once`` joins the searches that do not wait for each other.
+where s_j is the spectrum of term j, exp(theta_j) its squared coefficient, e unit white noise, and z the transforms of
+what is deterministic (ramp, sinusoids, temperature). beta follows by generalised least squares, and the last term makes
+the likelihood a restricted one. k = 0 is the mean, which is left out. Sums over the coefficients are formed once, in
+bins whose edges have the ratio ``BIN_RATIO``.
+
+A *composition* is a set of terms. Fits of all axes, compositions and columns run together, by Fisher scoring with the
+damping of Levenberg and Marquardt: a search is a generator that yields the ``Trial``s it needs next and receives their
+``Fits``; ``at_once`` joins the trials of several searches.
 
 Sources: Strang, SIAM Review 41, 1999 (the transform); Whittle 1953; Patterson & Thompson, Biometrika 58, 1971.
 """
@@ -30,10 +33,10 @@ if TYPE_CHECKING:
 
     from pipeline.records import Integers, Mask, Values
 
-RATIO = 1.05  # of the edges of a bin: the spectrum of a random walk changes by a tenth, its mean by 0.2 %
+BIN_RATIO = 1.05  # of the edges of a bin: the spectrum of a random walk changes by a tenth, its mean by 0.2 %
 LONGEST_TIME = 0.5  # correlation time, in lengths of the recording, above which a process is a random walk
-STEPS = (-4.0, 1.5)  # largest changes of a logarithm in one iteration; a term that is not there falls fast
-ITERATIONS, PRECISE = 40, 1e-2  # of -2 log L, promised or gained by the last step; 3.84 is 95 %
+STEP_LIMITS = (-4.0, 1.5)  # largest changes of a logarithm in one iteration; a term that is not there falls fast
+ITERATIONS, PRECISION = 40, 1e-2  # of -2 log L, promised or gained by the last step; 3.84 is 95 %
 LARGEST_DAMPING = 1e4
 LOG_LEAST = -690.0  # of a squared coefficient: above the smallest double
 
@@ -75,7 +78,7 @@ def spectrum_of(stretches: Sequence[Values], interval: float) -> Spectrum:
     if len(stretches) > 1:
         order = np.argsort(w, kind="stable")
         w, y = w[order], y[:, order]
-    bins = np.floor(np.log(w / w[0]) / np.log(RATIO) + 1e-9)
+    bins = np.floor(np.log(w / w[0]) / np.log(BIN_RATIO) + 1e-9)
     first = np.flatnonzero(np.diff(bins, prepend=-1.0))
     count = np.diff(np.append(first, len(w))).astype(np.float64)
     parts = np.split(y, first[1:], axis=1)
@@ -269,7 +272,7 @@ def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
         own = information[:, diagonal, diagonal]
         information[:, diagonal, diagonal] += np.where(here, damping[:, None] * own + 1e-9, 1.0)
         gradient = np.where(here, gradient, 0.0)
-        step = np.clip(-np.linalg.solve(information, gradient[:, :, None])[:, :, 0], *STEPS)
+        step = np.clip(-np.linalg.solve(information, gradient[:, :, None])[:, :, 0], *STEP_LIMITS)
         tried = np.where(here, np.clip(now.parameters + step, *bounds), now.parameters)
         new = _evaluated(spectrum, now.axis, now.kinds, now.columns, tried)
         gain = now.deviance - new.deviance
@@ -280,8 +283,8 @@ def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
             now.replace(better, new.rows(better))
         damping *= np.where(better, 0.2, 8.0)
         promised = -np.sum(gradient * step, axis=1)
-        slow = better & (gain < PRECISE) & (damping < 1.0)
-        going = (promised > PRECISE) & ~slow & (damping < LARGEST_DAMPING)
+        slow = better & (gain < PRECISION) & (damping < 1.0)
+        going = (promised > PRECISION) & ~slow & (damping < LARGEST_DAMPING)
         if not going.all():
             best.replace(running[~going], now.rows(~going))
             running, now, free, damping = running[going], now.rows(going), free[going], damping[going]

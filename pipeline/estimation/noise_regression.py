@@ -1,10 +1,11 @@
-"""What is deterministic in readings at rest, regressed out beside the noise: ramp, temperature, sinusoids.
+"""Deterministic parts of readings at rest, fitted together with the noise: ramp, temperature, sinusoids.
 
     reading = c + R t + k temperature + sum_i (a_i cos(2 pi f_i t) + b_i sin(2 pi f_i t)) + noise
 
-Ramp and temperature are in the composition where they lower its criterion. A sinusoid is a line of the periodogram with
-a Hann window, ``LINE ln(n)`` times the level around it; a column with its derivative by f refines f and gives its
-uncertainty. It stays where it raises twice the log-likelihood by ``3 ln(n)``, the penalty of its three parameters.
+Ramp and temperature are part of the model where they lower its BIC (``noise_search``). A sinusoid is a line of the
+periodogram with a Hann window, whose power is ``LINE_POWER ln(n)`` times the level around it. A column with its
+derivative by f refines f and gives its uncertainty. The sinusoid is kept where it raises twice the log-likelihood by
+``3 ln(n)``, the penalty of its three parameters.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ if TYPE_CHECKING:
     from pipeline.estimation.noise_search import Candidate
     from pipeline.records import Values
 
-STEADY_DEGC = 0.1  # a temperature that changes less is no regressor: the noise of thermometers on the chip
-STRAIGHT = 0.03  # share of a temperature's change that is no ramp, below which the two are not told apart
-LINES = 5  # sinusoids
+STEADY_DEGC = 0.1  # a temperature that changes less is not a regressor: the noise of thermometers on the chip
+RAMP_TOLERANCE = 0.03  # share of a temperature's change that is no ramp, below which the two are not told apart
+MOST_SINUSOIDS = 5  # sinusoids
 # Power of a line over the level around it, in ln(n): of n independent exponential values one exceeds it with a
 # probability of 1 / sqrt(n).
-LINE = 1.5
-SLOWEST = 16  # periods in the recording: slower sinusoids look like the slow terms
-WIDTH = 1.1  # ratio of the edges of the bins over which the level is a median
+LINE_POWER = 1.5
+FEWEST_PERIODS = 16  # periods in the recording: slower sinusoids look like the slow terms
+BIN_RATIO = 1.1  # ratio of the edges of the bins over which the level is a median
 FEWEST_OF_LEVEL = 16  # values of such a bin
-NEAR = 4  # lines of the periodogram that a Hann window spreads a sinusoid over
+LINE_WIDTH = 4  # lines of the periodogram that a Hann window spreads a sinusoid over
 # Change of a frequency, in widths of a line, at which it is found, and at which its power is right to 2 %.
-SETTLED, NEARLY = 0.01, 0.1
-ROUNDS = 6  # at most
+FREQUENCY_PRECISION, POWER_PRECISION = 0.01, 0.1
+MOST_ROUNDS = 6  # at most
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Regression:
         self.middle, self.span = float(0.5 * (start + end)), float(end - start)
         self.optional = (["ramp"] + ["temperature"] * self._warms()) if single else []
         self.lines = self._found() if single else []
-        for _ in range(ROUNDS if self.lines else 0):
+        for _ in range(MOST_ROUNDS if self.lines else 0):
             spectrum = spectrum_of([self.columns(s)[None] for s in stretches], interval)
             fit = solved(spectrum, Search(spectrum, 0).run(self.required())).fit
             if self._settled(fit.beta[0], fit.beta_covariance[0]) or not self.lines:
@@ -86,7 +87,7 @@ class Regression:
         warm = np.concatenate([s.temperature for s in self.stretches if s.temperature is not None])
         time = np.concatenate([s.time for s in self.stretches]) - self.middle
         left = warm - np.polynomial.Polynomial.fit(time, warm, 1)(time)
-        return bool(np.ptp(warm) > STEADY_DEGC and np.std(left) > STRAIGHT * np.std(warm))
+        return bool(np.ptp(warm) > STEADY_DEGC and np.std(left) > RAMP_TOLERANCE * np.std(warm))
 
     def required(self) -> tuple[int, ...]:
         """Return the numbers of the sinusoids' columns."""
@@ -173,10 +174,10 @@ class Regression:
             a, b, change = beta[at : at + 3].tolist()
             shift = change / np.hypot(line.a, line.b)  # in widths of a line, 1 / span
             inner = covariance[at : at + 2, at : at + 2]
-            if abs(shift) < NEARLY and np.array([a, b]) @ np.linalg.solve(inner, [a, b]) < penalty:
+            if abs(shift) < POWER_PRECISION and np.array([a, b]) @ np.linalg.solve(inner, [a, b]) < penalty:
                 settled = False
                 continue
-            settled &= bool(abs(shift) < SETTLED)
+            settled &= bool(abs(shift) < FREQUENCY_PRECISION)
             kept.append(_Sinusoid(line.frequency + float(np.clip(shift, -0.5, 0.5)) / self.span, a, b))
         self.lines = kept
         return settled
@@ -189,15 +190,15 @@ class Regression:
         y = y - np.polynomial.Polynomial.fit(t, y, 1)(t)
         power = np.abs(np.fft.rfft(y * np.hanning(n))) ** 2
         k = np.arange(len(power))
-        usable = (k >= SLOWEST) & (k < n // 2)
+        usable = (k >= FEWEST_PERIODS) & (k < n // 2)
         if usable.sum() < 2 * FEWEST_OF_LEVEL:
             return []
         ratio = np.zeros(len(power))
         ratio[usable] = power[usable] / np.maximum(_level(power[usable]), 1e-300)
         found: list[_Sinusoid] = []
-        while len(found) < LINES and ratio.max() > LINE * np.log(n):
+        while len(found) < MOST_SINUSOIDS and ratio.max() > LINE_POWER * np.log(n):
             peak = int(np.argmax(ratio))
-            ratio[max(peak - NEAR, 0) : peak + NEAR + 1] = 0.0
+            ratio[max(peak - LINE_WIDTH, 0) : peak + LINE_WIDTH + 1] = 0.0
             frequency = float(peak / (n * self.interval))
             phase = 2.0 * np.pi * frequency * t
             a, b = (2.0 / n * float(y @ wave) for wave in (np.cos(phase), np.sin(phase)))
@@ -206,8 +207,10 @@ class Regression:
 
 
 def _level(power: Values) -> Values:
-    """Return the level around each line of a periodogram that begins at ``SLOWEST``: of bins, by their median."""
-    number = np.floor(np.log(np.arange(SLOWEST, SLOWEST + len(power)) / SLOWEST) / np.log(WIDTH)).astype(int)
+    """Return the level around each line of a periodogram from ``FEWEST_PERIODS`` on, by medians of bins."""
+    number = np.floor(
+        np.log(np.arange(FEWEST_PERIODS, FEWEST_PERIODS + len(power)) / FEWEST_PERIODS) / np.log(BIN_RATIO)
+    ).astype(int)
     ends = np.append(np.flatnonzero(np.diff(number)) + 1, len(power)).tolist()
     edges = [0]
     for end in ends:  # bins of few lines join the next

@@ -1,17 +1,17 @@
-"""Which terms make up the noise of a sensor at rest, and how large each is: for every axis by itself.
+"""Selection of the terms that make up the noise of an axis at rest, and their sizes.
 
-Compositions of the terms of ``noise_terms`` are compared by
+Compositions (sets of the terms of ``noise_terms``) are compared by
 
     BIC = -2 log L + p ln(n),    probability proportional to exp(-BIC / 2)
 
-with p parameters and n coefficients (``noise_likelihood``). From white noise alone the search adds, drops and swaps
-one term at a time until no step lowers the criterion. A term that is certainly there stays. What may be added is
-screened by its score, the derivative of the likelihood at zero, so that a recording of white noise costs one fit. A
-ramp, sinusoids and a dependence on temperature are deterministic columns beside the noise. Sinusoids are found as lines
-of a Hann-windowed periodogram.
+with p parameters and n coefficients (``noise_likelihood``). The search begins with white noise and adds, drops or swaps
+one term at a time until no step lowers the BIC. A term whose gain is certain is not dropped. Terms are added only where
+their score, the derivative of the likelihood at zero, promises a gain, so that a recording of white noise needs one
+fit. A ramp, sinusoids and a dependence on temperature are deterministic columns (``noise_regression``).
 
-Intervals are those of the profile likelihood (of a ramp and a sinusoid: of generalised least squares). Of a term that
-is not in the composition the upper limit is the coefficient at which the profile loses 1.645^2, one-sided 95 %.
+Intervals are those of the profile likelihood (of a ramp and a sinusoid: of generalised least squares). The upper limit
+of a term that is not in the composition is the coefficient at which -2 log L of the profile rises by 1.645^2: one-sided
+95 %.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     from pipeline.estimation.noise_likelihood import Spectrum, Work
     from pipeline.records import Values
 
-MOST_MARKOV = 2  # processes of different correlation times; a third is not told apart by less than some 10^6 samples
-TIMES = 10  # correlation times whose score is looked at, in equal steps of their logarithm
-STARTS = 2  # of them that are fitted
-PROMISING = 0.25  # of the penalty of a term: a score that predicts less of it is not followed
-CERTAIN = 10.0  # penalties of a term: what a term gains at least, by its spread, so that it is certainly there
-SLIGHT = 2.0  # of the gain of one parameter: its penalty is ln(n), 4 and more
+MOST_MARKOV = 2  # processes of different correlation times; to distinguish a third takes some 10^6 samples
+TIMES_TRIED = 10  # correlation times whose score is computed, in equal steps of their logarithm
+TIMES_FITTED = 2  # of them that are fitted
+LEAST_PROMISE = 0.25  # of the penalty of a term: a score that predicts less of it is not followed
+CERTAIN_GAIN = 10.0  # penalties of a term: what a term gains at least, by its spread, so that it is certainly there
+SLIGHT_GAIN = 2.0  # of the gain of one parameter: its penalty is ln(n), 4 and more
 QUANTILE, ONE_SIDED = 1.959964, 1.644854  # of the standard normal distribution: 95 % from two sides, from one
-NEAREST = 12  # compositions that are published, best first
-FARTHEST = 14.0  # change of the logarithm of a squared coefficient: a factor of 1000 in the coefficient
+MOST_PUBLISHED = 12  # compositions that are published, best first
+LARGEST_CHANGE = 14.0  # change of the logarithm of a squared coefficient: a factor of 1000 in the coefficient
 PROFILE_STEPS, PROFILE_PRECISE = 9, 0.02  # of the root of the loss: 2 % of half an interval
 
 
@@ -92,7 +92,7 @@ class Search:
     def _dispensable(self, candidate: Candidate) -> list[int]:
         """Return the terms that are not certainly there: their gain is at least ``(coefficient^2 / spread)^2``."""
         spread = np.sqrt(np.diag(candidate.fit.covariance(self.spectrum.count)[0])[: len(candidate.kinds)])
-        return np.flatnonzero(spread**-2 < CERTAIN * self.penalty).tolist()
+        return np.flatnonzero(spread**-2 < CERTAIN_GAIN * self.penalty).tolist()
 
     def _best(self, columns: tuple[int, ...]) -> Candidate:
         """Return the best composition so far beside these columns."""
@@ -117,20 +117,20 @@ class Search:
         spectrum = self.spectrum
         absent = [k for k in SINGLE if k not in candidate.kinds]
         longest = np.log(LONGEST_TIME * spectrum.length / 1.5)
-        times = np.linspace(np.log(2.0 * spectrum.interval), longest, TIMES)
+        times = np.linspace(np.log(2.0 * spectrum.interval), longest, TIMES_TRIED)
         markov = candidate.kinds.count(MARKOV) < MOST_MARKOV and longest > np.log(4.0 * spectrum.interval)
         shapes = [spectrum.shapes[absent]]
         if markov:
             shapes.append(markov_shape(spectrum.omega, spectrum.interval, times)[0])
         gain, size, _ = _scores(spectrum, candidate.fit, np.concatenate(shapes))
-        promising = gain > PROMISING * self.penalty
+        promising = gain > LEAST_PROMISE * self.penalty
         out = [_with_term(candidate, kind, size[i], 0.0) for i, kind in enumerate(absent) if promising[i]]
         if markov:
             chosen: list[int] = []
             for i in np.argsort(gain[len(absent) :])[::-1].tolist():
                 if promising[len(absent) + i] and all(abs(i - c) > 1 for c in chosen):
                     chosen.append(i)
-            out += [_with_term(candidate, MARKOV, size[len(absent) + i], times[i]) for i in chosen[:STARTS]]
+            out += [_with_term(candidate, MARKOV, size[len(absent) + i], times[i]) for i in chosen[:TIMES_FITTED]]
         return out
 
 
@@ -201,7 +201,11 @@ def _crossing(best: Candidate, trial: Trial, at: int, step: float, *, one_sided:
     ``step``: a first guess.
     """
     quantile, least = ONE_SIDED if one_sided else QUANTILE, float(best.fit.deviance[0])
-    start, sign, size = float(trial.parameters[at]), float(np.sign(step)), float(np.clip(abs(step), 1e-6, FARTHEST))
+    start, sign, size = (
+        float(trial.parameters[at]),
+        float(np.sign(step)),
+        float(np.clip(abs(step), 1e-6, LARGEST_CHANGE)),
+    )
     parameters, inner, outer = trial.parameters.copy(), 0.0, np.inf
     for _ in range(PROFILE_STEPS):
         parameters[at] = start + sign * size
@@ -209,14 +213,14 @@ def _crossing(best: Candidate, trial: Trial, at: int, step: float, *, one_sided:
         deviance = float(fits.deviance[row])
         least = min(least, deviance) if one_sided else least
         excess = float(np.sqrt(max(deviance - least, 1e-12))) / quantile
-        if abs(excess - 1.0) < PROFILE_PRECISE or (size >= FARTHEST and excess < 1.0):
+        if abs(excess - 1.0) < PROFILE_PRECISE or (size >= LARGEST_CHANGE and excess < 1.0):
             break
         inner, outer = (size, outer) if excess <= 1.0 else (inner, size)
         secant = size - np.log(excess) if one_sided else size / excess
         guess = float(np.clip(secant, 0.3 * size, 3.0 * size))
         if not inner < guess < outer:
             guess = 0.5 * (inner + outer) if np.isfinite(outer) else min(2.0 * size, size + 2.0)
-        size = min(guess, FARTHEST)
+        size = min(guess, LARGEST_CHANGE)
         parameters = fits.own(row)
     return sign * size
 
@@ -225,18 +229,18 @@ def ranked(search: Search) -> list[tuple[Candidate, float]]:
     """Return the compositions by their criterion, best first, each with its probability."""
     best = sorted(search.found.values(), key=lambda c: c.bic)
     weight = np.exp(-0.5 * (np.array([c.bic for c in best]) - best[0].bic))
-    return list(zip(best[:NEAREST], (weight / weight.sum())[:NEAREST].tolist(), strict=True))
+    return list(zip(best[:MOST_PUBLISHED], (weight / weight.sum())[:MOST_PUBLISHED].tolist(), strict=True))
 
 
 def best_of(search: Search, required: tuple[int, ...], optional: Sequence[int]) -> Work[Candidate]:
     """Return the best composition over all choices of the optional deterministic columns.
 
-    Beside white noise alone, a column is left out where it gains less than ``SLIGHT`` of -2 log L.
+    Beside white noise alone, a column is left out where it gains less than ``SLIGHT_GAIN`` of -2 log L.
     """
     best = yield from search.run(required)
     if optional and len(best.kinds) == 1:
         fit = evaluate(search.spectrum, [Trial(search.axis, best.kinds, (*required, *optional), best.parameters)])
-        optional = [c for c in optional if fit.beta[0, c - 1] ** 2 > SLIGHT * fit.beta_covariance[0, c - 1, c - 1]]
+        optional = [c for c in optional if fit.beta[0, c - 1] ** 2 > SLIGHT_GAIN * fit.beta_covariance[0, c - 1, c - 1]]
     for size in range(1, len(optional) + 1):
         for chosen in combinations(optional, size):
             other = yield from search.run((*required, *chosen), best)

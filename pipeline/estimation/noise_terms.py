@@ -1,7 +1,7 @@
-"""The terms of a noise: spectra and Allan variances, by the coefficients of IEEE Std 952.
+"""The terms of the noise of a sensor at rest: their spectra and Allan variances, with the coefficients of IEEE Std 952.
 
-With ``w = 2 pi f dt`` and ``s = 2 sin(w / 2)``, a term contributes to the variance of a sample's cosine transform, and
-to the Allan variance at the averaging time t,
+With ``w = 2 pi f dt`` and ``s = 2 sin(w / 2)``, each term adds to the variance of a coefficient of the cosine transform
+(first column) and to the Allan variance at the averaging time t (second column):
 
     quantisation Q     : Q^2 s^2 / dt^2                                   3 Q^2 / t^2
     white N            : N^2 / dt                                         N^2 / t

@@ -12,8 +12,8 @@ improves it a little.
 
 After an effect of timing or with a time constant, the model is fitted anew and all columns are rebuilt there. Selected
 effects whose own delta BIC has become negative are dropped. One that a rival replaces with delta BIC > 10 is exchanged.
-If nothing passes although the wander seems three times that of a static recording or of the data sheet, two effects may
-hide each other: then all pairs are tried once.
+If nothing passes although the wander seems three times that of a static recording or of the sensor file, two effects
+may hide each other: then all pairs are tried once.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def select(
     observations: Observations,
     configured: Sequence[str],
     noise: Noise | None,
-    sheet: Mapping[str, Any],
+    sensor_config: Mapping[str, Any],
     known: SensorCalibration | None = None,
     *,
     accelerometer: SensorCalibration | None = None,
@@ -70,7 +70,7 @@ def select(
 ) -> Selection:
     """Select effects.
 
-    ``configured``: effects that are in the model already. ``sheet``: the sensor's section of the configuration.
+    ``configured``: effects that are in the model already. ``sensor_config``: the sensor's section of the configuration.
     ``known``: its effects are starts for the configured ones. ``accelerometer``, for the gyroscope: its mountings.
     ``search``: without it, no effect is scored: base and the candidates' products alone.
     """
@@ -82,8 +82,10 @@ def select(
         prior = prior_of(this, observations, accelerometer, configured)
         candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
     ranking = _ranking(observations, base, base, candidates, settings)
-    limits = limits_of(observations.sensor, sheet)
-    found = Selection(observations, noise, sheet, start, settings, limits, candidates, base, base, ranking, ranking)
+    limits = limits_of(observations.sensor, sensor_config)
+    found = Selection(
+        observations, noise, sensor_config, start, settings, limits, candidates, base, base, ranking, ranking
+    )
     if search:
         found.run()
     return found
@@ -112,7 +114,7 @@ class Selection:
 
     observations: Observations
     noise: Noise | None
-    sheet: Mapping[str, Any]
+    sensor_config: Mapping[str, Any]
     start: Start
     settings: list[Setting]
     limits: dict[str, Values]
@@ -365,10 +367,10 @@ class Selection:
         return True
 
     def _inflated(self) -> bool:
-        """Return whether the residual's wander is far above that of a static recording or of the data sheet."""
+        """Return whether the residual's wander is far above that of a static recording or of the sensor file."""
         _, at = self.ranking.of_model([])
         white = float(np.sqrt(np.mean(self.start.scale**2)))
-        expected = float(self.sheet.get("bias_wander") or 0.0)
+        expected = float(self.sensor_config.get("bias_wander") or 0.0)
         if self.noise is not None and self.noise.source == "static":
             expected = float(np.sqrt(np.mean(self.noise.wander**2)))
         return expected > 0 and self.ranking.settings[at].ratio * white > INFLATED * expected

@@ -3,15 +3,15 @@
     U = sum over sources of U_s,    nu_eff = u^4 / sum_s (u_s^4 / nu_s),    expanded uncertainty = k(nu_eff) u
 
 The noise of the readings is of type A, as the residuals show it (``pipeline.estimation.engine``); slow errors and lack
-of fit are part of it. Its parts are told apart: white noise, the bias instability that the static recording or the data
-sheet lets expect, and lack of fit beyond both. Everything else is of type B, with infinite degrees of freedom:
+of fit are part of it. Its parts are told apart: white noise, the bias instability that the static recording or the
+sensor file lets expect, and lack of fit beyond both. Everything else is of type B, with infinite degrees of freedom:
 
     bench         : the table's stated accuracies (``pipeline.estimation.table_errors``), local gravity
     quantisation  : where white noise does not make the rounding errors of the samples independent
     temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
     repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
 
-where a is the standard uncertainty of the thermometer, R the range of temperatures recorded, c the data sheet's limits
+where a is the standard uncertainty of the thermometer, R the range of temperatures recorded, c the sensor file's limits
 of the change per degC (or the fitted effect: then without the root, and R is 0), and r standard deviations from one
 switching-on to the next. The last two depend on no method and are added after the last stage of a fit. Sources without
 a stated accuracy are named and left out.
@@ -207,11 +207,11 @@ def with_stated(
     before, budget = calibration.covariance, calibration.budget
     if before is None or budget is None:
         return calibration
-    sheet = settings["sensor"].get(calibration.sensor) or {}
-    lines, missing = _repeatability(calibration, sheet)
+    sensor_config = settings["sensor"].get(calibration.sensor) or {}
+    lines, missing = _repeatability(calibration, sensor_config)
     accuracy = settings["sensor"].get(ACCURACY)
     if accuracy is not None:
-        warm = _temperature(calibration, float(accuracy), recordings, sheet.get("effects") or {})
+        warm = _temperature(calibration, float(accuracy), recordings, sensor_config.get("effects") or {})
         if isinstance(warm, str):
             missing["temperature"] = warm
         else:
@@ -239,11 +239,11 @@ def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]
 
 
 def _repeatability(
-    calibration: SensorCalibration, sheet: Mapping[str, Any]
+    calibration: SensorCalibration, sensor_config: Mapping[str, Any]
 ) -> tuple[list[Contribution], dict[str, str]]:
     lines, lacking = [], []
     for name, unit, effect in _effects_on(calibration):
-        u = sheet.get(f"repeatability_{name}")
+        u = sensor_config.get(f"repeatability_{name}")
         if u is None:
             lacking.append(f"sensor.{calibration.sensor}.repeatability_{name}")
         elif u:
@@ -267,10 +267,10 @@ def _temperature(
         if fitted is not None:
             slope, u, how = fitted.values.reshape(3, -1)[:, 0], accuracy, f"by the fitted {fitted.name}"
         elif limit is None:
-            return f"the sensor's data sheet states no effects.{name}_temperature"
+            return f"the sensor file states no effects.{name}_temperature"
         else:
             slope, u = np.full(3, limit / np.sqrt(3.0)), float(np.hypot(accuracy, spread))
-            how = f"by the data sheet's limit of {limit:g} {unit}/degC"
+            how = f"by the sensor file's limit of {limit:g} {unit}/degC"
         kind = NORMAL if fitted is not None else RECTANGULAR
         lines.append(type_b(f"temperature ({name.replace('_', ' ')})", kind, u, "degC", effect * slope, how))
     return lines

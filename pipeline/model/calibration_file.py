@@ -12,7 +12,7 @@ where
     P : (3, 3) symmetric, ``(K K^T)^(1/2)``: scale factors on its diagonal, cross-axis sensitivities off it
     R : (3, 3) rotation, of the unit against the table or its case: no property of the sensor
 
-A parameter p with the expanded uncertainty U and the data-sheet limit L is implausible where
+A parameter p with the expanded uncertainty U and the sensor file's limit L is implausible where
 
     |p| - 2 U > max(4 L, F)
 
@@ -265,38 +265,39 @@ Entry = dict[str, Any]
 Row = tuple[str, float, float, str, float, float, str]  # name, value, uncertainty, unit, limit, floor, likely cause
 
 
-def implausible(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) -> list[Entry]:
-    """Return the fitted parameters of a sensor that are beyond its data sheet, the largest ratio first.
+def implausible(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> list[Entry]:
+    """Return the fitted parameters of a sensor that are beyond the sensor file's limits, the largest ratio first.
 
-    ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``sheet`` its part of the configuration. An entry has
-    ``parameter``, ``value``, ``unit``, ``limit`` of the data sheet, ``ratio`` of the two and ``likely_cause``.
+    ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``sensor_config`` its part of the configuration. An
+    entry has ``parameter``, ``value``, ``unit``, ``limit`` of the sensor file, ``ratio`` of the two and
+    ``likely_cause``.
     """
     entries = [
         {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit,
          "likely_cause": cause}
         for name, value, uncertainty, unit, limit, floor, cause in (
-            *_of_bias_and_matrix(sensor, part, sheet), *_of_effects(sensor, part, sheet["effects"])
+            *_of_bias_and_matrix(sensor, part, sensor_config), *_of_effects(sensor, part, sensor_config["effects"])
         )
         if abs(value) - 2.0 * uncertainty > max(MULTIPLE * limit, floor)
     ]  # fmt: skip
     return sorted(entries, key=lambda entry: -entry["ratio"])
 
 
-def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) -> Iterator[Row]:
+def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> Iterator[Row]:
     """Yield the rows of biases, scale factors and cross-axis sensitivities."""
     K = np.linalg.inv(np.array(part["matrix"], float))
     squares, axes = np.linalg.eigh(K @ K.T)
     P = (axes * np.sqrt(squares)) @ axes.T
     spread = part["expanded_uncertainty"]
     of_matrix = np.abs(K) @ np.array(spread["matrix"], float) @ np.abs(K)  # dK = -K dM K
-    floor, unit = LOW_COST_BIAS[sensor] * sheet["full_scale"], SENSOR_UNITS[sensor]
+    floor, unit = LOW_COST_BIAS[sensor] * sensor_config["full_scale"], SENSOR_UNITS[sensor]
     for a, value, uncertainty in zip(AXES, part["bias"], spread["bias"], strict=True):
-        yield f"bias_{a}", float(value), float(uncertainty), unit, sheet["bias"], floor, OF_BIAS
-    scale, limit = _scale_cause(sensor, np.diag(P)), sheet["scale_factor"]
+        yield f"bias_{a}", float(value), float(uncertainty), unit, sensor_config["bias"], floor, OF_BIAS
+    scale, limit = _scale_cause(sensor, np.diag(P)), sensor_config["scale_factor"]
     for i, a in enumerate(AXES):
         yield f"scale_factor_{a}", float(P[i, i] - 1.0), float(of_matrix[i, i]), "1", limit, LOW_COST_SCALE, scale
     for i, j in ((0, 1), (0, 2), (1, 2)):
-        name, limit = f"cross_axis_{AXES[i]}{AXES[j]}", sheet["cross_axis"]
+        name, limit = f"cross_axis_{AXES[i]}{AXES[j]}", sensor_config["cross_axis"]
         yield name, float(P[i, j]), float(of_matrix[i, j]), "1", limit, LOW_COST_CROSS, OF_CROSS_AXIS
 
 
@@ -341,7 +342,7 @@ def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
         unit = "" if worst["unit"] == "1" else f" {worst['unit']}"
         found.append(
             f"Implausible for this model of {sensor}: {names}; {worst['parameter']} is {worst['value']:+.4g}{unit}, "
-            f"{worst['ratio']:.3g} times the data sheet's limit of {worst['limit']:.4g}{unit}. Likely cause: {cause}. "
+            f"{worst['ratio']:.3g} times the sensor file's limit of {worst['limit']:.4g}{unit}. Likely cause: {cause}. "
             f"Where it is meant so: sensor.{sensor}.accept_implausible=true."
         )
     return found

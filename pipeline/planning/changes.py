@@ -240,7 +240,7 @@ Columns of a canonical CSV: {columns}, and optionally {optional}. Other columns,
 pipeline check FILE` proposes an ingest profile.
 """
 PLANNED = """\
-By the noise of the data sheet, for half of the units. `python -m pipeline plan {options}` also names the additional
+By the noise of the sensor file, for half of the units. `python -m pipeline plan {options}` also names the additional
 recordings that help most.
 """
 

@@ -10,13 +10,13 @@ signal of size a, given the base, and that of noise alone, ``T_t = s^-2 tr(C_t^-
     log L_t(a) = -N/2 log [(T_t + a^2 lambda_t) / N] - penalty_t,    g(a) = 2 [max_t log L_t(0) - max_t log L_t(a)]
     P(found) = P(chi^2_k(g) > max(k log N + 10, quantile of chi^2_k at 1 - 0.01/m))
 
-so that a wander which can explain the effect takes it (C: covariance of the noise by the data sheet, C_t that of
+so that a wander which can explain the effect takes it (C: covariance of the noise by the sensor file, C_t that of
 setting t, s the white noise). The difference of two BICs is normal with mean ``g_i - (k - k_i) (log N - 1)`` and
 variance ``4 g_i``, g_i the gain over the look-alike.
 
 Rests and moves (``RestLimits``), whose equations are few and whose noise is not known beforehand. Draws of
 
-    r = a Z d + C^1/2 w,    w standard normal, C the covariance by the data sheet, and a unit that rests firmly
+    r = a Z d + C^1/2 w,    w standard normal, C the covariance by the sensor file, and a unit that rests firmly
 
 go with signs d through the likelihoods of the selection, at any size a without a new simulation, as all sums of squares
 are polynomials in a.

@@ -8,7 +8,7 @@ where
 
     J_i : (9,) derivative of the length of gravity at rest i (``derivative_of``)
     s_i : g; standard deviation of that length: white noise of the mean, and the scatter between rests
-    P   : precision by the data sheet's limits, taken for two standard deviations; F is regular by it from the start
+    P   : precision by the sensor file's limits, taken for two standard deviations; F is regular by it from the start
     g_p : variance of the fit over ``(F^-1)_pp``: bias wander, and a scatter that a few rests show only roughly; 1
           before there is a fit
     k_p : coverage factor, with one more degree of freedom for each further rest
@@ -149,10 +149,10 @@ def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dw
         values = np.concatenate([fitted.bias, fitted.matrix.ravel()])[PLACE]
         reason = _open(fitted)
         scatter = 0.0 if reason else float(fitted.stages[-1].details["scatter_between_rests"])
-    sheet, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
-    rests, white = orientations.rests, _white_of_rest(orientations, sheet, dwell)
+    sensor_config, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
+    rests, white = orientations.rests, _white_of_rest(orientations, sensor_config, dwell)
     error = float(np.hypot(white, scatter))
-    F = _precision(sheet, gravity)
+    F = _precision(sensor_config, gravity)
     if len(rests.time):
         J = derivative_of(rests.reading, values)
         F = F + (J / (np.mean(orientations.white**2) * rests.share + scatter**2)[:, None]).T @ J
@@ -203,20 +203,20 @@ def _open(fitted: SensorCalibration) -> str:
     return f"{count} orientations determine nine parameters without a check" if count <= FEWEST else ""
 
 
-def _white_of_rest(orientations: Orientations, sheet: Mapping[str, Any], dwell: float) -> float:
+def _white_of_rest(orientations: Orientations, sensor_config: Mapping[str, Any], dwell: float) -> float:
     """Return the standard deviation by white noise of the mean of a rest to come, an axis, g."""
     white = float(np.sqrt(np.mean(orientations.white**2)))
     if white > 0.0:
         (recording, _), *_ = orientations.used
         return white / float(np.sqrt(max((dwell - WINDOW_S) / recording.interval, 1.0)))
-    return float(sheet["noise_density"]) / float(np.sqrt(2.0 * dwell))
+    return float(sensor_config["noise_density"]) / float(np.sqrt(2.0 * dwell))
 
 
-def _precision(sheet: Mapping[str, Any], gravity: float) -> Values:
+def _precision(sensor_config: Mapping[str, Any], gravity: float) -> Values:
     """Return P: (9, 9) array."""
-    limits = {True: float(sheet["scale_factor"]), False: float(sheet["cross_axis"])}
+    limits = {True: float(sensor_config["scale_factor"]), False: float(sensor_config["cross_axis"])}
     matrix = [limits[bool(i == j)] for i, j in zip(ROWS, COLUMNS, strict=True)]
-    return np.diag(np.square(2.0 / np.array([float(sheet["bias"]) / gravity] * 3 + matrix)))
+    return np.diag(np.square(2.0 / np.array([float(sensor_config["bias"]) / gravity] * 3 + matrix)))
 
 
 def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Values:

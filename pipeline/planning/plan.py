@@ -25,9 +25,9 @@ from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
-from pipeline.model.data_sheet import assumed_figures
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
+from pipeline.model.sensor_file import assumed_figures
 from pipeline.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
 from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
 from pipeline.report.numbers import aligned
@@ -98,11 +98,11 @@ def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = F
 
 def _limits(sensor: str, simulated: SimulatedProcedure) -> tuple[DetectionLimits, dict[str, str]]:
     """Return what a selection is expected to find, and the effects that it cannot find, each with the reason."""
-    noise, sheet = simulated.noise[sensor], simulated.sheets[sensor]
+    noise, sensor_config = simulated.noise[sensor], simulated.sensor_configs[sensor]
     if is_multi_position(sensor, simulated.recordings):
         selected = select_by_hand(sensor, simulated)
         return RestLimits(selected, noise), not_observable_by_hand(selected, [])
-    selection = select(observe(sensor, simulated.recordings, simulated.table), [], noise, sheet, search=False)
+    selection = select(observe(sensor, simulated.recordings, simulated.table), [], noise, sensor_config, search=False)
     return TurntableLimits(selection, noise), not_observable(selection, [])
 
 
@@ -111,14 +111,14 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Select
 
     Raises ``NotObservableError`` if bias and matrix cannot be determined, or there are no rests.
     """
-    sections = {"sensor": simulated.sheets, "table": simulated.table, "procedure": simulated.procedure}
+    sections = {"sensor": simulated.sensor_configs, "table": simulated.table, "procedure": simulated.procedure}
     settings: dict[str, Any] = {**sections, "effects": {"accelerometer": [], "gyroscope": []}}
     start = nonlinear_least_squares.fit(simulated.recordings, None, settings)
     other = None
     if sensor == "gyroscope":
         start, other = SensorCalibration(sensor), start
     model = require_model(simulated.recordings, start, simulated.noise[sensor], settings, other)
-    return by_hand.Selection(model, start, [], simulated.noise[sensor], simulated.sheets[sensor])
+    return by_hand.Selection(model, start, [], simulated.noise[sensor], simulated.sensor_configs[sensor])
 
 
 def _entry(sensor: str, found: Detection, *, limited: bool) -> Document:
@@ -150,10 +150,10 @@ def _faint(sensor: str, found: Detection) -> str:
 
 @dataclass(frozen=True)
 class SimulatedProcedure:
-    """What a procedure would record with a faultless sensor and table, the configurations, and the sheets' noise."""
+    """What a procedure would record with a faultless sensor and table, the configurations, and their noise."""
 
     recordings: list[Recording]
-    sheets: Mapping[str, Any]
+    sensor_configs: Mapping[str, Any]
     table: Mapping[str, Any]
     procedure: Mapping[str, Any]
     noise: dict[str, Noise]
@@ -169,32 +169,40 @@ def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> 
         unit, effects={}, imperfections=FAULTLESS, held_out={}, temperature={**ROOM, **unit.temperature}
     )
     recordings, _ = simulate_unit(faultless, SEED, 0, extra)
-    sheets, table = read_config("sensor", unit.sensor), read_config("table", unit.table)
+    sensor_configs, table = read_config("sensor", unit.sensor), read_config("table", unit.table)
     long_rest = any(recording.role == "static" for recording in recordings)
-    noise = {s: noise_of_sheet(sheets[s], unit.interval_s, long_rest=long_rest) for s in ("accelerometer", "gyroscope")}
+    noise = {
+        s: stated_noise(sensor_configs[s], unit.interval_s, long_rest=long_rest) for s in ("accelerometer", "gyroscope")
+    }
     minutes = max(float(r.time[-1]) for r in recordings) / 60.0
-    return SimulatedProcedure(recordings, sheets, table, read_config("procedure", unit.procedure), noise, minutes)
+    return SimulatedProcedure(
+        recordings, sensor_configs, table, read_config("procedure", unit.procedure), noise, minutes
+    )
 
 
-def noise_of_sheet(sheet: Mapping[str, Any], interval: float, *, long_rest: bool) -> Noise:
-    """Return the noise of a sensor by its data sheet.
+def stated_noise(sensor_config: Mapping[str, Any], interval: float, *, long_rest: bool) -> Noise:
+    """Return the noise of a sensor by the sensor file.
 
         white^2 = noise_density^2 / (2 dt) + (1 / counts_per_unit)^2 / 12
 
     with the sampling interval dt in s, the one-sided density in unit/sqrt(Hz), and the quantisation. ``long_rest``: the
     noise will be estimated from a long rest.
     """
-    variance = sheet["noise_density"] ** 2 * 0.5 / interval + 1.0 / (12.0 * sheet["counts_per_unit"] ** 2)
-    wander = float(sheet.get("bias_wander") or 0.0)
+    variance = sensor_config["noise_density"] ** 2 * 0.5 / interval + 1.0 / (
+        12.0 * sensor_config["counts_per_unit"] ** 2
+    )
+    wander = float(sensor_config.get("bias_wander") or 0.0)
     source = "static" if long_rest else "rests"
-    return Noise(np.full(3, np.sqrt(variance)), np.full(3, wander), float(sheet.get("wander_time_s") or 100.0), source)
+    return Noise(
+        np.full(3, np.sqrt(variance)), np.full(3, wander), float(sensor_config.get("wander_time_s") or 100.0), source
+    )
 
 
 def _warnings(simulated: SimulatedProcedure, sensor: str) -> list[str]:
     """Return what sensor or table cannot do of the procedure, and figures that are assumed, as sentences."""
-    full = float(simulated.sheets["gyroscope"]["full_scale"])
+    full = float(simulated.sensor_configs["gyroscope"]["full_scale"])
     rates = [float(np.abs(r.table_rate).max()) for r in simulated.recordings if r.table_rate is not None]
-    fastest, assumed = max(rates, default=0.0), assumed_figures(sensor, simulated.sheets)
+    fastest, assumed = max(rates, default=0.0), assumed_figures(sensor, simulated.sensor_configs)
     found = [assumed] if assumed else []
     if fastest > full:
         found.append(f"the fastest turn, {fastest:g} deg/s, is beyond the gyroscope's full scale of {full:g} deg/s")

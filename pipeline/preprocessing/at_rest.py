@@ -9,7 +9,7 @@ A static recording determines the noise of all results, so it must be at rest. I
     the table's log turns by 0.02 deg/s or more
 
 The usual scatter is the first quartile of the blocks', and no more than twice that of the table's rests in the unit's
-other recordings, or four times the data sheet's white noise where there are none. Slow changes by the data sheet's
+other recordings, or four times the sensor file's white noise where there are none. Slow changes by the sensor file's
 limits: six standard deviations of ``bias_wander``, ``bias_drift`` over the recording, ``bias_temperature`` times the
 range of the temperature, ``warm_up``; and 6 times the usual scatter, as if all noise of a block had a memory.
 
@@ -19,7 +19,7 @@ quietest tenth of a recording by hand. It gets the note ``N-REFERENCE`` where
     its scatter is more than twice theirs on an axis,
     its white noise, by successive differences, is less than half of theirs on all axes, or
     its gyroscope's mean is outside the range of the table's rests by more than 6 standard deviations of a rest's mean,
-        Earth's rate and the data sheet's limits of a bias that changes: the slow changes above, ``g_sensitivity`` and
+        Earth's rate and the sensor file's limits of a bias that changes: the slow changes above, ``g_sensitivity`` and
         ``g_squared_sensitivity``, as the unit may lie in another attitude.
 
 Its noise and bias are then not those of the others: it may be of another unit. White noise grows with the square root
@@ -72,14 +72,18 @@ def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -
     """
     if all(r.role != "static" for r in recordings):
         return list(recordings)
-    sheets, rests = settings.get("sensor") or {}, _rests_of(recordings)
+    sensor_configs, rests = settings.get("sensor") or {}, _rests_of(recordings)
     return [
-        _doubted(_resting(r, rests, sheets), recordings, rests, sheets) if r.role == "static" else r for r in recordings
+        _doubted(_resting(r, rests, sensor_configs), recordings, rests, sensor_configs) if r.role == "static" else r
+        for r in recordings
     ]
 
 
 def _doubted(
-    recording: Recording, recordings: Sequence[Recording], rests_of: Mapping[str, Values], sheets: Mapping[str, Any]
+    recording: Recording,
+    recordings: Sequence[Recording],
+    rests_of: Mapping[str, Values],
+    sensor_configs: Mapping[str, Any],
 ) -> Recording:
     """Return a static recording, with the note ``N-REFERENCE`` where it contradicts the rests of the others."""
     others = [r for r in recordings if r.role != "static" and r.samples > 1]
@@ -108,16 +112,16 @@ def _doubted(
                 f"the {sensor} has at most {1.0 / quieter:.2g} times the white noise of the rests of the other "
                 "recordings: if the recording is of another unit, the noise of this one is underestimated"
             )
-        sheet = sheets.get(sensor)
-        if sensor == "gyroscope" and sheet:
+        sensor_config = sensor_configs.get(sensor)
+        if sensor == "gyroscope" and sensor_config:
             means = rests[:, 2]
             away = float(np.max([means.min(axis=0) - own[2], own[2] - means.max(axis=0)]))
             noise = SIGNIFICANT * float(usual[0].max()) / np.sqrt(FEWEST_OF_REST)
-            most = noise + _bias_change([recording, *others], sheet)
+            most = noise + _bias_change([recording, *others], sensor_config)
             if away > most:
                 details.append(
-                    f"the {sensor} reads {away:.3g} deg/s beyond all rests of the other recordings, where the data "
-                    f"sheet allows {most:.3g}: is the static recording of this unit?"
+                    f"the {sensor} reads {away:.3g} deg/s beyond all rests of the other recordings, where the sensor "
+                    f"file allows {most:.3g}: is the static recording of this unit?"
                 )
     notes = [Note("N-REFERENCE", recording.samples, 0, 0, detail) for detail in details]
     return replace(recording, notes=(*recording.notes, *notes))
@@ -129,16 +133,16 @@ def _digit(reading: Values) -> Values:
     return np.asarray(np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
 
 
-def _bias_change(recordings: Sequence[Recording], sheet: Mapping[str, Any]) -> float:
+def _bias_change(recordings: Sequence[Recording], sensor_config: Mapping[str, Any]) -> float:
     """Return by how much the gyroscope's reading at rest can change between recordings, deg/s."""
-    effects = sheet.get("effects") or {}
+    effects = sensor_config.get("effects") or {}
     attitude = 2.0 * float(effects.get("g_sensitivity") or 0.0) + float(effects.get("g_squared_sensitivity") or 0.0)
     warmth = [r.temperature for r in recordings]
     known = [t for t in warmth if t is not None]
     change = float(np.ptp(np.concatenate(known))) if len(known) == len(warmth) else UNKNOWN_DEGC
     duration = max(r.time[-1] for r in recordings) - min(r.time[0] for r in recordings)
     duration = max(float(duration), sum(float(r.time[-1] - r.time[0]) for r in recordings))
-    return attitude + 2.0 * EARTH_RATE_DPS + _slow(sheet, change, duration)
+    return attitude + 2.0 * EARTH_RATE_DPS + _slow(sensor_config, change, duration)
 
 
 def _blocks(recording: Recording, values: Values) -> Values:
@@ -148,7 +152,7 @@ def _blocks(recording: Recording, values: Values) -> Values:
     return values[: count * size].reshape(count, size, *values.shape[1:])
 
 
-def _resting(recording: Recording, rests_of: Mapping[str, Values], sheets: Mapping[str, Any]) -> Recording:
+def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_configs: Mapping[str, Any]) -> Recording:
     if recording.samples < 2 * FEWEST_OF_BLOCK:
         return recording
     count, size = _blocks(recording, recording.time).shape
@@ -164,7 +168,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sheets: Mappi
         if reading is None:
             continue
         blocks = _blocks(recording, reading)
-        found, what = _moving(recording, sensor, blocks, sheets.get(sensor) or {}, rests_of[sensor])
+        found, what = _moving(recording, sensor, blocks, sensor_configs.get(sensor) or {}, rests_of[sensor])
         why = why or (what if found.any() else "")
         moving |= found
     if not moving.any():
@@ -190,7 +194,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sheets: Mappi
 
 
 def _moving(
-    recording: Recording, sensor: str, blocks: Values, sheet: Mapping[str, Any], rests: Values
+    recording: Recording, sensor: str, blocks: Values, sensor_config: Mapping[str, Any], rests: Values
 ) -> tuple[Mask, str]:
     """Return which blocks a sensor moves in, and the largest sign of it in words."""
     unit = SENSOR_UNITS[sensor]
@@ -199,7 +203,7 @@ def _moving(
     tiny = np.finfo(float).tiny
     spread = np.minimum(np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE, WIDEST)
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
-    white = float(sheet.get("noise_density") or 0.0) * np.sqrt(0.5 / recording.interval)
+    white = float(sensor_config.get("noise_density") or 0.0) * np.sqrt(0.5 / recording.interval)
     if len(rests):
         usual = np.minimum(usual, OF_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
     elif white:
@@ -208,7 +212,7 @@ def _moving(
     loud = scatter / usual
     away = np.abs(means - median(means))
     change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
-    allowed = _slow(sheet, change, float(recording.time[-1] - recording.time[0])) + SIGNIFICANT * usual
+    allowed = _slow(sensor_config, change, float(recording.time[-1] - recording.time[0])) + SIGNIFICANT * usual
     moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)
     if np.any(loud > louder):
         return moving, f"the {sensor} scatters {loud.max():.3g} times as usual"
@@ -218,11 +222,11 @@ def _moving(
     )
 
 
-def _slow(sheet: Mapping[str, Any], change: float, duration: float) -> float:
+def _slow(sensor_config: Mapping[str, Any], change: float, duration: float) -> float:
     """Return by how much a bias can change at rest, for a change of temperature (degC) and a duration (s)."""
-    effects = sheet.get("effects") or {}
+    effects = sensor_config.get("effects") or {}
     return (
-        SIGNIFICANT * float(sheet.get("bias_wander") or 0.0)
+        SIGNIFICANT * float(sensor_config.get("bias_wander") or 0.0)
         + float(effects.get("bias_drift") or 0.0) * duration
         + float(effects.get("bias_temperature") or 0.0) * change
         + float(effects.get("warm_up") or 0.0)

@@ -42,7 +42,7 @@ class Limits:
     rate_stated: float  # relative: three times the stated standard uncertainty of the table's rate
     angle_deg: float
     angle_stated_deg: float
-    gain: float  # relative, of a gyroscope by its data sheet
+    gain: float  # relative, of a gyroscope by its sensor file
     offset_dps: float  # what gravity adds to the gyroscope's reading
     columns: Mapping[str, Any]  # ingest.csv.columns
 

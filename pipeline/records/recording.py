@@ -183,7 +183,7 @@ class Noise:
 
     ``source``, ``wander_source``, ``time_source`` are those of the white noise, the wander and its correlation time:
     ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in turns
-    about a local polynomial) or ``data_sheet`` (the sensor file). ``length``, s, is that of the static rest, else 0;
+    about a local polynomial) or ``sensor_file`` (the sensor file). ``length``, s, is that of the static rest, else 0;
     the relative uncertainty of its wander is about ``sqrt(correlation_time / length)``. ``likelihood``: None where no
     static recording determines it.
     """

@@ -1,8 +1,8 @@
 """The page of a campaign: failures first, then every unit, the fleet in charts, comparisons and statistics.
 
-Strip plots show fitted parameters, each unit a dot, as a share of its data sheet's limit, ``value / limit``, beside its
-siblings: units of one sensor model that were calibrated by one method. A row is a parameter of the measurement: bias,
-error of a scale factor, or what one axis reads of another.
+Strip plots show fitted parameters, each unit a dot, as a share of the sensor file's limit, ``value / limit``, beside
+its siblings: units of one sensor model that were calibrated by one method. A row is a parameter of the measurement:
+bias, error of a scale factor, or what one axis reads of another.
 """
 
 from __future__ import annotations
@@ -279,16 +279,16 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, placed: Tabl
     farthest = f"{units[numbers[worst]]}, {labels[column].lower()} ({percent(float(abs(share[worst, column])))})"
     count = int(beyond.any(axis=1).sum())
     said = f"{count} of {len(numbers)} units are beyond" if count else f"all {len(numbers)} units are within"
-    caption = "Each unit a dot, as a share of its data sheet's limit; shaded: within the limit."
+    caption = "Each unit a dot, as a share of the sensor file's limit; shaded: within the limit."
     if many:
         caption += f" Grey bars: 5 to 95 % of the units; dots: the {ENDS} smallest and largest."
     if np.nanmax(np.abs(share)) > EDGE:
         caption += f" Shares above {percent(EDGE)} stand at the edge."
-    figure = Figure(name, f"{title}: {said} the data sheet; farthest: {farthest}", caption, tuple(legend))
+    figure = Figure(name, f"{title}: {said} the sensor file's limits; farthest: {farthest}", caption, tuple(legend))
     medians = zip(labels, np.nanmedian(share, axis=0), strict=True)
     description = "Median share of the limit. " + "; ".join(f"{k}: {percent(float(m))}" for k, m in medians)
     panel = Panel([*layers, *dots], "", ROW * len(labels), limits=(0.4, at[0] + 0.6), rows=labels[::-1])
-    label = "share of the data sheet's limit, %"
+    label = "share of the sensor file's limit, %"
     return chart(figure, description, [panel], label, margin=0.03, left=LEFT, units="units"), values
 
 

@@ -49,17 +49,17 @@ def evidence_figures(sensor: str, found: JSON) -> list[Figure]:
     return first + unexplained(sensor, found)
 
 
-def limit_rows(sensor: str, found: JSON, sheet: JSON) -> list[JSON]:
-    """Return for each effect that was not selected its upper limits as text, and the largest share of the data sheet's.
+def limit_rows(sensor: str, found: JSON, sensor_config: JSON) -> list[JSON]:
+    """Return for each effect that was not selected its upper limits as text, and its share of the sensor file's limit.
 
-    ``share`` is None where the data sheet has no limit; the largest come first.
+    ``share`` is None where the sensor file has no limit; the largest come first.
     """
     rows = []
     for name, limits in (found.get("upper_limit") or {}).items():
         this = catalogue().get(name)
         stated: dict[str, float] = {}
         if this is not None:
-            values = parameter_limits(this, sensor, sheet.get("effects") or {}).tolist()
+            values = parameter_limits(this, sensor, sensor_config.get("effects") or {}).tolist()
             stated = dict(zip((p.name for p in this.parameters(sensor)), values, strict=True))
         text = ", ".join(f"{number(v, 2)} {unit_text(unit)}".rstrip() for unit, v in largest_by_unit(limits).items())
         shares = {key: v["value"] / stated[key] for key, v in limits.items() if np.isfinite(stated.get(key, np.inf))}
@@ -72,21 +72,21 @@ def limit_rows(sensor: str, found: JSON, sheet: JSON) -> list[JSON]:
 
 
 def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
-    """Draw upper limits as shares of the data sheet's limits; None where there is none."""
+    """Draw upper limits as shares of the sensor file's limits; None where there is none."""
     shown = [row for row in rows if row["share"]]
     if not shown:
         return None
     count, beyond = len(shown), sum(row["share"] >= 1.0 for row in shown)
-    finding = f"{count - beyond} of {count} effects that were not selected are excluded at the data sheet's limit"
+    finding = f"{count - beyond} of {count} effects that were not selected are excluded at the sensor file's limit"
     caption = (
-        "Upper limits (95 %) of the largest parameter of each effect, were it there, over the data sheet's limit: left "
-        "of the line the recordings exclude an effect of that size."
+        "Upper limits (95 %) of the largest parameter of each effect, were it there, over the sensor file's limit: "
+        "left of the line the recordings exclude an effect of that size."
     )
     if rest := count - MOST_LIMITS:
         caption += f" {rest} more are lower, listed below." if rest > 0 else ""
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
     figure = Figure(f"{sensor}-limits", finding, caption)
-    return bars(figure, points, "upper limit over the data sheet's limit", levels={"limit of the data sheet": 1.0})
+    return bars(figure, points, "upper limit over the sensor file's limit", levels={"limit of the sensor file": 1.0})
 
 
 def ranking_rows(found: JSON) -> list[JSON]:
@@ -138,7 +138,7 @@ def _evidence(entry: JSON) -> float:
 def _ranking_row(entry: JSON, selected: Sequence[str]) -> Point:
     value, alike = _evidence(entry), entry.get("look_alikes") or []
     colour = 2 if entry["effect"] in selected else 4 if value > GATE else 3
-    beyond = " (beyond the data sheet)" if value > GATE and not entry.get("plausible", True) else ""
+    beyond = " (beyond the sensor file's limits)" if value > GATE and not entry.get("plausible", True) else ""
     note = "like " + ", ".join(f"{plain(a['effect'])} {percent(a['share'])}" for a in alike) if alike else ""
     return Point(plain(entry["effect"]) + beyond, value, colour, note=note)
 

@@ -84,10 +84,10 @@ def fleet_statistics(rows: Sequence[JSON], fitted: Table) -> JSON:
 
     ``rows``: one a unit, as of ``summary_row``; ``fitted``: of ``unit_parameters``, none of units that failed.
     """
-    sheet = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).set_index("unit").replace("", None)
+    units = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).set_index("unit").replace("", None)
     out: JSON = {key: [] for key in (*STATISTICS, "repeatability")}
-    known = fitted.frames[0].loc[sheet.index].notna().any(axis="columns").to_numpy(bool)
-    for (model, method), siblings in sheet[known].groupby(SIBLINGS, sort=False):
+    known = fitted.frames[0].loc[units.index].notna().any(axis="columns").to_numpy(bool)
+    for (model, method), siblings in units[known].groupby(SIBLINGS, sort=False):
         values, *stated = fitted.some(list(siblings.index))
         statistics = {key: statistic(values, siblings) for key, statistic in STATISTICS.items()}
         statistics["repeatability"] = _repeatability(values, siblings, *stated)

@@ -1,4 +1,4 @@
-"""Noise at rest: Allan deviation of each axis, the terms identified in it with their 95 % band, and the data sheet.
+"""Noise at rest: Allan deviation of each axis, the terms identified in it with their 95 % band, and the sensor file.
 
 The terms and their conventions are those of ``pipeline.estimation.noise_terms``; the white noise of a data sheet is
 one-sided, ``N = noise_density / sqrt(2)``. Source: IEEE Std 952-1997, annex C.
@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
 from pipeline.estimation.noise_terms import UNITS, allan_variance, each_term
-from pipeline.model.data_sheet import as_stated
+from pipeline.model.sensor_file import as_stated
 from pipeline.records import AXES, SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, chart
 from pipeline.report.numbers import number, percent, plain
@@ -26,16 +26,16 @@ SURE = 0.9  # probability above which other compositions are not worth a sentenc
 SYMBOLS = dict(zip(UNITS, "QNBKGRA", strict=True))
 
 
-def allan(sensor: str, noise: JSON | None, sheet: JSON, wander: JSON | None) -> Figure | None:
+def allan(sensor: str, noise: JSON | None, sensor_config: JSON, wander: JSON | None) -> Figure | None:
     """Draw the Allan deviation of each axis; None where no noise was identified.
 
-    ``noise``: the sensor's part of ``noise`` in its calibration; ``sheet``: the sensor's section of the configuration;
-    ``wander``: that which the fit of the diagnosis needed.
+    ``noise``: the sensor's part of ``noise`` in its calibration; ``sensor_config``: the sensor's section of the
+    configuration; ``wander``: that which the fit of the diagnosis needed.
     """
     axes = {a: part for a, part in ((noise or {}).get("axes") or {}).items() if part["terms"]}
     if not noise or not axes:
         return None
-    unit, layers, sheet = SENSOR_UNITS[sensor], list[Layer](), as_stated(sheet)
+    unit, layers, sensor_config = SENSOR_UNITS[sensor], list[Layer](), as_stated(sensor_config)
     for axis, part in axes.items():
         curve, colour = {k: np.array(v) for k, v in part["allan"].items()}, AXES.index(axis)
         layers += [
@@ -44,16 +44,19 @@ def allan(sensor: str, noise: JSON | None, sheet: JSON, wander: JSON | None) -> 
             Dots(curve["tau_s"], curve["deviation"], colour),
         ]
     legend, tau = list(AXES_LEGEND), np.array(next(iter(axes.values()))["allan"]["tau_s"])
-    if sheet.get("noise_density"):
-        legend.append(("c3", "data sheet"))
-        layers.append(Line(tau, _of_sheet(sheet, tau), 3, "dashed"))
+    if sensor_config.get("noise_density"):
+        legend.append(("c3", "sensor file"))
+        layers.append(Line(tau, _stated_deviation(sensor_config, tau), 3, "dashed"))
     mean = np.mean([part["allan"]["deviation"] for part in axes.values()], axis=0)
     told = ", ".join(f"{number(float(mean[k]))} {unit} at {number(float(tau[k]))} s" for k in (0, len(tau) // 2, -1))
     where = f"{', '.join(noise['recordings'][:3])}, {number(noise['length_s'])} s at rest, before any filter"
     caption = f"{where}: dots, measured; lines, the sum of the terms with its 95 % band."
     return chart(
         Figure(
-            f"{sensor}-allan", _finding(axes, sheet, unit), " ".join([caption, *_needed(wander, unit)]), tuple(legend)
+            f"{sensor}-allan",
+            _finding(axes, sensor_config, unit),
+            " ".join([caption, *_needed(wander, unit)]),
+            tuple(legend),
         ),
         f"Allan deviation, mean of the axes: {told}.",
         [Panel(layers, f"Allan deviation, {unit}", 190, logarithmic=True)],
@@ -139,15 +142,17 @@ def _text(part: JSON | None) -> str:
     return text
 
 
-def _of_sheet(sheet: JSON, tau: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    variance = allan_variance("white", {"value": float(sheet["noise_density"]) / np.sqrt(2.0)}, tau)
-    time = {"value": float(sheet.get("wander_time_s") or DEFAULT_TIME_S)}
-    wander = {"value": float(sheet.get("bias_wander") or 0.0), "correlation_time_s": time}
+def _stated_deviation(
+    sensor_config: JSON, tau: np.ndarray[Any, np.dtype[np.float64]]
+) -> np.ndarray[Any, np.dtype[np.float64]]:
+    variance = allan_variance("white", {"value": float(sensor_config["noise_density"]) / np.sqrt(2.0)}, tau)
+    time = {"value": float(sensor_config.get("wander_time_s") or DEFAULT_TIME_S)}
+    wander = {"value": float(sensor_config.get("bias_wander") or 0.0), "correlation_time_s": time}
     return np.asarray(np.sqrt(variance + allan_variance("gauss_markov", wander, tau)))
 
 
-def _finding(axes: JSON, sheet: JSON, unit: str) -> str:
-    """Return the white noise, its ratio to that of the data sheet with a likely cause, and the other terms."""
+def _finding(axes: JSON, sensor_config: JSON, unit: str) -> str:
+    """Return the white noise, its ratio to that of the sensor file with a likely cause, and the other terms."""
     terms = [part["terms"] for part in axes.values()]
     seen = [name for name in SYMBOLS if name != "white" and any(n == name for t in terms for n, _ in each_term(t))]
     others = f"; also {', '.join(plain(name) for name in seen)}" if seen else ""
@@ -156,17 +161,17 @@ def _finding(axes: JSON, sheet: JSON, unit: str) -> str:
         return f"No white noise seen{others}"
     white = float(np.sqrt(np.mean(np.square(densities))))
     head = f"White noise N = {number(white)} {unit}/sqrt(Hz)"
-    if not sheet.get("noise_density"):
+    if not sensor_config.get("noise_density"):
         return head + others
-    ratio = white / (float(sheet["noise_density"]) / np.sqrt(2.0))
+    ratio = white / (float(sensor_config["noise_density"]) / np.sqrt(2.0))
     if 1.0 / NEAR < ratio < NEAR:
-        return f"{head}, as the data sheet says{others}"
+        return f"{head}, as the sensor file says{others}"
     cause = ""
     if ratio > FAR:
         cause = ": vibration at rest, another range, or a column in another unit"
     elif ratio < 1.0 / FAR:
         cause = ": a filter in the sensor, smoothed or repeated samples, or a column in another unit"
-    return f"{head}, {number(ratio, 2)} × that of the data sheet{cause}{others}"
+    return f"{head}, {number(ratio, 2)} × that of the sensor file{cause}{others}"
 
 
 def _needed(wander: JSON | None, unit: str) -> list[str]:

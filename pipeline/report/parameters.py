@@ -1,6 +1,6 @@
 """The fitted parameters of a sensor with their uncertainties, and what pages say of the fit.
 
-The calibration file holds the matrix M of ``truth = M (reading - bias - effects)``. A data sheet states scale factor
+The calibration file holds the matrix M of ``truth = M (reading - bias - effects)``. A sensor file states scale factor
 errors and cross-axis sensitivities, which are elements of ``K = M^-1`` in ``reading = bias + K truth + effects``:
 
     dK = -K dM K,    cov(K) = J cov(M) J^T,    J = K (x) K^T    (rows of M one after the other)
@@ -72,7 +72,7 @@ def fitted_parameters(part: JSON) -> list[Parameter]:
 
 
 def reading_errors(part: JSON) -> list[Parameter]:
-    """Return the elements of K that a data sheet states, of a sensor's part of a calibration.
+    """Return the elements of K that a sensor file states, of a sensor's part of a calibration.
 
     ``scale_factor_error_x`` is ``K_xx - 1``; ``cross_axis_xy`` is what axis x reads of a truth along y. Each has the
     coverage factor of the same element of the matrix.
@@ -94,19 +94,19 @@ def reading_errors(part: JSON) -> list[Parameter]:
     ]
 
 
-def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
+def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
     """Return bias, scale factor errors, cross-axis terms and effects: ``p``, ``name`` and ``limit`` (or None).
 
-    ``part``: the sensor's part of the calibration; ``sheet``: its section of the configuration with the limits.
+    ``part``: the sensor's part of the calibration; ``sensor_config``: its section of the configuration with the limits.
     """
-    fitted, effects = fitted_parameters(part), sheet.get("effects") or {}
-    found = [(p, p.words.capitalize(), sheet.get("bias")) for p in fitted[:3]]
+    fitted, effects = fitted_parameters(part), sensor_config.get("effects") or {}
+    found = [(p, p.words.capitalize(), sensor_config.get("bias")) for p in fitted[:3]]
     for p in reading_errors(part):
         kind, _, axes = p.name.rpartition("_")
         if kind == "cross_axis":
-            found.append((p, f"{axes[0]} reads of {axes[1]}", sheet.get("cross_axis")))
+            found.append((p, f"{axes[0]} reads of {axes[1]}", sensor_config.get("cross_axis")))
         else:
-            found.append((p, f"Scale factor error {axes}", sheet.get("scale_factor")))
+            found.append((p, f"Scale factor error {axes}", sensor_config.get("scale_factor")))
     found += [(p, _of_effect(p), effects.get(p.name.partition(".")[0])) for p in fitted[12:]]
     bounds = (limit if isinstance(limit, int | float) and limit > 0 else None for *_, limit in found)
     return [{"p": p, "name": name, "limit": bound} for (p, name, _), bound in zip(found, bounds, strict=True)]

@@ -26,17 +26,17 @@ SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overr
 
 
 def summary_row(
-    unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, sheet_row: dict[str, str]
+    unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, units_table_row: dict[str, str]
 ) -> JSON:
     """Return a unit's row: a dict from column to value, None where there is none.
 
-    ``calibration, validation, diagnosis``: as in their files; ``sheet_row``: the unit's row of ``units.csv``.
+    ``calibration, validation, diagnosis``: as in their files; ``units_table_row``: the unit's row of ``units.csv``.
     """
     error = calibration.get("error") or {}
     file = f"{error['file']}: " if error.get("file") else ""
     row: JSON = dict.fromkeys(COLUMNS) | {
         "unit": unit,
-        **{key: sheet_row.get(key) or None for key in ("serial", "lot", "date")},
+        **{key: units_table_row.get(key) or None for key in ("serial", "lot", "date")},
         "status": calibration.get("status"),
         "error": f"{file}{error['message']}" if error.get("message") else None,
         "sensor": calibration.get("sensor"),
@@ -55,7 +55,7 @@ def summary_row(
         row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
         implausible = (calibration.get(sensor) or {}).get("implausible") or []
         row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
-    for key, value in sheet_row.items():
+    for key, value in units_table_row.items():
         if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
             row[f"sheet_{key}" if key in COLUMNS else key] = value
     return row
@@ -79,15 +79,15 @@ def unit_parameters(calibration: JSON) -> dict[str, tuple[float | str | None, ..
     }
 
 
-def against_limits(calibration: JSON, sheet: JSON) -> dict[str, tuple[float, float, str]]:
-    """Return value, limit and unit of the parameters that the data sheet limits: ``<sensor> Bias x``.
+def against_limits(calibration: JSON, sensor_config: JSON) -> dict[str, tuple[float, float, str]]:
+    """Return value, limit and unit of the parameters that the sensor file limits: ``<sensor> Bias x``.
 
-    ``sheet`` is the section ``sensor`` of the configuration.
+    ``sensor_config`` is the section ``sensor`` of the configuration.
     """
     return {
         f"{sensor} {row['name']}": (row["p"].value, row["limit"], unit_text(row["p"].unit))
         for sensor in SENSORS
         if calibration.get(sensor)
-        for row in parameter_rows(calibration[sensor], sheet.get(sensor) or {})
+        for row in parameter_rows(calibration[sensor], sensor_config.get(sensor) or {})
         if row["limit"]
     }

@@ -86,11 +86,15 @@ def _sensor(
     sensor: str, calibration: JSON, held_out: JSON, found: JSON, *, recordings: list[Recording], settings: JSON
 ) -> JSON:
     """Return what the template shows of a calibrated sensor, from its parts of validation and diagnosis."""
-    part, sheet, table = calibration[sensor], (settings.get("sensor") or {}).get(sensor) or {}, settings["table"]
+    part, sensor_config, table = (
+        calibration[sensor],
+        (settings.get("sensor") or {}).get(sensor) or {},
+        settings["table"],
+    )
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
-    limits, kind = limit_rows(sensor, found, sheet), VERDICTS.get(found.get("verdict", ""), "")
+    limits, kind = limit_rows(sensor, found, sensor_config), VERDICTS.get(found.get("verdict", ""), "")
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
     steps = [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)]
     return {
@@ -103,11 +107,11 @@ def _sensor(
         "model_figures": [measurement_and_model(sensor, r, noise) for r in traces],
         "held_out_figures": held_out_figures(sensor, calibration, held_out, recordings, table),
         "residual_figures": residual_figures(sensor, traces, noise),
-        "noise_figure": allan(sensor, at_rest, sheet, found.get("wander")),
+        "noise_figure": allan(sensor, at_rest, sensor_config, found.get("wander")),
         "noise_terms": term_rows(at_rest),
         "noise_remarks": remarks(at_rest) + in_motion(found.get("effective_noise")),
         "matrix": fitted_parameters(part)[3:12],
-        "parameters": parameter_rows(part, sheet),
+        "parameters": parameter_rows(part, sensor_config),
         "rests": rest_rows(part),
         "diagnosis": found,
         "ranking": ranking_rows(found),

@@ -73,11 +73,11 @@ def write_campaign(
         origin = names.index(unit.copy_of or unit.unit)
         original = replace(description.units[origin], table_log=unit.table_log)
         recordings, truth = simulate_unit(original, description.seed, origin)
-        sheet = read_config("sensor", unit.sensor)
+        sensor_config = read_config("sensor", unit.sensor)
         folder = directory / "raw" / unit.unit
         folder.mkdir(parents=True, exist_ok=True)
         for recording in recordings:
-            _write_recording(folder, recording, unit.format, sheet)
+            _write_recording(folder, recording, unit.format, sensor_config)
         path = directory / "truth" / f"{unit.unit}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({**truth, "unit": unit.unit}, indent=1) + "\n", encoding="utf-8")
@@ -112,8 +112,8 @@ def simulate_unit(
     those of the procedure.
     """
     streams, course = Streams(seed, number), course_of(unit)
-    sheets = read_config("sensor", unit.sensor)
-    effects = drawn_effects(unit.effects, sheets, streams["effects"])
+    sensor_configs = read_config("sensor", unit.sensor)
+    effects = drawn_effects(unit.effects, sensor_configs, streams["effects"])
 
     def bench_of(other: Mapping[str, Any]) -> Bench:
         """Return the bench of the description with ``other`` settings; the same sensors, mounted anew."""
@@ -126,7 +126,7 @@ def simulate_unit(
             **(other.get("imperfections", {}) if other else unit.imperfections),
         }
         given = {s: {**getattr(unit, s), **other.get(s, {})} for s in SENSORS}
-        return Bench(table, imperfections, drawn_sensors(sheets, given, effects, streams["unit"]))
+        return Bench(table, imperfections, drawn_sensors(sensor_configs, given, effects, streams["unit"]))
 
     bench = bench_of({})
     benches = {"": bench}
@@ -163,15 +163,15 @@ def _wanted(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
     return [p for p in planned if not unit.recordings or p.name in unit.recordings]
 
 
-def _write_recording(folder: Path, recording: Recording, kind: str, sheets: dict[str, Any]) -> None:
+def _write_recording(folder: Path, recording: Recording, kind: str, sensor_configs: dict[str, Any]) -> None:
     """Write one recording as ``<name>.csv`` or ``<name>.mcap``, in the axes of the unit's body."""
     if kind == "mcap":
         from pipeline.io.ros2_messages import write_mcap  # noqa: PLC0415  (needs the mcap library)
 
         write_mcap(folder / f"{recording.name}.mcap", recording)
         return
-    wanted = {f"accel_{a}_g": decimals_of(sheets["accelerometer"]) for a in AXES}
-    wanted |= {f"gyro_{a}_dps": decimals_of(sheets["gyroscope"]) for a in AXES}
+    wanted = {f"accel_{a}_g": decimals_of(sensor_configs["accelerometer"]) for a in AXES}
+    wanted |= {f"gyro_{a}_dps": decimals_of(sensor_configs["gyroscope"]) for a in AXES}
     wanted |= {"temperature_degc": TEMPERATURE_DECIMALS}
     wanted |= dict.fromkeys(("table_angle_deg", "table_rate_dps"), ANGLE_DECIMALS)
     wanted |= {f"table_q{c}": QUATERNION_DECIMALS for c in "wxyz"}
@@ -190,8 +190,8 @@ def _truth(sensor: SimulatedSensor, effects: Hidden, interval: float) -> dict[st
         **({"definitions": defined} if defined else {}),
         "noise": {
             "white": sensor.white(interval),
-            "wander": sensor.sheet["bias_wander"],
-            "correlation_time": sensor.sheet["wander_time_s"],
+            "wander": sensor.sensor_config["bias_wander"],
+            "correlation_time": sensor.sensor_config["wander_time_s"],
         },
     }
 

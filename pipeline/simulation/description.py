@@ -12,7 +12,7 @@
       - {suffix: -staged, columns: {method: staged, filter: rc_low_pass}}
     rows: [...]                      # further rows of units.csv, for units whose recordings another one has made
 
-What a unit leaves out is drawn at random from the sensor's data sheet. The keys of a unit are the attributes of
+What a unit leaves out is drawn at random from the sensor file. The keys of a unit are the attributes of
 ``UnitDescription``.
 """
 
@@ -28,7 +28,7 @@ from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import CONFIGS
 from pipeline.io.files import wrong_name
 from pipeline.io.yaml_file import read_yaml
-from pipeline.model.data_sheet import completed
+from pipeline.model.sensor_file import completed
 from pipeline.simulation.procedures import FERRARIS, ONE_RECORDING, TABLE_PROCEDURES, Course, fit_to_samples
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class UnitDescription:
     lost: float = 0.0  # share of the samples that the radio link loses
     format: str = "csv"
     # bias (g or deg/s), matrix, or in its place scale_factor (of the correction), non_orthogonality_deg (yx, zx, zy),
-    # mounting_deg (turns about x, then y, then z); noise_density, bias_wander, wander_time_s: not of the data sheet
+    # mounting_deg (turns about x, then y, then z); noise_density, bias_wander, wander_time_s: not of the sensor file
     accelerometer: dict[str, Any] = field(default_factory=dict)
     gyroscope: dict[str, Any] = field(default_factory=dict)
     # sensor.effect, or effect alone for both sensors, to null (a typical size, at random), a number (that size, with

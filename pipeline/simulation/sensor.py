@@ -31,8 +31,8 @@ wander : standard deviation of the bias wander m, a Gauss-Markov process with co
 S, n   : (3,) scale factors of the correction (body = matrix @ (reading - bias)), and non-orthogonality, rad
 R_m    : mounting, which takes body vectors to the sensor's axes: turns about x, then y, then z
 
-What a description leaves out is drawn: data-sheet limits are taken for three standard deviations; the mounting lies
-within 1 deg (Sudsanguan 2019, chapter 3). A description may also hide an effect by a formula:
+What a description leaves out is drawn: limits of the sensor file are taken for three standard deviations; the mounting
+lies within 1 deg (Sudsanguan 2019, chapter 3). A description may also hide an effect by a formula:
 
     effects:
       gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: [0.03, 0.03, 0.03]}
@@ -192,7 +192,7 @@ def alter(scene: Scene, effects: Mapping[str, Values]) -> Scene:
 
 
 KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
-NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # instead of those of the data sheet
+NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # instead of those of the sensor file
 POSITIVE = {"time_constant", "tau"}  # parameters without a sign
 
 
@@ -201,7 +201,7 @@ class SimulatedSensor:
     """One accelerometer or gyroscope with known errors."""
 
     sensor: str
-    sheet: Mapping[str, Any]  # its section of the configuration: full scale, counts, noise
+    sensor_config: Mapping[str, Any]  # its section of the configuration: full scale, counts, noise
     bias: Values  # (3,), g or deg/s
     matrix: Values  # (3, 3), of a perfect calibration: body = matrix @ (reading - bias - effects)
     effects: Hidden = field(default_factory=dict)  # those on the reading
@@ -216,19 +216,19 @@ class SimulatedSensor:
 
     def white(self, interval: float) -> float:
         """Return the standard deviation of one sample's white noise; interval in s."""
-        return float(self.sheet["noise_density"]) * float(np.sqrt(0.5 / interval))
+        return float(self.sensor_config["noise_density"]) * float(np.sqrt(0.5 / interval))
 
     def quantised(self, reading: Values) -> Values:
         """Return the reading in whole counts, at most at full scale: (n, 3) array, g or deg/s."""
-        counts = np.round(reading * self.sheet["counts_per_unit"])
-        top = self.sheet["full_scale"] * self.sheet["counts_per_unit"]
-        kept: Values = np.clip(counts, -top, top - 1.0) / self.sheet["counts_per_unit"]
+        counts = np.round(reading * self.sensor_config["counts_per_unit"])
+        top = self.sensor_config["full_scale"] * self.sensor_config["counts_per_unit"]
+        kept: Values = np.clip(counts, -top, top - 1.0) / self.sensor_config["counts_per_unit"]
         return kept
 
 
-def decimals_of(sheet: Mapping[str, Any]) -> int:
+def decimals_of(sensor_config: Mapping[str, Any]) -> int:
     """Return the decimals that keep a printed reading within a tenth of a count."""
-    return int(np.ceil(np.log10(sheet["counts_per_unit"]))) + 1
+    return int(np.ceil(np.log10(sensor_config["counts_per_unit"]))) + 1
 
 
 def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.Generator) -> list[Values]:
@@ -252,7 +252,7 @@ def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.
 
 
 def drawn_sensors(
-    sheets: Mapping[str, Mapping[str, Any]],
+    sensor_configs: Mapping[str, Mapping[str, Any]],
     given: Mapping[str, Mapping[str, Any]],
     effects: Mapping[str, Hidden],
     rng: np.random.Generator,
@@ -268,17 +268,24 @@ def drawn_sensors(
         if unknown:
             known = ", ".join(sorted(KEYS | NOISE_KEYS))
             raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {known}")
-        sheet = {**sheets[sensor], **{key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])}}
+        sensor_config = {
+            **sensor_configs[sensor],
+            **{key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])},
+        }
         own = {name: hidden for name, hidden in effects[sensor].items() if name not in ALTERATIONS}
-        drawn = _limited(sheet["bias"], rng)
+        drawn = _limited(sensor_config["bias"], rng)
         bias = np.array(given[sensor].get("bias", drawn), float)
-        out[sensor] = SimulatedSensor(sensor, sheet, bias, _matrix(sheet, given[sensor], mounting, rng), own)
+        out[sensor] = SimulatedSensor(
+            sensor, sensor_config, bias, _matrix(sensor_config, given[sensor], mounting, rng), own
+        )
     return out
 
 
-def _matrix(sheet: Mapping[str, Any], given: Mapping[str, Any], mounting: Values, rng: np.random.Generator) -> Values:
-    scale = 1.0 + _limited(sheet["scale_factor"], rng)
-    skew = np.degrees(_limited(sheet["cross_axis"], rng))
+def _matrix(
+    sensor_config: Mapping[str, Any], given: Mapping[str, Any], mounting: Values, rng: np.random.Generator
+) -> Values:
+    scale = 1.0 + _limited(sensor_config["scale_factor"], rng)
+    skew = np.degrees(_limited(sensor_config["cross_axis"], rng))
     if "matrix" in given:
         return np.array(given["matrix"], float)
     if KEYS & set(given) - {"bias"}:
@@ -298,7 +305,7 @@ def _limited(limit: float, rng: np.random.Generator) -> Values:
 
 
 def drawn_effects(
-    specification: Mapping[str, Any], sheets: Mapping[str, Mapping[str, Any]], rng: np.random.Generator
+    specification: Mapping[str, Any], sensor_configs: Mapping[str, Mapping[str, Any]], rng: np.random.Generator
 ) -> dict[str, Hidden]:
     """Return the effects that a description's ``effects`` hide in each sensor.
 
@@ -323,7 +330,7 @@ def drawn_effects(
             if name in ALTERATIONS and each != kind.sensors[0] and sensor == "":
                 out[each][name] = out[kind.sensors[0]][name]  # one table, one clock: the same for both sensors
             else:
-                out[each][name] = kind, _values(kind, each, size, sheets[each]["effects"], rng)
+                out[each][name] = kind, _values(kind, each, size, sensor_configs[each]["effects"], rng)
     return out
 
 

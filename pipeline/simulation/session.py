@@ -136,7 +136,7 @@ def record(
     seconds = [t / NANOSECONDS for t in times]
     rng = {name: streams[name] for name in ("table", "temperature", "link", *SENSORS)}
     first = benches.get(planned[0].role, benches[""]).sensors
-    wander = {s: bias_wander(seconds, first[s].sheet["wander_time_s"], rng[s]) for s in SENSORS}
+    wander = {s: bias_wander(seconds, first[s].sensor_config["wander_time_s"], rng[s]) for s in SENSORS}
     out = []
     for k, (plan, time) in enumerate(zip(planned, seconds, strict=True)):
         bench = benches.get(plan.role, benches[""])
@@ -148,8 +148,8 @@ def record(
             sensor, altered = bench.sensors[s], alter(scene, {name: values for name, (_, values) in effects[s].items()})
             motion = plain if altered is scene else altered.motion(time, temperature)
             white = sensor.white(unit.interval_s) * rng[s].standard_normal((len(time), 3))
-            reading = sensor.exact(motion) + white + sensor.sheet["bias_wander"] * wander[s][k]
-            readings[s] = _rounded(sensor.quantised(reading), decimals_of(sensor.sheet))
+            reading = sensor.exact(motion) + white + sensor.sensor_config["bias_wander"] * wander[s][k]
+            readings[s] = _rounded(sensor.quantised(reading), decimals_of(sensor.sensor_config))
         whole = Recording(
             plan.name,
             plan.role,

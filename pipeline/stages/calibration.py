@@ -112,10 +112,10 @@ def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
     return found
 
 
-def judged(sensor: str, fit: dict[str, Any], sheet: dict[str, Any]) -> dict[str, Any]:
-    """Return a sensor's fit with what in it is beyond the data sheet, and what of this the user accepts."""
-    found = implausible(sensor, fit, sheet)
-    accepted = sheet["accept_implausible"]
+def judged(sensor: str, fit: dict[str, Any], sensor_config: dict[str, Any]) -> dict[str, Any]:
+    """Return a sensor's fit with what in it is beyond the sensor file's limits, and what of this the user accepts."""
+    found = implausible(sensor, fit, sensor_config)
+    accepted = sensor_config["accept_implausible"]
     return fit | {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
 
 

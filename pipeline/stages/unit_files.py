@@ -43,7 +43,7 @@ def require_noises(
     pack: Pack,
     unit: str,
     recordings: list[Recording],
-    sheets: dict[str, dict[str, Any]],
+    sensor_configs: dict[str, dict[str, Any]],
     fits: Mapping[str, SensorCalibration | None],
 ) -> dict[str, Noise]:
     """Read the noise of each calibrated sensor.
@@ -51,4 +51,6 @@ def require_noises(
     Raises ``ConfigurationError`` if nothing determines it; ``estimate_noise`` names what is missing.
     """
     found = load_noises(pack, unit)
-    return {s: found[s] or estimate_noise(s, recordings, sheets[s]) for s, fit in fits.items() if fit is not None}
+    return {
+        s: found[s] or estimate_noise(s, recordings, sensor_configs[s]) for s, fit in fits.items() if fit is not None
+    }

@@ -3,8 +3,8 @@
 Further noise continues over all recordings of a unit, at the time t:
 
     ar_06, ar_09 : first-order autoregression with that coefficient, of the white noise's standard deviation
-    random_walk  : sigma_b sqrt(t / T), the data sheet's wander sigma_b per its correlation time T
-    one_over_f   : amplitudes of a spectrum 1/f, scaled to three times the data sheet's wander
+    random_walk  : sigma_b sqrt(t / T), the sensor file's wander sigma_b per its correlation time T
+    one_over_f   : amplitudes of a spectrum 1/f, scaled to three times the sensor file's wander
 
 and physics in another functional form than the catalogue's, with its own size and sign on each axis:
 
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 INTERVAL_S = 0.12  # the default of ``UnitDescription``
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}
 OF_WHITE = {"ar_06": 0.6, "ar_09": 0.9}  # coefficient of the autoregression
-AMPLITUDE = {  # g and deg/s; by assumption the order of data-sheet effects of the MPU-6050, well above its noise
+AMPLITUDE = {  # g and deg/s; by assumption, near the limits of the MPU-6050's sensor file
     "gear_mesh": {"accelerometer": 2e-3, "gyroscope": 0.03},
     "temperature_step": {"accelerometer": 4e-3, "gyroscope": 0.06},
     "saturation": {"accelerometer": 3e-3, "gyroscope": 0.6},
@@ -68,11 +68,11 @@ GAUSS_MARKOV = ("normal", "wander")  # families of noise for which lambda is kno
 
 def recordings_of(case: Case) -> list[Recording]:
     """Return the recordings of a case; nothing in them tells what is hidden."""
-    sheets = read_config("sensor", case.model)
+    sensor_configs = read_config("sensor", case.model)
     own = {
         sensor: {
-            "bias_wander": case.wander * sheets[sensor]["bias_wander"],
-            "noise_density": 0.0 if case.noise in OF_WHITE else sheets[sensor]["noise_density"],
+            "bias_wander": case.wander * sensor_configs[sensor]["bias_wander"],
+            "noise_density": 0.0 if case.noise in OF_WHITE else sensor_configs[sensor]["noise_density"],
         }
         for sensor in SENSORS
     }
@@ -92,7 +92,7 @@ def recordings_of(case: Case) -> list[Recording]:
         recordings = [_at_rest(r) for r in recordings if r.role != "gyroscope"]
     rng = np.random.default_rng([case.seed, case.number, 1])
     for sensor in SENSORS:
-        recordings = _with_noise(recordings, sensor, case.noise, sheets[sensor], rng)
+        recordings = _with_noise(recordings, sensor, case.noise, sensor_configs[sensor], rng)
     if case.shape:
         recordings = _with_shape(recordings, case)
     if case.noise == "cold":
@@ -110,27 +110,27 @@ def _at_rest(recording: Recording) -> Recording:
 
 
 def _with_noise(
-    recordings: list[Recording], sensor: str, noise: str, sheet: dict[str, Any], rng: np.random.Generator
+    recordings: list[Recording], sensor: str, noise: str, sensor_config: dict[str, Any], rng: np.random.Generator
 ) -> list[Recording]:
     """Add noise of a family other than the simulator's to one sensor, over all recordings of the unit."""
     first = min(float(r.time[0]) for r in recordings)
     last = max(float(r.time[-1]) for r in recordings)
     count = int((last - first) / INTERVAL_S) + 2
     if noise in OF_WHITE:
-        added = _white(sheet) * _autoregression(count, OF_WHITE[noise], rng)
+        added = _white(sensor_config) * _autoregression(count, OF_WHITE[noise], rng)
     elif noise == "random_walk":
-        step = sheet["bias_wander"] * np.sqrt(INTERVAL_S / sheet["wander_time_s"])
+        step = sensor_config["bias_wander"] * np.sqrt(INTERVAL_S / sensor_config["wander_time_s"])
         added = np.cumsum(step * rng.standard_normal((count, 3)), axis=0)
     elif noise == "one_over_f":
-        added = 3.0 * sheet["bias_wander"] * _one_over_f(count, rng)
+        added = 3.0 * sensor_config["bias_wander"] * _one_over_f(count, rng)
     else:
         return recordings
     return [_added(r, sensor, added[np.rint((r.time - first) / INTERVAL_S).astype(int)]) for r in recordings]
 
 
-def _white(sheet: Mapping[str, Any]) -> float:
+def _white(sensor_config: Mapping[str, Any]) -> float:
     """Return the standard deviation of one sample's white noise."""
-    return float(sheet["noise_density"] * np.sqrt(0.5 / INTERVAL_S))
+    return float(sensor_config["noise_density"] * np.sqrt(0.5 / INTERVAL_S))
 
 
 def _autoregression(count: int, coefficient: float, rng: np.random.Generator) -> Values:
@@ -198,18 +198,20 @@ def signals_left(case: Case) -> dict[str, float]:
     for name in case.hidden:
         rest = {other: values for other, values in case.hidden.items() if other != name}
         signals.append(_readings(recordings, case.sensor) - _readings(_used(replace(case, hidden=rest)), case.sensor))
-    sheet = read_config("sensor", case.model)[case.sensor]
+    sensor_config = read_config("sensor", case.model)[case.sensor]
     gravity = read_config("table", "acutronic")["gravity_g"]
     motions = [motion for r in recordings if (motion := reference_motion(r, gravity)) is not None]
     time = np.concatenate([r.time for r in recordings])
     base = np.concatenate([truth(case.sensor, motion) for motion in motions])
     columns = np.column_stack([np.ones(len(time)), base, *signals])
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    white, n = _white(sheet), len(time)
+    white, n = _white(sensor_config), len(time)
     each = Blocks(np.arange(n), np.ones(n), time, np.zeros(n), np.zeros(n, np.int64))
-    noise = GaussMarkov(each, [Setting(case.wander * sheet["bias_wander"] / white, sheet["wander_time_s"])])
+    noise = GaussMarkov(
+        each, [Setting(case.wander * sensor_config["bias_wander"] / white, sensor_config["wander_time_s"])]
+    )
     products = noise.products(columns / size)[0] * np.outer(size, size) / white**2
-    rounding = 3 * n / (6.0 * sheet["counts_per_unit"] ** 2 * white**2)
+    rounding = 3 * n / (6.0 * sensor_config["counts_per_unit"] ** 2 * white**2)
     found = {}
     for k, name in enumerate(case.hidden):
         left = 0.0

@@ -2,7 +2,7 @@
 
 Every case follows from its family, number and the study's seed. Families:
 
-    single, small, tiny  one observable effect at its data sheet's size, x0.3, x0.1
+    single, small, tiny  one observable effect at the sensor file's size, x0.3, x0.1
     pairs, pairs_wander  two of them; with five times the bias wander
     triples              three
     null_<noise>         nothing; both sensors are judged
@@ -52,8 +52,8 @@ ALTERNATIVES = [  # not hidden together: their signals are nearly alike
     {"bias_temperature", "bias_temperature_quadratic"},
     {"table_rate_ripple", "table_encoder_error"},
 ]
-FACTOR = {"small": 0.3, "tiny": 0.1}  # of the data sheet's size
-WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the data sheet's
+FACTOR = {"small": 0.3, "tiny": 0.1}  # of the sensor file's size
+WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the sensor file's
 STIM_SHARE = 0.25  # of the units of the families that have both models
 REFERENCE, STAGED = "reference_least_squares", "staged"
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
@@ -70,7 +70,7 @@ class Case:
     sensor: str  # the one in which something is hidden
     procedure: str
     hidden: dict[str, list[float]] = field(default_factory=dict)  # effects and their parameters
-    wander: float = 1.0  # bias wander over that of the data sheet
+    wander: float = 1.0  # bias wander over that of the sensor file
     noise: str = "normal"
     left_out: tuple[str, ...] = ()  # effects that the catalogue is left without
     shape: str = ""  # of physics that is not in the catalogue

@@ -99,7 +99,9 @@ def page(cases: Sequence[JSON], command: str) -> str:
         _section("Physics in another form than the catalogue's", SHAPE_TEXT, SHAPE_HEAD, of_shapes(cases)),
         _section("Cases that miss a goal", MISS_TEXT, ["case", "unit", "hidden", "said"], _misses(cases, families)),
         _section("Faults", "", ["case", "error"], faults),
-        _section("What data-sheet size is", DATA_SHEET, ["model", "sensor", "effect", "size", "unit"], _data_sheet()),
+        _section(
+            "What data-sheet size is", DATA_SHEET, ["model", "sensor", "effect", "size", "unit"], _sensor_file_sizes()
+        ),
     ]
     return "\n".join(part for part in parts if part)
 
@@ -216,7 +218,7 @@ def _misses(cases: Sequence[JSON], scores: Sequence[Score]) -> Rows:
     return [*rows, *([[f"and {more} more", "", "", ""]] if more else [])]
 
 
-def _data_sheet() -> Rows:
+def _sensor_file_sizes() -> Rows:
     rows = []
     for model, sensors in SIZES.items():
         for sensor, sizes in sensors.items():

@@ -68,7 +68,7 @@ def not_seen(case: JSON) -> bool:
 
 
 def warned(case: JSON) -> bool:
-    """Return whether there is a warning: a doubtful verdict, beyond the data sheet, or more wander than expected."""
+    """Return whether there is a warning: a doubtful verdict, a size beyond the limit, or more wander than expected."""
     return bool(case["verdict"] in DOUBTFUL or not case["plausible"] or case["inflated"])
 
 
@@ -104,7 +104,7 @@ def stands_out(case: JSON) -> bool:
 
 # Family, what is counted, how it is judged, goal.
 PLAN: list[tuple[str, str, Callable[[JSON], bool], str]] = [
-    ("single", "one effect at its data sheet's size: named first", first_is_right, ">= 98 %"),
+    ("single", "one effect at the sensor file's size: named first", first_is_right, ">= 98 %"),
     ("single", "... and nothing else named", exact, ""),
     ("small", "one effect, x0.3: named first", first_is_right, ""),
     ("tiny", "one effect, x0.1: named first", first_is_right, ""),

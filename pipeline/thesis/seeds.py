@@ -60,7 +60,7 @@ TIME_CONSTANT_S = 0.12  # of campaign.yaml
 INTERVAL_S = 0.12  # of simulation.yaml
 SAME_GAIN_S = (np.sqrt(INTERVAL_S**2 + 2.0 * TIME_CONSTANT_S * (INTERVAL_S + TIME_CONSTANT_S)) - INTERVAL_S) / 2.0
 # Causes of disturbance; each includes those before it.
-SHEET = "noise of the data sheet, up to half the sampling rate"
+SHEET = "noise of the sensor file, up to half the sampling rate"
 WHOLE = "noise of the sensor's whole bandwidth, folded into the samples"
 LOST = "and samples lost on the radio link"
 SHAKEN = "and a table that shakes like the home-made one"
@@ -112,19 +112,19 @@ class Set:
         exact = self.still if self.unit.table == "acutronic" else _exact(self.unit, seed, self.number)
         if cause == SHAKEN:
             exact = self.shaken
-        sheet = read_config("sensor", self.unit.sensor)[self.sensor]
+        sensor_config = read_config("sensor", self.unit.sensor)[self.sensor]
         given = getattr(self.unit, self.sensor)
         if cause != SHEET and "noise_density" in given:
-            sheet = {**sheet, "noise_density": given["noise_density"]}  # of the whole bandwidth
+            sensor_config = {**sensor_config, "noise_density": given["noise_density"]}  # of the whole bandwidth
         lost = self.unit.lost if cause in (LOST, SHAKEN) else 0.0
         link, noise = (np.random.default_rng([seed, self.number, k]) for k in (0, 1 + SENSORS.index(self.sensor)))
-        simulated = SimulatedSensor(self.sensor, sheet, np.zeros(3), np.eye(3))
-        wander = bias_wander([r.time for r in exact], sheet["wander_time_s"], noise)
+        simulated = SimulatedSensor(self.sensor, sensor_config, np.zeros(3), np.eye(3))
+        wander = bias_wander([r.time for r in exact], sensor_config["wander_time_s"], noise)
         out = []
         for recording, slow in zip(exact, wander, strict=True):
             white = simulated.white(recording.interval) * noise.standard_normal(slow.shape)
             reading = simulated.quantised(
-                np.asarray(recording.reading(self.sensor)) + white + sheet["bias_wander"] * slow
+                np.asarray(recording.reading(self.sensor)) + white + sensor_config["bias_wander"] * slow
             )
             own: dict[str, Any] = {s: reading if s == self.sensor else None for s in SENSORS}
             out.append((replace(recording, **own), received(recording.samples, lost, link)))

@@ -1,7 +1,8 @@
-"""What a calibration is worth in an attitude: its drift on held-out motion, before and after.
+"""Errors of an attitude that is integrated from the readings of held-out motion, before and after calibration.
 
-Gyroscope alone, from the table's attitude at the start, with the rotation vector a[n] over one interval, of rates w in
-rad/s that are interpolated by a cubic (Magnus expansion: A. Iserles et al., Lie-group methods, Acta Numerica 9, 2000):
+Of the gyroscope alone, from the table's attitude at the start, with the rotation vector a[n] over one interval, of
+rates w in rad/s that are interpolated by a cubic (Magnus expansion: A. Iserles et al., Lie-group methods, Acta Numerica
+9, 2000):
 
     q[n+1] = q[n] exp(a[n] / 2)
     a[n] = dt (13 w[n] + 13 w[n+1] - w[n-1] - w[n+2]) / 24 + dt^2 (w[n] x w[n+1]) / 12
@@ -34,13 +35,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 
-MINUTE = 60.0  # s over which a drift is stated
-STARTS = 60  # of the minutes over which a drift is averaged
-SHORTEST = 10.0  # s: a drift over less than that is mostly noise
-CURVE = 120  # points of the published curves
+DRIFT_TIME_S = 60.0  # s over which a drift is stated
+DRIFT_STARTS = 60  # of the minutes over which a drift is averaged
+SHORTEST_DRIFT_S = 10.0  # s: a drift over less than that is mostly noise
+CURVE_POINTS = 120  # points of the published curves
 STEP_S, STEP_DEG = 0.1, 5.0  # of the complementary filter, which integrates to first order
-GAIN = 0.5  # of the complementary filter: its library's default
-SETTLED = 10.0  # s after which the tilt counts
+FILTER_GAIN = 0.5  # of the complementary filter: its library's default
+SETTLING_S = 10.0  # s after which the tilt counts
 
 
 def attitude(
@@ -58,8 +59,8 @@ def attitude(
     if recording.gyroscope is None or gyroscope is None:
         return {"reason": "the gyroscope is not calibrated"}
     known, logged = _with_reference(recording)
-    if known.samples < 2 or known.time[-1] - known.time[0] < SHORTEST:
-        return {"reason": f"recording {recording.name} is shorter than {SHORTEST:g} s"}
+    if known.samples < 2 or known.time[-1] - known.time[0] < SHORTEST_DRIFT_S:
+        return {"reason": f"recording {recording.name} is shorter than {SHORTEST_DRIFT_S:g} s"}
     try:
         compensated = Compensation(accelerometer, gyroscope).apply(
             known.accelerometer, known.gyroscope, known.temperature, known.time
@@ -69,9 +70,9 @@ def attitude(
     reference = (logged / np.linalg.norm(logged, axis=1, keepdims=True)).T
     time = known.time * known.table_seconds  # by the clock of the reference
     found: dict[str, Any] = {"reason": None, "recording": recording.name}
-    found["seconds"] = float(min(MINUTE, time[-1] - time[0]))
+    found["seconds"] = float(min(DRIFT_TIME_S, time[-1] - time[0]))
     found |= {"drift_deg": {}, "tilt_rms_deg": {} if accelerometer and known.accelerometer is not None else None}
-    shown = np.unique(np.linspace(0, known.samples - 1, CURVE).astype(int))
+    shown = np.unique(np.linspace(0, known.samples - 1, CURVE_POINTS).astype(int))
     found["curve"] = {"time_s": _rounded(time[shown] - time[0])}
     pairs = {
         "before": (known.accelerometer, known.gyroscope),
@@ -86,7 +87,7 @@ def attitude(
             assert force is not None  # noqa: S101
             at, fused = _fuse(time, force, alone)
             tilt, since = _tilt_between(fused, reference[:, at].T), time[at] - time[0]
-            found["tilt_rms_deg"][name] = float(np.sqrt(np.mean(tilt[since >= min(SETTLED, 0.5 * since[-1])] ** 2)))
+            found["tilt_rms_deg"][name] = float(np.sqrt(np.mean(tilt[since >= min(SETTLING_S, 0.5 * since[-1])] ** 2)))
             found["curve"][f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
     return found
 
@@ -117,7 +118,7 @@ def _product(p: Values, q: Values) -> Values:
 def drift(time: Values, estimate: Values, reference: Values, seconds: float) -> float:
     """Return by how much an attitude (4, n) is off after so many seconds, root mean square over starts, deg."""
     last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
-    start = np.unique(np.linspace(0, max(last, 0), STARTS).astype(int))
+    start = np.unique(np.linspace(0, max(last, 0), DRIFT_STARTS).astype(int))
     interval = float(np.median(np.diff(time)))
     stop = np.minimum(np.searchsorted(time, time[start] + seconds - 0.5 * interval), len(time) - 1)
     turned, known = (_between(q[:, start], q[:, stop]) for q in (estimate, reference))
@@ -153,7 +154,7 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     settings = imufusion.AhrsSettings(
         sample_rate=float(1.0 / np.median(intervals)),
         convention=imufusion.CONVENTION_NWU,
-        gain=GAIN,
+        gain=FILTER_GAIN,
         gyroscope_range=0.0,
         acceleration_rejection=0.0,
         magnetic_rejection=0.0,

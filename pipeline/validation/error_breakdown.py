@@ -3,9 +3,10 @@
     accelerometer: e_n = |a_n| - gravity_g,    gyroscope: e_n = |g_n| - I_n        (Sudsanguan 2019, eqs 5.1 to 5.4)
     corrected = matrix @ (reading - bias - sum of effects)
 
-Where the attitude is logged, effects are those of the reference motion, effects of timing move the reference, and the
-vector error is ``sqrt(mean |corrected - truth|^2)``. Without an attitude, effects are those of the log's own calibrated
-signals, by fixed point, and effects of timing move the logged rate.
+with e_n the error of sample n, a_n and g_n its corrected readings and I_n the rate of the table. Where the attitude is
+logged, effects are computed from the reference motion, effects of timing shift the reference in time, and the vector
+error is ``sqrt(mean |corrected - truth|^2)``. Without an attitude, effects are computed from the log's own calibrated
+readings, by fixed point, and effects of timing shift the logged rate.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     Corrected = tuple[Values, Values, Values | None]  # vector, magnitude, truth
 
-DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s are followed to 1e-4 deg/s at 0.12 s
+SPLINE_DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s are followed to 1e-4 deg/s at 0.12 s
 
 
 def error_breakdown(
@@ -121,7 +122,7 @@ def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples
         missing = [need for need in found.needs if samples.motion and getattr(samples.motion, need) is None]
         return f"the held-out recording holds no {' and no '.join(missing)}" if missing else None
     if found.moves:
-        few = not samples.resting and len(samples.time) <= DEGREE
+        few = not samples.resting and len(samples.time) <= SPLINE_DEGREE
         return f"the held-out recording has {len(samples.time)} samples, too few to follow its rate" if few else None
     try:
         used = fields_used(calibration.sensor, [fitted])
@@ -187,7 +188,7 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> Value
         return samples.magnitude
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed without an attitude log alone)
 
-    time, spline = samples.time, make_interp_spline(samples.time, samples.magnitude, k=DEGREE)
+    time, spline = samples.time, make_interp_spline(samples.time, samples.magnitude, k=SPLINE_DEGREE)
     interval = float(np.median(np.diff(time)))
 
     def motion(offset: float | Values = 0.0) -> Motion:

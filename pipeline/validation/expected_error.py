@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, SHEET_WIDTH, block_covariance
+from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
 from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED
 from pipeline.model.measurement import inverse_of
@@ -299,14 +299,14 @@ def _factors(calibration: SensorCalibration, noise: Noise, observed_s: float, *,
     from scipy.special import gammaincinv, ndtri  # noqa: PLC0415  (0.1 s that other stages do not pay)
 
     z = ndtri(LEVELS)
-    width = SHEET_WIDTH
+    width = STATED_WIDTH
     if upper and observed_s > 0.0:
         minutes = min(1.0, noise.correlation_time / DEFAULT_TIME_S)
         width = np.sqrt(max(noise.correlation_time / observed_s, SMALLEST_WIDTH**2 * minutes))
-        width = float(np.clip(width, SHARPEST_WIDTH, SHEET_WIDTH))
+        width = float(np.clip(width, SHARPEST_WIDTH, STATED_WIDTH))
     wander = np.exp(2.0 * width * z)
     drift = 2.0 * gammaincinv(0.5, LEVELS) if upper else np.zeros(len(z))
-    white = np.ones(len(z)) if noise.source != "data_sheet" else np.exp(2.0 * SHEET_WIDTH * z)
+    white = np.ones(len(z)) if noise.source != "data_sheet" else np.exp(2.0 * STATED_WIDTH * z)
     nu = max(calibration.degrees_of_freedom, 1.0)
     parameters, weights = np.full(1, float(upper)), np.ones(1)
     if upper and nu < EXACT_FREEDOM:

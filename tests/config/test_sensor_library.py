@@ -10,7 +10,7 @@ import yaml
 from pipeline.config.compose import Composer
 from pipeline.config.options import Problem
 from pipeline.files import CONFIGS
-from pipeline.model.data_sheet import as_stated
+from pipeline.model.sensor_file import as_stated
 from pipeline.simulation.description import read_config
 
 if TYPE_CHECKING:

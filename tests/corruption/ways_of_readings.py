@@ -11,7 +11,7 @@ from unit_copy import ANGLE, COLUMNS, RATE, TEMPERATURE, TIME, Copy, NotApplicab
 
 SIZE = {"accelerometer": 1.0, "gyroscope": 100.0}  # g and deg/s: what a recording typically spans
 WHITE = {
-    ("mpu6050", "accelerometer"): 8e-4,  # g, white noise of a sample at 0.12 s: the data sheet's density
+    ("mpu6050", "accelerometer"): 8e-4,  # g, white noise of a sample at 0.12 s: the sensor file's density
     ("mpu6050", "gyroscope"): 0.0102,
     ("stim300", "accelerometer"): 2.9e-4,
     ("stim300", "gyroscope"): 7.2e-3,

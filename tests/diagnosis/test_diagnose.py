@@ -186,7 +186,7 @@ def test_an_effect_outside_the_data_sheet_is_called_implausible() -> None:
     part = diagnosed("accelerometer", recordings)
     assert part["selected"] == ["lever_arm"]
     assert not part["ranking"][0]["plausible"]
-    assert any("data sheet" in line for line in in_words(part, "accelerometer"))
+    assert any("sensor file" in line for line in in_words(part, "accelerometer"))
 
 
 def test_earth_rotation_is_no_candidate_where_the_place_is_configured() -> None:

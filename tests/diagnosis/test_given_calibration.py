@@ -51,7 +51,7 @@ def test_a_scale_factor_is_named_and_a_rotation_of_the_mounting_is_not() -> None
 
 
 def test_what_the_uncertainties_of_both_explain_is_not_named() -> None:
-    near = given(bias=FREE.bias + 0.04)  # four times the wander of the data sheet, as the file states no uncertainty
+    near = given(bias=FREE.bias + 0.04)  # four times the wander of the sensor file, as the file states no uncertainty
     assert given_differences(near, lambda: FREE, MOVES, SHEET) == []
     wide = replace(given(bias=FREE.bias + SHIFT), covariance=np.eye(12) * 0.1**2)
     assert given_differences(wide, lambda: FREE, MOVES, SHEET) == []

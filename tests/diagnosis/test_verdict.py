@@ -55,10 +55,10 @@ def held_out(after: float) -> dict[str, float]:
         (replace(NOTHING, found="unexplained", published=ABOVE), "unexplained", "at most 1.2 deg/s"),
         (replace(NOTHING, found="unexplained"), "unexplained", "1 times the noise"),
         (replace(NOTHING, found="unexplained", unknown=("time",)), "unexplained", "depends on time"),
-        (replace(BEYOND, held_out=held_out(after=0.99)), "unexplained", "data sheet"),
-        (replace(BEYOND, held_out=held_out(after=0.99), published=ABOVE, full=INSIDE), "unexplained", "data sheet"),
-        (replace(BEYOND, held_out=held_out(after=0.3)), "missing_effect", "data sheet"),
-        (replace(BEYOND, held_out=held_out(after=0.3), published=ABOVE, full=INSIDE), "missing_effect", "data sheet"),
+        (replace(BEYOND, held_out=held_out(after=0.99)), "unexplained", "sensor file"),
+        (replace(BEYOND, held_out=held_out(after=0.99), published=ABOVE, full=INSIDE), "unexplained", "sensor file"),
+        (replace(BEYOND, held_out=held_out(after=0.3)), "missing_effect", "sensor file"),
+        (replace(BEYOND, held_out=held_out(after=0.3), published=ABOVE, full=INSIDE), "missing_effect", "sensor file"),
         (STAGED, "left_by_method", "the method staged causes the rest"),
         (replace(STAGED, filtered=True), "left_by_method", "the method staged and the filter cause the rest"),
         (
@@ -96,7 +96,7 @@ def test_a_recording_of_another_unit_is_unexplained_with_a_reason_and_nothing_is
     noise = estimate_noise("accelerometer", recordings, settings["sensor"]["accelerometer"])
     found = diagnose(calibrated(recordings, "accelerometer", settings), recordings, noise, settings)
     assert found["verdict"] == "unexplained"
-    assert "data sheet" in found["reason"]
+    assert "sensor file" in found["reason"]
     assert (found["override"], commands_of(found, "accelerometer", "U1", {"campaign": "c"})) == ("", {})
     assert any(not entry["plausible"] for entry in found["ranking"] if entry["effect"] in found["selected"])
     row = summary_row("U1", {}, None, {"accelerometer": found}, {})

@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.gauss_markov import (
-    SHEET_WIDTH,
+    STATED_WIDTH,
     TIME_FACTORS,
     TIME_PRIOR,
     block_covariance,
@@ -84,7 +84,7 @@ def test_wander_is_recovered_from_a_static_recording(name: str, wander: float) -
 def test_hypotheses_of_a_static_recording_predict_the_scatter_of_an_average() -> None:
     rng, covered, length = np.random.default_rng(3), [], 100.0
     for seed in range(100):
-        wander = SHEET["bias_wander"] * np.exp(SHEET_WIDTH * rng.standard_normal())
+        wander = SHEET["bias_wander"] * np.exp(STATED_WIDTH * rng.standard_normal())
         tau = 100.0 * rng.choice(TIME_FACTORS, p=TIME_PRIOR)
         noise = estimate_noise("accelerometer", [rest(7500, wander, seed, tau=tau)], SHEET)
         settings = wander_prior(noise, SHEET).grid(WHITE)

@@ -101,7 +101,7 @@ def test_kalibrs_input_holds_its_six_fields(tmp_path: Path) -> None:
     given = yaml.safe_load((tmp_path / "kalibr_imu.yaml").read_text())
     kinds = [f"{s}_{k}" for s in SENSORS for k in ("noise_density", "random_walk")]
     assert set(given) == {*kinds, "rostopic", "update_rate"}
-    # the data sheet's density is one-sided: a sample at 100 Hz has the noise of the band up to 50 Hz
+    # the sensor file's density is one-sided: a sample at 100 Hz has the noise of the band up to 50 Hz
     assert given["accelerometer_noise_density"] * np.sqrt(100.0) == pytest.approx(1e-3 * np.sqrt(50.0) * G0)
     assert given["gyroscope_random_walk"] == pytest.approx(1e-4 * np.sqrt(2 / 100) * RADIAN)
     assert given["update_rate"] == 100.0

@@ -1,4 +1,4 @@
-"""Parameters far beyond the data sheet are marked; those of real sensors and of the thesis are not."""
+"""Parameters far beyond the sensor file's limits are marked; those of real sensors and of the thesis are not."""
 
 from __future__ import annotations
 

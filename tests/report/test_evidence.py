@@ -158,18 +158,18 @@ def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_
     assert figure is not None
     density = np.sqrt(np.mean([part["terms"]["white"]["value"] ** 2 for part in noise["axes"].values()]))
     assert density == pytest.approx(0.003 * np.sqrt(0.12), rel=0.05)
-    assert figure.finding == f"White noise N = {density:.5f} g/√Hz, as the data sheet says"
+    assert figure.finding == f"White noise N = {density:.5f} g/√Hz, as the sensor file says"
     assert "static, 108 s at rest, before any filter" in figure.caption
     assert (
         "needs a wander of 0.000900 g, correlation time 50.0 s, against 0.000100 expected: it is inflated"
         in figure.caption
     )
-    assert [text for _, text in figure.legend[3:]] == ["data sheet"]
+    assert [text for _, text in figure.legend[3:]] == ["sensor file"]
     assert figure.svg.count('class="band') == 3
     calm = allan("accelerometer", noise, sheet | {"noise_density": 1e-3}, wander | {"inflated": False})
     assert calm is not None
     assert "inflated" not in calm.caption
-    assert "1.5 × that of the data sheet" in calm.finding
+    assert "1.5 × that of the sensor file" in calm.finding
     assert allan("accelerometer", noise_at_rest(50), sheet, wander) is None
     assert allan("accelerometer", None, sheet, wander) is None
 
@@ -271,7 +271,7 @@ def test_every_figure_of_the_page_says_its_finding(unit: Unit) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "cause"), [(1.0, "as the data sheet says"), (6.0, "vibration at rest"), (0.1, "a filter")]
+    ("factor", "cause"), [(1.0, "as the sensor file says"), (6.0, "vibration at rest"), (0.1, "a filter")]
 )
 def test_white_noise_far_from_the_data_sheet_gets_a_likely_cause(factor: float, cause: str) -> None:
     noise = noise_at_rest(2000, factor * 1e-3 * np.sqrt(0.5 / 0.01), 0.01)

@@ -165,9 +165,9 @@ def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_sum
     row = summary_row("U", calibration, unit.validation, unit.diagnosis, {})
     assert (row["accelerometer_implausible"], row["gyroscope_implausible"]) == (None, "scale_factor_x")
     page = Text(campaign_page.render("bench", [row], []))
-    assert "1 sensor beyond the data sheet" in page.text
+    assert "1 sensor beyond the sensor file's limits" in page.text
     assert "U , gyroscope: scale_factor_x" in page.text
-    assert "beyond the data sheet" not in Text(campaign_page.render("bench", rows(unit, 2), [])).text
+    assert "beyond the sensor file's limits" not in Text(campaign_page.render("bench", rows(unit, 2), [])).text
 
 
 def test_a_row_of_a_large_campaign_is_small(unit: Unit) -> None:

@@ -209,7 +209,7 @@ def test_readings_are_whole_counts_and_stop_at_full_scale() -> None:
     sensor = SimulatedSensor("accelerometer", SHEETS["accelerometer"], np.zeros(3), np.eye(3))
     counts = sensor.quantised(np.array([[0.1, -5.0, 5.0]])) * 16384.0
     assert counts.tolist() == [[1638.0, -32768.0, 32767.0]]
-    assert decimals_of(sensor.sheet) == 6  # half a unit of the last digit is 0.008 counts
+    assert decimals_of(sensor.sensor_config) == 6  # half a unit of the last digit is 0.008 counts
 
 
 def test_wander_has_unit_variance_and_its_correlation_time_within_recordings_and_across_pauses() -> None:

@@ -8,8 +8,8 @@ unit of one number is the same sensor with the same hidden effect on every bench
 unit that is in the file is not run again. Without --units the table of the file is printed.
 
 With --coverage the units are fitted only, hide nothing, and each bench has units of its own. ``--coverage sheet``: the
-bias wander is that of the data sheet. ``--coverage drawn``: each sensor has another one, whose standard deviation and
-correlation time are drawn from the prior that a fit takes from the data sheet (``pipeline.estimation.gauss_markov``).
+bias wander is that of the sensor file. ``--coverage drawn``: each sensor has another one, whose standard deviation and
+correlation time are drawn from the prior that a fit takes from the sensor file (``pipeline.estimation.gauss_markov``).
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def drawn(
 
 
 def _drawn_wander(model: str, sensor: str, rng: np.random.Generator) -> dict[str, float]:
-    """Return a bias wander of the prior that a fit takes from the data sheet."""
+    """Return a bias wander of the prior that a fit takes from the sensor file."""
     prior = wander_prior(None, read_config("sensor", model)[sensor])
     return {
         "bias_wander": prior.wander * float(np.exp(prior.width * rng.standard_normal())),

@@ -2,7 +2,7 @@
 
     python tests/study/guided_rests.py --units 200 --seed 7         (three minutes)
 
-Each unit (MPU-6050: bias, scale factors, cross-axis sensitivity, white noise and bias wander by its data sheet) is
+Each unit (MPU-6050: bias, scale factors, cross-axis sensitivity, white noise and bias wander by its sensor file) is
 drawn once for each of the three: rests of equal length at 20 Hz, moves of 2.5 s, reading = bias + K f + wander +
 noise, nothing of the product's own simulation. ``orientations_24`` sets the goal, the unit's largest expanded
 uncertainty of bias (g) and matrix. The other two stop at the first rest with which the published fit reaches it. A hand

@@ -50,7 +50,7 @@ FITS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 ALONE = 5  # every fifth log holds the accelerometer alone
 TOGETHER = 3  # units of one log
 LOW, HIGH = 0.85, 1.15  # mean squared error over its variance, of every matrix element
-HIDDEN = {  # sensor, effect, half of its data-sheet limit, and length of the rests in s
+HIDDEN = {  # sensor, effect, half of its limit in the sensor file, and length of the rests in s
     "quadratic": ("accelerometer", "quadratic_nonlinearity", 5e-3, 4.0),
     "g_sensitivity": ("gyroscope", "g_sensitivity", 0.1, 4.0),
     "gyro_drift": ("gyroscope", "bias_drift", 1.5e-4, 4.0),

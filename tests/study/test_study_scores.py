@@ -136,7 +136,7 @@ def test_a_form_of_unknown_physics_is_unexplained_warned_of_silently_replaced_or
 def test_the_page_has_the_figures_the_code_and_the_cases_that_miss() -> None:
     cases = [truth("g_sensitivity") | said("b", code="0123")]
     text = page(cases, "python -m pipeline study DIR")
-    assert "| one effect at its data sheet's size: named first | 1 | 0.0 % | 0.0 to 79.3 % | >= 98 % |" in text
+    assert "| one effect at the sensor file's size: named first | 1 | 0.0 % | 0.0 to 79.3 % | >= 98 % |" in text
     assert "code being `0123`." in text
     assert "| single-00000 | mpu6050 gyroscope one_way | g_sensitivity | b |" in text
     assert "| mpu6050 | gyroscope | `g_sensitivity` | 0.1 | deg/s/g |" in text

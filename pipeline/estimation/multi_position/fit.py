@@ -11,7 +11,7 @@ where k = 1 if the scatter within the rests tells the white noise and a scatter 
 (``NoiseHypothesis.known``).
 
 A few rests leave some combinations of parameters open: two of the nine cross-axis terms of an accelerometer at rest, or
-the amplitude of a warm-up far from its end. So the last fit of plausible effects has the data sheet's limits of their
+the amplitude of a warm-up far from its end. So the last fit of plausible effects has the sensor file's limits of their
 parameters p, taken for two standard deviations, as prior with the precision P; it is zero for bias, matrix and time
 constants, and where there is no limit.
 

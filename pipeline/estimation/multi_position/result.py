@@ -84,11 +84,11 @@ def fit_effects_by_rests(
     determine an effect; ``ConfigurationError`` if an effect is unknown or not one of this sensor.
     """
     sensor = before.sensor
-    wanted, sheet = settings["effects"][sensor], settings["sensor"][sensor]
+    wanted, sensor_config = settings["effects"][sensor], settings["sensor"][sensor]
     model = model_of(recordings, before, noise, settings)
     if model is None:
         return before
-    names = Selection(model, before, [], noise, sheet).names if wanted == AUTO else list(wanted)
+    names = Selection(model, before, [], noise, sensor_config).names if wanted == AUTO else list(wanted)
     if not names:
         return before
     for name in names:
@@ -96,7 +96,7 @@ def fit_effects_by_rests(
         if reason:
             raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
     hypotheses = selection_hypotheses(noise, model.kinds)
-    limits = limits_of(sensor, sheet)
+    limits = limits_of(sensor, sensor_config)
     found = fit_configured(model, before, names, hypotheses)
     if plausible(model, found, limits):
         found = fit_configured(model, before, names, hypotheses, limits)

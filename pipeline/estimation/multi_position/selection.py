@@ -3,9 +3,9 @@
     delta BIC > 10   and   m p < 0.01
 
 with the gain, delta BIC and p of ``likelihood`` and m the number of candidates. After each acceptance all parameters
-are fitted anew and every column is rebuilt. An effect that would need ten times its data-sheet limit is no explanation
-of a few rests. Selected effects whose own delta BIC has become negative are dropped; one that a rival replaces with
-delta BIC > 10 is exchanged.
+are fitted anew and every column is rebuilt. An effect that would need ten times its limit in the sensor file is no
+explanation of a few rests. Selected effects whose own delta BIC has become negative are dropped; one that a rival
+replaces with delta BIC > 10 is exchanged.
 
 The posterior over effects is that of the linear problem of ``pipeline.estimation.evidence``: columns are taken at the
 fit of what was selected, with its values put back into the residual, ``y = r + Z p``. As in the likelihood of the
@@ -78,18 +78,19 @@ def fit_configured(
     return max(fits, key=lambda found: found.log_likelihood)
 
 
-def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, Values]:
-    """Return the limits of every effect's parameters, infinite where the data sheet has none."""
-    given = sheet.get("effects") or {}
+def limits_of(sensor: str, sensor_config: Mapping[str, Any]) -> dict[str, Values]:
+    """Return the limits of every effect's parameters, infinite where the sensor file has none."""
+    given = sensor_config.get("effects") or {}
     return {name: parameter_limits(e, sensor, given) for name, e in catalogue().items() if sensor in e.sensors}
 
 
 class Selection:
     """What was selected, and how every candidate did: ``first`` and ``last`` before and after the search.
 
-    ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sheet``: the sensor's
-    section of the configuration. ``names``: in order. ``steps``: score of each when it was accepted. ``fits``: of base
-    and configured effects, then with each further selected one. ``own``: scores given all selected effects but one.
+    ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sensor_config``: the
+    sensor's section of the configuration. ``names``: in order. ``steps``: score of each when it was accepted. ``fits``:
+    of base and configured effects, then with each further selected one. ``own``: scores given all selected effects but
+    one.
     """
 
     def __init__(
@@ -98,11 +99,11 @@ class Selection:
         start: SensorCalibration,
         configured: Sequence[str],
         noise: Noise | None,
-        sheet: Mapping[str, Any],
+        sensor_config: Mapping[str, Any],
     ) -> None:
         self.model = model
         self.hypotheses = selection_hypotheses(noise, model.kinds)
-        self.limits = limits_of(model.sensor, sheet)
+        self.limits = limits_of(model.sensor, sensor_config)
         self.candidates = candidates_for(model.sensor, model.rests, configured)
         self.kept_near = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}
         self.base = fit_configured(model, start, configured, self.hypotheses, self.kept_near)

@@ -163,7 +163,7 @@ class Effect(abc.ABC):
         return None
 
     def limits(self, sensor: str) -> dict[str, float]:
-        """Return the largest plausible sizes that the effect brings itself, keyed as those of the data sheet."""
+        """Return the largest plausible sizes that the effect brings itself, keyed as those of the sensor file."""
         del sensor
         return {}
 

@@ -271,7 +271,7 @@ def test_six_positions_give_bias_and_scale_factors_and_say_what_is_fixed() -> No
     factor = coverage_factor(calibration.degrees_of_freedom)
     assert np.all(np.abs(calibration.bias - BIAS) < 2 * factor * _uncertainty(calibration)[:3])
     assert np.diag(calibration.matrix) == pytest.approx(np.diag(MATRIX), abs=1e-3)
-    assert np.min(_uncertainty(calibration)[:3]) > 1e-4 / np.sqrt(2.0)  # the bias wander of the data sheet is in it
+    assert np.min(_uncertainty(calibration)[:3]) > 1e-4 / np.sqrt(2.0)  # the bias wander of the sensor file is in it
 
 
 def test_one_misalignment_alone_may_be_left_undetermined() -> None:

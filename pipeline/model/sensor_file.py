@@ -2,7 +2,7 @@
 
 ``ranges`` maps a full scale to counts per unit; the override ``sensor.accelerometer.range=6`` stands for ``full_scale``
 and ``counts_per_unit`` of one of them. A figure that is null, or left out, is that of ``generic``, and its name stands
-in ``assumed``; so is the whole sheet of a sensor that the chip does not have. Full scale and counts are never assumed.
+in ``assumed``; so is the whole part of a sensor that the chip does not have. Full scale and counts are never assumed.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str
     """Return a sensor in which the figures of ``generic`` stand for those that are not stated."""
     out = dict(sensor)
     for part in SENSORS:
-        sheet = dict(sensor.get(part) or {k: generic[part][k] for k in ("full_scale", "counts_per_unit")})
-        missing = [key for key in NEEDED if sheet.get(key) is None]
+        sensor_config = dict(sensor.get(part) or {k: generic[part][k] for k in ("full_scale", "counts_per_unit")})
+        missing = [key for key in NEEDED if sensor_config.get(key) is None]
         if missing:
-            out[part] = sheet | {key: generic[part][key] for key in missing} | {"assumed": missing}
+            out[part] = sensor_config | {key: generic[part][key] for key in missing} | {"assumed": missing}
     return out
 
 
@@ -57,12 +57,12 @@ def settings_of_ranges(sensor: Mapping[str, Any], wanted: Sequence[float | None]
         raise ConfigurationError("--range takes that of the accelerometer in g, then that of the gyroscope in deg/s")
     found = []
     for part, value in zip(parts, wanted, strict=False):
-        sheet = sensor[part]
-        if value is not None and sheet.get("ranges"):
+        sensor_config = sensor[part]
+        if value is not None and sensor_config.get("ranges"):
             range_settings(f"sensor.{part}.range", value, sensor)  # refuses what the file does not list
             found.append(f"sensor.{part}.range={value:g}")
         elif value is not None:
-            counts = float(sheet["counts_per_unit"]) * float(sheet["full_scale"]) / value
+            counts = float(sensor_config["counts_per_unit"]) * float(sensor_config["full_scale"]) / value
             found += [f"sensor.{part}.full_scale={value:g}", f"sensor.{part}.counts_per_unit={counts:.10g}"]
     return found
 
@@ -73,18 +73,18 @@ def assumed_figures(name: str, sensor: Mapping[str, Any]) -> str:
     return f"the file of the sensor {name} does not state {', and '.join(parts)}: generic's are used" if parts else ""
 
 
-def as_stated(sheet: Mapping[str, Any]) -> dict[str, Any]:
+def as_stated(sensor_config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures that the sensor's file states; None for those of ``generic``."""
-    return {**sheet, **dict.fromkeys(sheet.get("assumed") or ())}
+    return {**sensor_config, **dict.fromkeys(sensor_config.get("assumed") or ())}
 
 
 def without_overridden(sensor: dict[str, Any], keys: set[str]) -> dict[str, Any]:
     """Return a sensor in which what an override states (``sensor.gyroscope.bias``) is not assumed."""
     for part in SENSORS:
-        sheet = sensor.get(part) if isinstance(sensor, dict) else None
-        sheet = sheet if isinstance(sheet, dict) else {}
-        assumed = sheet.get("assumed")
+        sensor_config = sensor.get(part) if isinstance(sensor, dict) else None
+        sensor_config = sensor_config if isinstance(sensor_config, dict) else {}
+        assumed = sensor_config.get("assumed")
         left = [key for key in assumed or () if f"sensor.{part}.{key}" not in keys]
         if assumed and len(left) < len(assumed):
-            sensor = {**sensor, part: {**sheet, "assumed": left}}
+            sensor = {**sensor, part: {**sensor_config, "assumed": left}}
     return sensor
