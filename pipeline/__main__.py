@@ -63,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def run_command(words: list[str]) -> int:
     """Run a known command in this process."""
-    from pipeline.errors import PipelineError  # noqa: PLC0415
+    from pipeline.errors import UNKNOWN_LAYOUT, PipelineError  # noqa: PLC0415
 
     command, *rest = words
     try:
@@ -73,6 +73,8 @@ def run_command(words: list[str]) -> int:
         return int(import_module("pipeline.stages.batch").main(command, rest))
     except PipelineError as error:
         print(f"{PROGRAM} {command}: {error}", file=sys.stderr)
+        if error.code in UNKNOWN_LAYOUT:
+            print(f"{PROGRAM} check FILE --save PROFILE.yaml proposes how to read it, for --ingest", file=sys.stderr)
         return 2
     except BrokenPipeError:
         sys.stderr.close()

@@ -15,7 +15,7 @@ from pipeline.commands.readings import Reading, campaign_of, config_of_log, grou
 from pipeline.commands.trial import try_unit
 from pipeline.config.campaign import find_campaign, load_campaign
 from pipeline.config.options import nearest
-from pipeline.errors import ConfigurationError, IngestError, PipelineError
+from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError
 from pipeline.files import write_atomically
 from pipeline.io.files import SUFFIXES, recording_files
 from pipeline.model.calibration_file import LEFT_OUT
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 SEARCHED_BYTES = 1 << 25  # of a log, for its layout
 MOST_IN_FULL = 3  # logs of one layout
 WIDTH = 118  # characters of a line
-UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")
 EPILOG = """\
 Recordings of a campaign are checked as a run would do it: with the settings of their unit, compared with the other
 recordings of the unit, and fitted. --campaign without files checks every unit of a campaign, with its effects and its

@@ -394,3 +394,11 @@ def test_the_parts_of_a_log_whose_clock_fell_back_are_used_by_the_settings_that_
     assert "unit U: 9 recordings, no refusal" in Checked(capsys, "--campaign", linked).out
     both = Checked(capsys, log)
     assert f"session 2 of 2: lines 433 to {432 + len(again)} were read" in both.words
+
+
+def test_a_command_that_cannot_read_a_log_names_the_one_that_proposes_a_profile(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "log.csv").write_text("t,ax,ay,az\n" + "".join(f"{0.01 * i:.2f},0,0,1\n" for i in range(100)))
+    assert main(["guide", str(tmp_path / "log.csv")]) == 2
+    assert "pipeline check FILE --save PROFILE.yaml proposes how to read it" in capsys.readouterr().err
