@@ -1,8 +1,8 @@
 """The tree of user errors.
 
-Each says what is wrong, where, what was expected and what to do. A user error is one line (of an unknown log a second one
-names the command that proposes a profile) and exit code 2 on the command line, and a failure record of one unit in a
-batch; all else that is raised is a bug and keeps its traceback.
+Each says what is wrong, where, what was expected and what to do. A user error is one line and exit code 2 on the
+command line (of an unknown log a second line names the command that proposes a profile), and a failure record of one
+unit in a batch; all else that is raised is a bug and keeps its traceback.
 """
 
 from __future__ import annotations
