@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.generalized_least_squares import Fit, fit_terms
-from pipeline.estimation.observations import through_filter
+from pipeline.estimation.observations import filtered_motion
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import table_motion
@@ -254,7 +254,7 @@ def _errors(difference: _Difference, recording: Recording, table: Mapping[str, A
     if before is None:
         return {}
     filtered = recording.filter["name"] != "none"
-    motion = through_filter(replace(before, at_offset=None, at_lag=None), recording) if filtered else before
+    motion = filtered_motion(replace(before, at_offset=None, at_lag=None), recording) if filtered else before
     u = truth(sensor, motion)
     size = np.linalg.norm(u, axis=1)
     found: Errors = {name: (e, np.linalg.norm(u + e, axis=1) - size) for name, e in difference.parts(motion).items()}

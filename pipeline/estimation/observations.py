@@ -226,7 +226,7 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     filtered = recording.filter["name"] != "none"
     if filtered:
         sure = _filter_settled(motion, recording) if sensor == "gyroscope" else reference_valid(motion)
-        motion = replace(through_filter(motion, recording), reference_valid=sure)
+        motion = replace(filtered_motion(motion, recording), reference_valid=sure)
     valid = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.valid)
     rows = rows_of(motion, valid, together=not filtered).settled(reading)
     if len(rows.first) == 0:
@@ -261,7 +261,7 @@ def _shared(recording: Recording, motion: Motion, rows: Rows) -> Motion:
     return found
 
 
-def through_filter(motion: Motion, recording: Recording) -> Motion:
+def filtered_motion(motion: Motion, recording: Recording) -> Motion:
     """Return the motion after the filter that the readings went through.
 
     The filter is linear, so that filtered readings are the model of filtered truth; in effects that are not linear in
@@ -273,7 +273,7 @@ def through_filter(motion: Motion, recording: Recording) -> Motion:
     def at(trajectory: Callable[..., Motion | None], **to: Any) -> Motion:  # noqa: ANN401  (an offset or a lag)
         there = trajectory(**to)
         assert there is not None  # noqa: S101
-        return through_filter(there, recording)
+        return filtered_motion(there, recording)
 
     return replace(
         motion,

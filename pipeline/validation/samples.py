@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.gauss_markov import variance_of_average
-from pipeline.estimation.observations import through_filter
+from pipeline.estimation.observations import filtered_motion
 from pipeline.estimation.rest_means import rest_means, split_rests
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.timing import shifted
@@ -100,7 +100,7 @@ def samples_of_motion(
     motion, earth = table_motion(recording, table), earth_of(table)
     smoothed = smoothed and motion is not None and recording.filter["name"] != "none"
     if motion is not None:
-        motion = through_filter(motion, recording) if smoothed else shifted(motion, -delay)
+        motion = filtered_motion(motion, recording) if smoothed else shifted(motion, -delay)
     magnitude = np.full(recording.samples, gravity)
     by_angle = _rate_by_angle(recording) if sensor == "gyroscope" else None
     if sensor == "gyroscope":

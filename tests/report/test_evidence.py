@@ -240,12 +240,14 @@ def test_the_stairs_go_on_to_what_the_missing_effect_would_bring() -> None:
         {"name": "raw", "rms_error": 1.0, "vector_rms_error": 2.0},
         {"name": "calibrated", "rms_error": 0.1, "vector_rms_error": 0.2},
     ]
-    held_out = {"steps": steps, "noise_floor": 0.01, "vector_noise_floor": 0.02}
+    held_out: dict[str, Any] = {"steps": steps, "noise_floor": 0.01, "vector_noise_floor": 0.02}
+    held_out["noise"] = {"source": "static", "wander_source": "data_sheet", "correlation_time_source": "data_sheet"}
     found = diagnosis_of("accelerometer")
     found["ranking"][0] |= {"held_out_error_before": 0.19, "held_out_error_after": 0.021}
     figure = error_steps("accelerometer", held_out, found, vector=True)
     assert figure is not None
     assert "+ quadratic nonlinearity, if added" in figure.svg
+    assert "White noise is that of the static recording, bias wander that of the sensor file" in figure.caption
     assert figure.finding == (
         "The error of the vector ends at 0.200 g, 10.0 × the noise floor; with the missing effects, at 0.0210"
     )
