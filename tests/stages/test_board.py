@@ -31,7 +31,7 @@ def test_the_reference_of_a_board_says_how_the_others_sit(tmp_path: Path) -> Non
     for sensor in ("accelerometer", "gyroscope"):
         files[sensor] = {f"{c.unit}.json": c.calibrations[sensor].to_json() for c in chips}
     inputs = {stage: Pack(write_pack(tmp_path / f"{stage}.zip", own)) for stage, own in files.items()}
-    units = {chip.unit: {"sensor": chip.sheet, "method": {"as_printed": False}} for chip in chips}
+    units = {chip.unit: {"sensor": chip.sensor_config, "method": {"as_printed": False}} for chip in chips}
     job = Job("calibration", units, {}, inputs, tmp_path / "out.zip", tmp_path)
     board = {"name": "B1", "chips": [*names, "lost"]}
     found = _on_board(job, names[0], board)
