@@ -37,7 +37,7 @@ UPRIGHT = 28  # px, of height for each tick of axis y
 MAXIMUM_DOTS = 240  # samples that are drawn as dots; about one in 1.4 px
 BUCKETS = 140  # ranges that are drawn of more samples; about one in 2.4 px
 MAXIMUM_FULL = 20_000  # samples that a page holds of a curve (53 kB); of more, the ends of half as many buckets
-LARGE_DOTS, LARGE_MEANS = 300, 20  # dots, and dots with intervals, that have room to be large
+LARGE_DOTS, LARGE_MEANS = 300, 40  # dots, and dots with intervals, that have room to be large
 LETTER = 6.2  # px, width of a letter
 
 

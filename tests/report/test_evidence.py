@@ -93,7 +93,7 @@ def test_the_line_of_an_added_variable_has_the_parameter_as_its_slope() -> None:
     figure = added_variable("gyroscope", added(0.4))
     assert figure is not None
     path = re.search(r'class="line c5 model" d="M(\d+) (\d+)l(-?\d+) (-?\d+)"', figure.svg)
-    dots = re.search(r'class="dots c1" d="M(\d+) (\d+)h0(.*?)"', figure.svg)
+    dots = re.search(r'class="dots large c1" d="M(\d+) (\d+)h0(.*?)"', figure.svg)
     assert path is not None
     assert dots is not None
     x, y, right, down = (int(v) for v in path.groups())
