@@ -27,6 +27,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.least_squares import ScaledColumns
+from pipeline.estimation.observations import without_rows
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.model.effects.base import Effect, Layout, truth
 
@@ -100,6 +101,18 @@ def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) ->
             part.moved.pop(next(iter(part.moved)))
         part.moved[key] = motion
     return part.moved[key]
+
+
+def followed(observations: Observations, terms: Sequence[Term]) -> Observations:
+    """Return observations without the rows that effects of timing move to times at which the log tells no motion.
+
+    The same observations where there is none.
+    """
+    known = [true_motion(part, terms).reference_valid for part in observations.parts]
+    if all(mask is None or mask.all() for mask in known):
+        return observations
+    lost = [np.zeros(len(p.weight), bool) if m is None else ~m for p, m in zip(observations.parts, known, strict=True)]
+    return without_rows(observations, lost)
 
 
 def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:

@@ -23,7 +23,18 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import HELD, TILT, is_held, parameter_names, require_available, starts_of
-from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base, placed, stepped
+from pipeline.estimation.design import (
+    BASE,
+    BASE_NAMES,
+    Design,
+    Start,
+    Term,
+    followed,
+    motions_of,
+    ordinary_base,
+    placed,
+    stepped,
+)
 from pipeline.estimation.engine import RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
@@ -303,6 +314,9 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     require_available(observations, effects)
     grid = selection_grid(noise, RATIOS, TIMES)
     fit = fit_best(observations, combinations, base, grid)
+    known = followed(observations, fit.terms)
+    if known is not observations:
+        observations, fit = known, fit_terms(known, fit.terms, fit, grid)
     require_observable(observations, fit)
     return calibration_of(sensor, fit, observations, start, settings, noise)
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
-from pipeline.estimation.design import Start, Term, ordinary_base, placed
+from pipeline.estimation.design import Start, Term, followed, ordinary_base, placed
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gauss_markov import Setting, selection_grid
 from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms
@@ -75,6 +75,26 @@ def select(
     ``search``: without it, no effect is scored: base and the candidates' products alone.
     """
     observations = weighted(observations, noise)
+
+    def searched(observations: Observations) -> Selection:
+        return _selection(observations, configured, noise, sensor_config, known, accelerometer, search=search)
+
+    found = searched(observations)
+    told = followed(observations, found.fit.terms)
+    return found if told is observations else searched(told)
+
+
+def _selection(  # noqa: PLR0917  (as ``select``)
+    observations: Observations,
+    configured: Sequence[str],
+    noise: Noise | None,
+    sensor_config: Mapping[str, Any],
+    known: SensorCalibration | None,
+    accelerometer: SensorCalibration | None,
+    *,
+    search: bool,
+) -> Selection:
+    """Select effects by all rows of the observations."""
     start, settings = ordinary_base(observations, noise), selection_grid(noise)
     base = fit_best(observations, starts_of(configured, observations, known, accelerometer), start, settings)
     candidates = {}

@@ -263,6 +263,10 @@ class Rows:
         shape = (-1,) + (1,) * (values.ndim - 1)
         return np.add.reduceat(kept, self.first, axis=0) / self.count.reshape(shape)
 
+    def all(self, mask: Mask | None) -> Mask | None:
+        """Return at which groups an (n,) mask holds throughout: (m,) array; None for none."""
+        return None if mask is None else np.logical_and.reduceat(mask[self.kept], self.first)
+
     def motion(self, motion: Motion) -> Motion:
         """Return the motion at the rows."""
         arrays = {name: v for name, v in vars(motion).items() if isinstance(v, np.ndarray) and v.dtype != bool}
@@ -272,7 +276,7 @@ class Rows:
             motion,
             **means,
             still=motion.still[self.kept[self.first]],
-            reference_valid=None,
+            reference_valid=self.all(motion.reference_valid),
             at_offset=None if trajectory is None else partial(self._at, trajectory),
             at_lag=None if motion.at_lag is None else partial(self._at, motion.at_lag),
         )

@@ -131,6 +131,17 @@ class EncoderTrajectory:
             angle[smooth], rate[smooth], acceleration[smooth] = self._quintic(k[smooth], x[smooth])
         return angle, rate, acceleration
 
+    def known_at(self, time: Values) -> Mask:
+        """Return which times are known from the log: (n,) array.
+
+        Those from ``MEMORY_S`` before a sample of ``valid_samples`` to the next sample belong to it; others must lie
+        between two such samples.
+        """
+        step = np.append(self._step, 0.0)
+        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self._step) - 1)
+        near = (time > self.time - MEMORY_S) & (time <= self.time + step)
+        return np.where(near, self.valid_samples, self.valid_samples[k] & self.valid_samples[k + 1])
+
     def lagged(self, time: Values, lag: float) -> tuple[Values, Values]:
         """Return the rate (deg/s) that a first-order lag shows, and its derivative (deg/s^2), at any times.
 

@@ -181,7 +181,7 @@ def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
         axis=axis,
         still=np.zeros(len(log.time), bool),
         level=level,
-        reference_valid=log.valid_samples,
+        reference_valid=log.known_at(log.time + offset) if np.any(offset) else log.valid_samples,
     )
 
 

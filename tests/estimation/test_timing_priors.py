@@ -11,9 +11,12 @@ import pytest
 from pipeline.config.schema import OF_BENCH
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.noise import noise_of
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import select
 from pipeline.estimation.stages import fit_stage
 from pipeline.model.effects import bench_priors
 from pipeline.preprocessing.checks import check_recordings
+from pipeline.preprocessing.coarse_temperature import refined
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from pipeline.study.bench import recordings_of
@@ -83,6 +86,17 @@ def test_a_slow_clock_is_found_beside_effects_that_could_take_its_signal() -> No
     found = {e.name: e.values for e in fitted("gyroscope", recordings_of(case), settings).effects}
     assert found["clock_rate"] == pytest.approx(case.hidden["clock_rate"], abs=0.1)
     assert found["table_rate_ripple"][:4] == pytest.approx(case.hidden["table_rate_ripple"][:4], abs=2e-5)
+
+
+def test_a_slow_clock_alone_is_all_that_is_selected() -> None:
+    """The readings at the corners of ramps come 0.48 s late: these rows, not those logged there, are not explained."""
+    case = draw("lost", 12, 84)
+    assert list(case.hidden) == ["clock_rate"]
+    settings = settings_of(case.model, "reference_least_squares")
+    recordings = refined(recordings_of(case))
+    noise = noise_of("gyroscope", recordings, settings)
+    observations = observe("gyroscope", recordings, settings["table"])
+    assert select(observations, [], noise, settings["sensor"]["gyroscope"]).names == ["clock_rate"]
 
 
 def test_rests_leave_the_offset_as_uncertain_as_its_prior() -> None:

@@ -35,6 +35,20 @@ def test_ramps_of_a_few_samples_are_followed_exactly_between_them(program: Progr
     assert np.mean(np.abs(acceleration - truth[2]) > 1e-3) < 0.01
 
 
+@pytest.mark.parametrize("shift", [-0.7, -0.2, 0.05, 0.48])
+def test_times_that_are_known_are_followed_however_far_from_the_samples(program: Program, shift: float) -> None:
+    time = np.arange(0.0, program.duration, 0.12)
+    angle, rate, _, _ = program.at(time)
+    knocked = np.abs(time - 12.0) < 0.2  # the log is wrong there
+    log = EncoderTrajectory(time, angle + 0.3 * knocked, rate)
+    known = log.known_at(time + shift)
+    inside = (time + shift > 0.0) & (time + shift < time[-1])
+    miss = np.abs(log.at(time + shift)[0] - program.at(time + shift)[0])
+    assert miss[known & inside].max() < 1e-5
+    assert not known[miss > 0.1].any()
+    assert known.mean() > 0.9
+
+
 def test_a_step_between_two_samples_is_not_claimed_to_be_followed() -> None:
     time = np.arange(0.0, 6.0, 0.12)
     angle = np.where(time < 3.0, 0.0, 1.0)
