@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.files import read_json, write_json
 from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
-from pipeline.results_folder import hold_as_job, record_written
+from pipeline.results_folder import hold_as_job, record_written, repetitions
 from pipeline.stages import MODULES
 
 if TYPE_CHECKING:
@@ -74,12 +74,12 @@ def main(stage: str, argv: Sequence[str]) -> int:
     if hasattr(module, f"{stage}_batch"):
         getattr(module, f"{stage}_batch")(job)
         return 0
-    last = last_output(job.output)
+    last, edited = last_output(job.output), _edited(job)
     with new_pack(job.output) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
             inputs = _inputs_of(job, unit, settings) if stage in BY_INPUTS else ""
-            files = _unchanged(last, unit, inputs) if inputs else {}
+            files = _unchanged(last, unit, inputs) if inputs and not edited else {}
             if files:
                 print(f"{stage}: {unit} unchanged, taken from the last run", file=sys.stderr, flush=True)
             else:
@@ -112,10 +112,15 @@ def forget_last_outputs(results: Path) -> None:
         last.unlink()
 
 
+def _edited(job: Job) -> bool:
+    """Return whether a job is repeated because its output was edited."""
+    return bool(job.run.get("again", 0) != repetitions(job.results, _below(job, job.output))[0])
+
+
 def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:
     """Return a digest of settings, code and files of earlier stages that a unit depends on, "" where one is damaged."""
     packs = [*job.inputs.values(), *([Pack(Path(job.run["previous"]))] if job.run.get("previous") else [])]
-    run = {key: value for key, value in job.run.items() if key != "previous"}
+    run = {key: value for key, value in job.run.items() if key not in {"previous", "again"}}
     found = hashlib.sha256(json.dumps([run, settings], sort_keys=True).encode())
     own = (f"{unit}.", f"{unit}_")
     try:
@@ -177,8 +182,12 @@ def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 def record_output(job: Job, output: Path, names: Sequence[str] = ("",)) -> None:
     """Record what a job wrote, so that the next run detects edited files."""
     if output.is_relative_to(job.results):
-        below = output.relative_to(job.results).as_posix()
-        record_written(job.results, below.removeprefix("."), job.run.get("again", 0), names)
+        record_written(job.results, _below(job, output), job.run.get("again", 0), names)
+
+
+def _below(job: Job, output: Path) -> str:
+    """Return an output's path below the results, empty for these and outside of them."""
+    return output.relative_to(job.results).as_posix().removeprefix(".") if output.is_relative_to(job.results) else ""
 
 
 def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
