@@ -22,7 +22,7 @@ An encoder with a wrong number of counts a turn, or a gear of another ratio, giv
     f_k = c_k + A_k cos(s a) + B_k sin(s a) + r_k
 
 with table angle a, both axes k across the turn axis, one s for both, and in r what else depends on the motion:
-harmonics up to the third, what a delay (rate times the first harmonic) and a lever arm add, a drift.
+harmonics up to the third, what a delay (rate times the first harmonic) and a lever arm add, drifts of bias and scale.
 """
 
 from __future__ import annotations
@@ -202,7 +202,8 @@ def doubt_of_angle(recording: Recording, limits: Limits) -> str | None:
 def _gear(recording: Recording) -> tuple[float, float] | None:
     """Return how many times as far the angle turns as gravity, and its standard uncertainty."""
     angle, rate, force = recording.table_angle, recording.logged_rate, recording.accelerometer
-    if angle is None or rate is None or force is None or gravity_turned(recording) is None:
+    slow = recording.role != "gyroscope"  # a turn of minutes: a bias that follows the temperature looks the same
+    if slow or angle is None or rate is None or force is None or gravity_turned(recording) is None:
         return None
     keep = recording.valid
     if np.count_nonzero(keep) < FEWEST_OF_A_GEAR or float(np.ptp(angle[keep])) < WHOLE_TURN_DEG:
@@ -210,15 +211,18 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
     axis, w, t = axis_index(recording), np.radians(rate[keep]), recording.time[keep]
     y = force[keep][:, [(axis + 1) % 3, (axis + 2) % 3]]
     a = logged = np.radians(angle[keep] - float(np.mean(angle[keep])))
-    slope = np.gradient(w, t)
+    slope, late = np.gradient(w, t), (t - t[0]) / (t[-1] - t[0])
     for _ in range(ROUNDS):
         c, s = np.cos(a), np.sin(a)
-        columns = [np.ones_like(a), c, s, w * c, w * s, w * w, slope, t - t[0]]
+        columns = [np.ones_like(a), c, s, w * c, w * s, w * w, slope, late, late * late]
         columns += [f(k * a) for k in (2, 3) for f in (np.cos, np.sin)]
-        Q = np.linalg.qr(np.column_stack(columns))[0]
         first = np.linalg.lstsq(np.column_stack(columns[:3]), y, rcond=None)[0]
-        d = a[:, None] * (np.outer(c, first[2]) - np.outer(s, first[1]))
-        d, e = d - Q @ (Q.T @ d), y - Q @ (Q.T @ y)
+        d, e = a[:, None] * (np.outer(c, first[2]) - np.outer(s, first[1])), y.copy()
+        for k in range(2):
+            harmonic = first[1, k] * c + first[2, k] * s
+            Q = np.linalg.qr(np.column_stack([*columns, late * harmonic, late * late * harmonic]))[0]
+            d[:, k] -= Q @ (Q.T @ d[:, k])
+            e[:, k] -= Q @ (Q.T @ e[:, k])
         information = float(np.sum(d * d))
         a = a * (1.0 + float(np.sum(d * e)) / information)
     starts = np.linspace(0, len(t), BLOCKS_OF_A_GEAR, endpoint=False).astype(int)
