@@ -77,7 +77,8 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
     if not shown:
         return None
     count, beyond = len(shown), sum(row["share"] >= 1.0 for row in shown)
-    finding = f"{count - beyond} of {count} effects that were not selected are excluded at the sensor file's limit"
+    verb = "is" if count - beyond == 1 else "are"
+    finding = f"{count - beyond} of {count} effects that were not selected {verb} excluded at the sensor file's limit"
     caption = (
         "Upper limits (95 %) of the largest parameter of each effect, were it there, over the sensor file's limit: "
         "left of the line the recordings exclude an effect of that size."

@@ -140,7 +140,7 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
     legend = tuple((f"c{c}", f"rest, {use}") for use, c in USES.items() if c in colours) or ((f"c{LOGGED}", "rest"),)
     names = [r.name if len(r.name) <= LETTERS else f"{r.name[: LETTERS - 1]}…" for r in lanes]
     return chart(
-        Figure("segments", finding, "Thick: at rest; thin: in motion.", legend),
+        Figure("segments", finding, "Thick: rests that were found; thin: the remaining time.", legend),
         f"Rests of each recording. {'; '.join(f'{name}: {len(of)}' for name, of in spans.items())}.",
         [Panel(layers, "", LANE * len(lanes), limits=(0.5, len(lanes) + 0.5), rows=names)],
         "time since the start of the recording, s",

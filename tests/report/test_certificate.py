@@ -134,6 +134,12 @@ def test_the_accuracy_of_gravity_is_asked_for(unit: Unit) -> None:
     assert [m["key"] for m in report["missing"]] == ["table.gravity_accuracy_g"]
 
 
+def test_only_a_table_that_moves_the_item_has_its_mounting_in_the_matrix(unit: Unit) -> None:
+    for motion in ("logged", "commanded", "none"):
+        page = render("U1", report_of(unit, STATED, motion=motion))
+        assert ("mounting of the item" in page) == (motion != "none")
+
+
 def test_what_a_laboratory_writes_is_escaped_in_the_page_and_in_its_style(unit: Unit) -> None:
     hostile = '"; } </style><script>alert(1)</script>'
     page = render("U1", report_of(unit, STATED | {"number": hostile, "place": hostile}))
