@@ -45,16 +45,23 @@ BEFORE = {  # what a reader would have at that command
     "fleet.md": "printf 'unit,sensor\\nU0123,mpu6050\\n' > my_fleet/units.csv",
     "record.md": "rm -rf my_bench",
     "your_bench.md": "sed '1s/time_s/Time (s)/; 1s/accel_\\(.\\)_g/A\\1 (g)/g; 1s/gyro_\\(.\\)_dps/G\\1 (deg\\/s)/g' "
-    "log.csv > my_log.csv; rm -rf my_bench; python -m pipeline new my_bench --sensor mpu6050; " + U1.format("my_bench"),
+    "log.csv > my_log.csv; mkdir my_logs; cp my_log.csv my_logs; rm -rf my_bench; "
+    "python -m pipeline new my_bench --sensor mpu6050; " + U1.format("my_bench"),
 }
 FILES = {
     "boards.md": {"yaml": "two_chips/simulation.yaml"},
     "effects_of_your_own.md": {"yaml": "data/bench/effects/gear_mesh.yaml", "python": "path/to/loose_part.py"},
 }
-MAY_END_WITH = {"python -m pipeline check my_log.csv": 2}  # a log that needs a profile
+MAY_END_WITH = {
+    "python -m pipeline check my_log": 2,  # logs that need a profile
+    "python -m pipeline add bench U1 --suggested": 2,  # these recordings hide nothing
+    "python -m pipeline unpack my_fleet": 2,  # so few units have their files already
+}
 NOT_RUN = {  # by the start of the command, and why
     "pip ": "no package is installed by a test",
     "snakemake --profile profiles/slurm": "python -m pytest -m slurm runs it",
+    "snakemake --profile profiles/kubernetes": "needs its executor: docs/fleet.md states the dry run",
+    "snakemake --profile profiles/aws": "needs its executor: docs/fleet.md states the dry run",
     "python -m pipeline.field_logs.ros2_node": "needs ROS 2; tests/commands play a log to it",
     "python -m pipeline guide": "waits for a growing log; tests/commands run it",
     "python -m pipeline thesis seeds": "some minutes; tests/thesis makes some of its rows",
