@@ -89,7 +89,9 @@ else:
     MONITOR = Monitor(
         CAMPAIGN.results,
         {batch: len(units) for batch, units in CAMPAIGN.batches.items()},
-        sum("effects" in s for chain in CAMPAIGN.chains.values() for s in chain.values()),
+        sum(
+            "effects" in s for chain in CAMPAIGN.chains.values() for s in chain.values()
+        ),
         logger,
     )
 # In a container the interpreter of this machine does not exist; elsewhere each machine parses this file with its own.
