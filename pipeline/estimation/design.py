@@ -103,10 +103,10 @@ def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) ->
     return part.moved[key]
 
 
-def followed(observations: Observations, terms: Sequence[Term]) -> Observations:
-    """Return observations without the rows that effects of timing move to times at which the log tells no motion.
+def without_unknown_motion(observations: Observations, terms: Sequence[Term]) -> Observations:
+    """Return observations without the rows that effects of timing move to times at which the motion is not known.
 
-    The same observations where there is none.
+    The same object where there is no such row.
     """
     known = [true_motion(part, terms).reference_valid for part in observations.parts]
     if all(mask is None or mask.all() for mask in known):

@@ -29,11 +29,11 @@ from pipeline.estimation.design import (
     Design,
     Start,
     Term,
-    followed,
     motions_of,
     ordinary_base,
     placed,
     stepped,
+    without_unknown_motion,
 )
 from pipeline.estimation.engine import RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
@@ -314,7 +314,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     require_available(observations, effects)
     grid = selection_grid(noise, RATIOS, TIMES)
     fit = fit_best(observations, combinations, base, grid)
-    known = followed(observations, fit.terms)
+    known = without_unknown_motion(observations, fit.terms)
     if known is not observations:
         observations, fit = known, fit_terms(known, fit.terms, fit, grid)
     require_observable(observations, fit)

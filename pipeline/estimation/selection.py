@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
-from pipeline.estimation.design import Start, Term, followed, ordinary_base, placed
+from pipeline.estimation.design import Start, Term, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gauss_markov import Setting, selection_grid
 from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms
@@ -80,8 +80,8 @@ def select(
         return _selection(observations, configured, noise, sensor_config, known, accelerometer, search=search)
 
     found = searched(observations)
-    told = followed(observations, found.fit.terms)
-    return found if told is observations else searched(told)
+    remaining = without_unknown_motion(observations, found.fit.terms)
+    return found if remaining is observations else searched(remaining)
 
 
 def _selection(  # noqa: PLR0917  (as ``select``)

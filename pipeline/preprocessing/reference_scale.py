@@ -202,8 +202,9 @@ def doubt_of_angle(recording: Recording, limits: Limits) -> str | None:
 def _gear(recording: Recording) -> tuple[float, float] | None:
     """Return how many times as far the angle turns as gravity, and its standard uncertainty."""
     angle, rate, force = recording.table_angle, recording.logged_rate, recording.accelerometer
-    slow = recording.role != "gyroscope"  # a turn of minutes: a bias that follows the temperature looks the same
-    if slow or angle is None or rate is None or force is None or gravity_turned(recording) is None:
+    if recording.role != "gyroscope":  # in a turn of minutes, a bias that follows the temperature looks the same
+        return None
+    if angle is None or rate is None or force is None or gravity_turned(recording) is None:
         return None
     keep = recording.valid
     if np.count_nonzero(keep) < FEWEST_OF_A_GEAR or float(np.ptp(angle[keep])) < WHOLE_TURN_DEG:

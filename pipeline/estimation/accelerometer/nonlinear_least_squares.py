@@ -75,7 +75,7 @@ OF_LENGTH = {
     "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
     "time base": "no time enters the length of gravity",
 }
-HELD = (
+HELD_MISALIGNMENT = (
     "the orientations do not determine it, so that it is held at 0; what it would change in bias and scale factors is "
     "not included: record rests at 45 deg between the two axes"
 )
@@ -331,7 +331,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     calibration = with_stage(before, NAME, details, solved.model, solved.fit, correction, parameters)
     gravity = gravity_contribution("accelerometer", calibration.matrix, settings["table"], 12)
     missing = OF_LENGTH if gravity else {"local gravity": "table.gravity_accuracy_g is not stated", **OF_LENGTH}
-    missing = missing | dict.fromkeys(NAMES[~solved.free].tolist(), HELD)
+    missing = missing | dict.fromkeys(NAMES[~solved.free].tolist(), HELD_MISALIGNMENT)
     lines = [gravity] if gravity else []
     complete, trials = combined(calibration, [scatter, *lines], missing), trials_of(settings)
     if not trials:
