@@ -9,20 +9,22 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from pipeline.estimation.stages import apply_correction
+from pipeline.io.yaml_file import read_yaml
 from pipeline.records import SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Figure, Panel, Samples, chart
 from pipeline.report.group_charts import Point, curves, stems
 from pipeline.report.held_out_section import held_out_over_time
 from pipeline.report.numbers import MINUS, NOTHING, number
 from pipeline.report.pages import template
-from pipeline.thesis.conclusions import KINDS, Errors, conclusions
-from pipeline.thesis.errata import agreements, errata, scatters
+from pipeline.thesis.conclusions import KINDS, Errors, conclusions, verdict_of
+from pipeline.thesis.errata import agreements, evidence, scatters
 from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, SILENT, STOPS, Results, in_words, read_printed
 from pipeline.thesis.seeds import CAUSES, device_of
 from pipeline.thesis.tables import all_tables
@@ -43,19 +45,19 @@ def render(campaign: Path, folder: Path) -> str:
     rows = pd.read_csv(campaign / "seeds.csv")
     scatter = scatters(printed, rows)
     cells = all_tables(printed, results)
-    cells["key"] = [
-        key_of(c["table"], c["block"], c["row"], c["column"]) if c["large"] else "" for c in cells.to_dict("records")
-    ]
+    explanations = read_yaml(printed / "explanations.yaml")
+    cells["key"] = [key_of(explanations, c) if c["large"] else "" for c in cells.to_dict("records")]
     page: str = template("thesis.html").render(
         tables=cells.groupby("table", sort=False),
         text=_text,
         figures=all_figures(printed, results, rows, scatter),
-        errata=errata(printed, results, rows),
+        evidence=evidence(printed, results, rows),
         conclusions=conclusions(rows),
+        verdict_of=verdict_of,
         kinds=KINDS,
         difference=_difference,
         agreements=agreements(printed, results).to_dict("records"),
-        explanations=sorted(e for e in EXPLANATIONS if e.key in set(cells["key"])),
+        explanations=sorted((e for e in explanations if e["key"] in set(cells["key"])), key=itemgetter("key")),
         scatter=scatter.to_dict("records"),
         devices=DEVICES,
         causes=CAUSES,
@@ -82,122 +84,10 @@ def _difference(estimate: Estimate) -> tuple[str, str]:
     return value, f"{low} to {high}"
 
 
-class Explanation(NamedTuple):
-    """A reason for large differences; ``where``: regular expression of ``table|block|row|column`` of the cells."""
-
-    key: str
-    text: str
-    where: str
-
-
-ACCELEROMETER = r"^5\.(8|9|10|11|12|13|24)\|"
-GYROSCOPE = r"^5\.(19|20|21|22|26)\|"
-EXPLANATIONS = (  # the first that holds for a cell
-    Explanation(
-        "a",
-        "The printed matrix of Cholesky and LU is the forward one (erratum 4); here stands its inverse, the "
-        "correction, and what that leaves.",
-        r"^5\.2[56]\|inverted.*\|.*, Cholesky and LU$",
-    ),
-    Explanation(
-        "p",
-        "b of y on the home-made table: a misprint of −0.014 (see the errata).",
-        r"^5\.7\|.*\|by",
-    ),
-    Explanation(
-        "b",
-        "As printed, b is what an axis reads at the samples where another axis reads most and least. Noise moves "
-        "these samples by some degrees from the true level, and a degree is 0.017 g. The printed b do not scatter "
-        "like that: they cannot have been read off single samples (see the table of scatter).",
-        r"^5\.([1-7]|23)\|.*as printed.*\|b",
-    ),
-    Explanation(
-        "c",
-        "What is simulated is the median over the procedures; the printed b of this one lies some thousandths of a "
-        "g beside it.",
-        r"^5\.([1-7]|23)\|.*\|b",
-    ),
-    Explanation(
-        "d",
-        "A bias of a few hundredths of a deg/s or less: that of the rests is uncertain by bias wander and noise of "
-        "thousandths. It is within 0.02 deg/s of the printed one.",
-        r"^5\.(15|16|17|18|25)\|.*\|b",
-    ),
-    Explanation(
-        "e",
-        "A misprint of the thesis, or one element of some thousandths that varies so from rate to rate; what is "
-        "simulated is the median over the rates (erratum 5).",
-        r"^5\.(15|16|17|25)\|",
-    ),
-    Explanation(
-        "f",
-        "What the home-made table's crossed axes and the mounting on it add to each other is not printed apart; the "
-        "simulated ones are of the same size.",
-        r"^5\.18\|",
-    ),
-    Explanation(
-        "g",
-        "The largest and the smallest of thousands of errors are matters of the tails of the noise and of the "
-        "fastest part of a motion that is not printed.",
-        r"(largest|smallest) e",
-    ),
-    Explanation(
-        "h",
-        "With errata corrected, what is left is hardly more than the noise of the held-out motion, and at 30 deg/s "
-        "what the filter takes of the turn. The printed parameters leave more even on this motion: see the block in "
-        "which they are applied to it.",
-        ACCELEROMETER + r".*(corrected|least squares$)",
-    ),
-    Explanation(
-        "i",
-        "What picked peaks leave depends on how far the largest sample lies above the peak, so on the noise, the "
-        "number of samples and the filter, of which only the second is printed.",
-        ACCELEROMETER + r".*as printed",
-    ),
-    Explanation(
-        "j",
-        "The printed parameters on this campaign's held-out motion. Where more is left than was printed, the "
-        "printed motion was kinder to them; where less is left, it held something else, noise or accelerations.",
-        r"^5\.(8|9|1[0-4]|19|2[0-2])\|by the printed parameters",
-    ),
-    Explanation(
-        "k",
-        "How the home-made table shakes is not printed; what is simulated, 0.05 g at 7.3 Hz while it moves, is of the "
-        "size of the printed errors of S. Samples picked in motion hold it, a sinusoid fitted to the rests does not: "
-        "with errata corrected the home-made table is hardly worse than the precise one.",
-        r"^5\.14\|",
-    ),
-    Explanation(
-        "l",
-        "The held-out motion of the gyroscope is not printed and was not isotropic (erratum 12); the noise of the "
-        "recordings is not printed either. Of the STIM300 what is left is noise alone, before as after.",
-        GYROSCOPE,
-    ),
-    Explanation(
-        "m",
-        "Angles of some thousandths of a degree: the noise of 24 rests of 10 s makes each uncertain by some "
-        "hundredths.",
-        r"^paper 1\|.*α",
-    ),
-    Explanation(
-        "n",
-        "What 24 means of 10 s leave is their noise; how long the paper's rests were, and how still, is not printed.",
-        r"^paper 1\|.*RMSE",
-    ),
-    Explanation(
-        "o",
-        "The printed table of errors is symmetric, which errors of turns about different axes are not, and its 5.3 "
-        "deg about x does not follow from the printed S, T and M: they make 0.1 deg over 45 deg. Unexplained. "
-        "After, ours is what the noise integrates to.",
-        r"^paper 4\|",
-    ),
-)
-
-
-def key_of(table: str, block: str, row: str, column: str) -> str:
+def key_of(explanations: Sequence[JSON], cell: JSON) -> str:
     """Return the key of the first explanation that holds for a cell, or nothing."""
-    place = f"{table}|{block}|{row}|{column}"
-    return next((e.key for e in EXPLANATIONS if re.search(e.where, place)), "")
+    place = "|".join(cell[name] for name in ("table", "block", "row", "column"))
+    return next((str(e["key"]) for e in explanations if re.search(e["where"], place)), "")
 
 
 PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}

@@ -7,11 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.io.yaml_file import read_yaml
 from pipeline.records import Recording
 from pipeline.signal.filters import apply_filter
 from pipeline.thesis.conclusions import CONFIRMED, REFUTED, conclusions, gain_of_filter
 from pipeline.thesis.errata import agreements, scatters
-from pipeline.thesis.page import EXPLANATIONS, key_of, render
+from pipeline.thesis.page import key_of, render
 from pipeline.thesis.results import Results
 from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S, sets_of
 from pipeline.thesis.tables import all_tables, with_differences
@@ -69,16 +70,10 @@ def test_the_study_has_fifty_seeds_of_every_set() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "verdict"),
-    [
-        ("Speed hurts because the filter is late", REFUTED),
-        ("The staged method beats nonlinear least squares", REFUTED),
-        ("The home-made table calibrates the gyroscope worse", CONFIRMED),
-    ],
+    ("conclusion", "verdict"), [("delay", REFUTED), ("least_squares", REFUTED), ("table_gyroscope", CONFIRMED)]
 )
-def test_a_conclusion_is_judged_by_its_interval_over_seeds(words: str, verdict: str) -> None:
-    found = next(c for c in conclusions(ROWS) if c.says.startswith(words))
-    judged = [line for line in found.lines if line.verdict == verdict]
+def test_a_conclusion_is_judged_by_its_interval_over_seeds(conclusion: str, verdict: str) -> None:
+    judged = [line for line in conclusions(ROWS)[conclusion] if line.verdict == verdict]
     assert judged
     for line in judged:
         low, high = line.difference.interval
@@ -112,7 +107,16 @@ def test_picked_peaks_explain_the_scatter_of_o_on_the_first_device_and_not_on_th
 
 
 def test_every_explanation_has_a_key_of_its_own_and_is_found() -> None:
-    assert len({e.key for e in EXPLANATIONS}) == len(EXPLANATIONS)
-    assert key_of("5.1", "as printed: the largest and smallest samples", "bx, g", "stop 1 s") == "b"
-    assert key_of("5.25", "inverted: Cholesky and LU's matrix", "R12", "STIM300, Cholesky and LU") == "a"
-    assert key_of("5.26", "as printed", "mean |e|, deg/s: after", "STIM300, staged") == "l"
+    explanations = read_yaml(CAMPAIGN / "printed" / "explanations.yaml")
+    assert len({e["key"] for e in explanations}) == len(explanations) == 16
+    for place, key in (
+        (("5.1", "as printed: the largest and smallest samples", "bx, g", "stop 1 s"), "b"),
+        (("5.25", "inverted: Cholesky and LU's matrix", "R12", "STIM300, Cholesky and LU"), "a"),
+        (("5.26", "as printed", "mean |e|, deg/s: after", "STIM300, staged"), "l"),
+    ):
+        assert key_of(explanations, dict(zip(("table", "block", "row", "column"), place, strict=True))) == key
+
+
+def test_the_page_names_every_conclusion_that_is_judged(tmp_path: Path) -> None:
+    page = Text(render(CAMPAIGN, tmp_path)).text
+    assert page.count(" comparisons\n") == len(conclusions(ROWS)) == 10

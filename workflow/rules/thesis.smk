@@ -15,6 +15,7 @@ if PLAN["page"] == "thesis":
                         "printed/method_comparison.csv",
                         "printed/conference_paper.csv",
                         "printed/conference_paper_six_positions.csv",
+                        "printed/explanations.yaml",
                     ],
                 )
             ),
