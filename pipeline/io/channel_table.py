@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.io.units import COUNTS, TRIADS, to_house_unit
-from pipeline.records import AXES, Encoding, Note
+from pipeline.records import AXES, Note
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,7 +33,8 @@ class ChannelTable:
     """The samples of one file.
 
     ``values`` are in house units, by channel (``pipeline.io.units.CHANNELS``). ``lines``: the line of each row, counted
-    from 1; None where a format has no lines. ``flags``: what the reader itself marks.
+    from 1; None where a format has no lines. ``flags``: what the reader itself marks. ``count_sizes``: one count in the
+    house unit, of channels that came as counts.
     """
 
     path: str
@@ -41,7 +42,7 @@ class ChannelTable:
     values: dict[str, Values]
     source: dict[str, Any]
     lines: Integers | None = None
-    encodings: dict[str, Encoding] = field(default_factory=dict)
+    count_sizes: dict[str, float] = field(default_factory=dict)
     notes: tuple[Note, ...] = ()
     flags: NDArray[np.uint16] | None = None
 
@@ -71,7 +72,7 @@ class ChannelTable:
 def in_house_unit(source: ChannelSource, numbers: Values) -> Values:
     """Return the numbers of a channel (not the time) in g, deg/s, deg or degC."""
     if source.unit == COUNTS:
-        return Encoding(1.0 / source.counts_per_unit, source.offset).decode(numbers)
+        return (numbers - source.offset) * (1.0 / source.counts_per_unit)
     return to_house_unit(source.channel, numbers, source.unit)
 
 
@@ -111,11 +112,11 @@ def in_body_axes(axis_map: Sequence[str], readings: Values) -> Values:
 
 
 def to_body_axes(table: ChannelTable, maps: Mapping[str, Sequence[str]]) -> ChannelTable:
-    """Rotate readings and their counts into the body's axes, by the axis map of each sensor.
+    """Rotate readings into the body's axes, by the axis map of each sensor.
 
     A left-handed map is used as it stands, with a note: no rotation does that, only a sensor with such axes.
     """
-    values, encodings, notes = dict(table.values), dict(table.encodings), table.notes
+    values, notes = dict(table.values), table.notes
     matrices = {sensor: axis_matrix(maps[sensor]) for sensor in TRIADS}
     if all(np.array_equal(m, np.eye(3)) for m in matrices.values()):
         return table
@@ -126,12 +127,8 @@ def to_body_axes(table: ChannelTable, maps: Mapping[str, Sequence[str]]) -> Chan
             sign = matrix[row].sum()
             if reading in table.values:
                 values[body] = table.values[reading] if sign > 0 else -table.values[reading]
-            encodings.pop(body, None)
-            if reading in table.encodings:
-                encoding = table.encodings[reading]
-                encodings[body] = replace(encoding, scale=sign * encoding.scale)
     left = [s for s, m in matrices.items() if np.linalg.det(m) < 0 and TRIADS[s][0] in table.values]
     if left:
         detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left)
         notes = (*notes, Note("N-LEFTHANDED", len(left), 0, 0, f"left-handed axis map: {detail}"))
-    return replace(table, values=values, encodings=encodings, notes=notes)
+    return replace(table, values=values, notes=notes)

@@ -1,4 +1,4 @@
-"""Text logs to channels in the units of the package; counts stay integers.
+"""Text logs to channels in the units of the package.
 
     value = (count - offset) / counts_per_unit
 
@@ -47,7 +47,7 @@ from pipeline.io.files import refuse_foreign, unchanged
 from pipeline.io.ingest_settings import AUTO, DROP, GAP, Checks, Column, CsvFormat
 from pipeline.io.text_log import TextLog
 from pipeline.io.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TRIADS, UNITS
-from pipeline.records import Encoding, Note
+from pipeline.records import Note
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -103,15 +103,15 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
 
 def _converted(log: TextLog, rows: Rows, time_ns: Integers) -> ChannelTable:
     """Return the rows of a log with their numbers in the units of the package."""
-    values, encodings = {}, {}
+    values, count_sizes = {}, {}
     for column, index in rows.layout.columns:
         if column.channel != "time":
             numbers = rows.numbers[index]
             values[column.channel] = in_house_unit(column, numbers)
             if column.unit == COUNTS and bool(np.all(numbers == np.rint(numbers))):
-                encodings[column.channel] = Encoding(1.0 / column.counts_per_unit, column.offset)
+                count_sizes[column.channel] = 1.0 / abs(column.counts_per_unit)
     source = {"file": log.path, "sha256": log.sha256}
-    return ChannelTable(log.path, time_ns, values, source, rows.lines, encodings, rows.notes)
+    return ChannelTable(log.path, time_ns, values, source, rows.lines, count_sizes, rows.notes)
 
 
 def also(first: IngestError, second: IngestError) -> IngestError:
@@ -290,7 +290,7 @@ def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
         first,
         values={k: v for t in tables for k, v in t.values.items()},
         source={**first.source, "parts": [t.source for t in tables]},
-        encodings={k: v for t in tables for k, v in t.encodings.items()},
+        count_sizes={k: v for t in tables for k, v in t.count_sizes.items()},
         notes=tuple(n for t in tables for n in t.notes),
     )
 

@@ -104,8 +104,7 @@ def unwrapped(table: ChannelTable) -> ChannelTable:
         return table
     values = {**table.values, "table_angle": np.asarray(np.unwrap(angle, period=360.0))}
     note = table.note("N-UNWRAP", rows, "the table's angle started again at a full turn and was counted on")
-    encodings = {c: e for c, e in table.encodings.items() if c != "table_angle"}
-    return replace(table, values=values, encodings=encodings, notes=(*table.notes, note))
+    return replace(table, values=values, notes=(*table.notes, note))
 
 
 def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
@@ -170,7 +169,6 @@ def _merged(  # noqa: PLR0917  (parts of one table)
         part,
         values=own | {channel: at(tau) for channel, at in found.items()},
         source=sensor.source | ({"table_clock": clock} if clock else {}) | ({} if same else {"table_log": log.source}),
-        encodings={c: e for c, e in sensor.encodings.items() if c in own},
     )
 
 

@@ -20,8 +20,8 @@ from pipeline.io.message_decoder import MAPPED, TopicDecoder, kind_of, listed_to
 from pipeline.io.message_logs import open_reader
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.io.timestamps import averaged, check_fine, check_plausible, in_order, rows_covered, slower_first
-from pipeline.io.units import ACCELEROMETER, GYROSCOPE, TABLE_CHANNELS, TRIADS
-from pipeline.records import Encoding, Note
+from pipeline.io.units import ACCELEROMETER, COUNTS, GYROSCOPE, TABLE_CHANNELS, TRIADS
+from pipeline.records import Note
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -111,7 +111,7 @@ class _Log:
         self.reader, self.path, self.settings = reader, reader.path, settings
         self.topics: dict[str, _Topic] = {}
         self.notes: list[Note] = []
-        self.encodings: dict[str, Encoding] = {}
+        self.count_sizes: dict[str, float] = {}
         self.table_logs: list[ChannelTable] = []  # of a table with a clock of its own
         self.end_ns = np.iinfo(np.int64).max  # the topics of a truncated file end at different times
 
@@ -134,7 +134,7 @@ class _Log:
         time = base.time_ns[base.time_ns <= self.end_ns]
         values = {c: v[: len(time)] for c, v in values.items()}
         source = {"file": self.path, "sha256": self.reader.sha256, "rows": len(time)}
-        table = ChannelTable(self.path, time, values, source, None, self.encodings, tuple(self.notes))
+        table = ChannelTable(self.path, time, values, source, None, self.count_sizes, tuple(self.notes))
         if self.table_logs:
             from pipeline.io.encoder_log import align  # noqa: PLC0415  (few logs need it)
 
@@ -189,7 +189,8 @@ class _Log:
         raise IngestError(f"{what}; the file has {listed}", self.path, code="missing_topic", hint=hint)
 
     def _series(self, topic: _Topic) -> ChannelTable:
-        self.encodings |= topic.decoder.encodings
+        fields = topic.decoder.fields.items()
+        self.count_sizes |= {c: 1.0 / abs(f.counts_per_unit) for c, f in fields if f.unit == COUNTS}
         return topic.series(self.settings, self.notes)
 
     def _temperature(self, series: ChannelTable, base: ChannelTable) -> Columns:
@@ -198,7 +199,6 @@ class _Log:
         count = len(series.time_ns)
         detail = f"temperature of {count} messages with stamps of their own, interpolated, held at the ends"
         self.notes.append(Note("N-INTERPOLATED", len(base.time_ns), 0, 0, detail))
-        self.encodings.pop("temperature", None)
         times, own = base.time_ns - base.time_ns[0], series.time_ns - base.time_ns[0]
         return {n: np.interp(times, own, numbers) for n, numbers in series.values.items()}
 
@@ -214,7 +214,7 @@ class _Log:
         rows = rows_covered(slow.time_ns, fast.time_ns, topic, self.path)
         values = {c: averaged(slow.time_ns, rows, fast.time_ns, v) for c, v in fast.values.items()}
         for channel in fast.values:
-            self.encodings.pop(channel, None)
+            self.count_sizes.pop(channel, None)
         lost = len(slow.time_ns) - len(rows)
         detail = f"{len(fast.time_ns)} messages on {topic} averaged over the intervals of {slow.source['topic']}"
         detail += f", {lost} of whose messages they do not cover" if lost else ""

@@ -42,7 +42,6 @@ from pipeline.io.message_layout import (
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE, VECTORS
 from pipeline.io.timestamps import LARGEST, nanoseconds, of_number, of_pair
 from pipeline.io.units import ATTITUDE, COUNTS, TRIADS, UNITS, unit_spelt
-from pipeline.records import Encoding
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -267,15 +266,12 @@ def listed_topics(reader: MessageReader) -> list[tuple[str, str]]:
 
 
 class TopicDecoder:
-    """Decoder of one topic; ``encodings`` are those of channels sent as counts, ``count`` the messages so far."""
+    """Decoder of one topic; ``count`` are the messages so far."""
 
     def __init__(self, topic: str, kind: str, settings: McapFormat, path: str) -> None:
         self.topic, self.kind, self.path = topic, kind, path
         fields = settings.topics[topic] if kind == MAPPED else _fields_of(kind, settings)
         self.fields = {c: f for c, f in fields.items() if c != TIME}
-        self.encodings = {
-            c: Encoding(1.0 / f.counts_per_unit, f.offset) for c, f in self.fields.items() if f.unit == COUNTS
-        }
         paths = {c: f.field for c, f in self.fields.items()}
         if kind == IMU:
             paths |= {vector: FieldPath.parse(f"{vector}_covariance[0]") for vector in VECTORS}

@@ -95,7 +95,7 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
         if channel not in table.values:
             continue
         values = table.values[channel]
-        count = abs(table.encodings[channel].scale) if channel in table.encodings else 0.0
+        count = table.count_sizes.get(channel, 0.0)
         largest = max(float(values.max()), -float(values.min()))
         if largest < full_scale - max(1.5 * count, RAIL * full_scale):
             continue

@@ -202,7 +202,6 @@ def to_recording(
         flags=flags,
         source=table.source,
         notes=(*table.notes, *notes),
-        encodings=table.encodings,
     )
     if recording.axis is None and recording.table_attitude is not None and recording.table_rate is None:
         rate = rate_of_attitude(recording.time * recording.table_seconds, recording.table_attitude)

@@ -53,9 +53,8 @@ def refined(recordings: Sequence[Recording]) -> list[Recording]:
     out = []
     for r in recordings:
         note = Note("N-STEPS", r.samples, 0, r.samples, f"{r.name}: {detail}")
-        encodings = {name: kept for name, kept in r.encodings.items() if name != "temperature"}
         fine = np.interp(r.time, nodes, curve)
-        out.append(replace(r, temperature=fine, encodings=encodings, notes=(*r.notes, note)))
+        out.append(replace(r, temperature=fine, notes=(*r.notes, note)))
     return out
 
 

@@ -192,8 +192,7 @@ def _turned_attitude(recording: Recording) -> Recording:
     detail = f"the attitude is turned to the axes of the unit: the table's x, y and z are body {', '.join(names)}"
     note = Note("N-FOUND", recording.samples, 0, 0, detail)
     attitude = np.asarray(about.as_quat(scalar_first=True), np.float64)
-    encodings = {k: e for k, e in recording.encodings.items() if k != "table_attitude"}
-    return replace(recording, table_attitude=attitude, encodings=encodings, notes=(*recording.notes, note))
+    return replace(recording, table_attitude=attitude, notes=(*recording.notes, note))
 
 
 def _negated(turns: Sequence[Turn], tolerance: float) -> bool:
@@ -237,14 +236,12 @@ def _applied(turn: Turn, doubt: Note | None, departure: _Departure | None, hint:
     if bench.vertical:
         detail = f"as stated, body {bench.up} points up throughout; the angle is taken {bench.sense:+d} times"
     notes.append(Note("N-MOUNTING" if departure is None else "N-FOUND", recording.samples, 0, 0, detail))
-    encodings = {k: e for k, e in recording.encodings.items() if k not in ("table_angle", "table_rate")}
     return replace(
         recording,
         up=bench.up if bench.vertical else "",
         sense=bench.sense,
         table_angle=None if angle is None else bench.sense * angle + bench.offset,
         table_rate=None if rate is None else bench.sense * rate,
-        encodings=encodings,
         notes=tuple(notes),
     )
 

@@ -65,29 +65,6 @@ class Note:
 
 
 @dataclass(frozen=True)
-class Encoding:
-    """How a stored integer becomes a value: ``value = (count - offset) * scale``.
-
-    Raw counts stay integers in every intermediate file, so that nothing is lost before the fit.
-    """
-
-    scale: float
-    offset: float = 0.0
-
-    def decode(self, counts: Values) -> Values:
-        """Return the values of counts: the one formula by which counts become values, to the last bit."""
-        values: Values = (counts - self.offset) * self.scale
-        return values
-
-    def encode(self, values: Values) -> NDArray[np.int64] | None:
-        """Return the counts that decode to exactly these values, or None where there are none."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            counts = np.rint(values / self.scale + self.offset)
-            exact = np.array_equal(self.decode(counts), values) and bool(np.all(np.abs(counts) < 2**53))
-        return counts.astype(np.int64) if exact else None
-
-
-@dataclass(frozen=True)
 class Recording:
     """The samples of one recording.
 
@@ -111,7 +88,6 @@ class Recording:
     source: dict[str, Any] = field(default_factory=dict)  # file, sha256, rows of the input
     notes: tuple[Note, ...] = ()
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
-    encodings: dict[str, Encoding] = field(default_factory=dict)  # of the columns that came as integers
     clock_shared: bool = True  # whether the time between this recording and the unit's others is known
     setup: str = ""  # which of several tables, mountings or sessions it was made in; empty where there is one alone
     # Body axis (+x, -z ..) that points up throughout a turn about a vertical axis; empty elsewhere: the table's angle

@@ -98,7 +98,6 @@ def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
             "delay_s": 0.0 if zero_phase else _delay(name, settings, sections, interval),
             "noise_gain": _noise_gain(sections, zero_phase=zero_phase),
         },
-        encodings={k: v for k, v in recording.encodings.items() if not k.startswith(("accel", "gyro"))},
     )
 
 

@@ -41,7 +41,7 @@ def test_the_filtered_rate_of_every_sample_that_is_used_is_that_of_a_log_with_ra
     for part in observe("gyroscope", filtered(without_rates(recordings), name), TABLE).parts:
         everything = next(r for r in filtered(recordings, name) if r.name == part.name)
         exact = apply_filter(
-            replace(everything, gyroscope=known_rate(everything), accelerometer=None, encodings={}), everything.filter
+            replace(everything, gyroscope=known_rate(everything), accelerometer=None), everything.filter
         ).gyroscope
         assert exact is not None
         at = np.searchsorted(everything.time, part.motion.time)

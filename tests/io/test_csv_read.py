@@ -182,7 +182,7 @@ def test_a_delimiter_may_be_given_by_name(tmp_path: Path, canonical: dict[str, A
     assert_same_bits(read_back(tmp_path, canonical), make_recording())
 
 
-def test_axis_map_turns_readings_and_their_counts_into_body_axes(tmp_path: Path) -> None:
+def test_axis_map_turns_readings_into_body_axes(tmp_path: Path) -> None:
     ingest = profile("mpu6050_multi_position")
     ingest["csv"]["skip_lines"] = 0
     (tmp_path / "accel_x.csv").write_text("ax,ay,az,gx,gy,gz\n1,2,16384,131,262,393\n1,2,16384,131,262,393\n")
@@ -192,8 +192,6 @@ def test_axis_map_turns_readings_and_their_counts_into_body_axes(tmp_path: Path)
     assert read.gyroscope is not None
     assert read.accelerometer[0].tolist() == [2 / 16384, -1 / 16384, 1.0]
     np.testing.assert_allclose(read.gyroscope[0], [2.0, -1.0, 3.0], rtol=1e-15)
-    assert read.encodings["accel_y"].scale == -1 / 16384
-    assert read.encodings["accel_x"].scale == 1 / 16384
 
 
 def test_a_sensor_may_have_an_axis_map_of_its_own(tmp_path: Path, canonical: dict[str, Any]) -> None:

@@ -37,7 +37,6 @@ def test_counts_are_scaled_as_the_file_says_and_stay_integers(tmp_path: Path) ->
     np.testing.assert_allclose(recording.accelerometer[0], np.array([-114, -1569, -299]) * 0.00048828125, rtol=1e-14)
     np.testing.assert_allclose(recording.gyroscope[1], np.degrees(np.array([40, 87, 184]) * 0.00122173047), rtol=1e-14)
     assert recording.time_ns.tolist() == [0, 10_000_000, 20_000_000]
-    assert set(recording.encodings) == {f"{s}_{a}" for s in ("accel", "gyro") for a in "xyz"}
 
 
 def test_times_of_a_scale_that_is_no_binary_fraction_are_exact(tmp_path: Path) -> None:

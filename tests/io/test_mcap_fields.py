@@ -183,7 +183,7 @@ def test_lists_counts_and_integer_times_are_read(tmp_path: Path) -> None:
     assert table.time_ns.tolist() == [1_700_000_000_000_001_000 + 10_000 * i for i in range(3)]
     assert table.values["accel_z"].tolist() == [1.0] * 3
     assert table.values["accel_x"].tolist() == [0.0, 1 / 8192, 2 / 8192]
-    assert table.encodings["accel_x"].scale == 1 / 8192
+    assert table.count_sizes["accel_x"] == 1 / 8192
 
 
 @pytest.mark.parametrize(

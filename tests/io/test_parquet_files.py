@@ -1,9 +1,8 @@
-"""Recordings between the stages: every bit comes back, or the file is refused."""
+"""Recordings between the stages: every bit comes back."""
 
 from __future__ import annotations
 
 import json
-import zlib
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,17 +13,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pyarrow import parquet
-from sample_logs import SENSOR, assert_same_bits, channels, make_recording, procedure, profile
+from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, profile
 from stage_files import load_recordings, save_recordings
 
 from pipeline.errors import InputError
 from pipeline.io.read import read_recordings
-from pipeline.records import Encoding, Note, Recording
+from pipeline.records import Note, Recording
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-FLIPS = 250
 
 
 def unit() -> list[Recording]:
@@ -51,7 +48,7 @@ def test_every_recording_comes_back_whole(tmp_path: Path) -> None:
     assert len(loaded) == 3
     for one, other in zip(unit(), loaded, strict=True):
         assert_same_bits(one, other)
-        for name in ("name", "role", "axis", "source", "notes", "filter", "encodings", "clock_shared"):
+        for name in ("name", "role", "axis", "source", "notes", "filter", "clock_shared"):
             assert getattr(one, name) == getattr(other, name), name
 
 
@@ -88,46 +85,10 @@ def counts(folder: Path) -> list[Recording]:
     return read_recordings(procedure("accel_x"), ingest, {**SENSOR, "axis_map": ["+x", "-z", "+y"]}, folder)
 
 
-def test_counts_stay_integers_on_disk(tmp_path: Path) -> None:
-    recordings = counts(tmp_path)
-    save_recordings(tmp_path / "a.parquet", recordings)
-    schema = parquet.read_schema(tmp_path / "a.parquet")
-    readings = [n for n in schema.names if n.startswith(("accel", "gyro"))]
-    assert len(readings) == 6
-    assert all(pa.types.is_integer(schema.field(n).type) for n in readings)
-    stored = parquet.read_table(tmp_path / "a.parquet").column("gyro_z").to_pylist()
-    text = [line.split(",")[4] for line in (tmp_path / "accel_x.csv").read_text().splitlines()[1:]]
-    assert stored == [int(c) for c in text]  # y of the sensor lies along -z of the body; the sign is in the scale
-    (loaded,) = load_recordings(tmp_path / "a.parquet")
-    assert_same_bits(loaded, recordings[0])
-    assert loaded.encodings == recordings[0].encodings
-    assert loaded.encodings["gyro_z"] == Encoding(scale=-1 / 131.0)
-
-
-def test_xsens_counts_stay_integers_on_disk(reference: Path, tmp_path: Path) -> None:
-    sensor = {"axis_map": SENSOR["axis_map"], "accelerometer": {}, "gyroscope": {}}
-    folder = reference / "xsens_mti_multi_position"
-    recordings = read_recordings(procedure("recording"), profile("xsens_mti_multi_position"), sensor, folder)
-    save_recordings(tmp_path / "a.parquet", recordings)
-    assert parquet.read_table(tmp_path / "a.parquet").column("accel_x")[:3].to_pylist() == [33108, 33096, 33104]
-    assert_same_bits(load_recordings(tmp_path / "a.parquet")[0], recordings[0])
-
-
-def test_filtered_counts_are_stored_as_doubles(tmp_path: Path) -> None:
+def test_counts_come_back_to_the_last_bit(tmp_path: Path) -> None:
     (recording,) = counts(tmp_path)
-    assert recording.accelerometer is not None
-    smoothed = replace(recording, accelerometer=recording.accelerometer * 0.3)  # encodings forgotten
-    save_recordings(tmp_path / "a.parquet", [smoothed])
-    (loaded,) = load_recordings(tmp_path / "a.parquet")
-    assert_same_bits(loaded, smoothed)
-    assert set(loaded.encodings) == {"gyro_x", "gyro_y", "gyro_z"}
-
-
-def test_counts_beside_numbers_are_stored_as_doubles(tmp_path: Path) -> None:
-    recordings = [*counts(tmp_path), make_recording()]
-    save_recordings(tmp_path / "a.parquet", recordings)
-    for one, other in zip(recordings, load_recordings(tmp_path / "a.parquet"), strict=True):
-        assert_same_bits(one, other)
+    save_recordings(tmp_path / "a.parquet", [recording])
+    assert_same_bits(load_recordings(tmp_path / "a.parquet")[0], recording)
 
 
 def test_writing_again_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -141,47 +102,6 @@ def test_the_recordings_of_a_unit_are_one_row_group(tmp_path: Path) -> None:
     save_recordings(tmp_path / "a.parquet", unit())
     metadata = parquet.read_metadata(tmp_path / "a.parquet")
     assert [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)] == [120 + 7 + 33]
-
-
-def test_flipped_bit_never_changes_a_value_in_silence(tmp_path: Path) -> None:
-    file = tmp_path / "a.parquet"
-    truth = [*unit(), *counts(tmp_path)]
-    save_recordings(file, truth)
-    whole = file.read_bytes()
-    generator = np.random.default_rng(11)
-    footer = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
-    places = np.concatenate([generator.integers(0, len(whole), FLIPS), generator.integers(footer, len(whole), FLIPS)])
-    refused = 0
-    for position, bit in zip(places, generator.integers(0, 8, len(places)), strict=True):
-        damaged = bytearray(whole)
-        damaged[position] ^= 1 << int(bit)
-        file.write_bytes(damaged)
-        try:
-            loaded = load_recordings(file)
-            for recording in loaded:
-                channels(recording)  # each is decoded when it is used first
-        except InputError:
-            refused += 1
-            continue
-        for one, other in zip(truth, loaded, strict=True):
-            assert_same_bits(one, other)
-            assert [one.name, one.notes, one.source, one.encodings == other.encodings or not other.encodings] == [
-                other.name,
-                other.notes,
-                other.source,
-                True,
-            ]
-    assert refused > FLIPS
-
-
-def test_file_that_ends_early_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "a.parquet"
-    save_recordings(file, unit())
-    whole = file.read_bytes()
-    for length in range(0, len(whole), 97):
-        file.write_bytes(whole[:length])
-        with pytest.raises(InputError, match="missing or damaged"):
-            load_recordings(file)
 
 
 def test_a_channel_is_decoded_when_it_is_used_first_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,11 +123,10 @@ def test_a_channel_is_decoded_when_it_is_used_first_and_once(tmp_path: Path, mon
 
 
 def rewrite(path: Path, change: dict[str, Any]) -> None:
-    """Change the description in a file and its checksum, as another version of the writer might."""
+    """Change the description in a file, as another version of the writer might."""
     table = parquet.read_table(path)
     text = json.dumps({**json.loads(table.schema.metadata[b"recordings"]), **change}).encode()
-    metadata = {b"recordings": text, b"recordings_crc32": str(zlib.crc32(text)).encode()}
-    parquet.write_table(table.replace_schema_metadata(metadata), path)
+    parquet.write_table(table.replace_schema_metadata({b"recordings": text}), path)
 
 
 def test_unknown_schema_version_is_refused(tmp_path: Path) -> None:

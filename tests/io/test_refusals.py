@@ -309,6 +309,4 @@ def test_counts_that_are_not_whole_are_read_as_numbers(tmp_path: Path) -> None:
     recording = read(tmp_path, ingest)
     assert recording.accelerometer is not None
     assert recording.accelerometer[0, 0] == 0.5 / 16384
-    assert "accel_x" not in recording.encodings
-    assert "accel_y" in recording.encodings
     np.testing.assert_array_equal(recording.time_ns, [0, 10_000_000])

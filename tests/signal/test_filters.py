@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.records import Encoding, Recording
+from pipeline.records import Recording
 from pipeline.signal.filters import apply_filter, smooth_temperature
 
 CONFIGS = Path(__file__).parents[2] / "configs/filter"
@@ -36,7 +36,6 @@ def _recording(accelerometer: Any, interval: float = 0.12, time: Any = None) -> 
         gyroscope=10.0 * values,
         temperature=np.full(len(values), 25.0),
         table_angle=np.arange(len(values), dtype=float),
-        encodings={"accel_x_g": Encoding(1e-4), "temperature_degc": Encoding(0.1)},
     )
 
 
@@ -163,12 +162,11 @@ def test_a_cutoff_has_half_the_power() -> None:
     assert np.std(out.accelerometer[5000:, 0]) == pytest.approx(0.5, rel=1e-6)
 
 
-def test_only_readings_are_filtered_and_lose_their_encoding() -> None:
+def test_only_readings_are_filtered() -> None:
     recording = _recording(np.random.default_rng(5).normal(size=100))
     out = apply_filter(recording, _settings("low_pass"))
     assert out.temperature is recording.temperature
     assert out.table_angle is recording.table_angle
-    assert list(out.encodings) == ["temperature_degc"]
     assert out.filter["name"] == "low_pass"
     assert out.filter["cutoff_hz"] == 1.0
 
