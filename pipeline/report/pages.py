@@ -104,7 +104,7 @@ def failure_page(unit: str, failure: Mapping[str, Any]) -> str:
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(unit)}</title>'
         '<meta name="viewport" content="width=device-width"><style>:root { color-scheme: light dark; } '
         "body { font: 15px/1.5 sans-serif; margin: 24px; } pre { white-space: pre-wrap; }</style></head>\n"
-        f"<body><h1>{escape(unit)}</h1><p>Not calibrated: the stage {escape(failure['stage'])} failed "
+        f"<body><h1>{escape(unit)}</h1><p>This unit has no result: the stage {escape(failure['stage'])} failed "
         f"({escape(failure['code'])}).</p><pre>{cause}</pre>\n"
         '<p><a href="../index.html">The campaign</a></p></body></html>\n'
     )
