@@ -22,7 +22,7 @@ import numpy as np
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import fit_stage
-from pipeline.estimation.uncertainty_budget import with_stated
+from pipeline.estimation.stated_lines import with_stated
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import SENSORS, coverage_factor
 from pipeline.simulation.campaign import simulate_unit

@@ -91,7 +91,7 @@ class CampaignResults:
         Columns: ``unit, serial, lot, date, status`` ("ok", "failed"), ``error, sensor, method``; for each sensor
         ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
         (g or deg/s), ``_verdict``, ``_selected`` (missing, joined by ";"), ``_reason``, ``_answers`` (how many are in
-        the answer set), ``_implausible``; ``pass``; ``left_out`` (rows that no fit
+        the answer set), ``_implausible``, ``_not_in_uncertainty``; ``pass``; ``left_out`` (rows that no fit
         uses); and the user's own columns of ``units.csv``.
         """
         kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}

@@ -139,6 +139,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         *lines_of(verdict_groups(findings)),
     ]
     lines += first(_not_held_out(results, [row["unit"] for row in rows]), NAMED, "reasons")
+    lines += lines_of(_not_in_uncertainty(rows).items())
     lines += first([f"{r['unit']}, left out: {what}" for r in rows if (what := r.get("left_out"))], NAMED, "units")
     entries = read_history(results) if of_this_run else []
     if entries:
@@ -163,6 +164,16 @@ def _not_held_out(results: Path, units: Sequence[str]) -> list[str]:
             if reason := (document.get(sensor) or {}).get("reason"):
                 groups.setdefault(f"{sensor}, {reason}", []).append(unit)
     return lines_of(groups.items())
+
+
+def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
+    """Return the units by what U of a sensor does not include and can exceed it."""
+    groups: dict[str, list[str]] = {}
+    for row in rows:
+        for sensor in SENSORS:
+            if source := row.get(f"{sensor}_not_in_uncertainty"):
+                groups.setdefault(f"{sensor}, U does not include {source}", []).append(row["unit"])
+    return groups
 
 
 def _changes(entries: Sequence[JSON]) -> list[str]:

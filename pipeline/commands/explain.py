@@ -16,7 +16,7 @@ from pipeline.exports.conversion import board_lines, explain_calibration
 from pipeline.exports.reading import counts_of, read_any
 from pipeline.files import read_json
 from pipeline.history import read_history
-from pipeline.model.calibration_file import left_out, sentences
+from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
 from pipeline.outcome import Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
@@ -72,6 +72,11 @@ def main(argv: Sequence[str]) -> int:
         )
         texts.append(explain(unit, document, validation, found))
         texts[-1] += "".join(f"  {line}\n" for s in SENSORS for line in sentences(s, calibration.get(s)))
+        texts[-1] += "".join(
+            f"  U of the {s} does not include {source}: {reason}.\n"
+            for s in SENSORS
+            for source, reason in beyond_uncertainty(calibration.get(s))
+        )
         texts[-1] += "".join(f"  Left out: {line}.\n" for line in left_out(calibration.get("inputs")))
         texts[-1] += "".join(f"{line}\n" for line in board_lines(calibration)[1:])
     texts += [_failed(unit, failure) for unit, failure in found.failures.items()]

@@ -44,7 +44,7 @@ FIT_OF_TABLE = (
 )  # fmt: skip
 FIT_OF_SENSOR = (
     "full_scale", "counts_per_unit", *NOISE, "effects.bias_temperature", "effects.scale_factor_temperature",
-    "repeatability_bias", "repeatability_scale_factor",
+    "effects.clock_rate", "repeatability_bias", "repeatability_scale_factor",
 )  # fmt: skip
 FIT = (
     *(f"table.{key}" for key in FIT_OF_TABLE),

@@ -8,13 +8,9 @@ sensor file lets expect, and lack of fit beyond both. Everything else is of type
 
     bench         : the table's stated accuracies (``pipeline.estimation.table_errors``), local gravity
     quantisation  : where white noise does not make the rounding errors of the samples independent
-    temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
-    repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
+    others        : temperature, repeatability, a time that was counted (``pipeline.estimation.stated_lines``)
 
-where a is the standard uncertainty of the thermometer, R the range of temperatures recorded, c the sensor file's limits
-of the change per degC (or the fitted effect: then without the root, and R is 0), and r standard deviations from one
-switching-on to the next. The last two depend on no method and are added after the last stage of a fit. Sources without
-a stated accuracy are named and left out.
+Sources without a stated accuracy are named and left out.
 """
 
 from __future__ import annotations
@@ -27,20 +23,18 @@ import numpy as np
 from pipeline.estimation.candidates import TILT, tilt_like_zeros
 from pipeline.estimation.design import BASE, BASE_NAMES, Term
 from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
-from pipeline.estimation.table_errors import Reference, table_errors, type_b
+from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.records import (
     NORMAL,
     RECTANGULAR,
     SENSOR_UNITS,
     Contribution,
     FittedEffect,
-    Recording,
     SensorCalibration,
     Values,
     coverage_factor,
     finite,
 )
-from pipeline.signal.filters import temperature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -59,8 +53,7 @@ ACROSS = (
     "table_tilt estimates the component across the shaft alone; the one about the shaft is the same as a common zero "
     "of the turns"
 )
-FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
-ACCURACY = "temperature_accuracy_degc"
+GRAVITY = "local gravity"
 
 
 def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: ArrayLike) -> Values:
@@ -116,14 +109,23 @@ def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float |
     return type_b(QUANTISATION, RECTANGULAR, step / np.sqrt(12.0), unit, np.concatenate(effects, axis=1))
 
 
-def gravity_contribution(sensor: str, matrix: Values, table: Mapping[str, Any], parameters: int) -> Contribution | None:
-    """Return what an error of local gravity does to a matrix that is scaled by it, ``dM = M dG / G``, if stated."""
+def gravity_line(calibration: SensorCalibration, table: Mapping[str, Any]) -> tuple[list[Contribution], dict[str, str]]:
+    """Return what an error of local gravity does to a matrix that is scaled by it, ``dM = M dG / G``; or why not."""
     u = table.get("gravity_accuracy_g")
-    if sensor != "accelerometer" or not u:
-        return None
-    effect = np.zeros((parameters, 1))
-    effect[3:12, 0] = matrix.ravel() / float(table.get("gravity_g") or 1.0)
-    return type_b("local gravity", NORMAL, float(u), "g", effect)
+    if not u:
+        return [], {GRAVITY: "table.gravity_accuracy_g is not stated"} if u is None else {}
+    effect = np.zeros((len(calibration.parameter_names()), 1))
+    effect[3:12, 0] = calibration.matrix.ravel() / float(table.get("gravity_g") or 1.0)
+    return [type_b(GRAVITY, NORMAL, float(u), "g", effect)], {}
+
+
+def clock_contribution(
+    calibration: SensorCalibration, ppm: float, distribution: str = NORMAL, remark: str = ""
+) -> Contribution:
+    """Return what an error of the sensor's clock does where a rate is an angle over a time by it: ``dM = M de``."""
+    effect = np.zeros((len(calibration.parameter_names()), 1))
+    effect[3:12, 0] = 1e-6 * calibration.matrix.ravel()
+    return type_b(TIME_BASE, distribution, ppm, "ppm", effect, remark)
 
 
 def combined(
@@ -151,7 +153,7 @@ def combined(
     reasons = {**not_included, "repeatability": f"{NOT_STATED}, and compare"}
     lines = {c.source for c in contributions}
     left = [{"source": source, "reason": reason} for source, reason in reasons.items() if source not in lines]
-    return _with_uncertainty(calibration, covariance, freedom, head, left)
+    return with_uncertainty(calibration, covariance, freedom, head, left)
 
 
 def budgeted(  # noqa: PLR0917  (what a fit on a table is)
@@ -197,83 +199,19 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     return beside_trials(complete, draw, trials, contributions[1:])
 
 
-def with_stated(
-    calibration: SensorCalibration, recordings: Sequence[Recording], settings: Mapping[str, Any]
-) -> SensorCalibration:
-    """Return a calibration whose budget holds temperature and repeatability, as far as they are stated.
+def covariance_beside_reference(calibration: SensorCalibration) -> Values:
+    """Return the covariance without the scale that calibration and held-out reference share: local gravity, time base.
 
-    ``recordings``: of the fit; only their temperature is used. ``settings``: section ``sensor``.
+    Both scale the whole matrix, ``dM = M e``, and the reference alike, so no held-out error shows them.
     """
-    before, budget = calibration.covariance, calibration.budget
-    if before is None or budget is None:
-        return calibration
-    sensor_config = settings["sensor"].get(calibration.sensor) or {}
-    lines, missing = _repeatability(calibration, sensor_config)
-    accuracy = settings["sensor"].get(ACCURACY)
-    if accuracy is not None:
-        warm = _temperature(calibration, float(accuracy), recordings, sensor_config.get("effects") or {})
-        if isinstance(warm, str):
-            missing["temperature"] = warm
-        else:
-            lines += warm
-    known = {line.source.partition(" (")[0] for line in lines} | set(missing)
-    kept = [entry for entry in budget["not_included"] if entry["source"] not in known]
-    left = [*kept, *({"source": source, "reason": reason} for source, reason in missing.items())]
-    covariance = before + np.sum([line.covariance for line in lines], axis=0) if lines else before
-    old = np.array([np.inf if v is None else v for v in budget["effective_degrees_of_freedom"]])
-    share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(before)), where=np.diag(before) > 0.0)
-    freedom = np.where(np.diag(before) > 0.0, old * share**2, np.inf)
-    contributions = [*budget["contributions"], *(line.to_json() for line in lines)]
-    return _with_uncertainty(calibration, covariance, freedom, {**budget, "contributions": contributions}, left)
-
-
-def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]:
-    """Return name, unit and effect, (p, 3), of errors of bias and of scale factor of each reading axis."""
     size = len(calibration.parameter_names())
-    of_scale = np.zeros((size, 3))
-    for axis in range(3):
-        change = np.zeros((3, 3))
-        change[:, axis] = -calibration.matrix[:, axis]
-        of_scale[3:12, axis] = change.ravel()
-    return [("bias", SENSOR_UNITS[calibration.sensor], np.eye(size)[:, :3]), ("scale_factor", "1", of_scale)]
-
-
-def _repeatability(
-    calibration: SensorCalibration, sensor_config: Mapping[str, Any]
-) -> tuple[list[Contribution], dict[str, str]]:
-    lines, lacking = [], []
-    for name, unit, effect in _effects_on(calibration):
-        u = sensor_config.get(f"repeatability_{name}")
-        if u is None:
-            lacking.append(f"sensor.{calibration.sensor}.repeatability_{name}")
-        elif u:
-            lines.append(type_b(f"repeatability ({name.replace('_', ' ')})", NORMAL, float(u), unit, effect))
-    reason = f"{NOT_STATED}, compare, and state it as {' and '.join(lacking)}"
-    return lines, {"repeatability": reason} if lacking else {}
-
-
-def _temperature(
-    calibration: SensorCalibration, accuracy: float, recordings: Sequence[Recording], limits: Mapping[str, float]
-) -> list[Contribution] | str:
-    """Return what the temperature contributes to bias and scale factor, or why that is not known."""
-    own = [r for r in recordings if r.role in (calibration.sensor, "rests") and r.temperature is not None]
-    if not own:
-        return "the recordings hold no temperature"
-    spread = float(np.ptp(np.concatenate([temperature_of(r) for r in own]))) / np.sqrt(12.0)
-    lines = []
-    for name, unit, effect in _effects_on(calibration):
-        fitted = next((e for e in calibration.effects if e.name in FITTED[name]), None)
-        limit = limits.get(f"{name}_temperature")
-        if fitted is not None:
-            slope, u, how = fitted.values.reshape(3, -1)[:, 0], accuracy, f"by the fitted {fitted.name}"
-        elif limit is None:
-            return f"the sensor file states no effects.{name}_temperature"
-        else:
-            slope, u = np.full(3, limit / np.sqrt(3.0)), float(np.hypot(accuracy, spread))
-            how = f"by the sensor file's limit of {limit:g} {unit}/degC"
-        kind = NORMAL if fitted is not None else RECTANGULAR
-        lines.append(type_b(f"temperature ({name.replace('_', ' ')})", kind, u, "degC", effect * slope, how))
-    return lines
+    out = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance.copy()
+    for line in (calibration.budget or {}).get("contributions", ()):
+        if line["source"] in (GRAVITY, TIME_BASE):
+            shared = np.zeros(size)
+            shared[3:12] = np.sign(calibration.matrix.ravel()) * line["contribution"][3:12]
+            out -= np.outer(shared, shared)
+    return out
 
 
 def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Values, Values]:
@@ -323,12 +261,12 @@ def effect_parameters(
     return tuple(effects), parameters
 
 
-def _with_uncertainty(
+def with_uncertainty(
     calibration: SensorCalibration,
     covariance: Values,
     freedom: Values,
     budget: Mapping[str, Any],
-    not_included: Sequence[Mapping[str, str]],
+    not_included: Sequence[Mapping[str, Any]],
 ) -> SensorCalibration:
     """Return a calibration with a covariance and all that follows from it: of its effects and its budget, too."""
     u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))

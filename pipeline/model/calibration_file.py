@@ -348,6 +348,21 @@ def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
     return found
 
 
+def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Return the sources that U of a sensor does not include and that can exceed it: source and size, and the reason.
+
+    ``part``: of ``calibrations/<unit>.json``.
+    """
+    found = []
+    part = part or {}
+    for entry in (part.get("uncertainty_budget") or {}).get("not_included", []):
+        for key, size in entry.get("up_to", {}).items():
+            if size > max(u or 0.0 for u in np.ravel(part["expanded_uncertainty"][key])):
+                of = f"{size:.2g} {part['unit']} of bias" if key == "bias" else f"{100.0 * size:.2g} % of the matrix"
+                found.append((f"{entry['source']}, up to {of}", entry["reason"]))
+    return found
+
+
 def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:
     """Return the rows of each recording that no fit uses, by its notes: ``404 of 18,247 rows of gyro_z (3.2 s stuck)``.
 

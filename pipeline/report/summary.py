@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.model.calibration_file import left_out
+from pipeline.model.calibration_file import beyond_uncertainty, left_out
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import first_and_last_step, passes
 from pipeline.report.numbers import unit_text
@@ -20,8 +20,8 @@ SENSOR_COLUMNS = (
     "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
     "answers",
 )  # fmt: skip
-IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
-COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE, "left_out")
+OF_CALIBRATION = tuple(f"{s}_{c}" for c in ("implausible", "not_in_uncertainty") for s in SENSORS)
+COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, "left_out")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 
 
@@ -53,8 +53,10 @@ def summary_row(
         texts.append(len(found.get("answer_set") or []) or None)
         values = [*errors, held_out.get("noise_floor"), *texts]
         row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
-        implausible = (calibration.get(sensor) or {}).get("implausible") or []
+        part = calibration.get(sensor)
+        implausible = (part or {}).get("implausible") or []
         row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
+        row[f"{sensor}_not_in_uncertainty"] = "; ".join(source for source, _ in beyond_uncertainty(part)) or None
     for key, value in units_table_row.items():
         if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
             row[f"sheet_{key}" if key in COLUMNS else key] = value

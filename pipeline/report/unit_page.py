@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.files import json_text
-from pipeline.model.calibration_file import left_out, sentences
+from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
 from pipeline.outcome import VERDICTS, commands_of, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS, Recording
 from pipeline.report.diagnosis_section import evidence_figures, limit_rows, ranking_rows, upper_limits
@@ -119,6 +119,7 @@ def _sensor(
         "limits": limits,
         "limit_figures": [figure for figure in [upper_limits(sensor, limits)] if figure],
         "implausible": sentences(sensor, part),
+        "beyond": beyond_uncertainty(part),
         "kind": "" if far and kind == "good" else kind,
         "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),

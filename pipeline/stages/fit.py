@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.stages import fit_stage
-from pipeline.estimation.uncertainty_budget import with_stated
+from pipeline.estimation.stated_lines import with_stated
 from pipeline.pack import Files, Pack
 from pipeline.records import SensorCalibration
 from pipeline.stages.unit_files import load_noises, recordings_of

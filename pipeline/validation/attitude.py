@@ -27,6 +27,7 @@ from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import moves_of, observed_rests
 from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
+from pipeline.estimation.uncertainty_budget import covariance_beside_reference
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect
 from pipeline.records import Integers, Noise, Recording, SensorCalibration, Values, continuous, level_in_body
@@ -235,7 +236,8 @@ def gravity_direction(
         ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
         freedom = gyroscope.effective_freedom()
         details = gyroscope.stages[-1].details if gyroscope.stages else {}
-        largest = model.largest_direction_error(calibrated, gyroscope.covariance, freedom, details, ratio)
+        covariance = covariance_beside_reference(gyroscope)
+        largest = model.largest_direction_error(calibrated, covariance, freedom, details, ratio)
         own["largest_expected_rms_deg"] = largest
     if turns:
         pairs = (turns.described(state) for state in (raw, calibrated))

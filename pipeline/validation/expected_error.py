@@ -4,7 +4,7 @@ The error of the calibrated reading of held-out sample n is ``M w_n + M m_n + J_
 matrix, w white noise after the filter, m bias wander (a Gauss-Markov process, and the slower drift that the sensor file
 and the residuals of the fit allow), d errors of the calibration's parameters and of the scale of the table's rate
 (once: in the covariance where its budget has such a line, else as a parameter of its own), and J the derivative with
-respect to d.
+respect to d. An error of local gravity or of the time base is in d no more than in the reference: it is left out.
 
 The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.samples``); its mean over samples
 is a quadratic form in Gaussians, replaced by a shifted chi-square with the same cumulants (J. P. Imhof, Biometrika 48
@@ -32,7 +32,7 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
 from pipeline.estimation.selection import INFLATED
-from pipeline.estimation.uncertainty_budget import DITHERED
+from pipeline.estimation.uncertainty_budget import DITHERED, covariance_beside_reference
 from pipeline.model.measurement import inverse_of
 from pipeline.validation.error_breakdown import last_step
 from pipeline.validation.samples import Samples, mean_squares
@@ -187,10 +187,11 @@ def _covariance(calibration: SensorCalibration, table: Mapping[str, Any]) -> Val
     lines = (calibration.budget or {}).get("contributions", ())
     out = np.zeros((size + 1, size + 1))
     if calibration.covariance is not None:
-        total = np.diag(calibration.covariance)
+        covariance = covariance_beside_reference(calibration)
+        total = np.diag(covariance)
         lack = np.sum([np.square(line["parts"][LACK_OF_FIT]) for line in lines if LACK_OF_FIT in line["parts"]], axis=0)
         kept = np.sqrt(np.clip(1.0 - lack / np.where(total > 0.0, total, 1.0), 0.0, 1.0)) * np.ones(size)
-        out[:size, :size] = calibration.covariance * kept[:, None] * kept
+        out[:size, :size] = covariance * kept[:, None] * kept
     if calibration.sensor == "gyroscope" and not any(line["source"] == "table rate" for line in lines):
         out[size, size] = float(table.get("rate_accuracy") or 0.0) ** 2
     return out

@@ -21,7 +21,7 @@ from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import CannotCalibrateError, PipelineError
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import fit_stage
-from pipeline.estimation.uncertainty_budget import with_stated
+from pipeline.estimation.stated_lines import with_stated
 from pipeline.model.effects import leaving_out
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import SENSORS

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from stage_files import documents, write_pack
-from table_turns import Bench, settings
+from table_turns import SHEETS, Bench, settings
 
 from pipeline.estimation import reference_least_squares
-from pipeline.estimation.uncertainty_budget import with_stated
+from pipeline.estimation.stated_lines import with_stated
+from pipeline.estimation.uncertainty_budget import covariance_beside_reference
 from pipeline.io.parquet import to_parquet
-from pipeline.records import FittedEffect
+from pipeline.model.calibration_file import beyond_uncertainty
+from pipeline.records import FittedEffect, Note
 from pipeline.stages import batch
 from pipeline.stages.unit_files import noise_file
 
@@ -99,6 +101,64 @@ def test_without_a_thermometer_in_the_recordings_that_is_said(fitted: Any) -> No
     found = with_stated(fitted[0], cold, sheet(accuracy=0.5))
     left = {entry["source"]: entry["reason"] for entry in (found.budget or {})["not_included"]}
     assert left["temperature"] == "the recordings hold no temperature"
+
+
+LIMIT_PPM = 10000.0
+
+
+def by_angle(sensor: str, *, counted: bool, **table: float) -> tuple[SensorCalibration, dict[str, Any]]:
+    """Return a calibration by a table that logs its angle alone, at rows that may be counted, and its budget."""
+    bench = Bench(sensor, [0.03, -0.02, 0.05], K, white=0.001)
+    turns = bench.turns_at([60.0, -60.0]) if sensor == "gyroscope" else bench.stop_and_go(45.0, 2.4)
+    note = Note("N-SYNTHTIME", 1, 0, 0, "")
+    turns = [replace(r, table_rate=None, notes=(note,) if counted else ()) for r in turns]
+    config = settings(**table) | {"sensor": {sensor: {**SHEETS[sensor], "effects": {"clock_rate": LIMIT_PPM}}}}
+    found = with_stated(reference_least_squares.fit(sensor, turns, None, config), turns, config)
+    return found, {entry["source"]: entry for entry in (found.budget or {})["not_included"]}
+
+
+def test_rows_counted_at_a_stated_rate_have_the_error_of_the_sensors_clock() -> None:
+    stamped, left = by_angle("gyroscope", counted=False)
+    assert left["time base"]["up_to"] == {"matrix": 0.01}
+    assert ("time base, up to 1 % of the matrix", left["time base"]["reason"]) in beyond_uncertainty(stamped.to_json())
+    counted, left = by_angle("gyroscope", counted=True)
+    own = line(counted, "time base")
+    assert own["distribution"] == "rectangular"
+    relative = np.abs(np.array(own["contribution"][3:12]) / counted.matrix.ravel())
+    assert relative == pytest.approx(np.full(9, 0.01 / np.sqrt(3.0)), rel=1e-6)
+    assert "time base" not in left
+    added = counted.covariance - stamped.covariance  # all elements have one error
+    m = counted.matrix.ravel()
+    assert added[3:12, 3:12] == pytest.approx(0.01**2 / 3.0 * np.outer(m, m), rel=1e-3, abs=1e-10)
+    stated, left = by_angle("gyroscope", counted=True, clock_accuracy_ppm=20.0)
+    assert line(stated, "time base")["standard_uncertainty"] == 20.0
+    assert "time base" not in {source.partition(",")[0] for source, _ in beyond_uncertainty(stated.to_json())}
+
+
+@pytest.mark.parametrize(
+    ("table", "up_to"), [({}, 0.0044), ({"gravity_g": 0.9976}, None), ({"gravity_accuracy_g": 0.0}, None)]
+)
+def test_gravity_that_nobody_states_is_named_with_its_size_on_earth(table: dict[str, float], up_to: float) -> None:
+    found, left = by_angle("accelerometer", counted=False, **table)
+    assert ("local gravity" in left) == ("gravity_accuracy_g" not in table)
+    assert left.get("local gravity", {}).get("up_to", {}).get("matrix") == up_to
+    assert any("local gravity" in source for source, _ in beyond_uncertainty(found.to_json())) == (up_to is not None)
+    for place in (9.7639, 9.8337):  # Huascaran, Arctic Ocean: m/s^2 (Hirt et al. 2013)
+        assert abs(place / 9.80665 - 1.0) < 0.00445
+
+
+@pytest.mark.parametrize(
+    ("sensor", "key", "u"),
+    [("accelerometer", "gravity_accuracy_g", 0.0025), ("gyroscope", "clock_accuracy_ppm", 5774.0)],
+)
+def test_a_scale_that_the_held_out_reference_shares_is_not_expected_in_its_error(
+    sensor: str, key: str, u: float
+) -> None:
+    without, _ = by_angle(sensor, counted=False)
+    stated, _ = by_angle(sensor, counted=False, **{key: u})
+    assert stated.covariance[3, 3] > 4.0 * without.covariance[3, 3]
+    beside = covariance_beside_reference(stated)
+    assert beside == pytest.approx(without.covariance, rel=1e-6, abs=1e-6 * np.max(np.abs(without.covariance)))
 
 
 def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:

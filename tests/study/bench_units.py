@@ -30,7 +30,7 @@ from pipeline.errors import PipelineError
 from pipeline.estimation.gauss_markov import TIME_FACTORS, TIME_PRIOR
 from pipeline.estimation.noise import noise_of, wander_prior
 from pipeline.estimation.stages import fit_stage
-from pipeline.estimation.uncertainty_budget import with_stated
+from pipeline.estimation.stated_lines import with_stated
 from pipeline.model.effects import built_in
 from pipeline.model.kinematics import reference_motion
 from pipeline.preprocessing.checks import check_recordings

@@ -44,7 +44,7 @@ from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import blocks_of_samples
-from pipeline.estimation.uncertainty_budget import combined, gravity_contribution, noise_contribution
+from pipeline.estimation.uncertainty_budget import combined, gravity_line, noise_contribution
 from pipeline.model.kinematics import table_motion
 from pipeline.records import Mask, Noise, Recording, SensorCalibration, Values, coverage_factor
 
@@ -329,10 +329,8 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     details = _details(rows, solved, float(scatter.degrees_of_freedom.min()))
     parameters = _parameters(solved, scatter.covariance)
     calibration = with_stage(before, NAME, details, solved.model, solved.fit, correction, parameters)
-    gravity = gravity_contribution("accelerometer", calibration.matrix, settings["table"], 12)
-    missing = OF_LENGTH if gravity else {"local gravity": "table.gravity_accuracy_g is not stated", **OF_LENGTH}
-    missing = missing | dict.fromkeys(NAMES[~solved.free].tolist(), HELD_MISALIGNMENT)
-    lines = [gravity] if gravity else []
+    lines, missing = gravity_line(calibration, settings["table"])
+    missing |= OF_LENGTH | dict.fromkeys(NAMES[~solved.free].tolist(), HELD_MISALIGNMENT)
     complete, trials = combined(calibration, [scatter, *lines], missing), trials_of(settings)
     if not trials:
         return complete

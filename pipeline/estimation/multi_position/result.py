@@ -28,17 +28,18 @@ from pipeline.estimation.multi_position.model import Model, State, parameter_pla
 from pipeline.estimation.multi_position.selection import Selection, fit_configured, limits_of
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
-from pipeline.estimation.table_errors import type_b
+from pipeline.estimation.table_errors import TIME_BASE
 from pipeline.estimation.uncertainty_budget import (
     TEMPERATURE,
     base_parameters,
+    clock_contribution,
     combined,
     effect_parameters,
-    gravity_contribution,
+    gravity_line,
     scatter_contribution,
 )
 from pipeline.model.effects import effect
-from pipeline.records import NORMAL, Contribution, Noise, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import Contribution, Noise, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -174,20 +175,17 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     parameters = parameters or base_parameters(model.sensor, found.state.bias, found.state.matrix, covariance)
     calibration = with_stage(before, name, details, model, found, correction, parameters)
     calibration = replace(calibration, effects=effects)
-    sensor, size, table = calibration.sensor, len(calibration.parameter_names()), settings["table"]
+    sensor, table = calibration.sensor, settings["table"]
     scatter = scatter_contribution(covariance, np.inf, parts, REMARK[sensor])
     lines = [replace(scatter, degrees_of_freedom=freedom)]
     missing = dict(not_included or NOT_INCLUDED)
     if sensor == "accelerometer":
-        gravity = gravity_contribution(sensor, calibration.matrix, table, size)
-        lines += [gravity] if gravity else []
-        missing |= {} if gravity else {"local gravity": "table.gravity_accuracy_g is not stated"}
+        gravity, unstated = gravity_line(calibration, table)
+        lines, missing = lines + gravity, missing | unstated
     elif table.get("clock_accuracy_ppm") is None:
-        missing["time base"] = "table.clock_accuracy_ppm is not stated"
-    else:  # a rate is an angle over a time: dM = M de
-        effect = np.zeros((size, 1))
-        effect[3:12, 0] = 1e-6 * calibration.matrix.ravel()
-        lines.append(type_b("time base", NORMAL, float(table["clock_accuracy_ppm"]), "ppm", effect))
+        missing[TIME_BASE] = "table.clock_accuracy_ppm is not stated"
+    else:
+        lines.append(clock_contribution(calibration, float(table["clock_accuracy_ppm"])))
     if sensor == "gyroscope":
         missing["Earth's rotation"] = "not in the model: by hand nobody knows the heading; up to 0.0042 deg/s of bias"
     complete, trials = combined(calibration, lines, missing), trials_of(settings)

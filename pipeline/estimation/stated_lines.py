@@ -1,0 +1,145 @@
+"""What the budget of a fit holds beside its method: temperature, repeatability, and a time that was counted.
+
+    temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
+    repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
+    time base     : dM = M e of a gyroscope whose rows were counted at the sensor's stated rate (note N-SYNTHTIME)
+
+where a is the standard uncertainty of the thermometer, R the range of temperatures recorded, c the sensor file's limits
+of the change per degC (or the fitted effect: then without the root, and R is 0), r standard deviations from one
+switching-on to the next, and e the sensor file's limit of ``clock_rate``, of rectangular distribution. They are added
+after the last stage of a fit, with ``up_to`` of each source that is not included and whose error has a known limit:
+relative for the elements of the matrix, in the sensor's unit for the bias.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.table_errors import TIME_BASE, type_b
+from pipeline.estimation.uncertainty_budget import GRAVITY, NOT_STATED, clock_contribution, with_uncertainty
+from pipeline.model.kinematics import EARTH_RATE_DPS
+from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, Recording, SensorCalibration, Values
+from pipeline.signal.filters import temperature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
+ACCURACY = "temperature_accuracy_degc"
+GRAVITY_ON_EARTH = 0.0044  # relative: 9.7639 to 9.8337 m/s^2 (Hirt et al. 2013, GRL 40, 4279) against 9.80665 m/s^2
+IN_LOCAL_GRAVITY = (
+    "table.gravity_g is 1 and table.gravity_accuracy_g is not stated, so that U holds in units of local gravity, which "
+    "is 0.9956 to 1.0028 g on Earth; state both, or table.gravity_accuracy_g=0 where these units are meant"
+)
+
+
+def with_stated(
+    calibration: SensorCalibration, recordings: Sequence[Recording], settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Return a calibration whose budget holds temperature, repeatability and a counted time, as far as they are known.
+
+    ``recordings``: of the fit; their temperature and notes are used. ``settings``: sections ``sensor``, ``table``.
+    """
+    before, budget = calibration.covariance, calibration.budget
+    if before is None or budget is None:
+        return calibration
+    sensor_config = settings["sensor"].get(calibration.sensor) or {}
+    lines, missing = _repeatability(calibration, sensor_config)
+    accuracy = settings["sensor"].get(ACCURACY)
+    if accuracy is not None:
+        warm = _temperature(calibration, float(accuracy), recordings, sensor_config.get("effects") or {})
+        if isinstance(warm, str):
+            missing["temperature"] = warm
+        else:
+            lines += warm
+    limits = sensor_config.get("effects") or {}
+    lines += _counted_time(calibration, recordings, limits.get("clock_rate"))
+    known = {line.source.partition(" (")[0] for line in lines} | set(missing)
+    kept = [entry for entry in budget["not_included"] if entry["source"] not in known]
+    left = [_bounded(entry, settings.get("table") or {}, limits.get("clock_rate")) for entry in kept]
+    left += [{"source": source, "reason": reason} for source, reason in missing.items()]
+    covariance = before + np.sum([line.covariance for line in lines], axis=0) if lines else before
+    old = np.array([np.inf if v is None else v for v in budget["effective_degrees_of_freedom"]])
+    share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(before)), where=np.diag(before) > 0.0)
+    freedom = np.where(np.diag(before) > 0.0, old * share**2, np.inf)
+    contributions = [*budget["contributions"], *(line.to_json() for line in lines)]
+    return with_uncertainty(calibration, covariance, freedom, {**budget, "contributions": contributions}, left)
+
+
+def _counted_time(
+    calibration: SensorCalibration, recordings: Sequence[Recording], limit_ppm: float | None
+) -> list[Contribution]:
+    """Return the line of a time base that is not stated, where rows were counted at the rate of the sensor's clock."""
+    unstated = any(map(_clock_unstated, (calibration.budget or {})["not_included"]))
+    own = (r for r in recordings if r.role in (calibration.sensor, "rests"))
+    if not limit_ppm or not unstated or not any(note.code == "N-SYNTHTIME" for r in own for note in r.notes):
+        return []
+    remark = f"rows counted at the stated rate, by the sensor file's limit of clock_rate, {limit_ppm:g} ppm"
+    return [clock_contribution(calibration, limit_ppm / np.sqrt(3.0), RECTANGULAR, remark)]
+
+
+def _clock_unstated(entry: Mapping[str, Any]) -> bool:
+    return entry["source"] == TIME_BASE and "clock_accuracy_ppm is not stated" in entry["reason"]
+
+
+def _bounded(entry: Mapping[str, Any], table: Mapping[str, Any], limit_ppm: float | None) -> dict[str, Any]:
+    """Return a source that is not included, with ``up_to`` where it is known how large its error can be."""
+    if entry["source"] == GRAVITY and float(table.get("gravity_g") or 1.0) == 1.0:
+        return {"source": GRAVITY, "reason": IN_LOCAL_GRAVITY, "up_to": {"matrix": GRAVITY_ON_EARTH}}
+    if _clock_unstated(entry) and limit_ppm:
+        reason = f"{entry['reason']}; the sensor file states {limit_ppm:g} ppm for times by the sensor's own clock"
+        return {"source": TIME_BASE, "reason": reason, "up_to": {"matrix": 1e-6 * limit_ppm}}
+    if entry["reason"].startswith("not in the model"):  # Earth's rotation
+        return {**entry, "up_to": {"bias": EARTH_RATE_DPS}}
+    return dict(entry)
+
+
+def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]:
+    """Return name, unit and effect, (p, 3), of errors of bias and of scale factor of each reading axis."""
+    size = len(calibration.parameter_names())
+    of_scale = np.zeros((size, 3))
+    for axis in range(3):
+        change = np.zeros((3, 3))
+        change[:, axis] = -calibration.matrix[:, axis]
+        of_scale[3:12, axis] = change.ravel()
+    return [("bias", SENSOR_UNITS[calibration.sensor], np.eye(size)[:, :3]), ("scale_factor", "1", of_scale)]
+
+
+def _repeatability(
+    calibration: SensorCalibration, sensor_config: Mapping[str, Any]
+) -> tuple[list[Contribution], dict[str, str]]:
+    lines, lacking = [], []
+    for name, unit, effect in _effects_on(calibration):
+        u = sensor_config.get(f"repeatability_{name}")
+        if u is None:
+            lacking.append(f"sensor.{calibration.sensor}.repeatability_{name}")
+        elif u:
+            lines.append(type_b(f"repeatability ({name.replace('_', ' ')})", NORMAL, float(u), unit, effect))
+    reason = f"{NOT_STATED}, compare, and state it as {' and '.join(lacking)}"
+    return lines, {"repeatability": reason} if lacking else {}
+
+
+def _temperature(
+    calibration: SensorCalibration, accuracy: float, recordings: Sequence[Recording], limits: Mapping[str, float]
+) -> list[Contribution] | str:
+    """Return what the temperature contributes to bias and scale factor, or why that is not known."""
+    own = [r for r in recordings if r.role in (calibration.sensor, "rests") and r.temperature is not None]
+    if not own:
+        return "the recordings hold no temperature"
+    spread = float(np.ptp(np.concatenate([temperature_of(r) for r in own]))) / np.sqrt(12.0)
+    lines = []
+    for name, unit, effect in _effects_on(calibration):
+        fitted = next((e for e in calibration.effects if e.name in FITTED[name]), None)
+        limit = limits.get(f"{name}_temperature")
+        if fitted is not None:
+            slope, u, how = fitted.values.reshape(3, -1)[:, 0], accuracy, f"by the fitted {fitted.name}"
+        elif limit is None:
+            return f"the sensor file states no effects.{name}_temperature"
+        else:
+            slope, u = np.full(3, limit / np.sqrt(3.0)), float(np.hypot(accuracy, spread))
+            how = f"by the sensor file's limit of {limit:g} {unit}/degC"
+        kind = NORMAL if fitted is not None else RECTANGULAR
+        lines.append(type_b(f"temperature ({name.replace('_', ' ')})", kind, u, "degC", effect * slope, how))
+    return lines
