@@ -1,4 +1,4 @@
-"""The templates of the pages: HTML, CSS and JavaScript in ``templates``, every value escaped."""
+"""The templates of the pages in ``templates``: HTML, CSS and JavaScript, every value escaped; Markdown as it is."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from jinja2 import Environment, FileSystemLoader, Template
+from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
 from pipeline.report.numbers import measured, number, percent, percent_change, plain, probability, typeset, unit_text
@@ -33,7 +33,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(FOLDER),
         auto_reload=False,
-        autoescape=True,
+        autoescape=select_autoescape(disabled_extensions=["md"], default=True),
         trim_blocks=True,
         lstrip_blocks=True,
     )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from pipeline.model.effects import effect
+from pipeline.report.pages import template
 from pipeline.study.cases import FAINT, SIZES
 from pipeline.study.scores import (
     Score,
@@ -31,90 +32,29 @@ Rows = list[list[Any]]
 LISTED = 40  # cases on the page that miss a goal
 OF_SIZE = ("single", "small", "tiny")
 BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))  # of lambda, around the 40 to 100 that a selection asks
-HEAD = """\
-# The blind study: how often the diagnosis is right
-
-Written by `{command}`, the product's code being {code}.
-
-Each case is a simulated unit, drawn at random: sensor model, sensor, procedure, effects, their sizes within 30 % of
-those in the last table with random signs, and every random number of the simulation, which turns the table with exact
-geometry. The truth stands in a file of its own; the diagnosis gets the recordings and the configuration of a unit, and
-every step is the function that the stage of a run calls. Shares have 95 % intervals (Wilson), means two standard errors
-to either side. A look-alike counts where the diagnosis itself declares that it reproduces over 95 % of the hidden
-signal. What each family hides: `pipeline/study/cases.py`; how: `pipeline/study/bench.py`.
-
-"Nothing hidden" counts each sensor of a unit by itself. "Taken out of the catalogue" counts the units of which the
-whole catalogue names the hidden effect and knows none with over 95 % of its signal.
-"""
-SIZE_TEXT = "Selected first, of n, on the MPU-6050 at the size of its data sheet and at shares of it."
-SIGNAL_TEXT = """\
-Every hidden effect by lambda: what a perfect diagnosis, to which noise and equation are known, would gain in 2 log L by
-it beside the others (`pipeline/study/bench.py`). A selection asks for 40 to 100, by its number of parameters."""
-FIGURE_HEAD = ["figure", "n", "share", "95 % interval", "goal"]
-ANSWER_TEXT = """\
-A case counts where one answer of the 95 % answer set is exactly the hidden effects, by their own names (nothing, where
-nothing is hidden or nothing can be seen). Limits do not depend on what is selected. They are counted where they are
-stated: for effects that were not selected, each parameter by itself."""
 DIAGRAM = "reliability.svg"
-RELIABLE_TEXT = f"""\
-The probability of every effect in the same cases, against the share of them in which it was there.
-
-![Probabilities of effects against the share of them that is there](images/{DIAGRAM})"""
-RELIABLE_HEAD = ["said, mean", "n", "true", "95 % interval"]
-MISS_TEXT = "In brackets lambda."
-SHAPE_HEAD = [
-    "hidden",
-    "n",
-    "unexplained",
-    "other warning",
-    "answered",
-    "silent",
-    "nothing",
-    "most often said",
-    "excess gone",
-]
-SHAPE_TEXT = """\
-Where the temperature only rises, a curve of the temperature and one of the time are the same. "Answered": no warning,
-but an answer of the answer set follows something outside the catalogue. What is said silently is a substitute, whose
-worth is the share of the held-out excess that it takes away (last column)."""
-DATA_SHEET = "Median of the size drawn; one number is for all parameters. A warm-up's time constant is 90 to 400 s."
 
 
 def page(cases: Sequence[JSON], command: str) -> str:
     """Return the page; ``command`` makes it again."""
-    code = " and ".join(sorted({f"`{case['code']}`" for case in cases if "code" in case})) or "unknown"
-    said = table_of(cases)
-    faults = [[case["key"], case["error"]] for case in cases if "error" in case]
-    families, answers = family_scores(cases), [score.cells for score in answer_scores(cases)]
-    reliable = [[f"{float(name):.2g}", *cells] for name, *cells, _ in (bin_.cells for bin_ in reliability(cases))]
-    parts = [
-        HEAD.format(command=command, code=code),
-        _table(FIGURE_HEAD, [score.cells for score in families]),
-        _section("Answer sets, probabilities and upper limits", ANSWER_TEXT, FIGURE_HEAD, answers),
-        _section("Are probabilities right?", RELIABLE_TEXT, RELIABLE_HEAD, reliable),
-        _section("Detection by size", SIZE_TEXT, ["sensor", "effect", "x1", "x0.3", "x0.1"], found_at(said)),
-        _section("Detection by signal", SIGNAL_TEXT, ["lambda", "n", "selected", "95 % interval"], by_signal(cases)),
-        _section("Called something else", "", ["sensor", "hidden", "said", "cases"], confusions(said)),
-        _section("Taken out of the catalogue", "", ["sensor", "hidden", "said", "warning", "cases"], instead(said)),
-        _section("Physics in another form than the catalogue's", SHAPE_TEXT, SHAPE_HEAD, of_shapes(cases)),
-        _section("Cases that miss a goal", MISS_TEXT, ["case", "unit", "hidden", "said"], _misses(cases, families)),
-        _section("Faults", "", ["case", "error"], faults),
-        _section(
-            "What data-sheet size is", DATA_SHEET, ["model", "sensor", "effect", "size", "unit"], _sensor_file_sizes()
-        ),
-    ]
-    return "\n".join(part for part in parts if part)
-
-
-def _table(head: Sequence[str], rows: Rows) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
-
-
-def _section(title: str, text: str, head: Sequence[str], rows: Rows) -> str:
-    if not rows:
-        return ""
-    return "\n".join([f"## {title}\n", *([f"{text}\n"] if text else []), _table(head, rows)])
+    said, families = table_of(cases), family_scores(cases)
+    text: str = template("study.md").render(
+        command=command,
+        code=" and ".join(sorted({f"`{case['code']}`" for case in cases if "code" in case})) or "unknown",
+        families=[score.cells for score in families],
+        answers=[score.cells for score in answer_scores(cases)],
+        reliable=[[f"{float(name):.2g}", *cells] for name, *cells, _ in (bin_.cells for bin_ in reliability(cases))],
+        diagram=DIAGRAM,
+        by_size=found_at(said),
+        by_signal=by_signal(cases),
+        confusions=confusions(said),
+        instead=instead(said),
+        shapes=of_shapes(cases),
+        misses=_misses(cases, families),
+        faults=[[case["key"], case["error"]] for case in cases if "error" in case],
+        sizes=_sensor_file_sizes(),
+    )
+    return text
 
 
 def table_of(cases: Iterable[JSON]) -> pd.DataFrame:
