@@ -12,7 +12,7 @@ from pipeline.commands import parser_of
 from pipeline.commands.convert import sensor_config
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
-from pipeline.exports.conversion import board_lines, explain_calibration
+from pipeline.exports.conversion import explain_board, explain_calibration
 from pipeline.exports.reading import counts_of, read_any
 from pipeline.files import read_json
 from pipeline.history import read_history
@@ -78,7 +78,7 @@ def main(argv: Sequence[str]) -> int:
             for source, reason in beyond_uncertainty(calibration.get(s))
         )
         texts[-1] += "".join(f"  Left out: {line}.\n" for line in left_out(calibration.get("inputs")))
-        texts[-1] += "".join(f"{line}\n" for line in board_lines(calibration)[1:])
+        texts[-1] += explain_board(calibration)
     texts += [_failed(unit, failure) for unit, failure in found.failures.items()]
     if len(texts) > 1:
         texts.insert(0, "\n".join(_summary(found)) + "\n")

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from jinja2 import Environment, StrictUndefined, Template
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from pipeline.exports.c_effects import plan_of
 from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, noise_remarks, plain
@@ -89,9 +89,9 @@ class Format:
 
 
 @cache
-def formats() -> dict[str, tuple[Format, Template]]:
-    """Return declaration and text of every format, by the name of the template, in alphabetical order."""
+def _environment() -> Environment:
     environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
         autoescape=False,  # noqa: S701  (no HTML; each comment filter closes its own comments)
         trim_blocks=True,
         lstrip_blocks=True,
@@ -101,11 +101,22 @@ def formats() -> dict[str, tuple[Format, Template]]:
     )
     environment.filters |= {"comment": _comment, "json": _json, "yaml": _yaml, "numbers": _numbers}
     environment.globals |= {**FUNCTIONS, "plan_of": plan_of}
+    return environment
+
+
+def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
+    """Return the text of a template that is no format."""
+    return _environment().get_template(name).render(values)
+
+
+@cache
+def formats() -> dict[str, tuple[Format, Template]]:
+    """Return declaration and text of every format, by the name of the template, in alphabetical order."""
     formats_by_name = {}
     for template in sorted(TEMPLATES.glob("*.j2")):
         header, _, text = template.read_text(encoding="utf-8").partition("\n---\n")
         declared = Format(**{"file": template.stem, **yaml.safe_load(header)})
-        formats_by_name[template.stem] = declared, environment.from_string(text)
+        formats_by_name[template.stem] = declared, _environment().from_string(text)
     return formats_by_name
 
 

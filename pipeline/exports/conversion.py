@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.exports import ExportedUnit, export, formats
+from pipeline.exports import ExportedUnit, export, formats, text_of
 from pipeline.exports.reading import CALIBRATION, ImportedCalibration, counts_of, read_any
 from pipeline.exports.sensors import FACTORS, SI, ExportedSensor, before_use
 from pipeline.files import json_text, write_atomically
@@ -151,103 +151,59 @@ SAMPLE: dict[str, Any] = {
 
 def explain_calibration(imported: ImportedCalibration) -> str:
     """Return the explanation of a calibration in any format."""
-    lines = [f"{imported.unit} ({imported.format_name})"]
-    if imported.document is None:
-        declared = formats()[imported.format_name][0]
-        lines += [f"  {declared.consumer}: {declared.equation}", "  The same in g, deg/s and body axes:"]
-    lines += [f"  {line}" for line in (before_use(imported.document) if imported.document else [])]
-    lines += [f"  {note}" for note in imported.notes]
-    for sensor in SENSORS:
-        calibration = imported.sensors.get(sensor)
-        lines += ["", f"  {sensor}"]
-        lines += [f"    {line}" for line in _sensor(calibration, imported)] if calibration else ["    not calibrated"]
-    return "\n".join(lines + board_lines(imported.document or {})) + "\n"
+    document = imported.document or {}
+    return text_of(
+        "explanation.txt",
+        imported=imported,
+        declared=None if document else formats()[imported.format_name][0],
+        notes=[*(before_use(document) if document else []), *imported.notes],
+        sensors={s: _explained(imported.sensors[s], imported) if s in imported.sensors else None for s in SENSORS},
+        sample=SAMPLE,
+        board=document.get("board"),
+    )
 
 
-def board_lines(document: dict[str, Any]) -> list[str]:
+def explain_board(document: JSON) -> str:
     """Return how the chips of a unit's board sit, in words and numbers; nothing where the unit is on no board."""
-    board = document.get("board")
-    if not board:
-        return []
-    lines = ["", f"  board {board['name']}: reference chip {board['reference']}"]
-    for name, chip in board["chips"].items():
-        if "refused" in chip:
-            lines.append(f"    {name}: not estimated: {chip['refused']}")
-            continue
-        lines += [
-            f"    {name}: f = R (f_ref + [omega x (omega x r) + alpha x r] / 9.80665), w = R w_ref; all calibrated",
-            *(f"      {'R =' if i == 0 else '   '} {_row(np.array(row))}" for i, row in enumerate(chip["rotation"])),
-        ]
-        for parameter, p in chip["parameters"].items():
-            note = "" if p["observable"] else "   not observable"
-            lines.append(f"      {parameter:26s} {p['value']:.6g} ± {p['expanded_uncertainty']:.2g} {p['unit']}{note}")
-        for lost in chip["not_observable"]:
-            along = f" along {lost['direction']}" if lost["direction"] else ""
-            lines.append(f"      not observable: {lost['parameter']}{along}: {lost['reason']}")
-        lines += [f"      in doubt: {doubt}" for doubt in chip["doubts"]]
-    return lines
+    return text_of("board.txt", board=document["board"]) if document.get("board") else ""
 
 
-def _sensor(calibration: SensorCalibration, imported: ImportedCalibration) -> list[str]:
-    unit, effects = SENSOR_UNITS[calibration.sensor], sensor_effects(calibration)
-    names = [e.name for e in effects]
-    bench = [e.name for e in calibration.effects if e not in effects]
-    minus = "".join(f" - {name}" for name in names)
-    lines = [
-        f"calibrated = matrix (reading - bias{minus}), {unit}; vectors are columns x, y, z",
-        "signs: at rest the upward axis reads + local gravity"
-        if calibration.sensor == "accelerometer"
-        else "signs: a turn about +x, +y, +z by the right-hand rule reads +",
-        "order: 1. readings to body axes  2. subtract the bias"
-        + ("".join(f"  {i}. subtract {name}" for i, name in enumerate(names, 3)))
-        + f"  {len(names) + 3}. multiply by the matrix",
-        f"bias   = {_row(calibration.bias)} {unit}",
-        *(f"{'matrix =' if i == 0 else '        '} {_row(row)}" for i, row in enumerate(calibration.matrix)),
-        *_uncertainty(calibration, unit),
-    ]
-    for effect in effects:
-        expressions = effect_of(effect).in_c(effect.values) or ()
-        terms = "" if expressions else ", ".join(f"{n} = {p['value']:.6g}" for n, p in effect.parameters.items())
-        lines.append(f"{effect.name}, {unit}: {terms}".rstrip(": "))
-        lines += [f"  {axis}: {_plain(term)}" for axis, term in zip("xyz", expressions, strict=False)]
-    if effects:
-        lines.append(
-            "  (f: specific force, g; w: angular rate, deg/s; u: that of this sensor, all calibrated; dt: T - 25 degC)"
-        )
-    lines += [f"of the bench, not subtracted: {', '.join(bench)}"] * bool(bench)
-    return lines + _worked(calibration, imported)
-
-
-def _uncertainty(calibration: SensorCalibration, unit: str) -> list[str]:
-    """Return the expanded uncertainties (95 %) of bias and matrix, or that none is known."""
-    if calibration.covariance is None:
-        return ["uncertainty: not stated"]
-    freedom = calibration.freedom if calibration.freedom is not None else np.array(calibration.degrees_of_freedom)
-    U = coverage_factor(np.broadcast_to(freedom, len(calibration.covariance)))
-    U = U * np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None))
-    return [f"expanded uncertainty (95 %): bias {_row(U[:3], '.2g')} {unit}, matrix up to {U[3:12].max():.2g}"]
-
-
-def _worked(calibration: SensorCalibration, imported: ImportedCalibration) -> list[str]:
-    """Return one reading, calibrated step by step; the effects are those that the compensation subtracts."""
-    sensor, unit = calibration.sensor, SENSOR_UNITS[calibration.sensor]
+def _explained(calibration: SensorCalibration, imported: ImportedCalibration) -> JSON:
+    """Return what the explanation of a sensor states; the effects are those that the compensation subtracts."""
+    sensor, effects = calibration.sensor, sensor_effects(calibration)
     compensation = Compensation(imported.sensors.get("accelerometer"), imported.sensors.get("gyroscope"), imported.unit)
     truth = getattr(compensation.apply(**SAMPLE, smoothing=0.0), sensor)
-    reading, centred = SAMPLE[sensor], SAMPLE[sensor] - calibration.bias
-    effects = centred - np.linalg.solve(calibration.matrix, truth)
-    lines = [f"worked sample: reading      {_row(reading)} {unit}", f"  - bias                    {_row(centred)}"]
-    if sensor_effects(calibration):
-        at = f"at {SAMPLE['temperature']:g} degC, {SAMPLE['time']:g} s"
-        other = "gyroscope" if sensor == "accelerometer" else "accelerometer"
-        lines.append(f"  - effects                 {_row(effects)}  ({at}, {other} {_row(SAMPLE[other], '.4g')})")
-    return [*lines, f"  matrix times that         {_row(truth)} {unit}  calibrated"]
+    centred = SAMPLE[sensor] - calibration.bias
+    return {
+        "unit": SENSOR_UNITS[sensor],
+        "calibration": calibration,
+        "expanded": _expanded_uncertainty(calibration),
+        "effects": [
+            {
+                "name": e.name,
+                "parameters": e.parameters,
+                "terms": [_plain(t) for t in effect_of(e).in_c(e.values) or ()],
+            }
+            for e in effects
+        ],
+        "bench": [e.name for e in calibration.effects if e not in effects],
+        "centred": centred,
+        "subtracted": centred - np.linalg.solve(calibration.matrix, truth),
+        "truth": truth,
+        "other": "gyroscope" if sensor == "accelerometer" else "accelerometer",
+    }
+
+
+def _expanded_uncertainty(calibration: SensorCalibration) -> Values | None:
+    """Return the expanded uncertainties (95 %) of all parameters; None where none is known."""
+    if calibration.covariance is None:
+        return None
+    freedom = calibration.freedom if calibration.freedom is not None else np.array(calibration.degrees_of_freedom)
+    k = coverage_factor(np.broadcast_to(freedom, len(calibration.covariance)))
+    return np.asarray(k * np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None)))
 
 
 def _plain(expression: str) -> str:
     """Return a C expression of an effect without casts, its numbers to six digits."""
     bare = expression.replace("(imu_real)", "").replace("m->", "")
     return NUMBER.sub(lambda number: f"{float(number[0]):.6g}", bare)
-
-
-def _row(values: Values, form: str = ".9g") -> str:
-    return "[" + ", ".join(f"{value:{form}}" for value in values) + "]"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_formats import document, settings
 
 from pipeline.exports import exports
-from pipeline.exports.conversion import board_lines
+from pipeline.exports.conversion import explain_board
 
 __all__ = ["settings"]
 PLACE = [0.03, -0.02, 0.01]
@@ -73,7 +73,7 @@ def test_only_the_reference_of_a_board_has_the_file(settings: dict[str, Any]) ->
 
 
 def test_the_explanation_names_what_is_not_observable(on_board: dict[str, Any]) -> None:
-    text = "\n".join(board_lines(on_board))
+    text = explain_board(on_board)
     assert "board B7: reference chip A" in text
     assert re.search(r"lever_arm_x +0.03 ± 0.0002 m$", text, re.MULTILINE)
     assert re.search(r"lever_arm_z +0.01 ± 0.0002 m   not observable$", text, re.MULTILINE)
