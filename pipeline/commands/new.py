@@ -12,6 +12,8 @@ from pipeline.files import CONFIGS
 from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.outcome import run_command
 from pipeline.planning.changes import readme
+from pipeline.records import SENSOR_UNITS, SENSORS
+from pipeline.report.pages import template
 from pipeline.simulation.description import UnitDescription, read_option
 from pipeline.simulation.procedures import TABLE_PROCEDURES
 
@@ -19,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
-UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
 EPILOG = """\
 On a terminal the command asks for the sensor, the ranges, the procedure and the table that no option states.
@@ -27,17 +28,6 @@ On a terminal the command asks for the sensor, the ranges, the procedure and the
 examples:
   python -m pipeline new my_bench --sensor mpu6050 --range 4 500
   python -m pipeline new by_hand --sensor mpu6050 --procedure multi_position
-"""
-SETTINGS = """\
-# Hydra overrides for all units of this campaign; units.csv and the command line are stronger.
-overrides:
-  []
-  # - table.gravity_g=0.9976          # local gravity, g (9.80665 m/s^2)
-  # - filter=rc_low_pass              # a group: one of its options
-  # - filter.cutoff_hz=2.0            # a value
-  # - effects.gyroscope=[g_sensitivity]
-  # - limits.gyroscope.held_out_rms_error=0.05
-  # - batch_size=50                   # units that one job handles
 """
 
 
@@ -74,9 +64,7 @@ def main(argv: Sequence[str]) -> int:
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)
     folder.mkdir(parents=True, exist_ok=True)
     (arguments.directory / "README.md").write_text(text, encoding="utf-8")
-    (arguments.directory / "campaign.yaml").write_text(
-        SETTINGS + _ranges(sensor_name, sensor, ranges) + _options(), encoding="utf-8"
-    )
+    (arguments.directory / "campaign.yaml").write_text(_campaign(sensor_name, sensor, ranges), encoding="utf-8")
     row = f"{arguments.unit},,,,{sensor_name},{table_name},{procedure_name},"
     units_table.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
     print(f"{units_table}: one row for each unit; put the recordings into {folder}")
@@ -90,7 +78,7 @@ def _accuracy(name: str, table: dict[str, Any]) -> str:
     """Return the accuracy of the table that the results assume, and how to state another."""
     if table["motion"] == "none":
         return f"table {name}: there is no table; the unit is placed by hand"
-    others = ", ".join(sorted(f.stem for f in (CONFIGS / "table").glob("*.yaml") if f.stem != name))
+    others = ", ".join(option for option in _options("table") if option != name)
     angle, rate = f"{table['angle_accuracy_deg']:g} deg", f"{100 * table['rate_accuracy']:g} %"
     return (
         f"table {name}: accuracy of its angles {angle}, of its rates {rate} (standard uncertainties); "
@@ -122,38 +110,28 @@ def _chosen_ranges(sensor: dict[str, Any], given: list[float] | None) -> list[fl
 
 
 def _ranges_of(sensor: dict[str, Any]) -> list[float]:
-    return [float(sensor[name]["full_scale"]) for name in UNITS if sensor.get(name)]
+    return [float(sensor[s]["full_scale"]) for s in SENSORS if sensor.get(s)]
 
 
-def _ranges(name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
-    """Return the settings of the ranges, as comments where they are those of the sensor's file."""
-    sensor_configs = [sensor[s] for s in UNITS if sensor.get(s)]
-    held = ", ".join(f"{s} +-{sensor[s]['full_scale']:g} {UNITS[s]}" for s in UNITS if sensor.get(s))
+def _campaign(name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
+    """Return ``campaign.yaml``: the settings of the ranges are comments where they are those of the sensor's file."""
+    held = [(s, sensor[s]["full_scale"], SENSOR_UNITS[s]) for s in SENSORS if sensor.get(s)]
     other = [
-        None if value == float(h["full_scale"]) else value for h, value in zip(sensor_configs, wanted, strict=False)
+        None if value == float(full_scale) else value for value, (_, full_scale, _) in zip(wanted, held, strict=False)
     ]
-    settings = settings_of_ranges(sensor, [*other, *wanted[len(other) :]])
-    mark = "" if settings else "# "
-    lines = ["", f"# The file of the sensor {name} states the ranges {held}."]
-    lines += [] if settings else ["# Example for larger ones:"]
-    lines += [f"{mark}models:", f"{mark}  {name}:"]
-    lines += [
-        f"{mark}    - {s}"
-        for s in settings or settings_of_ranges(sensor, [_larger(sensor_config) for sensor_config in sensor_configs])
-    ]
-    return "\n".join(lines) + "\n"
+    larger = []
+    for s, full_scale, _ in held:
+        listed = [float(r) for r in sensor[s].get("ranges") or ()] or [2.0 * full_scale]
+        larger.append(min((r for r in listed if r > full_scale), default=full_scale))
+    text: str = template("campaign.yaml").render(
+        sensor=name,
+        held=held,
+        settings=settings_of_ranges(sensor, [*other, *wanted[len(other) :]]),
+        example=settings_of_ranges(sensor, larger),
+        groups={group: _options(group) for group in GROUPS},
+    )
+    return text
 
 
-def _larger(sensor_config: dict[str, Any]) -> float:
-    """Return the next larger range of a sensor, or twice that of its file."""
-    full_scale = float(sensor_config["full_scale"])
-    listed = [float(r) for r in sensor_config.get("ranges") or ()] or [2.0 * full_scale]
-    return min((r for r in listed if r > full_scale), default=full_scale)
-
-
-def _options() -> str:
-    lines = ["", "# Groups and their options (columns of units.csv, or overrides):"]
-    for group in GROUPS:
-        options = ", ".join(sorted(f.stem for f in (CONFIGS / group).glob("*.yaml")))
-        lines.append(f"#   {group}: {options}")
-    return "\n".join(lines) + "\n"
+def _options(group: str) -> list[str]:
+    return sorted(file.stem for file in (CONFIGS / group).glob("*.yaml"))
