@@ -76,6 +76,7 @@ def _prepare() -> None:
     for module in ("scipy.interpolate", "scipy.spatial.transform", "imufusion", "pipeline.io.csv_read"):
         import_module(module)  # stages import them where they need them
 
+    from pipeline.diagnosis import words  # noqa: PLC0415
     from pipeline.exports import formats  # noqa: PLC0415
     from pipeline.model.effects import built_in  # noqa: PLC0415
     from pipeline.report.pages import compile_templates  # noqa: PLC0415
@@ -83,6 +84,7 @@ def _prepare() -> None:
     built_in()
     formats()
     compile_templates()
+    words.template()
 
 
 def _next_job(listener: socket.socket) -> tuple[socket.socket, bytes, list[int]] | None:
