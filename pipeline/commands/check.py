@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from pipeline.commands.trial import Trial
     from pipeline.config.campaign import Campaign
-    from pipeline.profile_detection.columns import TextLayout
+    from pipeline.profile_detection.columns import Log
     from pipeline.profile_detection.proposal import Proposal
     from pipeline.profile_detection.recording_facts import Line
 
@@ -314,7 +314,7 @@ def _place(file: str | None, files: Sequence[Path]) -> str:
     return f"line {line}: " if line.isdigit() else f"{file}: "
 
 
-def _layouts(reading: Reading, code: str) -> list[TextLayout]:
+def _layouts(reading: Reading, code: str) -> list[Log]:
     """Return the layout of each log that the profile does not describe; of a log of messages, that of one topic."""
     if code not in UNKNOWN_LAYOUT:
         return []
@@ -327,7 +327,7 @@ def _layouts(reading: Reading, code: str) -> list[TextLayout]:
     return found
 
 
-def _text_layout(file: Path) -> TextLayout:
+def _text_layout(file: Path) -> Log:
     with file.open("rb") as stream:
         return find_layout(stream.read(SEARCHED_BYTES), str(file))
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from pipeline.config.comparisons import resolve_comparisons
 from pipeline.config.compose import Composer
-from pipeline.config.layers import as_list, load_layers, read_units_table
+from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import RUN_SETTINGS, Problem, mapping_of, nearest, parse
 from pipeline.config.schema import OF_BENCH, RunSettings
 from pipeline.config.stage_settings import config_sha256
@@ -50,42 +50,22 @@ class UnitRow:
 class Campaign:
     """A campaign with everything resolved.
 
-    Attributes
-    ----------
-    name : str
-        Last part of its directory; its results are in ``<results>/<name>``.
-    units : dict of str to UnitRow
-        In the order of ``units.csv``.
-    batches : dict of str to list of str
-        Units of one chain of stages, cut in the order of ``units.csv``.
-    chains : dict of str to dict
-        Batch and sensor to the ordered stages of its fit.
-    compare : list
-        What the campaign's page compares, resolved to groups of units.
-    simulation : Path or None
-        The description from which the run makes the recordings; None where they are recorded.
-    settings : mapping
-        What ``snakemake --config`` gave.
-    page : str or None
-        A page that the campaign asks for in addition to its own.
-    combine : str or None
-        ``serial``: a joint estimate of units that share a serial; ``lot``: each unit with the prior of its lot.
-    publish_limit : int
-        Up to how many units each has published files of its own.
+    ``combine``: ``serial`` for a joint estimate of units that share a serial; ``lot`` for each unit with the prior of
+    its lot.
     """
 
-    name: str
+    name: str  # last part of its directory; its results are in ``<results>/<name>``
     directory: Path
     results: Path
-    units: dict[str, UnitRow]
-    batches: dict[str, list[str]]
-    chains: dict[str, dict[str, list[str]]]
-    compare: list[Any]
-    simulation: Path | None
-    settings: Mapping[str, Any]
-    page: str | None
+    units: dict[str, UnitRow]  # in the order of ``units.csv``
+    batches: dict[str, list[str]]  # units of one chain of stages, cut in the order of ``units.csv``
+    chains: dict[str, dict[str, list[str]]]  # batch and sensor to the ordered stages of its fit
+    compare: list[Any]  # what the campaign's page compares, resolved to groups of units
+    simulation: Path | None  # the description from which the run makes the recordings; None where they are recorded
+    settings: Mapping[str, Any]  # what ``snakemake --config`` gave
+    page: str | None  # that the campaign asks for in addition to its own
     combine: str | None = None
-    publish_limit: int = 0
+    publish_limit: int = 0  # up to how many units each has published files of its own
 
     @cached_property
     def boards(self) -> dict[str, list[str]]:
@@ -153,7 +133,14 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError("the configuration is refused:\n" + "\n".join(lines), str(directory / "units.csv"))
     of_run = run_settings(layers.of_run)
     batches, chains = cut_batches(units, None if of_run.batch_size == "auto" else of_run.batch_size)
-    _check_boards(boards_of(units), batches, str(directory / "units.csv"))
+    batch_of = {unit: batch for batch, members in batches.items() for unit in members}
+    split = [board for board, chips in boards_of(units).items() if len({batch_of[chip] for chip in chips}) > 1]
+    if split:
+        raise ConfigurationError(
+            f"column board: the chips of {_few(split)} are estimated together; expected consecutive rows with the same "
+            "method",
+            str(directory / "units.csv"),
+        )
     results = Path(str(settings.get("results", "results"))) / directory.name
     compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
     return Campaign(
@@ -165,9 +152,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
 def read_layers(directory: Path, settings: Mapping[str, Any]) -> tuple[Composer, Layers]:
     """Read the options, the units table and the overrides of a campaign and of the command line."""
     composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "a list of paths of Python files"))
-    return composer, load_layers(
-        directory, settings, read_units_table(directory / "units.csv"), composer.options["sensor"]
-    )
+    return composer, load_layers(directory, settings, composer.options["sensor"])
 
 
 def find_campaign(name: str) -> Path:
@@ -240,18 +225,6 @@ def boards_of(units: Mapping[str, UnitRow]) -> dict[str, list[str]]:
         if unit.row.get("board"):
             found.setdefault(unit.row["board"], []).append(name)
     return {board: chips for board, chips in found.items() if len(chips) > 1}
-
-
-def _check_boards(boards: Mapping[str, Sequence[str]], batches: Mapping[str, Sequence[str]], units_table: str) -> None:
-    """Refuse boards whose chips are not in one batch; raises ``ConfigurationError``."""
-    batch_of = {unit: batch for batch, units in batches.items() for unit in units}
-    split = [b for b, chips in boards.items() if len({batch_of[chip] for chip in chips}) > 1] if boards else []
-    if split:
-        raise ConfigurationError(
-            f"column board: the chips of {_few(split)} are estimated together; expected consecutive rows with the same "
-            "method",
-            units_table,
-        )
 
 
 def _few(names: Sequence[str]) -> str:

@@ -231,9 +231,12 @@ class Composer:
     def _check_effect(self, sensor: str, whole: str, procedure: dict[str, Any]) -> None:
         name, separator, setup = whole.partition("@")
         if separator:
-            _check_setup(whole, setup, procedure)
-        if separator and name in OF_A_SETUP:
-            return
+            known = {entry.get("setup") for entry in procedure["recordings"].values()} - {None}
+            if setup not in known:
+                hint = nearest(setup, known) if known else "; name the setup of each recording in the procedure config"
+                raise Problem(f"{whole}: no recording of procedure {procedure['name']} has setup: {setup}{hint}")
+            if name in OF_A_SETUP:
+                return
         if name not in self.effects:
             raise Problem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
         own = self.user_effects.effects.get(name)
@@ -287,16 +290,6 @@ def _without_need(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str
     entries = procedure["recordings"].items()
     recordings = {name: {**e, "optional": True} if e["role"] in unused else e for name, e in entries}
     return {**procedure, "recordings": recordings} if unused else procedure
-
-
-def _check_setup(name: str, setup: str, procedure: dict[str, Any]) -> None:
-    """Refuse an effect of a setup in which no recording of the procedure is made."""
-    known = {entry.get("setup") for entry in procedure["recordings"].values()} - {None}
-    if setup not in known:
-        raise Problem(
-            f"{name}: no recording of procedure {procedure['name']} has setup: {setup}"
-            f"{nearest(setup, known) if known else '; name the setup of each recording in the procedure config'}"
-        )
 
 
 def _quoted(folder: Path) -> str:

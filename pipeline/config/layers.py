@@ -46,20 +46,11 @@ ALIKE = 0.85  # similarity of a name that is taken for a slip: overide 0.88, pro
 LARGEST_BYTES = 100_000_000  # a million units of 100 characters each
 
 
-@dataclass(frozen=True)
-class UnitsTable:
-    """The rows of ``units.csv``.
+class UnitsTable(NamedTuple):
+    """The rows of ``units.csv``, in its order."""
 
-    Attributes
-    ----------
-    rows : dict of str to dict
-        Unit to its cells by column, in the order of the units table.
-    lines : dict of str to int
-        Unit to the line of the file on which its row ends.
-    """
-
-    rows: dict[str, dict[str, str]]
-    lines: dict[str, int]
+    rows: dict[str, dict[str, str]]  # unit to its cells by column
+    lines: dict[str, int]  # unit to the line of the file on which its row ends
 
 
 def read_units_table(path: Path) -> UnitsTable:
@@ -204,31 +195,15 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Layers:
-    """Everything that overrides settings of units.
-
-    Attributes
-    ----------
-    campaign : CampaignFile
-        Its ``overrides`` without those of the run.
-    of_run : list of str
-        Settings of the run, from ``campaign.yaml`` and the command line.
-    devices : dict of str to list of str
-        Serial or unit to the overrides of its file.
-    command : list of str
-        ``overrides=`` of the command line.
-    per_unit : dict of str to list of str
-        ``unit_overrides=`` of the command line.
-    simulation : Path or None
-        The description from which the run makes the recordings; None where they are recorded.
-    """
+    """Everything that overrides settings of units."""
 
     units_table: UnitsTable
-    campaign: CampaignFile
-    of_run: list[str]
-    devices: dict[str, list[str]]
-    command: list[str]
-    per_unit: dict[str, list[str]]
-    simulation: Path | None
+    campaign: CampaignFile  # its ``overrides`` without those of the run
+    of_run: list[str]  # settings of the run, from ``campaign.yaml`` and the command line
+    devices: dict[str, list[str]]  # serial or unit to the overrides of its file
+    command: list[str]  # ``overrides=`` of the command line
+    per_unit: dict[str, list[str]]  # ``unit_overrides=`` of the command line
+    simulation: Path | None  # the description from which the run makes the recordings; None where they are recorded
 
     def of(self, unit: str) -> list[Layer]:
         """Return a unit's overrides, weakest first."""
@@ -250,16 +225,12 @@ class Layers:
         return [*below, *above]
 
 
-def load_layers(
-    directory: Path, settings: Mapping[str, Any], units_table: UnitsTable, sensors: Iterable[str]
-) -> Layers:
-    """Read the overrides of a campaign and of the command line.
-
-    Raises ``ConfigurationError`` naming the file and the key.
+def load_layers(directory: Path, settings: Mapping[str, Any], sensors: Iterable[str]) -> Layers:
+    """Read the overrides of a campaign and of the command line; ``ConfigurationError`` names the file and the key.
 
     ``settings`` are those of ``--config``, ``sensors`` the names of the sensor configs.
     """
-    path = directory / "campaign.yaml"
+    units_table, path = read_units_table(directory / "units.csv"), directory / "campaign.yaml"
     file = _read(path, CampaignFile) if os.path.lexists(path) else CampaignFile()
     _check_models_and_lots(file, units_table, set(sensors), str(path))
     in_file, units = _split(file.overrides)
@@ -272,10 +243,21 @@ def load_layers(
     problem = not_regular(simulation) if simulation else None
     if problem:
         raise ConfigurationError(problem, str(simulation))
-    campaign = file.model_copy(update={"overrides": units})
-    per_unit = _unit_overrides(settings.get("unit_overrides", {}), units_table.rows)
-    of_run = [*in_file, *on_command_line]
-    return Layers(units_table, campaign, of_run, _read_devices(directory, units_table), command, per_unit, simulation)
+    per_unit = settings.get("unit_overrides", {})
+    if not isinstance(per_unit, dict):
+        form = """'unit_overrides={U1: [filter.cutoff_hz=5, "effects.gyroscope=[g_sensitivity]"]}'"""
+        raise ConfigurationError(f"unit_overrides: {form} is the form (lists within are quoted), got {per_unit!r}")
+    for name in (str(n) for n in per_unit if str(n) not in units_table.rows):
+        raise ConfigurationError(f"unit_overrides: no unit {name!r} in units.csv{nearest(name, units_table.rows)}")
+    return Layers(
+        units_table,
+        file.model_copy(update={"overrides": units}),
+        [*in_file, *on_command_line],
+        _read_devices(directory, units_table),
+        command,
+        {str(name): as_list(v, f"unit_overrides of {name}") for name, v in per_unit.items()},
+        simulation,
+    )
 
 
 def as_list(value: Any, where: str, what: str = LIST) -> list[str]:  # noqa: ANN401  (the user's)
@@ -361,14 +343,3 @@ def _check_models_and_lots(campaign: CampaignFile, units_table: UnitsTable, sens
                 raise ConfigurationError(str(problem)) from problem
             if another:
                 raise ConfigurationError(f"models, {name}: the overrides of a model cannot choose another", file)
-
-
-def _unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:  # noqa: ANN401
-    """Check ``unit_overrides``: unit name to a list of overrides, of units that exist."""
-    if not isinstance(value, dict):
-        form = """'unit_overrides={U1: [filter.cutoff_hz=5, "effects.gyroscope=[g_sensitivity]"]}'"""
-        raise ConfigurationError(f"unit_overrides: {form} is the form (lists within are quoted), got {value!r}")
-    for name in value:
-        if str(name) not in rows:
-            raise ConfigurationError(f"unit_overrides: no unit {name!r} in units.csv{nearest(str(name), rows)}")
-    return {str(name): as_list(v, f"unit_overrides of {name}") for name, v in value.items()}

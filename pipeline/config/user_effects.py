@@ -35,16 +35,10 @@ ONLY_FROM_THE_COMMAND_LINE = (
 
 @dataclass(frozen=True)
 class UserEffects:
-    """The effects of the user's own.
-
-    Attributes
-    ----------
-    python : dict of str to dict
-        Of those in Python, by name: ``path`` and ``sha256``.
-    """
+    """The effects of the user's own."""
 
     effects: dict[str, Effect] = field(default_factory=dict)
-    python: dict[str, dict[str, str]] = field(default_factory=dict)
+    python: dict[str, dict[str, str]] = field(default_factory=dict)  # of those in Python, by name: path, sha256
 
     def section(self) -> dict[str, Any]:
         """Return what goes into the configuration of each unit; empty where there are none."""

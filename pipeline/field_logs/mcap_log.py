@@ -145,7 +145,7 @@ class McapLog:
             self.copy.add(new_imu(rows, readings, channel.id, time_ns, self.covariances), before, channel.id)
         else:
             truths = {s: v for s, v in readings.items() if s in changed | turned}
-            copies = replaced(rows, self.readings.decoders[rows.channel], truths, channel.id, self.covariances)
+            copies = replaced(rows, self.readings.groups, truths, channel.id, self.covariances)
             self.copy.add(copies, before, channel.id)
 
     def _channel(self, source: int) -> tuple[Channel, list[McapRecord]]:

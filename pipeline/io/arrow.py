@@ -71,7 +71,8 @@ def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str,
         raise ConfigurationError(f"decimals of unknown columns {', '.join(unknown)}; known are {known}")
     columns = columns_of(recording)
     time = columns.pop("time_ns")
-    arrays = {CANONICAL["time"]: times_as_decimals(time, _time_digits(time))}
+    digits = next((d for d in (3, 6) if not np.any(time % 10 ** (9 - d))), 9)  # the fewest that hold the times exactly
+    arrays = {CANONICAL["time"]: times_as_decimals(time, digits)}
     for channel, name in CANONICAL.items():
         if channel in columns and name in decimals:
             values = np.rint(columns[channel] * 10.0 ** decimals[name]).astype(np.int64)
@@ -88,11 +89,6 @@ def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str,
 def times_as_decimals(time_ns: Integers, digits: int = 9) -> pa.Array:
     """Return times in s as decimals with ``digits`` after the point, which have to hold them exactly."""
     return _decimal(time_ns, 9).cast(pa.decimal128(38, digits))
-
-
-def _time_digits(time_ns: Integers) -> int:
-    """Return the fewest digits, of 3, 6 and 9, that hold the times exactly."""
-    return next((d for d in (3, 6) if not np.any(time_ns % 10 ** (9 - d))), 9)
 
 
 def _decimal(units: Integers, digits: int) -> pa.Array:

@@ -281,11 +281,23 @@ def _longest_run(faults: list[Fault]) -> int:
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
-    first = tables[0]
-    if len(tables) == 1:
+    """Join files row by row; refuse files that were not logged at the same times: their rows do not belong together."""
+    first, *others = tables
+    same = "parts of one recording need the same times"
+    for other in others:
+        rows = min(len(first.time_ns), len(other.time_ns))
+        differs = np.flatnonzero(first.time_ns[:rows] != other.time_ns[:rows])
+        if differs.size:
+            row = int(differs[0])
+            times = f"time {other.time_ns[row] / 1e9:.9g} s differs from {first.time_ns[row] / 1e9:.9g} s"
+            hint = "a table's log with a clock of its own is marked own_clock: true"
+            message = f"{times} in {first.place(row)}; {same}"
+            raise IngestError(message, other.place(row), code="other_times", hint=hint)
+        if len(first.time_ns) != len(other.time_ns):
+            message = f"{other.source['rows']} rows, but {first.path} has {first.source['rows']}; {same}"
+            raise IngestError(message, other.path, code="other_times")
+    if not others:
         return first
-    for other in tables[1:]:
-        _check_same_times(first, other)
     return replace(
         first,
         values={k: v for t in tables for k, v in t.values.items()},
@@ -293,22 +305,6 @@ def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
         count_sizes={k: v for t in tables for k, v in t.count_sizes.items()},
         notes=tuple(n for t in tables for n in t.notes),
     )
-
-
-def _check_same_times(first: ChannelTable, other: ChannelTable) -> None:
-    """Refuse files that were not logged at the same times: their rows do not belong together."""
-    rows = min(len(first.time_ns), len(other.time_ns))
-    differs = np.flatnonzero(first.time_ns[:rows] != other.time_ns[:rows])
-    same = "parts of one recording need the same times"
-    if differs.size:
-        row = int(differs[0])
-        times = f"time {other.time_ns[row] / 1e9:.9g} s differs from {first.time_ns[row] / 1e9:.9g} s"
-        hint = "a table's log with a clock of its own is marked own_clock: true"
-        message = f"{times} in {first.place(row)}; {same}"
-        raise IngestError(message, other.place(row), code="other_times", hint=hint)
-    if len(first.time_ns) != len(other.time_ns):
-        message = f"{other.source['rows']} rows, but {first.path} has {first.source['rows']}; {same}"
-        raise IngestError(message, other.path, code="other_times")
 
 
 def read_gcsv(path: Path, checks: Checks) -> ChannelTable:

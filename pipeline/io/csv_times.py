@@ -22,7 +22,7 @@ import pyarrow as pa
 from pipeline.errors import IngestError
 from pipeline.io.csv_layout import PARTS
 from pipeline.io.quality_flags import REPAIRED
-from pipeline.io.timestamps import sorted_once, time_error
+from pipeline.io.timestamps import sorted_once
 from pipeline.io.units import UNITS
 
 if TYPE_CHECKING:
@@ -175,7 +175,16 @@ def _refusal(table: ChannelTable, row: int, starts: list[int]) -> IngestError:
 
     Where the time falls back for good, the refusal names the parts of the log.
     """
-    error = time_error(table.time_ns, table.place(row), row)
+    time_ns = table.time_ns
+    repeats = time_ns[row] == time_ns[row - 1]
+    what, count = "repeats" if repeats else "goes back to", int(np.count_nonzero(np.diff(time_ns) <= 0))
+    message = (
+        f"time {what} {time_ns[row] / 1e9:.9g} s after {time_ns[row - 1] / 1e9:.9g} s ({count} such samples); time has "
+        "to increase"
+    )
+    hint = "" if repeats else "a log that was restarted belongs in two files"
+    code = "duplicate_time" if repeats else "time_back"
+    error = IngestError(message, table.place(row), code=code, hint=hint)
     lines = np.arange(1, len(table.time_ns) + 1) if table.lines is None else table.lines
     start, count = next(((a, n) for at, a, n in _repeats(table) if at == row), (row, 0))
     if count > 1:

@@ -38,25 +38,13 @@ SAME_SIGN = 0.9  # correlation of the logged rate with the slope of the angle
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals of a table's motion that sensors respond to, on a regular grid of the log's time from its first sample.
+    """Signals of a table's motion that sensors follow, on a regular grid of the log's time from its first sample."""
 
-    Attributes
-    ----------
-    step, interval : float, s
-        Of the grid; median of the log's own.
-    rates : (n, m) array, deg/s
-        Signals that angular rates follow.
-    directions : (n, p) array
-        Signals that specific forces follow; p is 0 where the log does not determine them.
-    magnitude : bool
-        Whether only the magnitude of the rate is known.
-    """
-
-    step: float
-    rates: Values
-    directions: Values
-    interval: float
-    magnitude: bool = False
+    step: float  # of the grid, s
+    rates: Values  # (n, m), deg/s, which angular rates follow
+    directions: Values  # (n, p), which specific forces follow; p is 0 where the log does not determine them
+    interval: float  # median of the log's own, s
+    magnitude: bool = False  # whether only the magnitude of the rate is known
 
     @property
     def duration(self) -> float:

@@ -43,14 +43,10 @@ FITS_DEG, FAILS_DEG = 15.0, 30.0  # the next possible unit misses by tens of deg
 
 @dataclass(frozen=True)
 class Move:
-    """A move between two rests.
+    """A move between two rests."""
 
-    ``turns``: integral of the angular rate over parts of the move, (64, 3), unit of the gyroscope times s. ``before``
-    and ``after``: direction of the specific force at rest.
-    """
-
-    turns: Values
-    before: Values
+    turns: Values  # integral of the angular rate over parts of the move, (64, 3), unit of the gyroscope times s
+    before: Values  # direction of the specific force at rest
     after: Values
 
     @property

@@ -19,7 +19,7 @@ from pipeline.io.ingest_settings import HEADER, OWN
 from pipeline.io.message_decoder import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
 from pipeline.io.message_logs import open_reader
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.io.timestamps import averaged, check_fine, check_plausible, in_order, rows_covered, slower_first
+from pipeline.io.timestamps import averaged, check_fine, check_plausible, in_order, rows_covered
 from pipeline.io.units import ACCELEROMETER, COUNTS, GYROSCOPE, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note
 
@@ -78,7 +78,7 @@ class _Topic:
         """Return all messages in the order of their times."""
         if self.error is not None:
             raise self.error
-        topic, path, decoders = self.decoder.topic, self.decoder.path, self.decoder.decoders.values()
+        topic, path = self.decoder.topic, self.decoder.path
         values = {n: np.concatenate(self.values.pop(n)) for n in list(self.values)}
         recorded = np.concatenate(self.recorded)
         time = np.concatenate(self.times) if self.times else recorded
@@ -95,12 +95,11 @@ class _Topic:
         notes += found
         if order is not None:
             time, values = time[order], {n: column[order] for n, column in values.items()}
-        if any(d.coarse_time for d in decoders):
+        if self.decoder.coarse_time:
             check_fine(topic, time, path)
-        one_by_one = sum(d.one_by_one for d in decoders)
-        if one_by_one:
-            detail = f"messages on {topic} vary in length or texts and were decoded one by one"
-            notes.append(Note("N-FALLBACK", one_by_one, 0, 0, detail))
+        if self.decoder.varying:
+            detail = f"messages on {topic} vary in length or texts, and those of one layout were decoded together"
+            notes.append(Note("N-FALLBACK", self.decoder.varying, 0, 0, detail))
         return ChannelTable(path, time, values, {"topic": topic, "rows": len(time)})
 
 
@@ -209,7 +208,7 @@ class _Log:
         if other is None:
             return base, others
         others = [s for s in others if s is not other]
-        slow, fast = (base, other) if slower_first(base.time_ns, other.time_ns) else (other, base)
+        slow, fast = sorted((base, other), key=lambda series: -float(np.median(np.diff(series.time_ns))))
         topic = fast.source["topic"]
         rows = rows_covered(slow.time_ns, fast.time_ns, topic, self.path)
         values = {c: averaged(slow.time_ns, rows, fast.time_ns, v) for c, v in fast.values.items()}

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mcap.records import McapRecord
     from numpy.typing import NDArray
 
-    from pipeline.records import Integers
+    from pipeline.records import Index, Integers
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = 9  # bytes of opcode and length
@@ -51,40 +51,27 @@ _RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH")
 
 @dataclass
 class Rows:
-    """The messages of one channel in one run.
-
-    Attributes
-    ----------
-    data : (m,) array of uint8
-        All records of the run.
-    heads : (n,) structured array
-        ``HEAD`` of each message.
-    starts, sizes : (n,) arrays of int64
-        Where the payload of each message begins in ``data``, and its bytes.
-    stride : int
-        Distance of the starts where it is the same for all, else 0.
-    place, offset : str, int
-        The run, for messages: ``chunk 3``; byte of the file at which it begins.
-    """
+    """The messages of one channel in one run."""
 
     channel: int
-    data: NDArray[np.uint8]
-    heads: NDArray[np.void]
-    starts: Integers
-    sizes: Integers
-    stride: int
-    place: str
-    offset: int
+    data: NDArray[np.uint8]  # all records of the run
+    heads: NDArray[np.void]  # ``HEAD`` of each message
+    starts: Integers  # where the payload of each message begins in ``data``
+    sizes: Integers  # of the payloads, bytes
+    stride: int  # distance of the starts where it is the same for all, else 0
+    place: str  # the run, for messages: ``chunk 3``
+    offset: int  # byte of the file at which the run begins
 
     def payload(self, row: int) -> bytes:
         """Return the data of one message."""
         start = int(self.starts[row])
         return self.data[start : start + int(self.sizes[row])].tobytes()
 
-    def only(self, row: int) -> Rows:
-        """Return one message."""
-        part = slice(row, row + 1)
-        return replace(self, heads=self.heads[part], starts=self.starts[part], sizes=self.sizes[part], stride=0)
+    def select(self, rows: Index) -> Rows:
+        """Return some messages, by their indices in increasing order."""
+        if len(rows) == len(self.starts):
+            return self
+        return replace(self, heads=self.heads[rows], starts=self.starts[rows], sizes=self.sizes[rows], stride=0)
 
     def table(self, layout: np.dtype[np.void]) -> NDArray[np.void]:
         """Return all messages, each as one item of a type of their common size."""
@@ -98,29 +85,17 @@ class Rows:
 class Run:
     """Records of the data section up to and with the messages of one chunk, or messages between chunks.
 
-    Attributes
-    ----------
-    offset, name : int, str
-        Byte of the file at which the chunk, or the first message outside chunks, begins; its name for messages.
-    data : bytes
-        The chunk's records, or the messages.
-    loose : bool
-        Whether the messages lie outside chunks.
-    index : dict of int to (n,) array of int64
-        Channel to the offsets of its messages in ``data`` by the file's index, which may be wrong.
-    records : list of (head, content)
-        As they stand in the file, without messages outside chunks.
-    rows : list of Rows
-        The messages, one entry for each channel.
+    ``index``: channel to the offsets of its messages in ``data`` by the file's index, which may be wrong. ``records``
+    (head, content) are as in the file, without messages outside chunks.
     """
 
-    offset: int = 0
-    name: str = ""
-    data: bytes | memoryview = b""
-    loose: bool = False
+    offset: int = 0  # byte of the file at which the chunk, or the first message outside chunks, begins
+    name: str = ""  # for messages
+    data: bytes | memoryview = b""  # the chunk's records, or the messages
+    loose: bool = False  # whether the messages lie outside chunks
     index: dict[int, Integers] = field(default_factory=dict)
     records: list[tuple[bytes, bytes]] = field(default_factory=list)
-    rows: list[Rows] = field(default_factory=list)
+    rows: list[Rows] = field(default_factory=list)  # the messages of each channel
 
 
 def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryview:

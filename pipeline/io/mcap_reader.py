@@ -50,20 +50,9 @@ class _TruncatedError(Exception):
 class MessageReader:
     """One pass over a log of messages.
 
-    Attributes
-    ----------
-    path : str
-        For messages.
-    schemas, channels, counts
-        By number; ``counts`` are those of messages.
-    notes : list of Note
-        What the format's own reader remarks.
-    has_recorder : bool
-        Whether the messages have times of the logger.
-    truncated : str
-        What is missing at the end of a file whose complete chunks are read on request; else empty.
-    sha256 : str
-        Of the whole file; set when the iteration has ended.
+    ``schemas``, ``channels`` and ``counts`` of messages are by number. ``notes``: what the format's own reader remarks.
+    ``has_recorder``: whether the messages have times of the logger. ``truncated``: what is missing at the end of a file
+    whose complete chunks are read on request. ``sha256``: of the whole file, once the iteration has ended.
     """
 
     def __init__(self, path: str) -> None:

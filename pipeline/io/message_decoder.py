@@ -4,8 +4,8 @@
     arrays (of other formats: ``message_logs``)       likewise
     protobuf, json                                    message by message
 
-Where the ROS messages of a chunk differ in layout (a text or a list changes its length), the layout of each message is
-found by itself. The official ROS decoders are not used: that of ROS 1 runs Python code that it writes from the
+Where the ROS messages of a chunk differ in layout (a text or a list changes its length), those of one layout are read
+together. The official ROS decoders are not used: that of ROS 1 runs Python code that it writes from the
 definition, and a log from a stranger must not run code; that of ROS 2 accepts bytes that are left over.
 
 The profile states which number of a message is which channel (``ingest.mcap.topics``). Four ROS types are known:
@@ -20,9 +20,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -44,15 +43,14 @@ from pipeline.io.timestamps import LARGEST, nanoseconds, of_number, of_pair
 from pipeline.io.units import ATTITUDE, COUNTS, TRIADS, UNITS, unit_spelt
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from mcap.records import Channel, Schema
-    from numpy.typing import NDArray
 
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.mcap_reader import MessageReader
-    from pipeline.records import Integers, Mask, Values
+    from pipeline.records import Index, Integers, Mask, Values
 
 T = TypeVar("T")
 SUPPORTED = "cdr with ros2msg, ros1 with ros1msg, protobuf with protobuf, and json are supported"
@@ -62,145 +60,9 @@ ARRAYS = "arrays"  # encoding of messages made of arrays; the definition is JSON
 MAPPED = "mapped"  # the kind of a topic whose fields the profile names; other kinds are ROS types
 KINDS = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
 STATED = "unit of "  # before a field's name in the metadata of a channel: the unit that the file states
+MOST_LAYOUTS = 32  # in a run; the messages after so many are read one by one, which bounds the cost
 FindLayout = Callable[[bytes], MessageLayout]
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What is read of a message: the number of each column, and the moment (None: the recorder's time is used).
-
-    ``time_unit`` is that of a moment which is one number.
-    """
-
-    values: Mapping[str, FieldPath]
-    time: FieldPath | None
-    time_unit: str = "s"
-
-
-@dataclass
-class Batch:
-    """Columns of the messages of one channel in one run.
-
-    A value is NaN where the message has an empty list in its place. ``absent`` marks these rows of a column.
-    """
-
-    time_ns: Integers | None
-    values: dict[str, Values]
-    absent: dict[str, Mask] = field(default_factory=dict)
-
-    def times(self, rows: Rows) -> Integers:
-        """Return the moments or, where none is read, the recorder's times, ns."""
-        return rows.heads["log_time"].astype(np.int64) if self.time_ns is None else self.time_ns
-
-
-class ChannelDecoder:
-    """Decoder of one channel; ``path`` names the file in messages. An encoding that is not supported is refused."""
-
-    def __init__(self, channel: Channel, schema: Schema | None, wanted: Wanted, path: str) -> None:
-        self.topic, self.wanted, self.path = channel.topic, wanted, path
-        self.kind = schema.name if schema else "json"
-        self.done = 0  # messages so far
-        self.one_by_one = 0  # ROS messages among them whose layout was found one by one
-        self.coarse_time = False  # whether moments are floating-point numbers
-        self.layout: MessageLayout | None = None  # of the messages that were read last, if they were alike
-        self.find_layout: FindLayout | None = None
-        self.decode: Callable[[bytes], Any] | None = None
-        try:
-            self.find_layout = ros_layouts(channel, schema)
-            self.decode = None if self.find_layout else object_decoder(channel, schema)
-        except Exception as error:
-            message = f"topic {self.topic}: its message definition cannot be read ({error})"
-            raise IngestError(message, path, code="unsupported") from error
-        if not self.find_layout and not self.decode:
-            message = (
-                f"topic {self.topic} is encoded as {channel.message_encoding!r} with "
-                f"{schema.encoding if schema else ''!r} definitions"
-            )
-            raise IngestError(message, path, code="unsupported", hint=SUPPORTED)
-
-    def read(self, rows: Rows) -> Batch:
-        """Return the columns of messages; a refusal names the first message that is not what its definition says."""
-        if self.find_layout and (self.layout is None or not self.layout.matches(rows)):
-            first = self._in_message(0, rows, self.find_layout)
-            self.layout = first if first.matches(rows) else None
-        layout = self.layout
-        if layout is not None:
-            batch = self._in_message(0, rows, lambda _payload: self._columns(rows, layout))
-        else:
-            batch = self._read_one_by_one(rows)
-            self.one_by_one += len(rows.starts) if self.find_layout else 0
-        self.done += len(rows.starts)
-        return batch
-
-    def layout_of(self, row: int, rows: Rows) -> MessageLayout:
-        """Return the layout of one ROS message."""
-        assert self.find_layout is not None  # noqa: S101  (asked for ROS messages only)
-        return self._in_message(row, rows, self.find_layout)
-
-    def _columns(self, rows: Rows, layout: MessageLayout) -> Batch:
-        places = {name: place_of(path, layout) for name, path in self.wanted.values.items()}
-        numbers = {name: place for name, place in places.items() if place is not None}
-        columns = layout.columns(rows, numbers | _stamp_places(self.wanted.time, layout))
-        count = len(rows.starts)
-        values = {n: columns[n].astype(np.float64) if n in numbers else np.full(count, np.nan) for n in places}
-        absent = {n: np.ones(count, np.bool_) for n in places if n not in numbers}
-        return Batch(self._moments(columns), values, absent)
-
-    def _moments(self, columns: Mapping[str, NDArray[Any]]) -> Integers | None:
-        if SECONDS not in columns:
-            return None
-        if NANOSECONDS in columns:
-            return of_pair(columns[SECONDS], columns[NANOSECONDS])
-        self.coarse_time |= columns[SECONDS].dtype.kind == "f"
-        return of_number(columns[SECONDS], self.wanted.time_unit)
-
-    def _read_one_by_one(self, rows: Rows) -> Batch:
-        values: dict[str, list[float | None]] = {name: [] for name in self.wanted.values}
-        moments: list[int] = []
-        for row in range(len(rows.starts)):
-            numbers, moment = self._in_message(row, rows, self._read_message)
-            for name, number in numbers.items():
-                values[name].append(number)
-            if moment is not None:
-                moments.append(moment)
-        absent = {n: np.array([v is None for v in numbers]) for n, numbers in values.items() if None in numbers}
-        columns = {n: np.array([np.nan if v is None else v for v in numbers]) for n, numbers in values.items()}
-        return Batch(None if self.wanted.time is None else np.array(moments, np.int64), columns, absent)
-
-    def _read_message(self, payload: bytes) -> tuple[dict[str, float | None], int | None]:
-        moment: tuple[int, int] | int | Decimal
-        if self.find_layout is not None:
-            layout = self.find_layout(payload)
-            places = {name: place_of(path, layout) for name, path in self.wanted.values.items()}
-            numbers = {n: None if place is None else float(layout.number(place)) for n, place in places.items()}
-            parts = [layout.number(place) for place in _stamp_places(self.wanted.time, layout).values()]
-            if not parts:
-                return numbers, None
-            single = parts[0] if isinstance(parts[0], int) else Decimal(parts[0])
-            moment = (int(parts[0]), int(parts[1])) if len(parts) == 2 else single
-            self.coarse_time |= isinstance(moment, Decimal)
-        else:
-            assert self.decode is not None  # noqa: S101  (the constructor found it)
-            message = self.decode(payload)
-            numbers = {name: number_at(path, message) for name, path in self.wanted.values.items()}
-            if self.wanted.time is None:
-                return numbers, None
-            moment = stamp_at(self.wanted.time, message)
-            self.coarse_time |= isinstance(moment, Decimal) and not isinstance(message, dict)  # JSON is decimal text
-        return numbers, nanoseconds(moment, self.wanted.time_unit)
-
-    def _in_message(self, row: int, rows: Rows, work: Callable[[bytes], T]) -> T:
-        """Call a function on a message; any error becomes an ``IngestError`` that names the message."""
-        payload = rows.payload(row)
-        try:
-            return work(payload)
-        except Exception as error:
-            reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__} {error}".strip()
-            message = (
-                f"message {self.done + row + 1} on {self.topic} ({rows.place}, {len(payload)} bytes) cannot be read "
-                f"as {self.kind}: {reason}"
-            )
-            raise IngestError(message, self.path, code="bad_message", offset=rows.offset) from error
+Decode = Callable[[bytes], Any]
 
 
 def ros_layouts(channel: Channel, schema: Schema | None) -> FindLayout | None:
@@ -216,7 +78,7 @@ def ros_layouts(channel: Channel, schema: Schema | None) -> FindLayout | None:
     return lambda payload: find_layout(root, definitions, payload, cdr=cdr)
 
 
-def object_decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any] | None:
+def object_decoder(channel: Channel, schema: Schema | None) -> Decode | None:
     """Return the decoder of protobuf or JSON messages; None for other encodings."""
     if channel.message_encoding == "json":
         return lambda payload: json.loads(payload.decode("utf-8"), parse_float=Decimal)
@@ -265,46 +127,173 @@ def listed_topics(reader: MessageReader) -> list[tuple[str, str]]:
     return sorted(found)
 
 
+class Batch(NamedTuple):
+    """Some messages of a topic: their moments, ns (None: the recorder's times are used), and values by channel."""
+
+    time_ns: Integers | None
+    values: dict[str, Values]
+
+    def times(self, rows: Rows) -> Integers:
+        """Return the moments or, where none is read, the recorder's times, ns."""
+        return rows.heads["log_time"].astype(np.int64) if self.time_ns is None else self.time_ns
+
+
+def _together(parts: Sequence[Batch], groups: Sequence[tuple[Index, MessageLayout]]) -> Batch:
+    """Return the messages of all layouts in the order of the file."""
+    if len(parts) == 1:
+        return parts[0]
+    order = np.argsort(np.concatenate([own for own, _ in groups]))
+    times = [part.time_ns for part in parts if part.time_ns is not None]
+    values = {name: np.concatenate([part.values[name] for part in parts])[order] for name in parts[0].values}
+    return Batch(np.concatenate(times)[order] if times else None, values)
+
+
 class TopicDecoder:
-    """Decoder of one topic; ``count`` are the messages so far."""
+    """Decoder of one topic; ``path`` names the file in messages.
+
+    ``fields``: channel to its field, unit and scale. ``count``: messages so far; ``varying``: those in runs with
+    several layouts. ``coarse_time``: whether moments are floating-point numbers. ``groups``: the ROS messages that were
+    read last, those of one layout together, by their indices.
+    """
 
     def __init__(self, topic: str, kind: str, settings: McapFormat, path: str) -> None:
         self.topic, self.kind, self.path = topic, kind, path
         fields = settings.topics[topic] if kind == MAPPED else _fields_of(kind, settings)
         self.fields = {c: f for c, f in fields.items() if c != TIME}
-        paths = {c: f.field for c, f in self.fields.items()}
+        self._paths = {c: f.field for c, f in self.fields.items()}
         if kind == IMU:
-            paths |= {vector: FieldPath.parse(f"{vector}_covariance[0]") for vector in VECTORS}
+            self._paths |= {vector: FieldPath.parse(f"{vector}_covariance[0]") for vector in VECTORS}
         time = fields.get(TIME) if settings.time_source == HEADER else None
-        self.wanted = Wanted(paths, time.field if time else None, time.unit if time else "ns")
-        self.decoders: dict[int, ChannelDecoder] = {}
-        self.count = 0
+        self._time = time.field if time else None
+        self._time_unit = time.unit if time else "ns"
+        self.count = self.varying = 0
+        self.coarse_time = False
+        self.groups: list[tuple[Index, MessageLayout]] = []
+        self._channels: dict[int, tuple[str, FindLayout | None, Decode | None]] = {}  # type, and what reads a message
+        self._layouts: dict[int, MessageLayout] = {}  # the last one of each channel
         self._absent: dict[str, bool] = {}  # columns, by the first message
 
     def read(self, rows: Rows, reader: MessageReader) -> Batch:
-        """Return time and channels of some messages; channels that are absent are left out."""
+        """Return time and channels of some messages; channels that are absent are left out.
+
+        A refusal names the first message that is not what its definition says.
+        """
         recorded = rows.heads["log_time"]
         if (recorded > LARGEST).any():
             number = self.count + int(np.argmax(recorded > LARGEST)) + 1
             message = f"message {number} on {self.topic}: the recorder's time of {recorded.max()} ns is none"
             raise IngestError(message, self.path, code="bad_time")
-        if rows.channel not in self.decoders:
-            channel = reader.channels[rows.channel]
-            schema = reader.schemas.get(channel.schema_id)
-            self._check_units(channel.metadata)
-            self.decoders[rows.channel] = ChannelDecoder(channel, schema, self.wanted, self.path)
-        batch = self.decoders[rows.channel].read(rows)
-        present = np.zeros(len(recorded), np.bool_)
-        for name, column in batch.values.items():
-            self._note_absent(name, column == -1.0 if name in VECTORS else batch.absent.get(name, present))
+        if rows.channel not in self._channels:
+            self._channels[rows.channel] = self._open(reader, rows.channel)
+        _, find, decode = self._channels[rows.channel]
+        if decode is not None:
+            batch = self._decoded(rows, decode)
+        elif find is not None:
+            self.groups = list(self._by_layout(rows, find))
+            batch = _together([self._columns(rows, own, layout) for own, layout in self.groups], self.groups)
+            self.varying += len(recorded) if len(self.groups) > 1 else 0
         self.count += len(recorded)
         absent = {name for name, is_absent in self._absent.items() if is_absent}
         absent |= {c for vector in absent & set(VECTORS) for c in TRIADS[VECTORS[vector][0]]}
         if self.kind == IMU and absent >= set(VECTORS):
             message = f"topic {self.topic} says that both quantities are absent (covariance -1)"
             raise IngestError(message, self.path, code="absent")
-        values = {c: in_house_unit(self.fields[c], batch.values[c]) for c in self.fields if c not in absent}
-        return Batch(batch.time_ns, values)
+        values = {c: in_house_unit(f, batch.values[c]) for c, f in self.fields.items() if c not in absent}
+        return batch._replace(values=values)
+
+    def _open(self, reader: MessageReader, number: int) -> tuple[str, FindLayout | None, Decode | None]:
+        """Return the type of a channel's messages and what reads one; refuse an encoding that is not supported."""
+        channel = reader.channels[number]
+        schema = reader.schemas.get(channel.schema_id)
+        self._check_units(channel.metadata)
+        try:
+            find = ros_layouts(channel, schema)
+            decode = None if find else object_decoder(channel, schema)
+        except Exception as error:
+            message = f"topic {self.topic}: its message definition cannot be read ({error})"
+            raise IngestError(message, self.path, code="unsupported") from error
+        if not find and not decode:
+            message = (
+                f"topic {self.topic} is encoded as {channel.message_encoding!r} with "
+                f"{schema.encoding if schema else ''!r} definitions"
+            )
+            raise IngestError(message, self.path, code="unsupported", hint=SUPPORTED)
+        return schema.name if schema else "json", find, decode
+
+    def _by_layout(self, rows: Rows, find: FindLayout) -> Iterator[tuple[Index, MessageLayout]]:
+        """Yield the indices of the messages of each layout."""
+        left = np.arange(len(rows.starts))
+        layout = self._layouts.get(rows.channel)
+        for _ in range(MOST_LAYOUTS):
+            rest = rows.select(left)
+            own = np.zeros(0, np.intp) if layout is None else layout.matching(rest)
+            if not own.size or own[0]:
+                layout = self._layouts[rows.channel] = self._in_message(int(left[0]), rows, find)
+                own = layout.matching(rest)
+            assert layout is not None  # noqa: S101  (found above)
+            yield left[own], layout
+            if len(own) == len(left):
+                return
+            left = np.delete(left, own)
+        for row in left.tolist():
+            yield np.array([row]), self._in_message(row, rows, find)
+
+    def _columns(self, rows: Rows, own: Index, layout: MessageLayout) -> Batch:
+        """Return moments and columns of the messages of one layout; a column is NaN where the list is empty."""
+
+        def find(_: bytes) -> dict[str, tuple[int, str] | None]:
+            places = {name: place_of(path, layout) for name, path in self._paths.items()}
+            return places | _stamp_places(self._time, layout)
+
+        def moments(_: bytes) -> Integers | None:
+            if NANOSECONDS in found:
+                return of_pair(found[SECONDS], found[NANOSECONDS])
+            return of_number(found[SECONDS], self._time_unit) if SECONDS in found else None
+
+        places = self._in_message(int(own[0]), rows, find)
+        found = layout.columns(rows.select(own), {n: place for n, place in places.items() if place is not None})
+        time_ns = self._in_message(int(own[0]), rows, moments)
+        self.coarse_time |= SECONDS in found and found[SECONDS].dtype.kind == "f"
+        empty, columns = np.full(len(own), np.nan), {}
+        for name in self._paths:
+            columns[name] = found[name].astype(np.float64) if name in found else empty
+            absent = columns[name] == -1.0 if name in VECTORS else np.full(len(own), name not in found)
+            self._note_absent(name, absent, own)
+        return Batch(time_ns, columns)
+
+    def _decoded(self, rows: Rows, decode: Decode) -> Batch:
+        """Return moments and columns of messages that are decoded one by one."""
+        numbers: dict[str, list[float | None]] = {name: [] for name in self._paths}
+        moments: list[int] = []
+
+        def work(payload: bytes) -> None:
+            message = decode(payload)
+            for name, path in self._paths.items():
+                numbers[name].append(number_at(path, message))
+            if self._time is not None:
+                moment = stamp_at(self._time, message)
+                self.coarse_time |= isinstance(moment, Decimal) and not isinstance(message, dict)  # JSON is decimal
+                moments.append(nanoseconds(moment, self._time_unit))
+
+        for row in range(len(rows.starts)):
+            self._in_message(row, rows, work)
+        for name, values in numbers.items():
+            self._note_absent(name, np.array([v is None for v in values]), np.arange(len(values)))
+        columns = {name: np.array(values, np.float64) for name, values in numbers.items()}
+        return Batch(None if self._time is None else np.array(moments, np.int64), columns)
+
+    def _in_message(self, row: int, rows: Rows, work: Callable[[bytes], T]) -> T:
+        """Call a function on a message; any error becomes an ``IngestError`` that names the message."""
+        payload = rows.payload(row)
+        try:
+            return work(payload)
+        except Exception as error:
+            reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__} {error}".strip()
+            message = (
+                f"message {self.count + row + 1} on {self.topic} ({rows.place}, {len(payload)} bytes) cannot be read "
+                f"as {self._channels[rows.channel][0]}: {reason}"
+            )
+            raise IngestError(message, self.path, code="bad_message", offset=rows.offset) from error
 
     def _check_units(self, stated: Mapping[str, str]) -> None:
         """Refuse a unit of the profile that is not the one which the file states (``STATED``)."""
@@ -317,14 +306,14 @@ class TopicDecoder:
                 )
                 raise IngestError(message, self.path, code="other_unit", hint=f"write unit: {unit} for {channel}")
 
-    def _note_absent(self, name: str, absent: Mask) -> None:
-        """Refuse a quantity that some messages lack."""
+    def _note_absent(self, name: str, absent: Mask, own: Index) -> None:
+        """Refuse a quantity that some messages lack; ``own`` are their indices."""
         before = self._absent.setdefault(name, bool(absent[0]))
         changed = np.flatnonzero(absent != before)
         if changed.size:
             covariance = name in VECTORS
-            what = f"{name} is absent (covariance -1)" if covariance else f"{self.wanted.values[name].text} is empty"
-            message = f"{what} in some messages on {self.topic}, see message {self.count + int(changed[0]) + 1}"
+            what = f"{name} is absent (covariance -1)" if covariance else f"{self._paths[name].text} is empty"
+            message = f"{what} in some messages on {self.topic}, see message {self.count + int(own[changed[0]]) + 1}"
             raise IngestError(message, self.path, code="absent" if covariance else "bad_message")
 
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.mcap_chunk import Rows
+    from pipeline.records import Index
 
 NUMBERS = {
     "bool": "u1", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
@@ -147,14 +148,17 @@ class MessageLayout:
     texts: dict[str, str | list[str]] = field(default_factory=dict)
     fixed: list[tuple[int, int]] = field(default_factory=list)
 
-    def matches(self, rows: Rows) -> bool:
-        """Return whether all messages have their numbers where the sample has them."""
-        if not (rows.sizes == len(self.sample)).all():
-            return False
+    def matching(self, rows: Rows) -> Index:
+        """Return which messages have their numbers where the sample has them."""
+        own = np.flatnonzero(rows.sizes == len(self.sample))
+        if not own.size:
+            return own
         words = [word for span in self.fixed for word in _words(*span)]
-        table = rows.table(self._items({f"{at}": (at, f"<u{width}") for at, width in words}))
-        expected = {f"{at}": int.from_bytes(self.sample[at : at + width], "little") for at, width in words}
-        return all(bool((table[at] == number).all()) for at, number in expected.items())
+        table = rows.select(own).table(self._items({f"{at}": (at, f"<u{width}") for at, width in words}))
+        same = np.ones(len(own), np.bool_)
+        for at, width in words:
+            same &= table[f"{at}"] == int.from_bytes(self.sample[at : at + width], "little")
+        return own[same]
 
     def columns(self, rows: Rows, wanted: dict[str, tuple[int, str]]) -> dict[str, NDArray[np.generic]]:
         """Return numbers of all messages: name to (offset, type) becomes name to column, a copy."""
@@ -169,11 +173,6 @@ class MessageLayout:
             size = int(place.code[2:])
             found |= {name + index: (place.offset + i * size, place.code) for i, index in enumerate(indices)}
         return found
-
-    def number(self, place: tuple[int, str]) -> float:
-        """Return a number of the sample at (offset, type)."""
-        value: float = np.frombuffer(self.sample, place[1], 1, place[0])[0].item()
-        return value
 
     def _items(self, places: dict[str, tuple[int, str]]) -> np.dtype[np.void]:
         """Return the type of a message of which some places are read."""

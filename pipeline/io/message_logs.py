@@ -22,9 +22,8 @@ import hashlib
 import io
 import json
 import re
-from dataclasses import dataclass, field
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
-    from pymavlink.DFReader import DFReader_binary
 
     from pipeline.io.files import MessageFormat
     from pipeline.records import Integers
@@ -90,7 +88,9 @@ class LogReader(MessageReader):
 
 def _as_messages(log: LogReader) -> Iterator[Rows]:
     """Yield the arrays of each topic as messages."""
-    for topic in topics_of(log.file, log.notes):
+    suffix = log.file.suffix.lower()
+    arrays = _of_ulog(log) if suffix == ".ulg" else _of_dataflash(log) if suffix == ".bin" else _of_arrays(log.file)
+    for topic in arrays:
         log.has_recorder &= topic.recorded_ns is not None
         codes = {n: f"<{a.dtype.kind}{a.dtype.itemsize}" for n, a in topic.columns.items()}
         kind = np.dtype([(n, codes[n], a.shape[1:]) for n, a in topic.columns.items()])
@@ -151,9 +151,14 @@ def _rows(channel: int, data: NDArray[np.uint8], starts: Integers, sizes: Intege
     return Rows(channel, data, heads, starts, sizes, int(sizes[0]) if same else 0, "the log", 0)
 
 
-def open_log(path: Path) -> LogReader:
-    """Return the reader of a log other than MCAP, by its suffix; ``IngestError``: its package is not installed."""
-    known = MESSAGE_FORMATS[path.suffix.lower()]
+@contextlib.contextmanager
+def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[MessageReader]:
+    """Open a log of messages by its suffix, MCAP included; ``IngestError``: the package for it is not installed."""
+    known = MESSAGE_FORMATS.get(path.suffix.lower())
+    if known is None:
+        with path.open("rb") as stream:
+            yield McapReader(stream, str(path), allow_truncated=allow_truncated)
+        return
     library = "scipy.io" if is_mat_5(path) else known.library
     try:
         import_module(library)
@@ -164,62 +169,34 @@ def open_log(path: Path) -> LogReader:
             code="missing_extra",
             hint=f"pip install 'imu-calibration[{known.extra}]'",
         ) from error
-    return LogReader(path, known)
+    yield LogReader(path, known)
 
 
-@contextlib.contextmanager
-def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[MessageReader]:
-    """Open a log of messages of any format, MCAP included."""
-    if path.suffix.lower() in MESSAGE_FORMATS:
-        yield open_log(path)
-        return
-    with path.open("rb") as stream:
-        yield McapReader(stream, str(path), allow_truncated=allow_truncated)
+class Topic(NamedTuple):
+    """The messages of one topic as arrays: (n,) or (n, k) numbers by field, with the units that the file states.
 
-
-@dataclass(frozen=True)
-class Topic:
-    """The messages of one topic as arrays.
-
-    Attributes
-    ----------
-    name : str
-        Of the topic; where a log holds it several times, ``name[1]``, ``name[2]`` from the second one on.
-    columns : mapping of str to array
-        Field to (n,) or (n, k) numbers, all of the same n.
-    units : mapping of str to str
-        Field to the unit that the file states, as it writes it.
-    recorded_ns : (n,) array of int64, optional
-        Times of the logger.
+    Where a log holds a topic several times, its name is ``name[1]``, ``name[2]`` from the second one on.
     """
 
     name: str
     columns: Mapping[str, NDArray[Any]]
-    units: Mapping[str, str] = field(default_factory=dict)
-    recorded_ns: Integers | None = None
+    units: Mapping[str, str]
+    recorded_ns: Integers | None = None  # times of the logger
 
 
-def topics_of(path: Path, notes: list[Note]) -> Iterator[Topic]:
-    """Yield the topics of a log by its suffix; what was lost is added to ``notes``, a damaged log is refused."""
-    suffix = path.suffix.lower()
-    if suffix == ".ulg":
-        return _of_ulog(path, notes)
-    return _of_dataflash(path, notes) if suffix == ".bin" else _of_arrays(path)
-
-
-def _of_ulog(path: Path, notes: list[Note]) -> Iterator[Topic]:
+def _of_ulog(log: LogReader) -> Iterator[Topic]:
     from pyulog import ULog  # noqa: PLC0415  (an extra)
 
-    with path.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()) as said:
-        log = ULog(stream)
+    with log.file.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()) as said:
+        ulog = ULog(stream)
     complaint = said.getvalue().partition("\n")[0]
-    if log.file_corruption or "corrupt" in complaint:
+    if ulog.file_corruption or "corrupt" in complaint:
         message = f"damaged ULog file: {complaint or 'a part of it is no message'}"
-        raise IngestError(message, str(path), hint=COPY_AGAIN)
-    if log.dropouts:
-        lost = sum(d.duration for d in log.dropouts)
-        notes.append(Note("N-DROPOUT", len(log.dropouts), 0, 0, f"the logger lost data for {lost} ms in all"))
-    for data in log.data_list:
+        raise IngestError(message, log.path, hint=COPY_AGAIN)
+    if ulog.dropouts:
+        lost = sum(d.duration for d in ulog.dropouts)
+        log.notes.append(Note("N-DROPOUT", len(ulog.dropouts), 0, 0, f"the logger lost data for {lost} ms in all"))
+    for data in ulog.data_list:
         columns: dict[str, Any] = {}
         for name, values in data.data.items():  # the elements name[0], name[1] .. of a field are one (n, k) array
             element = ELEMENT.fullmatch(name)
@@ -235,18 +212,7 @@ def _instance(name: str, number: int) -> str:
     return f"{name}[{number}]" if number else name
 
 
-def _of_dataflash(path: Path, notes: list[Note]) -> Iterator[Topic]:
-    """Yield the topics of a log; refuse one in which other bytes stand between messages."""
-    from pymavlink.DFReader import DFReader_binary  # noqa: PLC0415  (an extra)
-
-    content = path.read_bytes()
-    _check_chain(content, str(path), notes)
-    data = np.frombuffer(content, np.uint8)
-    with DFReader_binary(str(path)) as log:
-        yield from _messages(log, data)
-
-
-def _check_chain(content: bytes, path: str, notes: list[Note]) -> None:
+def _check_chain(content: bytes, log: LogReader) -> None:
     """Refuse a log whose messages do not follow one another to its end; the lengths are those of its FMT messages."""
     lengths, at = {FORMAT: LENGTH_OF_FORMAT}, 0
     while at + MARKED <= len(content):
@@ -256,20 +222,30 @@ def _check_chain(content: bytes, path: str, notes: list[Note]) -> None:
             message = (
                 f"damaged, or no DataFlash log: {content[at : at + MARKED].hex(' ')} begins no message that it defines"
             )
-            raise IngestError(message, path, code="damaged", offset=at, hint=COPY_AGAIN)
+            raise IngestError(message, log.path, code="damaged", offset=at, hint=COPY_AGAIN)
         if content[at + 2] == FORMAT and at + LENGTH_OF_FORMAT <= len(content):
             lengths[content[at + 3]] = content[at + 4]
         at += max(lengths[content[at + 2]], MARKED)
     if at != len(content):
         what = f"the log ends within a message, or with bytes that are none ({abs(len(content) - at)} bytes)"
-        notes.append(Note("N-TRUNCATED", 1, 0, 0, f"{what}; the complete messages were used"))
+        log.notes.append(Note("N-TRUNCATED", 1, 0, 0, f"{what}; the complete messages were used"))
 
 
-def _messages(log: DFReader_binary, data: NDArray[np.uint8]) -> Iterator[Topic]:
-    for number, known in log.formats.items():
-        starts = np.array(log.offsets[number], np.int64)
+def _of_dataflash(log: LogReader) -> Iterator[Topic]:
+    """Yield the topics of a log; refuse one in which other bytes stand between messages."""
+    from pymavlink.DFReader import FORMAT_TO_STRUCT, DFReader_binary  # noqa: PLC0415  (an extra)
+
+    content = log.file.read_bytes()
+    _check_chain(content, log)
+    data = np.frombuffer(content, np.uint8)
+    codes = {letter: code for letter, (code, *_) in FORMAT_TO_STRUCT.items()}  # as of ``struct``, texts as 16s
+    kinds = {c: f"S{code[:-1]}" if code[-1:] == "s" else f"<{np.dtype(code).str[1:]}" for c, code in codes.items()}
+    with DFReader_binary(log.path) as known_by_library:
+        formats, offsets = known_by_library.formats, known_by_library.offsets
+    for number, known in formats.items():
+        starts = np.array(offsets[number], np.int64)
         starts = starts[starts + known.len <= len(data)]
-        fields = np.dtype([(n, _code(c)) for n, c in zip(known.columns, known.format, strict=False)])
+        fields = np.dtype([(n, kinds[c]) for n, c in zip(known.columns, known.format, strict=False)])
         if not len(starts) or TIME not in known.columns or fields.itemsize + MARKED != known.len:
             continue
         windows = np.lib.stride_tricks.sliding_window_view(data, known.len)[starts, MARKED:]
@@ -285,14 +261,6 @@ def _messages(log: DFReader_binary, data: NDArray[np.uint8]) -> Iterator[Topic]:
             own = instance == sensor
             times = table[TIME][own].astype(np.int64) * 1000
             yield Topic(_instance(known.name, sensor), {n: c[own] for n, c in columns.items()}, units, times)
-
-
-def _code(letter: str) -> str:
-    """Return numpy's type of a DataFlash field by its letter in the format."""
-    from pymavlink.DFReader import FORMAT_TO_STRUCT  # noqa: PLC0415  (an extra)
-
-    code = FORMAT_TO_STRUCT[letter][0]
-    return f"S{code[:-1]}" if code.endswith("s") else f"<{np.dtype(code).str[1:]}"
 
 
 def _of_arrays(path: Path) -> Iterator[Topic]:

@@ -1,6 +1,6 @@
 """Quality of a recording: the impossible is refused; gaps, clipped and stuck readings are flagged for the fits.
 
-Refused are times that do not increase or keep another rate than is known, specific force far from gravity, readings
+Refused are times that keep another rate than is known, specific force far from gravity, readings
 beyond the range, rates that contradict the table or the rotation of gravity, and an attitude that is no rotation: the
 cause is nearly always a wrong unit or column. ``pipeline.preprocessing.mounting`` checks the mounting.
 
@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.timestamps import time_error
 from pipeline.io.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TRIADS
 from pipeline.records import SENSOR_UNITS
 
@@ -186,7 +185,8 @@ def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[n
     for rows in [every] if where else stretches:
         own = {channel: stuck[0] for channel, at in found.items() if (stuck := at[np.isin(at, rows)]).size}
         channel, row = next(iter(own.items()))
-        one = f"stays at {table.values[channel][row] + 0.0:.6g} {_unit_of(channel)}"
+        unit = next(SENSOR_UNITS[sensor] for sensor, triad in TRIADS.items() if channel in triad)
+        one = f"stays at {table.values[channel][row] + 0.0:.6g} {unit}"
         stay = one if len(own) == 1 and not where else f"stay{'s' * (len(own) == 1)} at one value{where}"
         first, last = int(rows[0]), int(rows[-1])
         detail = f"{', '.join(own)} {stay} for longer than noise allows"
@@ -200,11 +200,6 @@ def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[n
             detail += ", and the temperature with them"
         notes.append(table.note("N-STUCK", rows, f"{detail}: stuck, and left out of every fit"))
     return notes
-
-
-def _unit_of(channel: str) -> str:
-    """Return the unit of a sensor's channel."""
-    return next(SENSOR_UNITS[sensor] for sensor, triad in TRIADS.items() if channel in triad)
 
 
 def equal_share(same: Mask) -> float:
@@ -247,8 +242,13 @@ def examine(
 
     ``sensor`` is the section of the unit's configuration; its full scales may be absent.
     """
-    _check_whole(table)
-    _check_times(table)
+    for channels in (*TRIADS.values(), ATTITUDE):
+        missing = [c for c in channels if c not in table.values]
+        if 0 < len(missing) < len(channels):
+            message = f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all"
+            raise IngestError(message, table.path, code="missing_column")
+    if len(table.time_ns) < 2:
+        raise IngestError(f"{len(table.time_ns)} data rows; at least 2 are needed", table.path, code="no_rows")
     _check_rate(table, checks)
     _check_force(table)
     _check_attitude(table)
@@ -263,24 +263,6 @@ def examine(
     notes += flag_stuck(table, stuck, flags)
     _check_turn_rate(table)
     return (flags if flags.any() else None), notes
-
-
-def _check_whole(table: ChannelTable) -> None:
-    for channels in (*TRIADS.values(), ATTITUDE):
-        missing = [c for c in channels if c not in table.values]
-        if 0 < len(missing) < len(channels):
-            message = f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all"
-            raise IngestError(message, table.path, code="missing_column")
-
-
-def _check_times(table: ChannelTable) -> None:
-    time = table.time_ns
-    if len(time) < 2:
-        raise IngestError(f"{len(time)} data rows; at least 2 are needed", table.path, code="no_rows")
-    back = time[1:] <= time[:-1]
-    if back.any():
-        row = int(np.argmax(back)) + 1
-        raise time_error(time, table.place(row), row)
 
 
 def _check_rate(table: ChannelTable, checks: Checks) -> None:

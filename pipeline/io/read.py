@@ -78,7 +78,12 @@ def read_recordings(
             recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(other), 0, 0, detail)))
         recordings.append(recording)
     if refused:
-        raise _with_others(refused)
+        first, *others = refused
+        if others:
+            listed = [f"{error.file} ({error.code})" for error in others]
+            first.message += f". Also refused: {'; '.join(listed[:MOST_NAMED])}"
+            first.message += f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
+        raise first
     _check_different(recordings)
     return _compare_clocks(recordings)
 
@@ -106,16 +111,6 @@ def read_table(
         return read_csv(paths, layouts, checks_of(ingest))
     table = read_csv(paths, [f.model_copy(update={"session": session}) for f in layouts], checks_of(ingest))
     return replace(table, source={**table.source, "session": session})
-
-
-def _with_others(refused: list[InputError]) -> InputError:
-    """Return the first refusal, with file and code of the others."""
-    first, *others = refused
-    if others:
-        listed = "; ".join(f"{error.file} ({error.code})" for error in others[:MOST_NAMED])
-        more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
-        first.message += f". Also refused: {listed}{more}"
-    return first
 
 
 def _missing(

@@ -24,15 +24,14 @@ from pipeline.io.units import SECOND_NS, STANDARD_GRAVITY
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from pipeline.io.mcap_chunk import Rows
-    from pipeline.io.message_decoder import ChannelDecoder
     from pipeline.io.message_layout import MessageLayout
-    from pipeline.records import Integers, Recording, Values
+    from pipeline.records import Index, Integers, Recording, Values
 
     Readings = Mapping[str, Values]  # sensor to (n, 3) readings, or to the (3, 3) covariance of a sample
 
@@ -184,22 +183,22 @@ def imu_table(time_ns: Integers, readings: Readings, covariances: Readings | Non
 
 
 def replaced(
-    rows: Rows, decoder: ChannelDecoder, truths: Readings, channel: int, covariances: Readings
+    rows: Rows, groups: Sequence[tuple[Index, MessageLayout]], truths: Readings, channel: int, covariances: Readings
 ) -> NDArray[np.uint8] | list[bytes]:
     """Return copies of Imu messages, whole records, in which the readings of some sensors are replaced.
 
-    ``decoder`` has read the messages last; ``truths`` are (n, 3) calibrated readings, g or deg/s; ``channel`` is the
-    number of the channel of the copies; ``covariances`` are those of a sample, (3, 3), g^2 or (deg/s)^2, of some
-    sensors: where there is none, that of the message stays.
+    ``groups`` are the messages of each layout, by their indices; ``truths`` are (n, 3) calibrated readings, g or deg/s;
+    ``channel`` is the number of the channel of the copies; ``covariances`` are those of a sample, (3, 3), g^2 or
+    (deg/s)^2, of some sensors: where there is none, that of the message stays.
     """
     numbers = _in_ros_units(truths, covariances)
-    if decoder.layout is not None:
-        return _all_at_once(rows, decoder.layout, numbers, channel)
-    copies = []
-    for row in range(len(rows.starts)):
-        own = {path: column[row : row + 1] for path, column in numbers.items()}
-        copies.append(_all_at_once(rows.only(row), decoder.layout_of(row, rows), own, channel).tobytes())
-    return copies
+    copies: dict[int, bytes] = {}
+    for own, layout in groups:
+        table = _all_at_once(rows.select(own), layout, {path: column[own] for path, column in numbers.items()}, channel)
+        if len(groups) == 1:
+            return table
+        copies |= {row: copy.tobytes() for row, copy in zip(own.tolist(), table, strict=True)}
+    return [copies[row] for row in sorted(copies)]
 
 
 def _in_ros_units(readings: Readings, covariances: Readings) -> dict[str, Values]:

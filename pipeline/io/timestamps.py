@@ -180,25 +180,6 @@ def check_fine(topic: str, time: Integers, path: str) -> None:
         raise IngestError(message, path, code="bad_time", hint="log integer times")
 
 
-def time_error(time_ns: Integers, place: str, row: int) -> IngestError:
-    """Return the refusal of a time that does not increase."""
-    steps = np.diff(time_ns)
-    repeats = steps[row - 1] == 0
-    what, code = ("repeats", "duplicate_time") if repeats else ("goes back to", "time_back")
-    count = int(np.count_nonzero(steps <= 0))
-    message = (
-        f"time {what} {time_ns[row] / 1e9:.9g} s after {time_ns[row - 1] / 1e9:.9g} s ({count} such samples); time has "
-        "to increase"
-    )
-    hint = "" if repeats else "a log that was restarted belongs in two files"
-    return IngestError(message, place, code=code, hint=hint)
-
-
-def slower_first(first: Integers, second: Integers) -> bool:
-    """Return whether the first of two sensors, by the times of their messages in ns, is the slower one."""
-    return float(np.median(np.diff(first))) >= float(np.median(np.diff(second)))
-
-
 def rows_covered(slow: Integers, fast: Integers, topic: str, path: str) -> Index:
     """Return the messages of the slower sensor whose whole interval the faster one covers without a gap.
 

@@ -9,11 +9,12 @@ import csv
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import IngestError
+from pipeline.io.ingest_settings import COMMENTED
 from pipeline.io.units import BRACKETS, CHANNELS, SPELLINGS, TRIADS, UNITS, unit_in_brackets
 from pipeline.profile_detection.unit_guesses import whole
 
@@ -87,27 +88,22 @@ RATE_KEY = re.compile(r"(fs|odr|(sampl\w*[ _]?)?(rate|freq\w*))\b", re.IGNORECAS
 
 @dataclass
 class Columns:
-    """The index of the column that may hold each channel of a log.
+    """The index of the column that may hold each channel of a log."""
 
-    ``counter`` counts samples. ``arrival``: a time that scatters beside a counter without a gap, which then is the
-    time. ``triads``: sensor to its x, y, z. ``others``: temperature, table_angle ... ``steady``: time, or the counter
-    of samples, never falls back. ``turn``: counts a turn of the table's encoder, and how they show.
-    """
-
-    layout: TextLayout
+    log: Log
     time: int | None = None
-    counter: int | None = None
-    arrival: int | None = None
-    triads: dict[str, Triad] = field(default_factory=dict)
-    others: dict[str, int] = field(default_factory=dict)
-    steady: bool = True
-    turn: tuple[float, str] | None = None
+    counter: int | None = None  # of samples
+    arrival: int | None = None  # a time that scatters beside a counter without a gap, which then is the time
+    triads: dict[str, Triad] = field(default_factory=dict)  # sensor to its x, y, z
+    others: dict[str, int] = field(default_factory=dict)  # temperature, table_angle ..
+    steady: bool = True  # time, or the counter of samples, never falls back
+    turn: tuple[float, str] | None = None  # counts a turn of the table's encoder, and how they show
     remarks: list[str] = field(default_factory=list)
 
     def free(self) -> list[int]:
         """Return the columns of numbers that hold nothing known."""
         used = {self.time, self.counter, self.arrival, *self.others.values(), *sum(self.triads.values(), ())}
-        return [i for i in self.layout.numbers if i not in used]
+        return [i for i in self.log.numbers if i not in used]
 
 
 def words_of(name: str) -> list[str]:
@@ -138,10 +134,10 @@ def stated_unit(name: str, channel: str) -> tuple[str | None, str]:
     return (unit, f"the name says {unit}") if unit in UNITS[channel] else (None, "")
 
 
-def find_columns(layout: TextLayout) -> Columns:
+def find_columns(log: Log) -> Columns:
     """Return the columns that may hold the channels of a log."""
-    found = Columns(layout)
-    words = {i: words_of(layout.names[i]) if layout.header else [] for i in layout.numbers}
+    found = Columns(log)
+    words = {i: words_of(log.names[i]) if log.named else [] for i in log.numbers}
     _find_time(found, words)
     for sensor in (*TRIADS, "?"):
         named = {i: w for i, w in words.items() if _sensor_of(w) == sensor}
@@ -149,18 +145,18 @@ def find_columns(layout: TextLayout) -> Columns:
         if triad is not None:
             found.triads[sensor] = triad
             _remark_on_other_triads(found, sensor, named)
-    for sensor, triad in _triads_by_one_letter(layout).items():
+    for sensor, triad in _triads_by_one_letter(log).items():
         found.triads.setdefault(sensor, triad)
     bare = found.triads.pop("?", None)
     if bare is not None and not found.triads:
-        found.triads[_sensor_of_file(layout, bare)] = bare
+        found.triads[_sensor_of_file(log, bare)] = bare
         found.remarks.append(f"taken as the {next(iter(found.triads))} by the file's name and numbers; check it")
-    if not layout.header:
+    if not log.named:
         _find_triads_without_names(found)
     for i, w in words.items():
-        channel = _other_channel(layout.names[i], w)
+        channel = _other_channel(log.names[i], w)
         low, high = TEMPERATURE_RANGE
-        values = layout.numbers[i]
+        values = log.numbers[i]
         possible = low < float(np.median(values)) < high
         if channel and channel not in found.others and (channel != "temperature" or possible or whole(values)):
             found.others[channel] = i
@@ -169,11 +165,11 @@ def find_columns(layout: TextLayout) -> Columns:
     return found
 
 
-def _triads_by_one_letter(layout: TextLayout) -> dict[str, Triad]:
+def _triads_by_one_letter(log: Log) -> dict[str, Triad]:
     """Return the sensors of three names that differ in a letter x, y, z beside the sensor's name: axr, ayr, azr."""
     groups: dict[tuple[str, str], dict[str, int]] = {}
-    for index in layout.numbers if layout.header else ():
-        name = layout.names[index].lower()
+    for index in log.numbers if log.named else ():
+        name = log.names[index].lower()
         for at in (i for i, letter in enumerate(name) if letter in "xyz"):
             groups.setdefault((name[:at], name[at + 1 :]), {})[name[at]] = index
     found: dict[str, Triad] = {}
@@ -212,13 +208,13 @@ def _other_channel(name: str, words: list[str]) -> str:
 
 
 def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
-    numbers = found.layout.numbers
+    numbers = found.log.numbers
     rising = [i for i, v in numbers.items() if len(v) > 2 and bool(np.all(np.diff(v) > 0))]
     counters = [i for i, v in numbers.items() if len(v) > 2 and bool(np.mean(np.diff(v) == 1.0) > COUNTING)]
     of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
     named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
-    unnamed = [i for i in rising if i not in counters and (not found.layout.header or i in of_sensor)]
-    unnamed = unnamed if not found.layout.header or len(unnamed) == 1 else []
+    unnamed = [i for i in rising if i not in counters and (not found.log.named or i in of_sensor)]
+    unnamed = unnamed if not found.log.named or len(unnamed) == 1 else []
     candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
     steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
@@ -233,7 +229,7 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
     if index is not None and index not in rising:
         back = int(np.count_nonzero(np.diff(numbers[index]) <= 0))
         found.remarks.append(
-            f"{found.layout.names[index]} does not increase at {back} rows: sessions one after the other (session: 1, "
+            f"{found.log.names[index]} does not increase at {back} rows: sessions one after the other (session: 1, "
             "2 .. reads one of them), or a counter that overflows"
         )
 
@@ -264,75 +260,67 @@ def _remark_on_other_triads(found: Columns, sensor: str, words: dict[int, list[s
         groups.setdefault((*w[:at], *w[at + 1 :]), {})[index] = w
     triads = [t for group in groups.values() if (t := _triad(group)) is not None]
     if len(triads) > 1:
-        texts = [", ".join(found.layout.names[i] for i in t) for t in triads]
-        taken = ", ".join(found.layout.names[i] for i in found.triads[sensor])
+        texts = [", ".join(found.log.names[i] for i in t) for t in triads]
+        taken = ", ".join(found.log.names[i] for i in found.triads[sensor])
         others = "; ".join(text for text in texts if text != taken)
         what = sensor if sensor != "?" else "sensor"
         found.remarks.append(f"{len(triads)} triads may be the {what}: taken {taken}; the others are {others}; choose")
 
 
-def _sensor_of_file(layout: TextLayout, triad: Triad) -> str:
-    stem = Path(layout.path).stem.lower()
+def _sensor_of_file(log: Log, triad: Triad) -> str:
+    stem = Path(log.path).stem.lower()
     if "gyr" in stem or "angular" in stem or "rotation" in stem:
         return "gyroscope"
-    return "accelerometer" if "acc" in stem or _spread(layout, triad) < 0.5 else "gyroscope"
+    return "accelerometer" if "acc" in stem or _spread(log, triad) < 0.5 else "gyroscope"
 
 
-def _spread(layout: TextLayout, triad: Triad) -> float:
+def _spread(log: Log, triad: Triad) -> float:
     """Return the relative spread of a vector's length, which is small for gravity."""
-    norm = np.linalg.norm(np.column_stack([layout.numbers[i] for i in triad]), axis=1)
+    norm = np.linalg.norm(np.column_stack([log.numbers[i] for i in triad]), axis=1)
     low, middle, high = np.quantile(norm, [0.16, 0.5, 0.84])
     return float((high - low) / max(middle, 1e-30))
 
 
 def _find_triads_without_names(found: Columns) -> None:
     """Find the sensors by content: gravity keeps its length."""
-    layout = found.layout
-    free = [i for i, v in layout.numbers.items() if i not in (found.time, found.counter) and np.ptp(v) > 0]
+    log = found.log
+    free = [i for i, v in log.numbers.items() if i not in (found.time, found.counter) and np.ptp(v) > 0]
     groups = list(zip(free[::3], free[1::3], free[2::3], strict=False))
     if len(groups) == 1:
-        sensor = _sensor_of_file(layout, groups[0])
+        sensor = _sensor_of_file(log, groups[0])
         found.triads[sensor] = groups[0]
         found.remarks.append(f"no names: columns {groups[0]} are taken as the {sensor}'s x, y, z; check it")
     elif groups:
-        first = min(range(len(groups)), key=lambda i: _spread(layout, groups[i]))
+        first = min(range(len(groups)), key=lambda i: _spread(log, groups[i]))
         found.triads["accelerometer"] = groups[first]
         found.triads["gyroscope"] = next(g for i, g in enumerate(groups) if i != first)
         found.remarks.append(
             f"no names: columns {groups[first]} are taken as the accelerometer's x, y, z, for their length varies by "
-            f"{_spread(layout, groups[first]):.1%} only, {found.triads['gyroscope']} as the gyroscope's; check it"
+            f"{_spread(log, groups[first]):.1%} only, {found.triads['gyroscope']} as the gyroscope's; check it"
         )
 
 
 @dataclass(frozen=True)
-class TextLayout:
-    """The layout of a text log.
-
-    ``delimiter``: a blank stands for any run of blanks and tabs. ``skip_lines``: before the header, or before the data.
-    ``comment``: start of the lines before the data. ``numbers``: the columns that hold finite numbers only.
-    ``rate_hz``: sampling rate that the line ``rate_line`` before the data states. ``odd_rows``: with another number of
-    fields.
-    """
+class Log:
+    """An unknown log as columns: of a text log, or of a topic of a log of messages."""
 
     path: str
-    delimiter: str
-    decimal: str
-    skip_lines: int
-    header: bool
-    comment: str | None
-    names: list[str]
-    numbers: dict[int, Values]
-    rate_hz: float | None
-    rate_line: str
-    odd_rows: int
+    csv: dict[str, Any]  # the section ``csv`` of a profile, without columns
+    keys: list[str | int]  # what a profile calls each column: its name, its index, or the path of a field
+    names: list[str]  # of the columns; of a field with the unit that the file states
+    numbers: dict[int, Values]  # the columns that hold finite numbers only
+    evidence: dict[str, str] = field(default_factory=dict)  # by key of ``csv``
+    remarks: list[str] = field(default_factory=list)
+    topic: str | None = None
 
-    def key(self, index: int) -> str | int:
-        """Return what a profile calls a column: its name, or its index where there is no header."""
-        return self.names[index] if self.header else index
+    @property
+    def named(self) -> bool:
+        """Whether the columns have names."""
+        return self.csv["header"] is not False
 
 
-def find_layout(data: bytes, path: str) -> TextLayout:
-    """Return the layout of a text; refuse one of which no part is a table of numbers."""
+def find_layout(data: bytes, path: str) -> Log:
+    """Return a text as columns; refuse one of which no part is a table of numbers."""
     lines = data.decode("utf-8", "replace").splitlines()
     tried = [_try(lines[:LINES_TRIED], separator, decimal) for separator in SEPARATORS for decimal in NUMBER]
     width, start, separator, decimal = max(tried, key=lambda t: (t[0], -t[1]))
@@ -346,10 +334,19 @@ def find_layout(data: bytes, path: str) -> TextLayout:
     stated = ((STATED_NUMBER.search(line), line.strip()) for line in lines[:start] if RATE_KEY.search(line))
     rates = ((float(found.group(1)), line) for found, line in stated if found)
     rate_hz, rate_line = next((rate for rate in rates if rate[0]), (None, ""))
-    return TextLayout(
-        path, separator, decimal, skip, names != _numbered(len(names)), comment, names, numbers,
-        rate_hz, rate_line, len(kept) - len(rows),
-    )  # fmt: skip
+    named, odd = names != _numbered(len(names)), len(kept) - len(rows)
+    csv_section = {
+        "delimiter": "whitespace" if separator == " " else separator,
+        "decimal": decimal,
+        "header": COMMENTED if named and comment is not None else named,
+        "skip_lines": 0 if comment is not None else skip,
+        "comment": comment,
+        "rate_hz": rate_hz,
+    }
+    evidence = {"rate_hz": f"the file states {rate_line!r}"} if rate_hz is not None else {}
+    remarks = [f"{odd} rows have another number of fields than the others"] if odd else []
+    keys = [name if named else i for i, name in enumerate(names)]
+    return Log(path, csv_section, keys, names, numbers, evidence, remarks)
 
 
 def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:

@@ -23,7 +23,6 @@ from pipeline.profile_detection.columns import (
     stated_unit,
     words_of,
 )
-from pipeline.profile_detection.recording_facts import TopicLayout
 from pipeline.profile_detection.table_encoder import CENTIDEGREES, find_encoder, unit_by_table
 from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
@@ -43,7 +42,7 @@ from pipeline.profile_detection.unit_guesses import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.profile_detection.columns import TextLayout
+    from pipeline.profile_detection.columns import Log
     from pipeline.records import Values
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
@@ -60,23 +59,22 @@ class Proposal:
     """
 
     files: list[str]
-    layouts: list[TextLayout]
+    logs: list[Log]
     csv: dict[str, Any]
     columns: list[Entries]
-    evidence: dict[str, str] = field(default_factory=dict)
+    evidence: dict[str, str]
+    seen: list[dict[str | int, str]]
     remarks: list[str] = field(default_factory=list)
-    seen: list[dict[str | int, str]] = field(default_factory=list)
 
     @property
     def parts(self) -> list[str]:
         """Names of the parts' files, empty where there is one file a recording."""
-        return [Path(s.path).name for s in self.layouts] if len(self.layouts) > 1 else []
+        return [Path(log.path).name for log in self.logs] if len(self.logs) > 1 else []
 
     @property
     def topic(self) -> str | None:
         """The topic of a log of messages; None of a text log."""
-        layout = self.layouts[0]
-        return layout.topic if isinstance(layout, TopicLayout) else None
+        return self.logs[0].topic
 
     @property
     def complete(self) -> bool:
@@ -104,12 +102,12 @@ class Proposal:
         return {"name": name, "csv": {**self.csv, "parts": parts, "columns": {}}, "mcap": {}}
 
 
-def propose(layouts: Sequence[TextLayout], sensor: dict[str, Any] | None = None) -> list[Proposal]:
+def propose(logs: Sequence[Log], sensor: dict[str, Any] | None = None) -> list[Proposal]:
     """Return the profiles that text logs seem to ask for, those of the same layout together.
 
     ``sensor``: its configuration, where the user states one; counts that the log does not tell are taken from it.
     """
-    found = [find_columns(layout) for layout in layouts]
+    found = [find_columns(log) for log in logs]
     proposals: list[Proposal] = []
     for columns in _joined(found):
         new = _proposal(columns, sensor or {})
@@ -136,17 +134,16 @@ def _joined(found: list[Columns]) -> list[list[Columns]]:
 def _belong_together(one: Columns, two: Columns) -> bool:
     if len(one.triads) != 1 or len(two.triads) != 1 or set(one.triads) == set(two.triads):
         return False
-    same = ("delimiter", "decimal", "skip_lines", "header", "comment")
-    if any(getattr(one.layout, k) != getattr(two.layout, k) for k in same) or one.time is None or two.time is None:
+    if one.log.csv | {"rate_hz": None} != two.log.csv | {"rate_hz": None} or one.time is None or two.time is None:
         return False
-    return np.array_equal(one.layout.numbers[one.time], two.layout.numbers[two.time])
+    return np.array_equal(one.log.numbers[one.time], two.log.numbers[two.time])
 
 
 def _alike(one: Proposal, two: Proposal) -> bool:
     """Return whether one profile reads both: the same names, or others only for channels that a file may lack."""
     if one.parts or two.parts:
         return False
-    if [s.names for s in one.layouts] == [s.names for s in two.layouts] and one.csv == two.csv:
+    if [log.names for log in one.logs] == [log.names for log in two.logs] and one.csv == two.csv:
         return True
     if one.csv.get("header") is not True or _without_delimiter(one) != _without_delimiter(two):
         return False
@@ -183,11 +180,10 @@ def _fill_in(proposal: Proposal, other: Proposal) -> None:
 
 
 def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
-    layouts = [c.layout for c in parts]
-    proposal = Proposal([s.path for s in layouts], layouts, _csv_section(layouts[0]), [{} for _ in parts])
-    proposal.seen = [{s.key(i): _described(s.numbers.get(i)) for i in range(len(s.names))} for s in layouts]
-    if layouts[0].rate_hz is not None:
-        proposal.evidence["rate_hz"] = f"the file states {layouts[0].rate_line!r}"
+    logs = [columns.log for columns in parts]
+    seen = [{key: _described(log.numbers.get(i)) for i, key in enumerate(log.keys)} for log in logs]
+    first = logs[0]
+    proposal = Proposal([log.path for log in logs], logs, {**first.csv}, [{} for _ in parts], {**first.evidence}, seen)
     time_s = _time(parts, proposal)
     force = _readings("accelerometer", parts)
     if force is not None:
@@ -206,8 +202,7 @@ def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
         proposal.remarks += columns.remarks
         if proposal.topic is not None and columns.time is None:
             proposal.remarks.append("no field of the topic is a time, which each topic needs")
-        if columns.layout.odd_rows:
-            proposal.remarks.append(f"{columns.layout.odd_rows} rows have another number of fields than the others")
+        proposal.remarks += columns.log.remarks
     if force is None and rate is None:
         _add_template(proposal)
     return proposal
@@ -252,21 +247,9 @@ def _gyroscope(
     return guess
 
 
-def _csv_section(layout: TextLayout) -> dict[str, Any]:
-    commented = layout.header and layout.comment is not None
-    return {
-        "delimiter": "whitespace" if layout.delimiter == " " else layout.delimiter,
-        "decimal": layout.decimal,
-        "header": "commented" if commented else layout.header,
-        "skip_lines": 0 if layout.comment is not None else layout.skip_lines,
-        "comment": layout.comment,
-        "rate_hz": layout.rate_hz,
-    }
-
-
 def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
     """Propose where the time comes from, and return it in s; None where it is not known."""
-    first = parts[0].layout
+    first = parts[0].log
     if parts[0].arrival is not None and parts[0].counter is not None:
         return _counted(parts[0], parts[0].counter, proposal)
     if parts[0].time is not None:
@@ -280,12 +263,12 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
         proposal.evidence["time"] = guess.evidence
         for columns, entries in zip(parts, proposal.columns, strict=True):
             assert columns.time is not None  # noqa: S101  (parts are joined by their times)
-            entries["time"] = {"column": columns.layout.key(columns.time), **guess.entry}
+            entries["time"] = {"column": columns.log.keys[columns.time], **guess.entry}
         return None if guess.second_s is None else values * guess.second_s
-    if parts[0].counter is not None and first.rate_hz is None:
+    if parts[0].counter is not None and first.csv["rate_hz"] is None:
         return _counted(parts[0], parts[0].counter, proposal)
-    if first.rate_hz is not None:
-        return np.arange(len(next(iter(first.numbers.values())))) / first.rate_hz
+    if first.csv["rate_hz"] is not None:
+        return np.arange(len(next(iter(first.numbers.values())))) / float(first.csv["rate_hz"])
     proposal.csv["rate_hz"] = UNKNOWN
     proposal.evidence["rate_hz"] = "there is no time column: the sampling rate in Hz"
     return None
@@ -293,11 +276,11 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
 
 def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | None:
     """Propose a counter of samples as time, at the mean rate of times of arrival that scatter beside it."""
-    layout, rate = columns.layout, None
-    key, count = layout.key(counter), layout.numbers[counter]
+    log, rate = columns.log, None
+    key, count = log.keys[counter], log.numbers[counter]
     evidence = f"{key} counts samples: counts_per_unit is the sampling rate in Hz"
     if columns.arrival is not None:
-        arrival, name = layout.numbers[columns.arrival], layout.names[columns.arrival]
+        arrival, name = log.numbers[columns.arrival], log.names[columns.arrival]
         second = time_unit(arrival, *stated_unit(name, "time")).second_s
         if second is not None:
             rate = float(f"{(count[-1] - count[0]) / ((arrival[-1] - arrival[0]) * second):.6g}")
@@ -322,44 +305,44 @@ def _in_dps(rate: Values, proposal: Proposal) -> Values | None:
 def _readings(sensor: str, parts: list[Columns]) -> Values | None:
     for columns in parts:
         if sensor in columns.triads:
-            return np.column_stack([columns.layout.numbers[i] for i in columns.triads[sensor]])
+            return np.column_stack([columns.log.numbers[i] for i in columns.triads[sensor]])
     return None
 
 
 def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) -> None:
     """Add a sensor's channels with the unit that their names state, else the one guessed."""
     place = next(i for i, c in enumerate(parts) if sensor in c.triads)
-    layout, triad = parts[place].layout, parts[place].triads[sensor]
+    log, triad = parts[place].log, parts[place].triads[sensor]
     proposal.evidence[sensor] = guess.evidence
     for channel, index in zip(TRIADS[sensor], triad, strict=True):
-        stated, why = stated_unit(layout.names[index], channel) if layout.header else (None, "")
+        stated, why = stated_unit(log.names[index], channel) if log.named else (None, "")
         entry = {"unit": stated} if stated in UNITS_OF[sensor] else guess.entry
-        proposal.columns[place][channel] = {"column": layout.key(index), **entry}
+        proposal.columns[place][channel] = {"column": log.keys[index], **entry}
         if entry is not guess.entry:
             proposal.evidence[sensor] = f"{why}; {guess.evidence}"
             if guess.entry["unit"] not in (stated, UNKNOWN):
-                proposal.remarks.append(f"{layout.names[index]}: {why}, and yet {guess.evidence}")
+                proposal.remarks.append(f"{log.names[index]}: {why}, and yet {guess.evidence}")
 
 
 def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str) -> None:
-    layout, (low, high) = columns.layout, TEMPERATURE_RANGE
+    log, (low, high) = columns.log, TEMPERATURE_RANGE
     for channel, index in columns.others.items():
-        values = layout.numbers[index]
+        values = log.numbers[index]
         usual = {"temperature": "degC", "table_angle": "deg", "table_rate": "deg/s"}.get(channel, "1")
-        stated, why = stated_unit(layout.names[index], channel)
-        entries[channel] = {"column": layout.key(index), "unit": stated or usual, "optional": True}
+        stated, why = stated_unit(log.names[index], channel)
+        entries[channel] = {"column": log.keys[index], "unit": stated or usual, "optional": True}
         span = f"{values.min():.6g} to {values.max():.6g}"
         proposal.evidence[channel] = f"{why}: {span}" if stated else f"{span}, so {usual}"
         if channel == "table_angle" and stated is None and columns.turn:
             turn, why = columns.turn
             entries[channel] |= {"unit": COUNTS, "counts_per_unit": float(f"{turn / 360.0:.12g}")}
             proposal.evidence[channel] = f"{span}, and {why}: {turn} / 360 counts a degree"
-        if channel == "table_angle" and CENTIDEGREES in words_of(layout.names[index]):
+        if channel == "table_angle" and CENTIDEGREES in words_of(log.names[index]):
             entries[channel] |= {"unit": COUNTS, "counts_per_unit": 100.0}
             proposal.evidence[channel] = f"the name says hundredths of a degree: {span}"
         if channel == "temperature" and not low < float(np.median(values)) < high:
             guess = temperature_counts(span, sensor)
-            entries[channel] = {"column": layout.key(index), **guess.entry, "optional": True}
+            entries[channel] = {"column": log.keys[index], **guess.entry, "optional": True}
             proposal.evidence[channel] = guess.evidence
     if GYROSCOPE[0] not in entries and "table_rate" in entries and not proposal.parts:
         proposal.remarks.append("a table's log, without the sensor's readings")

@@ -6,7 +6,6 @@ The topics of an unknown log of messages are also layouts of columns, which serv
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,7 @@ from pipeline.io.message_logs import open_reader
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
 from pipeline.io.units import DEGREES, TRIADS
 from pipeline.preprocessing.frames import other_axes
-from pipeline.profile_detection.columns import FEWEST_ROWS, MOST_ROWS, TextLayout, find_columns
+from pipeline.profile_detection.columns import FEWEST_ROWS, MOST_ROWS, Log, find_columns
 from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.signal.rests import rests_from_table, runs
@@ -268,44 +267,31 @@ def _number(value: float, digits: int = 4) -> str:
     return f"{value:.0f}" if "e" in text and 1 <= abs(value) < 1e7 else text
 
 
-@dataclass(frozen=True)
-class TopicLayout(TextLayout):
-    """The fields of a topic as columns. ``fields`` are their paths; ``names`` have the unit that the file states."""
-
-    topic: str = ""
-    fields: tuple[str, ...] = ()
-    rows: int = 0
-
-    def key(self, index: int) -> str | int:
-        """Return the path of a field."""
-        return self.fields[index]
-
-
-def topics_of(path: Path) -> list[TopicLayout]:
+def topics_of(path: Path) -> list[Log]:
     """Return the topics of a log with their first messages; refuse a log none of whose topics may hold readings."""
-    found: dict[int, TopicLayout] = {}
+    found: dict[int, Log] = {}
     listed = []
     with open_reader(path) as reader:
         for rows in reader.rows():
-            if rows.channel not in found and (layout := _layout(reader, rows)) is not None:
-                found[rows.channel] = layout
+            if rows.channel not in found and (log := _topic(reader, rows)) is not None:
+                found[rows.channel] = log
         listed = [f"{c.topic} ({reader.counts[n]})" for n, c in reader.channels.items()]
-    best = sorted(found.values(), key=lambda t: (-len(find_columns(t).triads), -t.rows))
+    best = sorted(found.values(), key=lambda t: (-len(find_columns(t).triads), -len(next(iter(t.numbers.values())))))
     if not best or not find_columns(best[0]).triads:
         message = f"no topic holds the three axes of a sensor; the file has {', '.join(listed) or 'no topics'}"
         raise IngestError(message, str(path), code="no_table")
     return best
 
 
-def _layout(reader: MessageReader, rows: Rows) -> TopicLayout | None:
-    """Return the numbers of a topic's messages; None where they are too few, vary in length or are no arrays."""
+def _topic(reader: MessageReader, rows: Rows) -> Log | None:
+    """Return a topic's messages as columns; None where they are too few, vary in length or are no arrays."""
     channel = reader.channels[rows.channel]
     try:
         find = ros_layouts(channel, reader.schemas.get(channel.schema_id))
         layout = find(rows.payload(0)) if find is not None and len(rows.starts) >= FEWEST_ROWS else None
     except (ValueError, KeyError):  # a definition that is none, or a message that is not what it says
         return None
-    if layout is None or not layout.places or not layout.matches(rows):
+    if layout is None or not layout.places or len(layout.matching(rows)) < len(rows.starts):
         return None
     found = layout.columns(rows, layout.elements(LONGEST_ARRAY))
     columns: dict[str, Any] = {n: c[:MOST_ROWS].astype(np.float64) for n, c in found.items()}
@@ -313,14 +299,12 @@ def _layout(reader: MessageReader, rows: Rows) -> TopicLayout | None:
         for base in [n.removesuffix(f".{seconds}") for n in columns if n.endswith(f".{seconds}")]:
             if f"{base}.{nanos}" in columns:
                 columns[base] = columns.pop(f"{base}.{seconds}") + columns.pop(f"{base}.{nanos}") / 1e9
-    fields = tuple(columns)
+    fields = list(columns)
     stated = [channel.metadata.get(STATED + f.partition("[")[0], "") for f in fields]
     names = [f"{f} [{unit}]" if unit else f for f, unit in zip(fields, stated, strict=True)]
     numbers = {i: columns[f] for i, f in enumerate(fields) if np.isfinite(columns[f]).all()}
-    return TopicLayout(
-        reader.path, ",", ".", 0, True, None, names, numbers, None, "", 0,  # noqa: FBT003  (fields of a text's layout)
-        topic=channel.topic, fields=fields, rows=len(rows.starts),
-    )  # fmt: skip
+    section = {"header": True, "rate_hz": None}
+    return Log(reader.path, section, [*fields], names, numbers, topic=channel.topic) if numbers else None
 
 
 def topic_lines(path: Path, *, fields: bool) -> list[Line]:

@@ -49,7 +49,7 @@ def find_encoder(
 ) -> None:
     """Find the counts a turn of an encoder that is named, or else the column that counts the turns of the readings."""
     for columns in parts:
-        numbers, names = columns.layout.numbers, columns.layout.names
+        numbers, names = columns.log.numbers, columns.log.names
         named = columns.others.get("table_angle")
         if columns.turn or (named is not None and stated_unit(names[named], "table_angle")[0]):
             continue
@@ -71,11 +71,11 @@ def unit_by_table(columns: Columns, rate: Values, time_s: Values | None) -> Gues
     if channel is None or (channel == "table_angle" and not columns.steady):
         return None
     index = columns.others[channel]
-    stated, _ = stated_unit(columns.layout.names[index], channel)
+    stated, _ = stated_unit(columns.log.names[index], channel)
     multiplier, divisor = UNITS[channel][stated or {"table_rate": "deg/s", "table_angle": "deg"}[channel]]
-    if CENTIDEGREES in words_of(columns.layout.names[index]):
+    if CENTIDEGREES in words_of(columns.log.names[index]):
         divisor *= 100
-    values = columns.layout.numbers[index]
+    values = columns.log.numbers[index]
     if channel == "table_angle" and stated is None and columns.turn:
         divisor *= columns.turn[0] / 360.0
     values = values * multiplier / divisor
