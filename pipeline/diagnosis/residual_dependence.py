@@ -40,7 +40,7 @@ DEGREE = 5  # up to four turning points over the span; faster changes are steps
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # one is an effect of the catalogue
 PLACES = 16  # of a test for a step: the nearest one is within 1/32 of the span
-EQUATION = 0.05  # of what slow effects gain: less may be the error of a smoothed temperature where it turns
+EQUATION = 0.05  # of what effects of time or temperature gain: less may be due to a smoothed temperature where it turns
 ABOVE = 1.1  # times the white noise: a residual that may hold something sudden
 SIGNALS = {"temperature": "temperature", "time": "time", "rate": "speed"}  # of covariates in which steps are tried
 
@@ -51,7 +51,7 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[t
     Curves ``explained`` (motion to (n, m) values) count as explained.
     """
     found = _significant(selection, explained)
-    if any(effect(name).slow for name in selection.names):
+    if any(effect(name).uses_time_or_temperature for name in selection.names):
         least = EQUATION * 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
         found = {k: v for k, v in found.items() if v[0] > least or k not in ("temperature", "time")}
     if found and any(setting.prior for setting in selection.settings):

@@ -23,6 +23,7 @@ from typing import Any, Literal
 import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
+from pipeline.errors import ConfigurationError
 from pipeline.exports.c_effects import plan_of
 from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, noise_remarks, plain
 from pipeline.records import SENSORS, SensorCalibration
@@ -112,10 +113,15 @@ def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
 @cache
 def formats() -> dict[str, tuple[Format, Template]]:
     """Return declaration and text of every format, by the name of the template, in alphabetical order."""
-    formats_by_name = {}
+    formats_by_name: dict[str, tuple[Format, Template]] = {}
     for template in sorted(TEMPLATES.glob("*.j2")):
         header, _, text = template.read_text(encoding="utf-8").partition("\n---\n")
         declared = Format(**{"file": template.stem, **yaml.safe_load(header)})
+        same = [name for name, (other, _) in formats_by_name.items() if other.file == declared.file]
+        if same:
+            raise ConfigurationError(
+                f"{template}: file: {declared.file} is also the file of {same[0]}.j2. Name another file"
+            )
         formats_by_name[template.stem] = declared, _environment().from_string(text)
     return formats_by_name
 

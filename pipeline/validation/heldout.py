@@ -4,7 +4,7 @@ Held out are the recordings of role ``validation``; without one, every third res
 nothing is held out, the samples of the fit are judged, and the result says so. With t the truth, M the matrix, n the
 noise of a sample (white noise after the filter, and bias wander) and V its covariance, which is diagonal,
 
-    noise_floor = sqrt(mean E(|t + M n| - |t|)^2),    vector_noise_floor = sqrt(mean tr(M V M^T))
+    noise_floor = sqrt(mean E[(|t + M n| - |t|)^2]),    vector_noise_floor = sqrt(mean tr(M V M^T))
 
 A calibration is worse than the raw readings where its error is above its expected interval
 (``pipeline.validation.expected_error``) and a t-test says so: per stretch of the recordings, the mean of its squared

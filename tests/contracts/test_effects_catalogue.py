@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from bench_session import CONTINUOUS, SIZE, K, Session, random_motion, record, values_of
 
 from pipeline.diagnosis.words import to_distinguish
@@ -103,12 +104,19 @@ def test_every_file_that_ships_is_an_effect_with_all_texts() -> None:
         assert effect.definition is None
 
 
-def test_effects_that_follow_time_or_temperature_are_slow() -> None:
-    of_bias = {"bias_drift", "bias_temperature", "bias_temperature_quadratic", "warm_up"}
+def test_effects_of_time_or_temperature_are_recognised_by_their_formulas() -> None:
     single = [e for e in built_in().values() if not e.of_turns]
-    assert {e.name for e in single if e.slow} == {*of_bias, "scale_factor_temperature"}
+    for e in single:
+        terms = yaml.safe_load((CONFIGS / f"{e.name}.yaml").read_text(encoding="utf-8")).get("terms")
+        if terms:
+            assert e.uses_time_or_temperature == bool(re.search(r"\b(time|temperature)\b", str(terms))), e.name
+    assert built_in()["warm_up"].uses_time_or_temperature
+    assert not built_in()["time_offset"].uses_time_or_temperature
+    of_bias = {"bias_drift", "bias_temperature", "bias_temperature_quadratic", "warm_up"}
     for sensor in SENSORS:
-        assert {e.name for e in single if sensor in e.sensors and e.of_the_room(sensor)} == of_bias
+        of_the_room = {e.name for e in single if sensor in e.sensors and e.of_the_room(sensor)}
+        assert of_bias <= of_the_room
+        assert not of_the_room & {"scale_factor_temperature", "quadratic_nonlinearity", "g_sensitivity", "time_offset"}
 
 
 def test_an_experiment_without_a_table_is_proposed_where_there_is_none() -> None:

@@ -13,6 +13,7 @@ from stage_files import export_all
 
 from pipeline import exports
 from pipeline.commands.convert import main as convert
+from pipeline.errors import ConfigurationError
 from pipeline.exports import formats
 from pipeline.exports.reading import read_any
 from pipeline.exports.sensors import lower_times_rotation
@@ -80,20 +81,20 @@ def test_the_template_of_the_documentation_adds_a_format_whose_file_is_named_by_
     try:
         export_all(made, settings, tmp_path)
         (tmp_path / "calibration.json").write_text(json.dumps(made))
-        assert convert([str(tmp_path / "calibration.json"), str(tmp_path / "other.ini")]) == 0
+        assert convert([str(tmp_path / "calibration.json"), str(tmp_path / "other.mine.ini")]) == 0
         content = configparser.ConfigParser()
-        content.read(tmp_path / "other.ini")
+        content.read(tmp_path / "other.mine.ini")
         assert [*content["imu"]] == ["offset", "scale"]
-        back = read_any(tmp_path / "other.ini")
+        back = read_any(tmp_path / "other.mine.ini")
     finally:
         formats.cache_clear()
-    assert (back.format_name, back.unit, [*back.sensors]) == ("mine", "other", ["accelerometer"])
+    assert (back.format_name, back.unit, [*back.sensors]) == ("mine", "other.mine", ["accelerometer"])
     K = np.linalg.inv(ACCELEROMETER)
     np.testing.assert_allclose(back.sensors["accelerometer"].bias, [0.031, -0.022, 0.067], rtol=1e-8)
     np.testing.assert_allclose(
         back.sensors["accelerometer"].matrix, np.diag(np.diag(K) / np.sum(K**2, axis=1)), rtol=1e-8
     )
-    lines = (tmp_path / "U1.b.ini").read_text().splitlines()
+    lines = (tmp_path / "U1.b.mine.ini").read_text().splitlines()
     assert lines[:2] == [
         "# Unit U1.b: corrected = (raw - offset) * scale.",
         "# Left out of this format, accelerometer: hysteresis.",
@@ -150,3 +151,15 @@ def test_what_a_format_cannot_carry_is_said_in_it(tmp_path: Path, settings: dict
         assert "Of the bench, not of the accelerometer: lever_arm" in text
         assert "the gyroscope is not calibrated: the recording holds no turn" in text
     assert "gyroscopes" not in yaml.safe_load((tmp_path / "kalibr.yaml").read_text())["imu0"]
+
+
+def test_two_templates_of_one_file_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "one.j2").write_text(EXAMPLE)
+    (tmp_path / "two.j2").write_text(EXAMPLE)
+    monkeypatch.setattr(exports, "TEMPLATES", tmp_path)
+    formats.cache_clear()
+    try:
+        with pytest.raises(ConfigurationError, match=r"two\.j2: file: .* is also the file of one\.j2"):
+            formats()
+    finally:
+        formats.cache_clear()

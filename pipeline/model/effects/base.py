@@ -135,13 +135,13 @@ class Effect(abc.ABC):
         return type(self).moved is not Effect.moved
 
     @property
-    def slow(self) -> bool:
-        """Whether the effect follows the time or the temperature, without moving the motion."""
+    def uses_time_or_temperature(self) -> bool:
+        """Whether its formula contains the time or the temperature; False for effects that move the motion in time."""
         return (self.needs_clock or "temperature" in self.needs) and not self.moves
 
     def of_the_room(self, sensor: str) -> bool:
         """Whether the effect follows the time and the temperature alone: it adds to the bias."""
-        return self.slow and self.fields(sensor, self.starts(sensor)[0]) <= OF_THE_ROOM
+        return self.uses_time_or_temperature and self.fields(sensor, self.starts(sensor)[0]) <= OF_THE_ROOM
 
     def starts(self, sensor: str) -> list[Values]:
         """Return the values from which a fit starts, several where the reading is not linear in them."""
