@@ -22,7 +22,7 @@ import pyarrow as pa
 from pipeline.errors import IngestError
 from pipeline.io.csv_layout import PARTS
 from pipeline.io.quality_flags import REPAIRED
-from pipeline.io.timestamps import sorted_once
+from pipeline.io.timestamps import blocks_error, sorted_once
 from pipeline.io.units import UNITS
 
 if TYPE_CHECKING:
@@ -149,7 +149,8 @@ def in_order(table: ChannelTable, rows: Rows, settings: CsvFormat, checks: Check
         row = int(max(order[place], order[place - 1]))
         message = f"time repeats {time_ns[row] / 1e9:.9g} s in rows that differ ({twice.size} such times)"
         hint = "time has to increase; has the time enough digits, or were two logs merged?"
-        raise IngestError(message, table.place(row), code="duplicate_time", hint=hint) from error
+        repeated = IngestError(message, table.place(row), code="duplicate_time", hint=hint)
+        raise blocks_error(table, repeated.code) or repeated from error
     touched = rows.repaired + moved.size + twice.size
     if touched > checks.repaired_rows * len(time_ns):
         raise over_budget(error, touched, len(time_ns), checks)

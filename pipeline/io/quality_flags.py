@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
+from pipeline.io.timestamps import blocks_error
 from pipeline.io.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TRIADS
 from pipeline.records import SENSOR_UNITS
 
@@ -71,7 +72,8 @@ def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) ->
     if lost > checks.missing_time:
         message = f"{rows.size} {detail}"
         hint = f"ingest.checks.missing_time allows a share of {checks.missing_time:g}"
-        raise IngestError(message, table.place(int(rows[np.argmax(lengths)])), code="missing_time", hint=hint)
+        error = IngestError(message, table.place(int(rows[np.argmax(lengths)])), code="missing_time", hint=hint)
+        raise blocks_error(table, error.code) or error
     return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], usual)]
 
 

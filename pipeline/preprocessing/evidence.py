@@ -160,13 +160,9 @@ def of_rate(recording: Recording, name: str, rate: Values, known: Mask | None = 
     return Channel(name, low, high, turned, noise)
 
 
-def alike(channels: list[Channel]) -> list[Channel]:
-    """Return channels with the sign of the first, where they are the same but for it: an angle counted left-handed."""
-    first = channels[0]
-    return [
-        replace(c, low=-c.high, high=-c.low, turned=-c.turned) if _alike(c.turned, first.turned) < -OPPOSITE else c
-        for c in channels
-    ]
+def opposite(channels: Sequence[Channel]) -> bool:
+    """Return whether some channel is another one with the opposite sign."""
+    return any(_alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels)
 
 
 def _alike(one: Values, two: Values) -> float:

@@ -29,12 +29,12 @@ import numpy as np
 
 from pipeline.preprocessing.evidence import (
     Limits,
-    alike,
     axis_index,
     gravity_turned,
     of_gravity,
     of_rate,
     of_table,
+    opposite,
     quantiles,
     refusal,
     slopes_of,
@@ -181,7 +181,13 @@ class _Gyroscope:
 
 
 def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> tuple[list[Note], Delay | None]:
-    channels, axis = alike(of_table(recording)), axis_index(recording)
+    channels, axis = of_table(recording), axis_index(recording)
+    if opposite(channels):
+        rate, angle = (limits.column(recording, name) for name in ("table_rate", "table_angle"))
+        hint = f"negate the column of one, or leave {rate} out (ingest.csv.columns.table_rate=null)"
+        raise refusal(
+            recording, "reference_contradiction", f"{rate} and the change of {angle} have opposite signs", hint
+        )
     seen = gyroscope.along(recording, axis)
     if seen is not None:
         channels.append(of_rate(recording, "gyroscope", seen, recording.valid))

@@ -409,6 +409,18 @@ def cases() -> dict[str, Case]:
         "36 too long": one(
             text([*ROWS[:600], *ROWS[700:]]), fault="missing_time", says="3.334% of the time is missing", line=602
         ),
+        "36 blocks": one(
+            times([f"{0.08 * (i // 8) + 0.0002 * (i % 8):.4f}" for i in range(SAMPLES)]),
+            fault="missing_time",
+            says=r"blocks of 8, 80 ms apart .* ingest.csv.columns.time=null and ingest.csv.rate_hz=100,",
+            line=10,
+        ),
+        "35 blocks": one(
+            times([f"{0.08 * (i // 8):.2f}" for i in range(SAMPLES)]),
+            fault="duplicate_time",
+            says=r"blocks of 8, 80 ms apart .* ingest.csv.columns.time=null and ingest.csv.rate_hz=100,",
+            line=10,
+        ),
         "37": one(
             times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]),
             notes=("N-JITTER",),

@@ -225,6 +225,12 @@ def cases() -> dict[str, Case]:
         "51 conjugate attitude": Case(
             at("validation", of("table_attitude", lambda q: q * [1, -1, -1, -1])), wrong, "about other body axes"
         ),
+        "51 opposite signs": Case(
+            at("", of(rate, times(-1.0))),
+            wrong,
+            "table_rate_dps and the change of table_angle_deg have opposite signs",
+            "accel_x.csv",
+        ),
         "51 frozen": Case(at("validation", of(rate, frozen(300, 700))), wrong, "is it frozen", "validation.csv"),
         "51 nothing but zeros": Case(at("gyro_z", of(rate, times(0.0))), wrong, "table_rate_dps"),
         "51 reversed": Case(at("gyro_y", of(angle, lambda v: v[::-1])), wrong, "table_angle_deg"),
