@@ -17,7 +17,7 @@ from pipeline.files import INSTALLED, read_json
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
 JSON = dict[str, Any]
@@ -138,7 +138,11 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         f"units calibrated: {calibrated}{failed}; look at {results}/index.html",
         *lines_of(verdict_groups(findings)),
     ]
-    lines += first(_not_held_out(results, [row["unit"] for row in rows]), NAMED, "reasons")
+    units = [row["unit"] for row in rows]
+    lines += first(_told(results, "validations", units, lambda part: part.get("reason") or ""), NAMED, "reasons")
+    lines += first(
+        _told(results, "calibrations", units, lambda part: part.get("not_determined") or ""), NAMED, "reasons"
+    )
     lines += lines_of(_not_in_uncertainty(rows).items())
     lines += first([f"{r['unit']}, left out: {what}" for r in rows if (what := r.get("left_out"))], NAMED, "units")
     entries = read_history(results) if of_this_run else []
@@ -154,14 +158,14 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     return "\n".join(lines) + "\n"
 
 
-def _not_held_out(results: Path, units: Sequence[str]) -> list[str]:
-    """Return why sensors were not judged on held-out motion, with the units, by the published validations."""
+def _told(results: Path, kind: str, units: Sequence[str], of_sensor: Callable[[JSON], str]) -> list[str]:
+    """Return what the published validations or calibrations tell of sensors, with the units; nothing of most."""
     groups: dict[str, list[str]] = {}
-    files = {unit: results / "validations" / f"{unit}.json" for unit in units}
+    files = {unit: results / kind / f"{unit}.json" for unit in units}
     for unit, file in files.items():
         document = read_json(file) if file.is_file() else {}
         for sensor in SENSORS:
-            if reason := (document.get(sensor) or {}).get("reason"):
+            if reason := of_sensor(document.get(sensor) or {}):
                 groups.setdefault(f"{sensor}, {reason}", []).append(unit)
     return lines_of(groups.items())
 

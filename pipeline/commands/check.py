@@ -219,6 +219,7 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
         told.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
     elif not names and not refused:
         lines = [(sensor, f"null: {reason}") for sensor, reason in trial.not_calibrated.items()]
+        lines += [(sensor, text) for sensor, text in trial.not_determined.items() if text]
         noted: dict[str, dict[tuple[str, str], list[str]]] = {}
         for recording in trial.recordings:
             for note in recording.notes:

@@ -77,6 +77,8 @@ def main(argv: Sequence[str]) -> int:
             for s in SENSORS
             for source, reason in beyond_uncertainty(calibration.get(s))
         )
+        lacks = [(s, (calibration.get(s) or {}).get("not_determined")) for s in SENSORS]
+        texts[-1] += "".join(f"  {sensor.capitalize()}: {lack}.\n" for sensor, lack in lacks if lack)
         texts[-1] += "".join(f"  Left out: {line}.\n" for line in left_out(calibration.get("inputs")))
         texts[-1] += explain_board(calibration)
     texts += [_failed(unit, failure) for unit, failure in found.failures.items()]

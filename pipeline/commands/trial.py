@@ -30,12 +30,14 @@ class Trial:
     """What came of a unit.
 
     ``recordings``: as ingest leaves them. ``failure``: the record of what a run would refuse, None where it calibrates
-    the unit. ``not_calibrated``: the reason of each sensor that would be null.
+    the unit. ``not_calibrated``: the reason of each sensor that would be null. ``not_determined``: what its
+    rests do not determine, of each that would not be.
     """
 
     recordings: list[Recording] = field(default_factory=list)
     failure: dict[str, Any] | None = None
     not_calibrated: dict[str, str] = field(default_factory=dict)
+    not_determined: dict[str, str] = field(default_factory=dict)
 
 
 def try_unit(campaign: Campaign, unit: str, until: str = "calibration", *, incomplete: bool = False) -> Trial:
@@ -83,5 +85,7 @@ def try_unit(campaign: Campaign, unit: str, until: str = "calibration", *, incom
             if stage == "ingest":
                 found.recordings = from_parquet(packs["ingest"].read(f"{unit}.parquet"), str(path))
             if stage == "calibration":
-                found.not_calibrated = packs["calibration"].json(f"{unit}.json")["not_calibrated"]
+                document = packs["calibration"].json(f"{unit}.json")
+                found.not_calibrated = document["not_calibrated"]
+                found.not_determined = {s: document[s]["not_determined"] for s in FITS if document[s]}
     return found

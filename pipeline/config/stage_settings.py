@@ -49,6 +49,7 @@ FIT_OF_SENSOR = (
 FIT = (
     *(f"table.{key}" for key in FIT_OF_TABLE),
     *(f"sensor.{{sensor}}.{key}" for key in FIT_OF_SENSOR),
+    *(f"sensor.accelerometer.{key}" for key in (*NOISE, "cross_axis")),  # its fit by hand is part of the gyroscope's
     "sensor.temperature_accuracy_degc", *BY_HAND, "method.{sensor}", "method.as_printed", "method.given",
     "uncertainty.monte_carlo",
 )  # fmt: skip

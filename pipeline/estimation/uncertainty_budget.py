@@ -6,6 +6,7 @@ The noise of the readings is of type A, as the residuals show it (``pipeline.est
 of fit are part of it. Its parts are told apart: white noise, the bias instability that the static recording or the
 sensor file lets expect, and lack of fit beyond both. Everything else is of type B, with infinite degrees of freedom:
 
+    limits        : misalignments that rests do not determine (``limit_contribution``)
     bench         : the table's stated accuracies (``pipeline.estimation.table_errors``), local gravity
     quantisation  : where white noise does not make the rounding errors of the samples independent
     others        : temperature, repeatability, a time that was counted (``pipeline.estimation.stated_lines``)
@@ -25,6 +26,7 @@ from pipeline.estimation.design import BASE, BASE_NAMES, Term
 from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.records import (
+    LIMIT,
     NORMAL,
     RECTANGULAR,
     SENSOR_UNITS,
@@ -128,6 +130,28 @@ def clock_contribution(
     return type_b(TIME_BASE, distribution, ppm, "ppm", effect, remark)
 
 
+def limit_contribution(
+    gain: Values, names: Sequence[str], curvature: Values, covariance: Values, place: Values
+) -> tuple[Contribution, Values]:
+    """Return what misalignments known by the sensor file's limit contribute, and the covariance to first order.
+
+    A limit is so wide that the square of a misalignment matters, as in six positions, where the readings depend on it
+    to second order alone. With the curvature H_i of equation i and the covariance C of a fit, ``d^T H_i d / 2`` of a
+    normal error d has the mean ``tr(H_i C) / 2`` and the covariances ``tr(H_i C H_j C) / 2`` (JCGM 100, 5.1.2, note).
+
+    ``gain``: (p, n), of the equations, over their standard deviations, in the fitted parameters; the last are the
+    pseudo-observations of the ``names``. ``curvature``: (n, p, p), likewise. ``covariance``: (p, p), C. ``place``: (12,
+    p).
+    """
+    own = gain[:, gain.shape[1] - len(names) :]
+    HC = curvature @ covariance
+    mean = 0.5 * np.trace(HC, axis1=1, axis2=2)
+    bent = 0.5 * np.einsum("iab,jba->ij", HC, HC) + np.outer(mean, mean)
+    first = place @ own @ own.T @ place.T
+    total = first + place @ gain @ bent @ gain.T @ place.T
+    return Contribution(LIMIT, "B", NORMAL, total, np.full(len(total), np.inf), remark=", ".join(names)), first
+
+
 def combined(
     calibration: SensorCalibration, contributions: Sequence[Contribution], not_included: Mapping[str, str]
 ) -> SensorCalibration:
@@ -222,7 +246,8 @@ def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Val
     size = len(calibration.parameter_names())
     C = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance
     lines = (calibration.budget or {}).get("contributions", [])
-    stated = np.sum([np.square(c["contribution"]) for c in lines if c["type"] == "B"] or [np.zeros(size)], axis=0)
+    of_bench = [np.square(c["contribution"]) for c in lines if c["type"] == "B" and c["source"] != LIMIT]
+    stated = np.sum(of_bench or [np.zeros(size)], axis=0)
     for line in lines:
         part_of, whole = np.square(line["parts"].get(shared, 0.0)), np.square(line["contribution"])
         stated = stated + np.where(part_of > BY_CHANCE * whole, part_of, 0.0)

@@ -36,7 +36,7 @@ from pipeline.model.checked import WrongValueError, each, fields, flag, items, m
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import parameter_limits
 from pipeline.pack import read_published
-from pipeline.records import AXES, SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration, Values
+from pipeline.records import AXES, LIMIT, SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration, Values
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -361,6 +361,16 @@ def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
                 of = f"{size:.2g} {part['unit']} of bias" if key == "bias" else f"{100.0 * size:.2g} % of the matrix"
                 found.append((f"{entry['source']}, up to {of}", entry["reason"]))
     return found
+
+
+def not_determined(part: Mapping[str, Any]) -> str:
+    """Return which misalignments of a calibrated sensor the rests do not determine, and what would; else nothing."""
+    lines = (part.get("uncertainty_budget") or {}).get("contributions") or []
+    names = next((str(line["remark"]) for line in lines if line["source"] == LIMIT), "")
+    return names and (
+        f"the rests do not determine {names}, known by the limit of the sensor file alone: rest the unit in more "
+        "attitudes, also half-way between two axes"
+    )
 
 
 def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:

@@ -44,6 +44,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import COLUMNS, IDEAL, PLACE, ROWS, triangle
+from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
 from pipeline.records import AXES, Recording, SensorCalibration, Values, coverage_factor
@@ -196,10 +197,10 @@ def derivative_of(y: Values, values: Values) -> Values:
 
 def _open(fitted: SensorCalibration) -> str:
     """Return what the rests do not determine yet; empty where they determine everything."""
-    fixed = fitted.stages[-1].details["fixed"]
+    open_ = fitted.stages[-1].details[KNOWN_BY_LIMIT]
     count = fitted.stages[-1].details["orientations_used"]
-    if fixed:
-        return f"{count} orientations leave {', '.join(fixed)} open"
+    if open_:
+        return f"{count} orientations leave {', '.join(open_)} open"
     return f"{count} orientations determine nine parameters without a check" if count <= FEWEST else ""
 
 

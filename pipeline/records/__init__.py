@@ -1,6 +1,7 @@
 """The data that stages pass to each other: recordings, motions, noise and calibrations (frozen dataclasses)."""
 
 from pipeline.records.calibration import (
+    LIMIT,
     NORMAL,
     RECTANGULAR,
     SENSOR_UNITS,
@@ -35,6 +36,7 @@ from pipeline.records.recording import (
 
 __all__ = [
     "AXES",
+    "LIMIT",
     "MEDIAN_SIZE",
     "NORMAL",
     "RECTANGULAR",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 NORMAL, RECTANGULAR = "normal", "rectangular"
+LIMIT = "misalignment not determined by the rests: limit of the sensor file"  # a source of the uncertainty budget
 
 
 @dataclass(frozen=True)

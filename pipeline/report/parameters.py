@@ -174,6 +174,7 @@ def convergence_of(part: JSON) -> str:
         return ""
     condition = f"condition {number(shown['condition'])}" if shown.get("condition") else "condition not finite"
     rank = f"{condition} in scaled columns, {shown['rank']} of {shown['parameters']} determined"
+    rank += ", the others by the limit of the sensor file" if part.get("not_determined") else ""
     if shown.get("closed_form"):
         return f"A closed formula, without iteration; {rank}."
     cosine = f"largest cosine of the residual and a column of the Jacobian {number(shown['cosine'], 2)}"

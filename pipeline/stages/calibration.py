@@ -20,7 +20,7 @@ from pipeline.estimation.chip_rows import Chip
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.channel_table import axis_maps
 from pipeline.io.quality_flags import GAP
-from pipeline.model.calibration_file import implausible
+from pipeline.model.calibration_file import implausible, not_determined
 from pipeline.pack import FAILED, Files
 from pipeline.records import SENSORS, Recording, SensorCalibration
 from pipeline.stages.unit_files import recordings_of
@@ -113,10 +113,11 @@ def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def judged(sensor: str, fit: dict[str, Any], sensor_config: dict[str, Any]) -> dict[str, Any]:
-    """Return a sensor's fit with what in it is beyond the sensor file's limits, and what of this the user accepts."""
+    """Return a sensor's fit with what in it is beyond the sensor file's limits, and what is known by them alone."""
     found = implausible(sensor, fit, sensor_config)
     accepted = sensor_config["accept_implausible"]
-    return fit | {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
+    lists = {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
+    return fit | lists | {"not_determined": not_determined(fit)}
 
 
 def header(unit: str, settings: dict[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from pipeline.records import Recording
 SETTINGS = {
     "table": {"gravity_g": 1.0},
     "procedure": {"holdout_every": 0},
-    "sensor": {"accelerometer": {"bias_wander": 1e-4, "wander_time_s": 100.0}},
+    "sensor": {"accelerometer": {"bias_wander": 1e-4, "wander_time_s": 100.0, "cross_axis": 0.02}},
     "method": {"as_printed": False},
 }
 BOTH = {**SETTINGS, "sensor": {**SETTINGS["sensor"], "gyroscope": {"bias_wander": 3e-3, "wander_time_s": 100.0}}}

@@ -7,9 +7,9 @@ its y lies in the plane of x and y, since the length of gravity says nothing of 
 orientations need not be known. Equations and fit are those of ``pipeline.estimation.multi_position``; the rows are
 hand-held rests, the dwells of a table's stop-and-go turns, or the single samples of its continuous turns.
 
-A misalignment that the orientations do not determine, as in six positions, is left at zero, and the result says so. On
-a table the errors of the rows are correlated by the bias wander, whose covariance is that of
-``pipeline.estimation.engine``.
+A misalignment of which the orientations say less than the sensor file, as in six positions, is a pseudo-observation by
+the file's limit, and the result says so. On a table the errors of the rows are correlated by the bias wander, whose
+covariance is that of ``pipeline.estimation.engine``.
 
 The start is the ellipsoid ``p . (x^2, y^2, z^2, 2xy, 2xz, 2yz, 2x, 2y, 2z) = 1``, that is ``y^T Q y + 2 h^T y = 1``. It
 is linear in p; its centre is ``b = -Q^-1 h``, and ``L^T L = Q G^2 / (1 + b^T Q b)``.
@@ -27,7 +27,7 @@ from pipeline.estimation.engine import LinearMap, ResidualNoise
 from pipeline.estimation.gauss_markov import WHITE, Prior
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.monte_carlo import KEY, beside_trials, quadratic_results, through, trials_of
-from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
+from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, AccelerometerModel, limit_of_misalignment
 from pipeline.estimation.multi_position.fit import Fit
 from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, prior_hypotheses
@@ -44,7 +44,7 @@ from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import blocks_of_samples
-from pipeline.estimation.uncertainty_budget import combined, gravity_line, noise_contribution
+from pipeline.estimation.uncertainty_budget import combined, gravity_line, limit_contribution, noise_contribution
 from pipeline.model.kinematics import table_motion
 from pipeline.records import Mask, Noise, Recording, SensorCalibration, Values, coverage_factor
 
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 NAME = "nonlinear_least_squares"
 ROWS, COLUMNS = np.tril_indices(3)
 PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine values among bias and full matrix
+PLACED = np.eye(12)[:, PLACE]
 NAMES = np.array(
     [f"bias_{axis}" for axis in "xyz"]
     + [
@@ -64,7 +65,7 @@ NAMES = np.array(
 )
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
 IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
-UNKNOWN = 0.05  # standard uncertainty, g, relative or rad, beyond which nothing of a parameter is known
+UNKNOWN = 0.05  # standard uncertainty, g or relative, beyond which nothing of a bias or scale factor is known
 FALSE_ALARM = 1e-3  # probability of calling one of the rests of a sound recording an outlier
 SMALLEST_OUTLIER_G = 1e-6  # rests of a noise-free recording are no outliers
 FEWEST_TO_JUDGE = 18  # rests, two a parameter
@@ -75,27 +76,41 @@ OF_LENGTH = {
     "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
     "time base": "no time enters the length of gravity",
 }
-HELD_MISALIGNMENT = (
-    "the orientations do not determine it, so that it is held at 0; what it would change in bias and scale factors is "
-    "not included: record rests at 45 deg between the two axes"
-)
 
 
 @dataclass(frozen=True)
 class _Solved:
-    """A fit of some of the nine values; ``columns`` and ``residual`` are over the standard deviation of each row."""
+    """A fit of m rows and k pseudo-observations, which come last.
+
+    ``columns`` and ``residual`` are over the standard deviation of each.
+    """
 
     model: AccelerometerModel
     fit: Fit
-    free: Mask  # (9,)
-    columns: Values  # (m, p)
-    residual: Values  # (m,)
-    deviation: Values  # (m,), g
+    columns: Values  # (m + k, 9)
+    residual: Values  # (m + k,)
+    deviation: Values  # (m + k,), g
+
+    @property
+    def rows(self) -> slice:
+        """The m rows."""
+        return slice(self.model.rests_equations)
 
     @property
     def error(self) -> Values:
         """|u| less its target: (m,) array, g."""
-        return -self.residual * self.deviation
+        return -(self.residual * self.deviation)[self.rows]
+
+    @property
+    def spare(self) -> int:
+        """Rows and pseudo-observations less parameters."""
+        return len(self.residual) - len(NAMES)
+
+    @property
+    def uncertainty(self) -> Values:
+        """Standard uncertainties by the scatter of the rows: (9,) array."""
+        scale = max(1.0, float(np.sum(self.residual**2)) / max(self.spare, 1))
+        return np.asarray(np.sqrt(scale * np.diag(np.linalg.pinv(self.columns.T @ self.columns, hermitian=True))))
 
     @property
     def values(self) -> Values:
@@ -105,7 +120,7 @@ class _Solved:
     @property
     def between(self) -> float:
         """What the rows scatter beyond white noise v, g: ``sum error^2 / (v + s^2) = m - p`` (Mandel & Paule 1970)."""
-        spare, squares, variance = _spare(self), self.error**2, self.fit.error**2
+        spare, squares, variance = self.spare, self.error**2, self.fit.error[self.rows] ** 2
         if spare < 1 or np.sum(squares / variance) <= spare:
             return 0.0
         low, high = 0.0, float(np.sum(squares)) / spare
@@ -145,39 +160,21 @@ def _fit_triangular(
 ) -> SensorCalibration:
     table, prior = settings["table"], prior_of("accelerometer", recordings, settings)
     gravity_g = float(table.get("gravity_g", 1.0))
-    rows = orientations_of(recordings, settings)
-    solved = _fit_determined(rows, gravity_g, prior)
+    rows, limit = orientations_of(recordings, settings), limit_of_misalignment(settings["sensor"]["accelerometer"])
+    solved = _fit_determined(rows, gravity_g, prior, limit)
     while refused := _outlier(rows, solved):
         rows = _without(rows, refused)
-        solved = _fit_determined(rows, gravity_g, prior)
+        solved = _fit_determined(rows, gravity_g, prior, limit)
     found, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
     correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
-    if not rows.by_hand and _spare(solved) > 1:
+    if not rows.by_hand and solved.spare > 1:
         return _on_table(rows, solved, before, correction, prior, settings)
-    place = np.eye(12)[:, PLACE[solved.free]]
-    covariance = place @ found.covariance @ place.T
+    covariance = PLACED @ found.covariance @ PLACED.T
     freedom = float(found.degrees_of_freedom.min())
     details, parameters = _details(rows, solved, freedom), _parameters(solved, covariance)
-    gain = ScaledColumns.of(solved.columns).weights() * (found.error / solved.deviation)
-    total = np.diag(covariance)
-    white = np.minimum(place @ np.sum(gain**2, axis=1), total)
-    parts = {"white noise": np.sqrt(white), "bias wander and scatter of the rests": np.sqrt(total - white)}
-    return after_stage(
-        before,
-        NAME,
-        details,
-        solved.model,
-        found,
-        settings,
-        correction,
-        parameters=parameters,
-        parts=parts,
-        not_included=OF_LENGTH,
-    )
-
-
-def _spare(solved: _Solved) -> int:
-    return len(solved.residual) - int(solved.free.sum())
+    gain = (ScaledColumns.of(solved.columns).weights() * (found.error / solved.deviation))[:, solved.rows]
+    told = {"parameters": parameters, "white": PLACED @ np.sum(gain**2, axis=1), "not_included": OF_LENGTH}
+    return after_stage(before, NAME, details, solved.model, found, settings, correction, **told)
 
 
 def _without(rows: Orientations, refused: Mapping[int, str]) -> Orientations:
@@ -189,39 +186,34 @@ def _without(rows: Orientations, refused: Mapping[int, str]) -> Orientations:
     return replace(rows, rests=rows.rests.select(kept), left_out=tuple(left_out))
 
 
-def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior) -> _Solved:
-    """Fit bias, scale factors and those misalignments that the orientations determine."""
+def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: float) -> _Solved:
+    """Fit the nine values, with the limit of each misalignment of which the orientations say less."""
     count = len(rows.rests.time)
     if count < 6:
         raise NotObservableError(
             f"{count} orientations determine neither bias nor scale factors: {_left(rows)}. Record rests in at "
             "least 6 orientations, each axis up and down, or better in 24 that are spread evenly"
         )
-    free = np.full(9, fill_value=True) if count >= 9 else ~MISALIGNMENT
-    while True:
-        try:
-            solved = _fitted(rows, gravity_g, prior, free)
-        except NotObservableError as lack:
-            if not np.any(free & MISALIGNMENT):
-                raise NotObservableError(
-                    f"the {count} orientations are too much alike: {lack.message} ({_left(rows)}). Record rests "
-                    "with each axis up, down and level, spread evenly"
-                ) from lack
-            free = ~MISALIGNMENT
-            continue
-        u, scale = np.zeros(9), max(1.0, float(np.sum(solved.residual**2)) / max(_spare(solved), 1))
-        u[free] = np.sqrt(scale * np.diag(np.linalg.pinv(solved.columns.T @ solved.columns, hermitian=True)))
-        if np.max(u[MISALIGNMENT]) > UNKNOWN:
-            free = free & (np.arange(9) != np.argmax(np.where(MISALIGNMENT, u, 0.0)))
-            continue
-        weak = NAMES[(u > UNKNOWN) & ~MISALIGNMENT]
-        if len(weak):
-            raise NotObservableError(
-                f"the {count} orientations are nearly degenerate: they leave {', '.join(weak)} open to "
-                f"{float(u.max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled columns). "
-                "Record rests with each axis up, down and level, spread evenly, not all in one plane or direction"
-            )
-        return solved
+    try:
+        solved = _fitted(rows, gravity_g, prior, MISALIGNMENT, limit)
+        # A variance of more than half that of the limit is mostly the limit's.
+        by_limit = MISALIGNMENT & ((solved.uncertainty > limit * np.sqrt(0.5)) | (count < len(NAMES)))
+        if not np.array_equal(by_limit, MISALIGNMENT):
+            solved = _fitted(rows, gravity_g, prior, by_limit, limit)
+    except NotObservableError as lack:
+        raise NotObservableError(
+            f"the {count} orientations are too much alike: {lack.message} ({_left(rows)}). Record rests "
+            "with each axis up, down and level, spread evenly"
+        ) from lack
+    u = solved.uncertainty
+    weak = (u > UNKNOWN) & ~MISALIGNMENT
+    if weak.any():
+        raise NotObservableError(
+            f"the {count} orientations are nearly degenerate: they leave {', '.join(NAMES[weak])} open to "
+            f"{float(u[weak].max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled "
+            "columns). Record rests with each axis up, down and level, spread evenly, not all in one plane or direction"
+        )
+    return solved
 
 
 def _left(rows: Orientations) -> str:
@@ -229,33 +221,32 @@ def _left(rows: Orientations) -> str:
     return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation"
 
 
-def _fitted(rows: Orientations, gravity_g: float, prior: Prior, free: Mask) -> _Solved:
-    """Fit some of the nine values; raise ``NotObservableError`` if the orientations do not determine them."""
+def _fitted(rows: Orientations, gravity_g: float, prior: Prior, by_limit: Mask, limit: float) -> _Solved:
+    """Fit the nine values; raise ``NotObservableError`` if orientations and limits do not determine them."""
     noise = Noise(rows.white, np.zeros(3), prior.time, "rests")
-    directions = np.eye(12)[:, PLACE[free]]
-    model = AccelerometerModel(rows.rests, directions, gravity_g, noise, wander=rows.by_hand)
-    values = _start(rows.rests.reading, gravity_g, free)
+    limits = dict.fromkeys(NAMES[by_limit].tolist(), limit)
+    model = AccelerometerModel(rows.rests, PLACED, gravity_g, noise, known_by_limit=limits, wander=rows.by_hand)
+    values = _start(rows.rests.reading, gravity_g, tilted=not by_limit.any())
     state = State(values[:3], triangle(values))
     equations = model.equations(state)
-    ScaledColumns.of(equations.base).require_full_rank(NAMES[free].tolist())
-    spare = len(rows.rests.time) - int(free.sum())
+    ScaledColumns.of(equations.base).require_full_rank(NAMES.tolist())
     known = Prior(0.0, prior.time) if not rows.by_hand else prior
     noises = prior_hypotheses(known, float(np.mean(model.white)), model.kinds)
     if known.wander == 0.0:  # on a table the wander follows from all readings
         noises = [noise for noise in noises if noise.bias.ratio == 0.0]
-    if spare <= 1:  # too few rows to show a scatter of their own: what is believed of the bias wander stands in
-        noises = [NoiseHypothesis(WHITE, (prior.wander / float(np.median(equations.error)),))]
+    if len(equations.residual) - len(NAMES) <= 1:  # too few rows to show a scatter: the believed bias wander stands in
+        own = float(np.median(equations.error[: model.rests_equations]))
+        noises = [NoiseHypothesis(WHITE, (prior.wander / own,))]
     noises = [replace(noise, known=True) for noise in noises]  # by the scatter within the rests
     found = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
     equations = model.equations(found.state)
     deviation = np.sqrt(np.diag(equations.covariance(found.noise)) if rows.by_hand else equations.variance(found.noise))
     scaled = equations.base / deviation[:, None], equations.residual / deviation
-    return _Solved(model, found, free, *scaled, deviation * equations.error)
+    return _Solved(model, found, *scaled, deviation * equations.error)
 
 
-def _start(y: Values, gravity_g: float, free: Mask) -> Values:
+def _start(y: Values, gravity_g: float, *, tilted: bool) -> Values:
     """Return the values of the ellipsoid through the readings, or those of an ideal sensor where they draw none."""
-    tilted = bool(free[MISALIGNMENT].all())
     products = 2.0 * y[:, [0, 0, 1]] * y[:, [1, 2, 2]]
     columns = [y**2, products, 2.0 * y] if tilted else [y**2, 2.0 * y]
     factors = ScaledColumns.of(np.concatenate(columns, axis=1))
@@ -269,8 +260,7 @@ def _start(y: Values, gravity_g: float, free: Mask) -> Values:
     b = -np.linalg.solve(Q, p[-3:])
     scaled = Q * gravity_g**2 / (1.0 + b @ Q @ b)
     reverse = np.linalg.cholesky(scaled[::-1, ::-1])[::-1, ::-1]  # upper triangular U with U U^T = L^T L
-    found = np.concatenate([b, reverse.T[ROWS, COLUMNS]])
-    return np.where(free, found, IDEAL)
+    return np.concatenate([b, reverse.T[ROWS, COLUMNS]])
 
 
 def _outlier(rows: Orientations, solved: _Solved) -> dict[int, str]:
@@ -280,11 +270,11 @@ def _outlier(rows: Orientations, solved: _Solved) -> dict[int, str]:
     ``t = r / (s sqrt(1 - h))`` follows Student's t with m - p - 1 degrees of freedom, where s is the scatter of the
     others, ``s^2 = (sum r^2 - r^2 / (1 - h)) / (m - p - 1)`` (Belsley, Kuh & Welsch 1980, section 2.1).
     """
-    r, left_out = solved.residual, len(rows.left_out)
+    r, left_out = solved.residual[solved.rows], len(rows.left_out)
     if not rows.by_hand or len(r) < FEWEST_TO_JUDGE or left_out >= OUTLIER_SHARE * (len(r) + left_out):
         return {}
-    rest = 1.0 - np.sum(ScaledColumns.of(solved.columns).basis ** 2, axis=1)
-    spare = _spare(solved) - 1
+    rest = 1.0 - np.sum(ScaledColumns.of(solved.columns).basis[solved.rows] ** 2, axis=1)
+    spare = solved.spare - 1
     others = np.maximum(np.sum(r**2) - r**2 / np.maximum(rest, 1e-9), 1e-12 * np.sum(r**2)) / spare
     t = np.abs(r) / np.sqrt(others * np.maximum(rest, 1e-9))
     worst = int(np.argmax(t))
@@ -309,7 +299,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
     in the readings of each channel c with the weights ``J^+ (n^T L)_c``.
     """
-    used, count, place = rows.used, rows.rests.count, np.eye(12)[:, PLACE[solved.free]]
+    used, count, of_limits = rows.used, rows.rests.count, solved.model.known_by_limit
     parts = []
     for i in dict.fromkeys(rows.rests.recording.tolist()):
         keep = np.zeros(rows.recordings[i].samples, bool)
@@ -324,14 +314,18 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         x, y, z = ((weights / count)[:, row] * along[row, c] for c in range(3))
         return LinearMap((x, y, z), (derivative, derivative, derivative))
 
-    gain = ScaledColumns.of(solved.columns).weights() / solved.deviation
-    scatter = noise_contribution(noise, map_of(gain, place), prior)
+    weights = ScaledColumns.of(solved.columns).weights()
+    scatter = noise_contribution(noise, map_of((weights / solved.deviation)[:, solved.rows], PLACED), prior)
+    lines = [scatter]
+    if of_limits:
+        bent = curvature(solved.model, solved.fit, len(NAMES)) * (solved.fit.error / solved.deviation)[:, None, None]
+        lines.append(limit_contribution(weights, list(of_limits), bent, solved.fit.covariance, PLACED)[0])
     details = _details(rows, solved, float(scatter.degrees_of_freedom.min()))
-    parameters = _parameters(solved, scatter.covariance)
+    parameters = _parameters(solved, np.sum([line.covariance for line in lines], axis=0))
     calibration = with_stage(before, NAME, details, solved.model, solved.fit, correction, parameters)
-    lines, missing = gravity_line(calibration, settings["table"])
-    missing |= OF_LENGTH | dict.fromkeys(NAMES[~solved.free].tolist(), HELD_MISALIGNMENT)
-    complete, trials = combined(calibration, [scatter, *lines], missing), trials_of(settings)
+    gravity, missing = gravity_line(calibration, settings["table"])
+    lines += gravity
+    complete, trials = combined(calibration, lines, missing | OF_LENGTH), trials_of(settings)
     if not trials:
         return complete
     if len(count) > MOST_ROWS:
@@ -339,15 +333,16 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         return replace(complete, budget={**(complete.budget or {}), KEY: {"trials": 0, "reason": reason}})
     steps = quadratic_results(
         solved.columns * (solved.deviation / solved.fit.error)[:, None],
-        curvature(solved.model, solved.fit, place.shape[1]),
+        curvature(solved.model, solved.fit, len(NAMES)),
         np.diag((solved.fit.error / solved.deviation) ** 2),
     )
     estimate, every = np.concatenate([calibration.bias, calibration.matrix.ravel()]), np.eye(len(count))
 
     def results(drawn: Values) -> Values:
-        return np.asarray(estimate + steps(drawn / solved.fit.error) @ place.T)
+        errors = np.pad(drawn / solved.fit.error[solved.rows], ((0, 0), (0, len(of_limits))))
+        return np.asarray(estimate + steps(errors) @ PLACED.T)
 
-    return beside_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines)
+    return beside_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines[1:])
 
 
 def _table_noise(parts: Sequence[tuple[Recording, Mask]], prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
@@ -375,19 +370,19 @@ def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]
     own = np.sqrt(np.clip(np.diag(J @ covariance[np.ix_(PLACE, PLACE)] @ J.T), 0.0, None))
     units = ["g"] * 3 + ["1" if i == j else "rad" for i, j in zip(ROWS, COLUMNS, strict=True)]
     return {
-        str(name): {"value": float(value), "unit": unit, "standard_uncertainty": float(u) if is_free else None}
-        for name, value, unit, u, is_free in zip(NAMES, values, units, own, solved.free, strict=True)
+        str(name): {"value": float(value), "unit": unit, "standard_uncertainty": float(u)}
+        for name, value, unit, u in zip(NAMES, values, units, own, strict=True)
     }
 
 
 def _details(rows: Orientations, solved: _Solved, freedom: float) -> dict[str, Any]:
     return {
-        "orientations_used": len(solved.residual),
+        "orientations_used": len(rows.rests.time),
         "samples_used": int(rows.rests.count.sum()),
         "rests_used": describe_rests(rows.used) if rows.by_hand else [],
         "rests_left_out": describe_rests(rows.left_out),
         "rests_held_out": describe_rests(rows.held_out),
-        "fixed": NAMES[~solved.free].tolist(),
+        KNOWN_BY_LIMIT: solved.model.known_by_limit,
         "white_noise": float(np.sqrt(np.mean(rows.white**2))),
         "scatter_between_rests": solved.between,
         "largest_error": float(np.max(np.abs(solved.error))),

@@ -10,7 +10,13 @@ where
     z   : effects, at the force of the magnitude of gravity; p their parameters
     s_e : standard deviation of |f| by white noise: ``s_e^2 = w sum_c (M^T n)_c^2 s_c^2``
 
-Where the procedure states faces, their equations follow (``faces_and_turns``), and the matrix is full.
+Where the procedure states faces, their equations follow (``faces_and_turns``), and the matrix is full. Otherwise a
+misalignment that the rests do not determine has an equation of its own, a pseudo-observation of 0 with the standard
+uncertainty u of the sensor file's limit c of the cross-axis sensitivity:
+
+    r = (0 - L_ij) / u,   u = sqrt(2 / 3) c
+
+since L_ij is the angle between two axes, the sum of what each reads of the other, both uniform within c.
 """
 
 from __future__ import annotations
@@ -32,14 +38,17 @@ if TYPE_CHECKING:
 ROUNDS = 12  # of effects that depend on the force
 SETTLED = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g
+KNOWN_BY_LIMIT = "known_by_limit"  # in the details of a stage: such misalignments, each with its u
+COLUMN = {"misalignment_yx": 4, "misalignment_zx": 6, "misalignment_zy": 7}  # of b and the lower triangle of L
 
 
 class AccelerometerModel:
     """Equations of the accelerometer's rests.
 
     ``rests``: those of the fit. ``directions``: (12, b), change of bias and matrix by each base parameter. ``held``:
-    rests that no fit sees. ``faces``: of ``rests``, where they are stated: bias and matrix are free then. ``wander``:
-    whether the equations hold the errors by a Gauss-Markov bias.
+    rests that no fit sees. ``faces``: of ``rests``, where they are stated: bias and matrix are free then.
+    ``known_by_limit``: misalignments with a pseudo-observation, each with its u. ``wander``: whether the equations hold
+    the errors by a Gauss-Markov bias.
     """
 
     sensor = "accelerometer"
@@ -54,12 +63,14 @@ class AccelerometerModel:
         *,
         held: Rests | None = None,
         faces: Faces | None = None,
+        known_by_limit: Mapping[str, float] | None = None,
         wander: bool = True,
     ) -> None:
         self.rests, self.gravity, self.held, self.faces = rests, gravity_g, held, faces
         self.noise = noise
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
         self.directions = directions if faces is None else np.eye(12)
+        self.known_by_limit = {} if known_by_limit is None or faces is not None else known_by_limit
         self.rests_equations = len(rests.time)
         self.stretches = len(rests.time) if wander else 0
 
@@ -92,7 +103,15 @@ class AccelerometerModel:
             scattered=True,
         )
         if self.faces is None:
-            return stacked([of_rests], self, state, candidates)
+            u = np.array(list(self.known_by_limit.values()))
+            angles = self.directions[:, [COLUMN[name] for name in self.known_by_limit]].T
+            of_limits = Block(
+                -angles @ np.concatenate([state.bias, state.matrix.ravel()]) / u,
+                angles / u[:, None],
+                lambda term: np.zeros((len(u), len(term.values))),
+                self.gravity * u,
+            )
+            return stacked([of_rests, of_limits], self, state, candidates)
         W = self.faces.weights() / self.gravity
         WM = W @ state.matrix
         wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,m,c->r", WM**2, rests.share, self.white**2))
@@ -139,7 +158,15 @@ class AccelerometerModel:
         """Return the model with some of its rests held out."""
         kept, judged = self.rests.select(~held), self.rests.select(held)
         faces = self.faces and self.faces.select(~held)
-        return AccelerometerModel(kept, self.directions, self.gravity, self.noise, held=judged, faces=faces)
+        return AccelerometerModel(
+            kept,
+            self.directions,
+            self.gravity,
+            self.noise,
+            held=judged,
+            faces=faces,
+            known_by_limit=self.known_by_limit,
+        )
 
     def _motion(self, force: Values, rests: Rests) -> Motion:
         return motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
@@ -152,19 +179,19 @@ def white_of(rests: Rests, noise: Noise | None) -> Values:
     return rests.white
 
 
+def limit_of_misalignment(sensor_config: Mapping[str, Any]) -> float:
+    """Return u of a misalignment by the sensor file's limit, rad; ``sensor_config``: its section ``accelerometer``."""
+    return float(np.sqrt(2.0 / 3.0)) * float(sensor_config["cross_axis"])
+
+
 def _directions(calibration: SensorCalibration) -> Values:
-    """Return what b and the lower triangle of L do to bias and matrix: (12, 9) array, fewer where some stay fixed."""
+    """Return what b and the lower triangle of L do to bias and matrix: (12, 9) array."""
     flipped, _ = np.linalg.qr(calibration.matrix[:, ::-1])
     Q = flipped[:, ::-1]
     Q = Q * np.sign(np.diag(Q.T @ calibration.matrix))
+    Q = np.eye(3) if np.allclose(Q, np.eye(3), atol=1e-9) else Q
     directions = [np.eye(12)[i] for i in range(3)]
-    known = calibration.covariance
-    plain = bool(np.allclose(Q, np.eye(3), atol=1e-9))
-    Q = np.eye(3) if plain else Q
     for i, j in zip(*np.tril_indices(3), strict=True):
-        at = 3 + 3 * i + j
-        if i != j and plain and known is not None and known[at, at] == 0.0:
-            continue
         directions.append(np.concatenate([np.zeros(3), np.outer(Q[:, i], np.eye(3)[j]).ravel()]))
     return np.array(directions).T
 
@@ -183,4 +210,6 @@ def model_of(
     held = rests_of("accelerometer", recordings, settings, role=HELD_OUT) or rests.select(rests.held_out)
     used = rests.select(~rests.held_out)
     faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings)
-    return AccelerometerModel(used, _directions(calibration), gravity, noise, held=held, faces=faces)
+    by_limit = {name: u for stage in calibration.stages for name, u in stage.details.get(KNOWN_BY_LIMIT, {}).items()}
+    directions = _directions(calibration)
+    return AccelerometerModel(used, directions, gravity, noise, held=held, faces=faces, known_by_limit=by_limit)

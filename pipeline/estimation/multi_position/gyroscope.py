@@ -61,6 +61,7 @@ class GyroscopeModel:
     """
 
     sensor = "gyroscope"
+    known_by_limit: Mapping[str, float] = {}  # as of the accelerometer's model
 
     def __init__(
         self,

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import AUTO
-from pipeline.estimation.engine import draw_normal
+from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, trials_of
 from pipeline.estimation.multi_position import accelerometer, gyroscope
@@ -36,6 +36,7 @@ from pipeline.estimation.uncertainty_budget import (
     combined,
     effect_parameters,
     gravity_line,
+    limit_contribution,
     scatter_contribution,
 )
 from pipeline.model.effects import effect
@@ -145,7 +146,9 @@ def with_stage(  # noqa: PLR0917  (what a fit by hand is)
         matrix=found.state.matrix,
         stages=(*before.stages, StageResult(name, parameters, rms, correction, details)),
         converged=found.converged,
-        convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
+        convergence=certified(
+            found.cosine, found.condition, found.rank - len(model.known_by_limit), len(found.covariance)
+        ),
     )
 
 
@@ -159,13 +162,14 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     correction: dict[str, Any] | None = None,
     *,
     parameters: dict[str, dict[str, Any]] | None = None,
-    parts: Mapping[str, Values] | None = None,
+    white: Values | None = None,
     not_included: Mapping[str, str] | None = None,
 ) -> SensorCalibration:
     """Return a fit as a calibration after one more stage, with its uncertainty budget by the residuals.
 
     ``settings``: sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``), ``uncertainty``.
-    ``parameters``: of the stage, where they are not bias and matrix. ``parts``: of the scatter's line of the budget.
+    ``parameters``: of the stage, where they are not bias and matrix. ``white``: (12,), variance by white noise, where
+    the budget tells it apart.
     """
     place = parameter_places(model, len(found.covariance))
     covariance = place @ found.covariance @ place.T
@@ -176,7 +180,12 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     calibration = with_stage(before, name, details, model, found, correction, parameters)
     calibration = replace(calibration, effects=effects)
     sensor, table = calibration.sensor, settings["table"]
-    scatter = scatter_contribution(covariance, np.inf, parts, REMARK[sensor])
+    limit, of_limit = _limit_contribution(model, found, place)
+    own, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
+    if white is not None:
+        white = np.minimum(white, own)
+        parts = {"white noise": np.sqrt(white), "bias wander and scatter of the rests": np.sqrt(own - white)}
+    scatter = scatter_contribution(covariance - of_limit, np.inf, parts, REMARK[sensor])
     lines = [replace(scatter, degrees_of_freedom=freedom)]
     missing = dict(not_included or NOT_INCLUDED)
     if sensor == "accelerometer":
@@ -188,8 +197,21 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
         lines.append(clock_contribution(calibration, float(table["clock_accuracy_ppm"])))
     if sensor == "gyroscope":
         missing["Earth's rotation"] = "not in the model: by hand nobody knows the heading; up to 0.0042 deg/s of bias"
-    complete, trials = combined(calibration, lines, missing), trials_of(settings)
+    complete, trials = combined(calibration, [*lines, *limit], missing), trials_of(settings)
     return _with_monte_carlo(complete, model, found, trials, lines[1:]) if trials else complete
+
+
+def _limit_contribution(model: Model, found: Fit, place: Values) -> tuple[list[Contribution], Values]:
+    """Return the line of the misalignments known by the sensor file's limit, if any, and its first-order covariance."""
+    if not model.known_by_limit:
+        return [], np.zeros((len(place), len(place)))
+    equations = model.equations(found.state)
+    X = equations.columns
+    inverse = np.linalg.inv(equations.covariance(found.noise))
+    gain = scaled_inverse(X.T @ inverse @ X) @ X.T @ inverse
+    bent = curvature(model, found, X.shape[1])
+    line, first = limit_contribution(gain, list(model.known_by_limit), bent, found.covariance, place)
+    return [line], first
 
 
 def _with_monte_carlo(
