@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from pipeline.diagnosis.words import listed, of_unknown, plain
+from pipeline.diagnosis.words import of_unknown, template
 from pipeline.model.effects.base import unit_of
 
 if TYPE_CHECKING:
@@ -104,12 +104,43 @@ class Evidence:
         return self.held_out["error_after"] ** 2 > (1.0 - HELPFUL) * self.held_out["error_before"] ** 2
 
     @property
+    def made_worse(self) -> bool:
+        """Whether what was selected raises the held-out error."""
+        return _made_worse(self.held_out)
+
+    @property
+    def too_many(self) -> bool:
+        """Whether more effects were selected than a unit usually has."""
+        return len(self.selected) > BELIEVED
+
+    @property
+    def too_quiet(self) -> bool:
+        """Whether the residual is below what the noise estimate makes possible."""
+        quiet = self.on_table and self.found == "nothing_missing" and self.over_noise is not None
+        return quiet and float(self.over_noise or 0.0) < QUIET
+
+    @property
+    def given(self) -> bool:
+        """Whether the calibration is given, not fitted."""
+        return self.method == GIVEN
+
+    @property
+    def of_free_method(self) -> bool:
+        """Whether the method leaves bias and matrix free."""
+        return self.method in FREE
+
+    @property
+    def unit(self) -> str:
+        """The unit of the sensor."""
+        return unit_of(self.sensor)
+
+    @property
     def of_method(self) -> bool:
         """Whether the method causes a held-out error above its interval: a free fit is within its own."""
         same = self.method == "reference_least_squares" and not self.filtered  # the calibration is the free fit
         free = self.free or self.published
         within = not (same or (free and free.above))
-        return self.as_printed or within or bool(self.method == GIVEN and self.free is None and self.at_noise)
+        return self.as_printed or within or bool(self.given and self.free is None and self.at_noise)
 
 
 def verdict_of_selection(
@@ -150,150 +181,36 @@ def _made_worse(held_out: Mapping[str, float] | None) -> bool:
     return more > WORSE * held_out["floor"] ** 2
 
 
+# Verdict, its reason (a macro of ``templates/reasons.txt``), and where it applies; ``e.above``: the held-out error of
+# the calibration is above its interval.
+RULES: tuple[tuple[str, str, Callable[[Evidence], object]], ...] = (
+    ("reference_in_doubt", "doubts", lambda e: e.doubts),
+    ("missing_effect", "beyond", lambda e: e.above and e.missing and not (e.full and e.full.above)),
+    ("unexplained", "above_and_unexplained", lambda e: e.above and e.unexplained),
+    ("left_by_method", "above_by_method", lambda e: e.above and e.of_method),
+    ("unexplained", "above_as_the_residual", lambda e: e.above and e.at_noise is False),
+    ("reference_in_doubt", "contradiction", lambda e: e.above),
+    ("unexplained", "unexplained", lambda e: e.unexplained),
+    ("unexplained", "moves", lambda e: e.moves and e.moves[0] > e.moves[1] and not e.missing),
+    ("missing_effect", "beyond", lambda e: e.missing),
+    ("floor_in_doubt", "below", lambda e: e.published and e.published.below),
+    ("floor_in_doubt", "too_quiet", lambda e: e.too_quiet),
+    ("left_by_method", "approximations", lambda e: e.found == "nothing_missing" and e.approximations),
+)
+
+
 def decide(e: Evidence) -> tuple[str, str]:
     """Return the verdict and its reason as one or two sentences; empty where the selection is the reason."""
-    return next(((verdict, reason(e)) for verdict, applies, reason in RULES if applies(e)), (e.found, ""))
-
-
-def _beyond(e: Evidence) -> str:
-    """Return which selected effects exceed the limits of the sensor, as a sentence."""
-    if not e.implausible:
-        return ""
-    beyond = listed([plain(name) for name in e.implausible])
-    return (
-        f"To explain the residual, {beyond} would have to exceed the limits of the sensor file. Possible "
-        "causes: a recording of another unit, a wrong range, an effect that is not in the catalogue. If the sensor is "
-        f"known to exceed these limits, set sensor.{e.sensor}.accept_implausible=true."
-    )
-
-
-def _why_unexplained(e: Evidence) -> str:
-    """Return why no effect of the catalogue explains the residual, as sentences."""
-    names, unit = listed([plain(name) for name in e.selected]), unit_of(e.sensor)
-    found = [_beyond(e)] if e.implausible else []
-    if _made_worse(e.held_out) and e.held_out:
-        before, after = e.held_out["error_before"], e.held_out["error_after"]
-        found.append(f"With {names} the error on held-out motion rises from {before:.3g} to {after:.3g} {unit}.")
-    if len(e.selected) > BELIEVED:
-        found.append(
-            f"It takes {len(e.selected)} effects together to explain the residual, more than a unit usually has: the "
-            "true one may not be in the catalogue."
-        )
-    given = f" with {names}" if e.selected else ""
-    if e.unknown:
-        depends = listed([plain(n) for n in e.unknown])
-        found.append(f"The residual{given} depends on {depends} in a form that no effect of the catalogue has.")
-    if e.beyond and e.selected and not e.unknown:
-        follows = listed([plain(n) for n in e.beyond])
-        found.append(f"Beside {names}, something outside the catalogue is likely to depend on {follows}.")
-    if e.left is not None and (not e.at_noise or not found):
-        found.append(f"The residual of the fit{given} is {e.left:.3g} times the noise.")
-    return " ".join(found) or "No effect of the catalogue explains the residual."
-
-
-def _of_method(e: Evidence) -> str:
-    """Return what the method causes, as a sentence."""
-    if e.as_printed:
-        return f"The method {e.method} uses the equations as printed, with their errata (as_printed)."
-    if e.free is None and e.method == GIVEN:
-        return "A fit of these recordings leaves noise alone: the given calibration causes it."
-    if e.free is None:
-        return f"The method {e.method} causes it."
-    found = f"The error of a free fit of the same recordings is {e.free.error:.3g} {unit_of(e.sensor)}"
-    if e.method == GIVEN:
-        return f"{found}: the given calibration causes the rest."
-    if e.filtered and e.method in FREE:
-        return f"{found} against the filtered reference: delay and smoothing by the filter cause the rest."
-    causes = f"the method {e.method} and the filter cause" if e.filtered else f"the method {e.method} causes"
-    against = " against the filtered reference" if e.filtered else ""
-    return f"{found}{against}: {causes} the rest."
-
-
-def _approximations(e: Evidence) -> str:
-    """Return in what the method's calibration differs from a free fit, as a sentence."""
-    differs = [name.replace("_", " ") for name in e.approximations]
-    if e.method == GIVEN:
-        return f"The given calibration differs from a free fit of these recordings in {listed(differs)}."
-    return (
-        f"The method {e.method} causes errors that a free fit of the same recordings does not have: "
-        f"{', '.join(differs)}."
-    )
-
-
-def _above(e: Evidence, why: str, *, selected: bool = False) -> str:
-    """Return by how much the held-out error is above its interval (``selected``: also with these effects), and why."""
-    assert e.published  # noqa: S101  (it is above)
-    unit, with_them = unit_of(e.sensor), ""
-    if selected and e.full and e.selected:
-        with_them = f"; with the selected effects it is {e.full.error:.3g} {unit}, against at most {e.full.high:.3g}"
-    return (
-        f"On held-out motion the error is {e.published.error:.3g} {unit}; noise and stated uncertainties explain at "
-        f"most {e.published.high:.3g} {unit}{with_them}. {why}"
-    )
-
-
-def _below(e: Evidence) -> str:
-    """Return by how much the held-out error is below its interval, and why."""
-    assert e.published  # noqa: S101  (it is below)
-    unit, held = unit_of(e.sensor), e.published
-    return (
-        f"On held-out motion the error is {held.error:.3g} {unit}, less than by the noise estimate "
-        f"({held.low:.3g} to {held.high:.3g} {unit}): this estimate is too large, and may hide an effect. "
-        "Check that the unit did not move in the recording that the noise is taken from."
-    )
-
-
-CONTRADICT = (
-    "The residual of the fit is noise alone, so fit and held-out recording contradict each other: check that the "
-    "held-out recording is of this unit in the same mounting, and check the rate, attitude and clock that the table "
-    "logged in it. The cause may also be an effect that the recordings of the fit cannot show (not observable)."
-)
-MOVES = (
-    "After the held-out moves, the integrated rate misses the direction of gravity by {0:.3g} deg (rms); noise and "
-    "stated uncertainties explain at most {1:.3g} deg. Check that the unit rested before and after each of them, "
-    "without sliding, and that no samples are missing."
-)
-TOO_QUIET = (
-    "The residual of the fit is {:.2g} times the noise estimate. Noise cannot be larger at rest than in turns: check "
-    "that the unit did not move in the static recording, and record it again."
-)
-# Verdict, where it applies, and its reason; ``e.above``: the held-out error of the calibration is above its interval.
-RULES: tuple[tuple[str, Callable[[Evidence], object], Callable[[Evidence], str]], ...] = (
-    (
-        "reference_in_doubt",
-        lambda e: e.doubts,
-        lambda e: f"A check of the recordings contradicts the reference: {'; '.join(e.doubts)}.",
-    ),
-    ("missing_effect", lambda e: e.above and e.missing and not (e.full and e.full.above), _beyond),
-    ("unexplained", lambda e: e.above and e.unexplained, lambda e: _above(e, _why_unexplained(e))),
-    ("left_by_method", lambda e: e.above and e.of_method, lambda e: _above(e, _of_method(e))),
-    (
-        "unexplained",
-        lambda e: e.above and e.at_noise is False,
-        lambda e: _above(e, f"The residual of the fit is {e.left:.3g} times the noise, too.", selected=True),
-    ),
-    ("reference_in_doubt", lambda e: e.above, lambda e: _above(e, CONTRADICT, selected=True)),
-    ("unexplained", lambda e: e.unexplained, _why_unexplained),
-    (
-        "unexplained",
-        lambda e: e.moves and e.moves[0] > e.moves[1] and not e.missing,
-        lambda e: MOVES.format(*e.moves or ()),
-    ),
-    ("missing_effect", lambda e: e.missing, _beyond),
-    ("floor_in_doubt", lambda e: e.published and e.published.below, _below),
-    (
-        "floor_in_doubt",
-        lambda e: e.on_table and e.found == "nothing_missing" and e.over_noise is not None and e.over_noise < QUIET,
-        lambda e: TOO_QUIET.format(e.over_noise),
-    ),
-    ("left_by_method", lambda e: e.found == "nothing_missing" and e.approximations, _approximations),
-)
+    for verdict, reason, applies in RULES:
+        if applies(e):
+            return verdict, " ".join(getattr(template("reasons.txt").module, reason)(e).split())
+    return e.found, ""
 
 
 def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     """Return the diagnosis of a selection with the verdict by the evidence, its reason, and what to do next."""
     verdict, reason = decide(e)
-    given, step = {"given": True} if e.method == GIVEN else {}, _next_step(verdict, document, e)
+    given, step = {"given": True} if e.given else {}, _next_step(verdict, document, e)
     if given and verdict == "missing_effect":
         effects = ", ".join(document["selected"])
         step = f"calibrate these recordings by a method that fits, with effects.{e.sensor}=[{effects}]"
@@ -321,9 +238,9 @@ def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
 
     Where the verdict is ``unexplained``, only plausible effects are offered that each reduce the held-out error.
     """
-    if e.method == GIVEN:
+    if e.given:
         return False
-    if verdict != "unexplained" or e.implausible or len(e.selected) > BELIEVED:
+    if verdict != "unexplained" or e.implausible or e.too_many:
         return verdict == "missing_effect"
     entries = [entry for entry in document["ranking"] if entry["effect"] in document["selected"]]
     errors = [(entry["held_out_error_before"], entry["held_out_error_after"]) for entry in entries]
@@ -344,9 +261,7 @@ def _next_step(verdict: str, document: Mapping[str, Any], e: Evidence) -> str:
     if verdict != "left_by_method":
         return ""
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
-    free = [
-        "the default method" if e.method == GIVEN else "a method that fits the full matrix (reference_least_squares)"
-    ]
-    changes += [] if e.method in FREE else free
+    free = ["the default method" if e.given else "a method that fits the full matrix (reference_least_squares)"]
+    changes += [] if e.of_free_method else free
     changes += ["no filter (filter=none)"] if e.filtered else []
     return f"calibrate the same recordings with {' and '.join(changes)}" if changes else ""

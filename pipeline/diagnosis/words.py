@@ -39,8 +39,7 @@ PLUS_MINUS = (
 
 
 @cache
-def template() -> Template:
-    """Return the template of the sentences."""
+def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=False,  # noqa: S701  (no HTML)
@@ -50,7 +49,12 @@ def template() -> Template:
     environment.filters |= {"plain": plain, "listed": listed, "answer": _answer}
     environment.globals |= {"is_held": is_held, "largest_by_unit": largest_by_unit, "plus_minus": PLUS_MINUS}
     environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED}
-    return environment.get_template("diagnosis.txt")
+    return environment
+
+
+def template(name: str) -> Template:
+    """Return a template of sentences by its file name."""
+    return _environment().get_template(name)
 
 
 def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | None = None) -> list[str]:
@@ -62,7 +66,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
     sets = part.get("answer_set") or []
     more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
-    text = template().render(
+    text = template("diagnosis.txt").render(
         part=part,
         sensor=sensor,
         unit=unit_of(sensor),

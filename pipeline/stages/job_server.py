@@ -84,7 +84,8 @@ def _prepare() -> None:
     built_in()
     formats()
     compile_templates()
-    words.template()
+    for name in ("diagnosis.txt", "reasons.txt"):
+        words.template(name)
 
 
 def _next_job(listener: socket.socket) -> tuple[socket.socket, bytes, list[int]] | None:
