@@ -20,9 +20,10 @@ from pipeline.model.calibration_file import beyond_uncertainty, left_out, senten
 from pipeline.outcome import Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
+from pipeline.report.pages import template
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 JSON = dict[str, Any]
 EPILOG = """\
@@ -34,23 +35,18 @@ examples:
 
 
 class Selection(NamedTuple):
-    """Diagnoses and failures by unit, settings of the last run, folder of all results, and the campaign's in it."""
+    """Folder of a campaign's results, and the diagnoses and failures of some of its units."""
 
+    folder: Path
     diagnoses: dict[str, JSON]
     failures: dict[str, JSON]
-    settings: JSON
-    results: str
-    folder: str
 
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline explain C [UNIT ...]``."""
     parser = parser_of("explain", __doc__, EPILOG, ("--sensor", "--results"))
-    parser.add_argument(
-        "campaign",
-        metavar="WHAT",
-        help="a campaign, the folder of its results, or a file: a diagnosis or a calibration",
-    )
+    words = "a campaign, the folder of its results, or a file: a diagnosis or a calibration"
+    parser.add_argument("campaign", metavar="WHAT", help=words)
     parser.add_argument("units", metavar="UNIT", nargs="*", help="units of the campaign (default: all)")
     words = "format of a calibration, where name and content of the file are ambiguous"
     parser.add_argument("--from", dest="format", metavar="FORMAT", help=words)
@@ -63,28 +59,7 @@ def main(argv: Sequence[str]) -> int:
         except InputError as error:
             raise InputError(f"is no diagnosis, and no calibration: {error.message}", error.file) from error
         return 0
-    found = find(arguments.campaign, arguments.units, Path(arguments.results))
-    folder = Path(found.results) / found.folder
-    texts = []
-    for unit, document in found.diagnoses.items():
-        validation, calibration = (
-            _json(folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
-        )
-        texts.append(explain(unit, document, validation, found))
-        texts[-1] += "".join(f"  {line}\n" for s in SENSORS for line in sentences(s, calibration.get(s)))
-        texts[-1] += "".join(
-            f"  U of the {s} does not include {source}: {reason}.\n"
-            for s in SENSORS
-            for source, reason in beyond_uncertainty(calibration.get(s))
-        )
-        lacks = [(s, (calibration.get(s) or {}).get("not_determined")) for s in SENSORS]
-        texts[-1] += "".join(f"  {sensor.capitalize()}: {lack}.\n" for sensor, lack in lacks if lack)
-        texts[-1] += "".join(f"  Left out: {line}.\n" for line in left_out(calibration.get("inputs")))
-        texts[-1] += explain_board(calibration)
-    texts += [_failed(unit, failure) for unit, failure in found.failures.items()]
-    if len(texts) > 1:
-        texts.insert(0, "\n".join(_summary(found)) + "\n")
-    sys.stdout.write("\n".join(texts))
+    sys.stdout.write(explain(find(arguments.campaign, arguments.units, Path(arguments.results))))
     return 0
 
 
@@ -115,30 +90,40 @@ def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
     for unit, document in diagnoses.items():
         if not _is_diagnosis(document):
             raise InputError("is no diagnosis: it is damaged, or not of this product", str(files[unit]))
-    failures = {unit: failure for unit, failure in failures.items() if not units or unit in units}
-    entries = read_history(folder)
-    settings = (entries[-1].get("settings") if entries else None) or {"campaign": folder.name}
-    return Selection(diagnoses, failures, settings, str(folder.parent), folder.name)
+    return Selection(folder, diagnoses, {unit: f for unit, f in failures.items() if not units or unit in units})
 
 
-def explain(unit: str, document: JSON, validation: JSON, selection: Selection) -> str:
-    """Return a unit's diagnosis as text, with the error of its held-out motion and the commands that add effects."""
-    unit = document.get("unit", unit)
-    lines = [unit]
-    for sensor in SENSORS:
-        part = document.get(sensor)
-        lines.append(f"  {sensor}")
-        verdict, *rest = in_words(part, sensor)
-        lines += [f"    {sentence}" for sentence in [verdict, *_held_out(validation.get(sensor)), *rest]]
-        commands = commands_of(part or {}, sensor, unit, selection.settings, selection.results)
-        if commands:
-            lines += [f"    To {commands['verb']}:", f"      {commands['add']}"]
-            lines += [f"    To {commands['verb']} for one run only:", f"      {commands['once']}"]
-    return "\n".join(lines) + "\n"
-
-
-def _summary(found: Selection) -> list[str]:
-    """Return the verdicts by sensor and effect, and how to continue."""
+def explain(found: Selection) -> str:
+    """Return the diagnoses as text, each with the error on held-out motion and the commands that add effects."""
+    entries, results = read_history(found.folder), str(found.folder.parent)
+    settings = (entries[-1].get("settings") if entries else None) or {"campaign": found.folder.name}
+    units: list[JSON] = []
+    for unit, document in found.diagnoses.items():
+        validation, calibration = (
+            _json(found.folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
+        )
+        name = document.get("unit", unit)
+        units.append({
+            "name": name,
+            "words": {s: in_words(document.get(s), s) for s in SENSORS},
+            "validation": validation,
+            "commands": {s: commands_of(document.get(s) or {}, s, name, settings, results) for s in SENSORS},
+            "notes": [
+                *(line for s in SENSORS for line in sentences(s, calibration.get(s))),
+                *(
+                    f"U of the {s} does not include {source}: {reason}."
+                    for s in SENSORS
+                    for source, reason in beyond_uncertainty(calibration.get(s))
+                ),
+                *(
+                    f"{s.capitalize()}: {lack}."
+                    for s in SENSORS
+                    if (lack := (calibration.get(s) or {}).get("not_determined"))
+                ),
+                *(f"Left out: {line}." for line in left_out(calibration.get("inputs"))),
+            ],
+            "board": explain_board(calibration),
+        })  # fmt: skip
     findings = [
         Finding(unit, sensor, document[sensor]["verdict"], document[sensor]["selected"])
         for unit, document in found.diagnoses.items()
@@ -147,31 +132,14 @@ def _summary(found: Selection) -> list[str]:
     ]
     counts = Counter(finding.verdict.replace("_", " ") for finding in findings).most_common()
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
-    lines = [f"{len(findings)} sensors of {len(found.diagnoses)} units: {counted}", *lines_of(verdict_groups(findings))]
-    if found.failures:
-        lines.append(f"failed: {', '.join(found.failures)}")
-    continued = next_commands(findings, found.settings, found.results)[:-1]  # the last is this command
-    return [*lines, *[f"{what}: {command}" for what, command in continued]]
-
-
-def _failed(unit: str, failure: Mapping[str, Any]) -> str:
-    where = f"{failure['file']}: " if failure.get("file") else ""
-    return (
-        f"{unit}\n  failed in stage {failure.get('stage')} ({failure.get('code')}), so there is no diagnosis:\n"
-        f"    {where}{failure.get('message')}\n"
-        "  Correct the file or the setting, then run the same command again.\n"
+    failed = [f"failed: {', '.join(found.failures)}"] if found.failures else []
+    text: str = template("explain.txt").render(
+        counted=f"{len(findings)} sensors of {len(found.diagnoses)} units: {counted}",
+        groups=[*lines_of(verdict_groups(findings)), *failed],
+        commands=next_commands(findings, settings, results)[:-1],  # the last is this command
+        units=[*units, *({"name": unit, "failure": failure} for unit, failure in found.failures.items())],
     )
-
-
-def _held_out(part: JSON | None) -> list[str]:
-    if not part or not part["steps"]:
-        return []
-    error, floor, unit = part["steps"][-1]["rms_error"], part["noise_floor"], part["unit"]
-    ratio = f", {error / floor:.3g} times the noise floor" if floor else ""
-    where = "held-out motion" if part.get("held_out", True) else "the samples of the fit"
-    why = [f"Not judged on held-out motion: {part['reason']}."] if part.get("reason") else []
-    notes = [f"Held-out error: {note}." for note in part.get("notes") or []]
-    return [f"In this run, the rms error of the magnitude on {where} is {error:.3g} {unit}{ratio}.", *why, *notes]
+    return text
 
 
 def _is_diagnosis(document: object) -> bool:

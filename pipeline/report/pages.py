@@ -33,7 +33,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(FOLDER),
         auto_reload=False,
-        autoescape=select_autoescape(disabled_extensions=["md", "yaml"], default=True),
+        autoescape=select_autoescape(disabled_extensions=["md", "txt", "yaml"], default=True),
         trim_blocks=True,
         lstrip_blocks=True,
     )
