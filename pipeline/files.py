@@ -24,7 +24,7 @@ INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"
 WRITE_AGAIN = "run the same command again: snakemake writes the file anew"
-_encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
+_encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=lambda array: array.tolist())  # of numpy
 _flushed_at_end: list[Path] = []  # folders whose files are flushed together
 
 
@@ -79,7 +79,7 @@ def _not_finite(value: Any, place: str = "value") -> Iterator[str]:  # noqa: ANN
         names = " ".join(v for v in value.values() if isinstance(v, str))
         for key, member in value.items():
             yield from _not_finite(member, f"{place}.{key}{f' ({names})' * bool(names)}")
-    elif isinstance(value, list | tuple):
+    elif hasattr(value, "__len__") and not isinstance(value, str):
         for number, member in enumerate(value):
             yield from _not_finite(member, f"{place}[{number}]")
 

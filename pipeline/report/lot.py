@@ -39,7 +39,10 @@ DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: 
 
 
 class Estimate(NamedTuple):
-    """What the prior of a lot needs of a sensor of a unit; units with the same ``comparable`` may be siblings."""
+    """What the prior of a lot needs of a sensor of a unit; units with the same ``comparable`` may be siblings.
+
+    As an entry of a file its arrays are lists.
+    """
 
     unit: str
     sensor: str
@@ -52,19 +55,14 @@ class Estimate(NamedTuple):
     freedom: Values
     shared: Values
     kind: Index
-    names: list[str]
     known: Mask  # the sensor's own parameters, of a stated uncertainty
 
-    def to_json(self) -> JSON:
-        """Return the estimate for a file."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in self._asdict().items()}
-
     @classmethod
-    def from_json(cls, data: JSON) -> Estimate:
-        """Return the estimate that ``to_json`` gave; units of a fleet share its texts."""
+    def read(cls, data: JSON) -> Estimate:
+        """Return the estimate of an entry; units of a fleet share its texts."""
         texts = {k: sys.intern(data[k]) for k in ("sensor", "lot", "comparable")}
         arrays = {k: np.array(data[k]) for k in ("values", "own", "freedom", "shared", "kind", "known")}
-        return cls(**{**data, **texts, **arrays, "names": list(map(sys.intern, data["names"]))})
+        return cls(**{**data, **texts, **arrays})
 
 
 class Prior(NamedTuple):
@@ -80,14 +78,9 @@ class Prior(NamedTuple):
     known: Mask = NONE.astype(bool)
     shared: Values = NONE  # mean standard uncertainty of the siblings by what they may share
 
-    def to_json(self) -> JSON:
-        """Return the prior for a file."""
-        arrays = {k: getattr(self, k).tolist() for k in ("known", "shared")}
-        return self._asdict() | arrays | {"predicted": [v.tolist() for v in self.predicted]}
-
     @classmethod
-    def from_json(cls, data: JSON) -> Prior:
-        """Return the prior that ``to_json`` gave."""
+    def read(cls, data: JSON) -> Prior:
+        """Return the prior of an entry of a file."""
         known, predicted = np.array(data["known"], bool), Prediction(*map(np.array, data["predicted"]))
         return cls(**{**data, "known": known, "predicted": predicted, "shared": np.array(data["shared"])})
 
@@ -121,7 +114,6 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
                 freedom=np.minimum(freedom, MOST_FREEDOM),
                 shared=np.sqrt(np.diag(shared)),
                 kind=kinds_of(fit),
-                names=fit.parameter_names(),
                 known=np.array(mine) & (np.diag(own) > 0.0),
             )
         )
@@ -183,10 +175,9 @@ def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, shared: Valu
     siblings, p, refused, worst = int(lots.siblings[i]), float(lots.probability[i]), estimate.refused, ""
     outlier = not refused and bool(lots.outlier[i])
     if outlier:
+        names = np.array(json.loads(estimate.comparable)[-1])[known]
         most = int(np.argmax(np.abs(lots.deviation[i])))
-        worst = (
-            f"{plain(estimate.names[np.flatnonzero(known)[most]])} by {number(abs(float(lots.deviation[i, most])), 2)}"
-        )
+        worst = f"{plain(str(names[most]))} by {number(abs(float(lots.deviation[i, most])), 2)}"
         refused = f"it differs from its {siblings} siblings (p = {number(p, 2)})"
     elif not refused and siblings < FEWEST:
         refused = f"without outliers {siblings} siblings are left, {FEWEST} or more are needed"

@@ -30,12 +30,12 @@ def lots_batch(job: Job) -> None:
         summaries = Pack(job.output.parent / name / "summary.zip")
         for unit in units:
             with suppress(DamagedFileError):  # ``gather`` finds that the unit has failed
-                found += [Estimate.from_json(e) for e in summaries.json(f"{unit}.json").get("estimates", ())]
+                found += [Estimate.read(e) for e in summaries.json(f"{unit}.json").get("estimates", ())]
     priors, told = priors_of(found)
     with new_pack(job.output) as add:
         add({TOLD: as_bytes(told)})
         for name, units in batches.items():
-            own = {u: {s: priors[u, s].to_json() for s in SENSORS if (u, s) in priors} for u in units}
+            own = {u: {s: priors[u, s]._asdict() for s in SENSORS if (u, s) in priors} for u in units}
             add({f"{name}.json": as_bytes(own)})
     record_output(job, job.output)
 
@@ -50,7 +50,7 @@ def prior_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     given = _of_batch(job.inputs["lots"], job.output.parent.name)[unit]
     if not given:
         return {}
-    priors = {sensor: Prior.from_json(prior) for sensor, prior in given.items()}
+    priors = {sensor: Prior.read(prior) for sensor, prior in given.items()}
     calibration, validation, diagnosis = (job.inputs[STAGE_OF[of]].json(f"{unit}.json") for of in DOCUMENTS)
     document = calibration_with_prior(calibration, priors)
     files: Files = {}

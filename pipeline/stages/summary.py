@@ -32,7 +32,7 @@ def summary_unit(job: Job, unit: str, settings: JSON) -> Files:
     if settings["lot_prior"]:
         from pipeline.report.lot import estimates  # noqa: PLC0415  (only where a lot is the prior)
 
-        found["estimates"] = [e.to_json() for e in estimates(settings["row"], calibration, diagnosis)]
+        found["estimates"] = [e._asdict() for e in estimates(settings["row"], calibration, diagnosis)]
     return {f"{unit}.json": found}
 
 
