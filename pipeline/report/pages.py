@@ -14,7 +14,7 @@ from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
 from pipeline.report.numbers import measured, number, percent, percent_change, plain, probability, typeset, unit_text
-from pipeline.report.parameters import convergence_of, monte_carlo_of, parameter_texts, stage_details
+from pipeline.report.parameters import monte_carlo_of, parameter_texts, stage_details
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
@@ -40,12 +40,7 @@ def _environment() -> Environment:
     functions = (number, measured, percent, percent_change, probability, typeset, parameter_texts)
     environment.filters |= {function.__name__: function for function in functions}
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text, "numeric": "#{}".format}
-    environment.filters |= {
-        "script_data": script_data,
-        "details": stage_details,
-        "monte_carlo": monte_carlo_of,
-        "convergence": convergence_of,
-    }
+    environment.filters |= {"script_data": script_data, "details": stage_details, "monte_carlo": monte_carlo_of}
     environment.globals |= {"asset": asset, "unit_link": unit_link}
     return environment
 

@@ -165,22 +165,3 @@ def monte_carlo_of(budget: JSON) -> JSON | None:
     if validated < len(rows):
         finding += " Where it does not, use the Monte Carlo interval."
     return {"finding": finding, "rows": rows}
-
-
-def convergence_of(part: JSON) -> str:
-    """Return one sentence on whether the fit is at a minimum, with the evidence; empty where nothing is known."""
-    shown = part.get("convergence")
-    if not shown:
-        return ""
-    condition = f"condition {number(shown['condition'])}" if shown.get("condition") else "condition not finite"
-    rank = f"{condition} in scaled columns, {shown['rank']} of {shown['parameters']} determined"
-    rank += ", the others by the limit of the sensor file" if part.get("not_determined") else ""
-    if shown.get("closed_form"):
-        return f"A closed formula, without iteration; {rank}."
-    cosine = f"largest cosine of the residual and a column of the Jacobian {number(shown['cosine'], 2)}"
-    if part.get("converged", True):
-        return f"The fit converged: {cosine}; {rank}."
-    return (
-        f"The fit did not converge: {cosine}, {rank}. Its values are where it stopped; do not use them. Record more, "
-        "or fit fewer effects."
-    )

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.records import SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, Line, Panel, chart
-from pipeline.report.numbers import NOTHING, number, plain
+from pipeline.report.numbers import NOTHING, number
 from pipeline.signal.rests import Rest, rests_from_table
 
 JSON = dict[str, Any]
@@ -94,21 +94,14 @@ def _flagged(recording: Recording) -> str:
     return ", ".join(f"{count} {kind}" for count, kind in counts if count)
 
 
-def environment(recordings: list[Recording], settings: JSON) -> list[tuple[str, str]]:
-    """Return the conditions that influence the result, by name: temperature, gravity, Earth's rotation, filter."""
-    table = settings.get("table") or {}
-    temperature = sensor_temperature(recordings)
-    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
-    rotation = "not in the model (latitude or azimuth not stated)"
-    if latitude is not None and azimuth is not None:
-        rotation = f"in the model, latitude {latitude:g}°, azimuth {azimuth:g}°"
-    return [
-        ("temperature of the sensor", f"{temperature} °C" if temperature else "not recorded"),
-        ("recorded", f"{number(sum(_duration(r) for r in recordings if r.samples), 4)} s"),
-        ("local gravity", f"{table.get('gravity_g') or 1.0:.7g} g"),
-        ("Earth's rotation", rotation),
-        ("filter", plain((settings.get("filter") or {}).get("name", "none"))),
-    ]
+def environment(recordings: list[Recording], settings: JSON) -> JSON:
+    """Return the conditions that influence the result: temperature, recorded time, table (gravity, place), filter."""
+    return {
+        "temperature": sensor_temperature(recordings),
+        "recorded_s": sum(_duration(r) for r in recordings if r.samples),
+        "table": settings.get("table") or {},
+        "filter": (settings.get("filter") or {}).get("name", "none"),
+    }
 
 
 def sensor_temperature(recordings: list[Recording]) -> str | None:

@@ -74,7 +74,7 @@ def render(
         recordings=recording_rows(recordings, rests),
         segments=segments(recordings, rests, calibration),
         rests=rest_rows(calibration),
-        environment=environment(recordings, settings) if recordings else [],
+        environment=environment(recordings, settings) if recordings else None,
         row={k: v for k, v in (settings.get("row") or {}).items() if v},
         command=run_command(settings["run"]) if settings.get("run") else None,
         settings_text=json_text({k: v for k, v in settings.items() if k not in ("row", "run", "certificate")}),
