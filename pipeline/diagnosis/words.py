@@ -42,6 +42,7 @@ PLUS_MINUS = (
 def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        auto_reload=False,
         autoescape=False,  # noqa: S701  (no HTML)
         trim_blocks=True,
         lstrip_blocks=True,

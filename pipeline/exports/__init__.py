@@ -25,7 +25,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from pipeline.errors import ConfigurationError
 from pipeline.exports.c_effects import plan_of
-from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, noise_remarks, plain
+from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, noise_figures, plain
 from pipeline.records import SENSORS, SensorCalibration
 
 JSON = dict[str, Any]
@@ -93,6 +93,7 @@ class Format:
 def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
+        auto_reload=False,
         autoescape=False,  # noqa: S701  (no HTML; each comment filter closes its own comments)
         trim_blocks=True,
         lstrip_blocks=True,
@@ -141,9 +142,9 @@ class ExportedUnit:
         return {s: SensorCalibration.from_json(s, self.document[s]) for s in SENSORS if self.document.get(s)}
 
     @cached_property
-    def noise_remarks(self) -> list[str]:
-        """Origin and intervals of the noise parameters."""
-        return noise_remarks(self.settings, self.document, self.diagnosis)
+    def noise_figures(self) -> dict[str, JSON]:
+        """Noise parameters of each sensor, with their origin and intervals."""
+        return {s: noise_figures(s, self.settings, self.document) for s in SENSORS}
 
     def sensors(self, declared: Format) -> dict[str, ExportedSensor]:
         """Return the calibrated sensors in the units of a format."""
@@ -194,37 +195,30 @@ def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> s
         unit=exported.document["unit"],
         document=exported.document,
         settings=exported.settings,
-        remarks=_remarks(declared, sensors, exported) + (exported.noise_remarks if declared.noise else []),
+        remarks=_remarks(declared, sensors, exported),
     )
 
 
 def _remarks(declared: Format, sensors: dict[str, ExportedSensor], exported: ExportedUnit) -> list[str]:
     """Return what a reader of the file must know, a sentence or a line each."""
-    document = exported.document
-    counts = {s: sensor.counts for s, sensor in sensors.items()}
-    fields = {"unit": document["unit"], "sensor": document["sensor"], "counts": counts, "sensors": [*sensors.values()]}
-    lines = [line.format(**fields) for line in declared.opening_remarks]
-    lines += before_use(document) if declared.units else []
-    if len(declared.units) == len(SENSORS):
-        reasons = document.get("not_calibrated") or {}
-        absent = [s for s in SENSORS if not document.get(s)]
-        lines += [f"Left out: the {s} is not calibrated: {reasons.get(s, 'no reason given')}." for s in absent]
     held = [*declared.effects, *declared.effects_in_part]
-    partly = any(kind != "full" for kind in declared.matrix.values())
-    for s, sensor in sensors.items():
-        lost = [] if "all" in declared.effects else [name for name in sensor.effects if name not in held]
-        lines += [f"Left out of this format, {s}: {', '.join(lost)}."] if lost else []
-        partly = partly or bool(lost)
-        lines += [f"Of the bench, not of the {s}: {', '.join(sensor.bench_effects)}."] if sensor.bench_effects else []
-    for s, sensor in sensors.items():
-        in_part = [name for name in sensor.effects if name in declared.effects_in_part]
-        lines += [f"{declared.effects_in_part[name]}, {s}: {name}." for name in in_part]
-        lines += sensor.left_by_matrix(declared.matrix.get(s, "full"))
-    lines += declared.closing_remarks
-    lines += declared.temperature_remarks if any(x.follows_temperature for x in sensors.values()) else []
-    sentence = declared.error_sentence or ("With all of the calibration: {}." if partly else "The {}.")
-    errors = [error for s in SENSORS if s in declared.units for error in final_errors(exported.validation, s)]
-    return lines + [sentence.format(error) for error in errors]
+    text = text_of(
+        "remarks.txt",
+        declared=declared,
+        document=exported.document,
+        validation=exported.validation,
+        diagnosis=exported.diagnosis,
+        before_use=before_use(exported.document),
+        sensors=sensors,
+        counts={s: sensor.counts for s, sensor in sensors.items()},
+        lost={
+            s: [] if "all" in held else [name for name in sensor.effects if name not in held]
+            for s, sensor in sensors.items()
+        },
+        follows_temperature=any(sensor.follows_temperature for sensor in sensors.values()),
+        figures=exported.noise_figures if declared.noise else {},
+    )
+    return text.splitlines()
 
 
 def _comment(lines: list[str], mark: str = "# ", end: str = "\n", *, escape: tuple[str, str] = ("", "")) -> str:

@@ -44,64 +44,27 @@ def noise(settings: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str,
     """Return Kalibr's four noise parameters in m/s^2 and rad/s; None where they are not known."""
     parameters: dict[str, float | None] = {}
     for sensor in SENSORS:
-        figures = _figures(sensor, settings, document)
+        figures = noise_figures(sensor, settings, document)
         for name, key in (("noise_density", "white"), ("random_walk", "walk")):
             value = figures[key]
             parameters[f"{sensor}_{name}"] = None if value is None else float(value * FACTORS[SI[sensor]])
     return parameters
 
 
-def noise_remarks(settings: Mapping[str, Any], document: Mapping[str, Any], diagnosis: JSON | None) -> list[str]:
-    """Return where the noise parameters come from, their intervals, and the effective densities."""
-    lines = []
-    for sensor in SENSORS:
-        figures, si = _figures(sensor, settings, document), SI[sensor]
-        factor = FACTORS[si]
-        for key, unit in (("white", f"{si}/sqrt(Hz)"), ("walk", f"{si}/sqrt(s)")):
-            if figures[key] is None:
-                lines.append(f"{sensor}, {key}: not known; null has to be replaced.")
-                continue
-            interval = figures[f"{key}_interval"]
-            within = f", 95 %: {factor * interval[0]:.3g} to {factor * interval[1]:.3g}" if interval else ""
-            lines.append(f"{sensor}, {key}: {factor * figures[key]:.4g} {unit}{within}; {figures[f'{key}_origin']}.")
-        identified = (document.get("noise") or {}).get(sensor) or {}
-        axes = (identified.get("axes") or {}).values()
-        doubts = dict.fromkeys(
-            [*(identified.get("doubts") or []), *(d for axis in axes for d in axis.get("doubts") or [])]
-        )
-        lines += [f"{sensor}, in doubt: {doubt}." for doubt in doubts]
-        effective = ((diagnosis or {}).get(sensor) or {}).get("effective_noise")
-        lines += [effective_text(sensor, effective)] if effective else []
-    return lines
+def nearest_density(effective: Mapping[str, Any]) -> JSON:
+    """Return the effective density over about ``AVERAGING_S``, of those that a diagnosis has."""
+    densities: list[JSON] = effective["densities"]
+    return min(densities, key=lambda d: abs(np.log(d["averaging_time_s"] / AVERAGING_S)))
 
 
-def effective_text(sensor: str, effective: Mapping[str, Any]) -> str:
-    """Return a sentence on the effective density of a sensor, in m/s^2 or rad/s, over about ``AVERAGING_S``."""
-    factor, si, motion = FACTORS[SI[sensor]], SI[sensor], effective["motion"]
-    nearest = min(effective["densities"], key=lambda d: abs(np.log(d["averaging_time_s"] / AVERAGING_S)))
-    shares = [
-        f"{e['effect'].replace('_', ' ')} {factor * e['density']:.3g}" for e in nearest["effects"] if e["density"]
-    ]
-    of_effects = f"; of effects that the diagnosis found and nothing compensates: {', '.join(shares)}" if shares else ""
-    moving = [
-        f"{value:.3g} {unit} rms"
-        for value, unit in ((motion["rate_dps"], "deg/s"), (motion["force_change_g"], "g"))
-        if value is not None
-    ]
-    return (
-        f"{sensor}, effective density in the motion of {', '.join(effective['recordings'])} ({', '.join(moving)}), "
-        f"averaged over {nearest['averaging_time_s']:g} s: {factor * nearest['density']:.3g} {si}/sqrt(Hz), "
-        f"{nearest['over_white']:.3g} times the white noise{of_effects}."
-    )
-
-
-def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, Any]) -> JSON:
-    """Return white noise and walk of a sensor in its own unit, their intervals (None: none) and origins.
+def noise_figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, Any]) -> JSON:
+    """Return white noise and walk of a sensor in its own unit, their intervals (None: none), origins and doubts.
 
     ``KeyError`` where nothing was measured and there is no configuration.
     """
     identified = (document.get("noise") or {}).get(sensor) or {}
-    axes = [axis["terms"] for axis in (identified.get("axes") or {}).values() if axis["terms"]]
+    of_axes = (identified.get("axes") or {}).values()
+    axes = [axis["terms"] for axis in of_axes if axis["terms"]]
     keys = ("noise_density", "bias_wander", "wander_time_s")
     density, wander, time = (settings["sensor"][sensor].get(k) if axes else settings["sensor"][sensor][k] for k in keys)
     white = None if density is None else density / np.sqrt(2.0)
@@ -109,11 +72,13 @@ def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, An
     origin = settings["sensor"][sensor].get("noise_origin")  # another program's file
     out: JSON = {"white": white, "white_interval": None, "white_origin": origin or "of the sensor's configuration"}
     out |= {"walk": walk, "walk_interval": None}
+    doubts = [identified.get("doubts"), *(axis.get("doubts") for axis in of_axes)]
+    out["doubts"] = list(dict.fromkeys(doubt for found in doubts for doubt in found or []))
     out["walk_origin"] = origin or "for the bias wander of the sensor's configuration"
     if not axes:
         return out
-    of_axes, walks = zip(*map(_white_and_walk, axes), strict=True)
-    whites = [w for w in of_axes if w is not None]
+    found, walks = zip(*map(_white_and_walk, axes), strict=True)
+    whites = [w for w in found if w is not None]
     if whites:
         out["white"], *out["white_interval"] = _rms(whites)
         out["white_origin"] = f"measured at rest ({identified['source']}), root mean square of the axes"
@@ -292,16 +257,6 @@ def before_use(document: dict[str, Any]) -> list[str]:
     return lines + [line for s in SENSORS for line in sentences(s, document.get(s))]
 
 
-def final_errors(validation: dict[str, Any] | None, sensor: str) -> list[str]:
-    """Return a sentence on the held-out error of a sensor with and without each effect."""
-    part, lines = (validation or {}).get(sensor) or {}, []
-    for step in part.get("steps") or []:
-        if step["name"] == "calibrated" or step["name"].startswith("+ "):
-            error = "unknown" if step["rms_error"] is None else f"{step['rms_error']:.4g} {part['unit']}"
-            lines.append(f"held-out rms error of the {sensor}, {step['name']}: {error}")
-    return lines
-
-
 def lower_times_rotation(K: Values) -> tuple[Values, Values]:
     """Return L (lower triangular, positive diagonal) and Q (orthonormal) with ``K = L Q``."""
     q, r = np.linalg.qr(K.T)
@@ -378,6 +333,7 @@ FUNCTIONS: dict[str, Any] = {
     "lever_arm_of": lever_arm_of,
     "matmul": np.matmul,
     "lower_half": np.triu_indices(3)[::-1],  # column by column
+    "nearest_density": nearest_density,
     "noise": noise,
     "scaled": lambda value, factor: None if value is None else float(value * factor),
     "sqrt": np.sqrt,
@@ -387,8 +343,10 @@ FUNCTIONS: dict[str, Any] = {
     "rotation_times_lower": rotation_times_lower,
     "row_lengths": row_lengths,
     "sampling_rate": sampling_rate,
+    "FACTORS": FACTORS,
     "RADIAN": FACTORS["rad/s"],
     "REFERENCE_TEMPERATURE": REFERENCE_TEMPERATURE,
+    "SI": SI,
     "STANDARD_GRAVITY": STANDARD_GRAVITY,
     "TEMPERATURES": TEMPERATURES,
 }
