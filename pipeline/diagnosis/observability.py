@@ -7,6 +7,9 @@ parameters at the sensor's limits: the mean gain in 2 log L stays below the gate
     turns on a table    lambda = sum_j limit_j^2 H_jj,  H the whitened products of its columns
     rests and moves     f n log(1 + lambda / n),  f the factor of the gain, n the equations
 
+In turns it is the largest lambda under those hypotheses about the noise that have weight where the effect is in the
+model: where it is not, a random walk is likelier, which would hide it.
+
 lambda of a drift of the bias grows as the square of the time between the first rest and the last, so that the time
 that shows it is known. (With 20 rests of an MPU-6050 in 110 s lambda is 12, of 167 that the gate asks for. Of simulated
 drifts of half the limit, 0 of 4 are found in 4 minutes, 14 of 16 in 8, and 16 of 16 in 11.)
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
 LEAST_SPAN_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
 OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that tells the heading"}
 DRIFT = "bias_drift"
+LEAST_WEIGHT = float(np.log(0.01))  # of a hypothesis about the noise, over that of the likeliest: log
 FEWEST = 3  # equations beyond bias and matrix, from which on an effect of one coefficient can be judged
 ENOUGH = 40  # rests that leave room for what the catalogue holds
 MORE = f"record {ENOUGH} rests or more, each in another orientation, all three axes inclined in most of them"
@@ -133,17 +137,22 @@ def _reason(this: Effect, selection: Selection) -> str:
         (not places and this.needs_both_directions and one_way(observations), in_one),
         (not places, "bias and matrix explain all that it would add in this motion"),
     ]
-    return next((reason for applies, reason in checks if applies), "") or _faint(this, selection, places)
+    return next((reason for applies, reason in checks if applies), "") or _faint(this, selection)
 
 
-def _faint(this: Effect, selection: Selection, places: Sequence[int]) -> str:
+def _faint(this: Effect, selection: Selection) -> str:
     """Return why an effect that did not show would not have; empty where it would."""
     limits, score = selection.limits.get(this.name), selection.alone.get(this.name)
     if limits is None or score is None or score.delta_bic > GATE_BIC:
         return ""
-    gate = score.parameters * float(np.log(selection.first.samples)) + GATE_BIC
-    if max(selection.first.visibility(j, limits, score.setting) for j in places) >= gate:
-        return ""
+    ranking, held = selection.ranking, selection.chosen()
+    gate = score.parameters * float(np.log(ranking.samples)) + GATE_BIC
+    for j in ranking.indices(this.name):
+        seen = np.array([ranking.visibility(j, limits, t) for t in range(1, len(ranking.settings))]) >= gate
+        if seen.any():
+            likely = ranking.log_likelihoods([*held, j])[1:]
+            if likely[seen].max() > likely.max() + LEAST_WEIGHT:
+                return ""
     return f"{at_its_limit(this, selection.observations.sensor, limits[0])} be below the noise"
 
 

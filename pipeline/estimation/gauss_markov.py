@@ -49,6 +49,7 @@ RANDOM_WALK = 8.0  # times the correlation time seen, with the same variance of 
 # A bias that never settles: times the ratio and the time of a setting, and its share of that setting's prior. Of 80
 # simulated random walks 17 showed an invented effect without it, and 6 with it.
 WALK_RATIO, WALK_TIME, WALK_SHARE = 8.0, 64.0, 0.3
+SLOW = 0.3  # share of white noise's spectrum, see ``steady_s``: right answers as with 0.05 (docs/blind_study.md)
 FAST_S = 25.0  # correlation time below which ``information`` replaces the model, as its blocks last seconds
 
 
@@ -146,6 +147,18 @@ def information(noise: Noise | None, interval: float) -> float:
         return 1.0
     ratio = float(np.mean((noise.wander / noise.white) ** 2))
     return 1.0 / (1.0 + 2.0 * ratio * noise.correlation_time / interval)
+
+
+def steady_s(noise: Noise | None, interval: float) -> float:
+    """Return how long a bias may be taken as constant, s: L with ``2 q L^2 / (pi^2 tau) = SLOW dt``.
+
+    At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is ``SLOW`` times that of white noise, dt.
+    Above, white noise hides it. ``interval``: s, dt.
+    """
+    if noise is None or not np.any(noise.wander > 0) or not np.all(noise.white > 0):
+        return float("inf")
+    ratio = float(np.mean((noise.wander / noise.white) ** 2))
+    return float(np.pi * np.sqrt(0.5 * SLOW * noise.correlation_time * interval / ratio))
 
 
 def variance_of_average(length: Values, tau: float | Values) -> Values:

@@ -221,7 +221,7 @@ def _residual_noise(
     design: Design, observations: Observations, settings: Sequence[Setting], reference: Reference
 ) -> ResidualNoise:
     """Weight hypotheses about the noise by their restricted likelihood, given a design at its solution."""
-    weight, blocks, white = observations.weight, observations.blocks, design.scale
+    weight, blocks, white = observations.weight, observations.long_blocks, design.scale
     disturbed = disturbance(reference, observations.reading, blocks, weight, white)
     if disturbed is not None:
         columns = np.zeros((3, len(blocks.weight), design.count + 1))
@@ -232,7 +232,8 @@ def _residual_noise(
         X /= np.maximum(np.linalg.norm(X, axis=(0, 1)), 1e-300)
         return noise_beside(X, columns[:, :, -1].T, blocks, settings, white, disturbed, weight)
     solved, free = _solve(design, observations, settings), max(3.0 * observations.samples - design.count, 1.0)
-    found = ResidualNoise.of(blocks, settings, solved.logarithms, solved.squares[:, None] / free, free, weight)
+    squares = solved.squares[:, None] / free
+    found = ResidualNoise.of(observations.blocks, settings, solved.logarithms, squares, free, weight)
     return replace(found, white_variance=found.white_variance * design.scale**2)
 
 

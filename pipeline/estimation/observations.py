@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.gauss_markov import Blocks, information
+from pipeline.estimation.gauss_markov import Blocks, fast, information, steady_s
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import Rows, reference_valid, rows_of
 from pipeline.model.effects import stated_priors
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 ROLES = ("accelerometer", "gyroscope", "static")
 BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
 SHORTEST_BLOCK_S = 4.0  # a fraction of the shortest correlation time of the grid
+MOST_BLOCKS = 600  # where the bias changes within longer ones: as many as give the right answers (docs/blind_study.md)
 FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # share of the largest rate that a filter may still hold of a doubtful one
 LONGEST_RESPONSE = 400  # samples
 # Variance of the angle's errors at a stop over that of noise, below which they stay noise: a gain in 2 log L by chance
@@ -75,6 +76,7 @@ class Observations:
     angle_deg: float = 0.0  # standard uncertainty of the angle at each stop; 0 where noise hides it
     levelling_deg: float = 0.0  # standard uncertainty of the table's level; 0: not stated
     white: float = 0.0  # standard deviation of a sample's white noise, mean of the axes; 0: not known
+    steady: float = float("inf")  # s; how long the bias may be taken as constant by its noise
 
     @cached_property
     def reading(self) -> Values:
@@ -120,10 +122,25 @@ class Observations:
     @cached_property
     def blocks(self) -> Blocks:
         """Short stretches of time in which the bias is taken as constant."""
-        span = sum(float(np.ptp(part.motion.time)) for part in self.parts)
+        return self._blocks(max(self._span / MOST_BLOCKS, min(self.steady, self._length)))
+
+    @cached_property
+    def long_blocks(self) -> Blocks:
+        """Longer stretches, so few that all three axes can have one dense covariance."""
+        return self._blocks(self._length)
+
+    @property
+    def _span(self) -> float:
+        return sum(float(np.ptp(part.motion.time)) for part in self.parts)
+
+    @property
+    def _length(self) -> float:
+        return max(SHORTEST_BLOCK_S, self._span / BLOCKS)
+
+    def _blocks(self, length: float) -> Blocks:
         apart = [not _follows(before, part) for before, part in zip([None, *self.parts], self.parts, strict=False)]
         rows = [(part.motion.time, part.weight) for part in self.parts]
-        return Blocks.of_rows(rows, np.cumsum(apart).tolist(), max(SHORTEST_BLOCK_S, span / BLOCKS))
+        return Blocks.of_rows(rows, np.cumsum(apart).tolist(), length)
 
     @property
     def clock_shared(self) -> bool:
@@ -169,7 +186,8 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
         if part.rounding is not None and white > 0.0:  # the noise r of the rate: 1 / (1 + r^2 / s^2) as much
             fewer = replace(fewer, weight=fewer.weight / (1.0 + part.rounding / white**2))  # the scatter is of rests
         parts.append(fewer)
-    found = replace(observations, parts=tuple(parts), white=white)
+    steady = min((steady_s(noise, part.interval) for part in parts if not fast(noise)), default=float("inf"))
+    found = replace(observations, parts=tuple(parts), white=white, steady=steady)
     lost = [_lost_at_stops(part, found).max(initial=0.0) for part in parts]
     return found if max(lost, default=0.0) > HIDDEN_ANGLE else replace(found, angle_deg=0.0)
 

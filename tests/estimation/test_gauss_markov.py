@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import dblquad
 
 from pipeline.estimation.gauss_markov import (
+    SLOW,
     Blocks,
     GaussMarkov,
     Prior,
@@ -14,8 +15,10 @@ from pipeline.estimation.gauss_markov import (
     Setting,
     block_covariance,
     orthonormal,
+    steady_s,
     variance_of_average,
 )
+from pipeline.records import Noise
 
 SETTINGS = [Setting(0.0, 1.0), Setting(0.1, 2.0), Setting(0.7, 60.0), Setting(5.0, 900.0), Setting(1.0, 0.3)]
 
@@ -111,3 +114,13 @@ def test_a_stated_instability_leaves_no_hypothesis_without_any() -> None:
     free = Prior().grid(1e-2)
     none = sum(np.exp(s.prior) for s in free if s.ratio == 0.0)
     assert none / sum(np.exp(s.prior) for s in free) == pytest.approx(0.9)
+
+
+def test_a_bias_counts_as_constant_while_its_spectrum_is_below_that_of_white_noise() -> None:
+    white, wander, tau, interval = 2.0, 3.0, 100.0, 0.1
+    noise = Noise(np.full(3, white), np.full(3, wander), tau, "static")
+    lags = np.arange(-200_000, 200_001) * 0.01  # s
+    frequency = 1.0 / (2.0 * steady_s(noise, interval))
+    spectrum = 0.01 * np.sum(wander**2 * np.exp(-np.abs(lags) / tau) * np.cos(2.0 * np.pi * frequency * lags))
+    assert spectrum == pytest.approx(SLOW * white**2 * interval, rel=0.01)
+    assert steady_s(Noise(np.full(3, white), np.zeros(3), tau, "static"), interval) == np.inf

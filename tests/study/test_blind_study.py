@@ -17,7 +17,7 @@ from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, SIZES, Case, draw
 from pipeline.study.run import judge, read_lines, say
-from pipeline.study.scores import exact, first_is_right, not_seen, outside_answered
+from pipeline.study.scores import exact, first_is_right, in_the_set, not_seen, outside_answered
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -155,3 +155,11 @@ def test_a_larger_study_reaches_its_goals(family: str, least: float, tmp_path: P
     ]
     assert len(found) >= 60
     assert np.mean(found) >= least
+
+
+@pytest.mark.parametrize("number", [6, 17])
+def test_the_answer_set_holds_the_truth_beside_a_large_wander(number: int) -> None:
+    # 6: without the drift, a random walk explains its signal. 17: the bias wanders within a block of 300.
+    case = draw("pairs_wander", number, 85)
+    (said,) = judge(case)
+    assert in_the_set({**case.to_json(), **said})
