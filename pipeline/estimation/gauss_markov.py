@@ -153,9 +153,12 @@ def steady_s(noise: Noise | None, interval: float) -> float:
     """Return how long a bias may be taken as constant, s: L with ``2 q L^2 / (pi^2 tau) = SLOW dt``.
 
     At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is ``SLOW`` times that of white noise, dt.
-    Above, white noise hides it. ``interval``: s, dt.
+    Above, white noise hides it. Without a static recording that shows slow wander, there is no bound. ``interval``:
+    s, dt.
     """
-    if noise is None or not np.any(noise.wander > 0) or not np.all(noise.white > 0):
+    if noise is None or noise.source != "static" or fast(noise):
+        return float("inf")
+    if not np.any(noise.wander > 0) or not np.all(noise.white > 0):
         return float("inf")
     ratio = float(np.mean((noise.wander / noise.white) ** 2))
     return float(np.pi * np.sqrt(0.5 * SLOW * noise.correlation_time * interval / ratio))

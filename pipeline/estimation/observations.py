@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.gauss_markov import Blocks, fast, information, steady_s
+from pipeline.estimation.gauss_markov import Blocks, information, steady_s
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import Rows, reference_valid, rows_of
 from pipeline.model.effects import stated_priors
@@ -186,7 +186,7 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
         if part.rounding is not None and white > 0.0:  # the noise r of the rate: 1 / (1 + r^2 / s^2) as much
             fewer = replace(fewer, weight=fewer.weight / (1.0 + part.rounding / white**2))  # the scatter is of rests
         parts.append(fewer)
-    steady = min((steady_s(noise, part.interval) for part in parts if not fast(noise)), default=float("inf"))
+    steady = min((steady_s(noise, part.interval) for part in parts), default=float("inf"))
     found = replace(observations, parts=tuple(parts), white=white, steady=steady)
     lost = [_lost_at_stops(part, found).max(initial=0.0) for part in parts]
     return found if max(lost, default=0.0) > HIDDEN_ANGLE else replace(found, angle_deg=0.0)

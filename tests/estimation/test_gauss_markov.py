@@ -124,3 +124,4 @@ def test_a_bias_counts_as_constant_while_its_spectrum_is_below_that_of_white_noi
     spectrum = 0.01 * np.sum(wander**2 * np.exp(-np.abs(lags) / tau) * np.cos(2.0 * np.pi * frequency * lags))
     assert spectrum == pytest.approx(SLOW * white**2 * interval, rel=0.01)
     assert steady_s(Noise(np.full(3, white), np.zeros(3), tau, "static"), interval) == np.inf
+    assert steady_s(Noise(np.full(3, white), np.full(3, wander), tau, "rests"), interval) == np.inf
