@@ -1,6 +1,6 @@
 """Compensation of a log as a stream: blocks are read, compensated and written one after the other.
 
-The format of the log gives the blocks and writes them (``pipeline.field_logs.text_output``, ``mcap_log``); all else is
+Each format of a log reads and writes its blocks (``pipeline.field_logs.text_output``, ``mcap_log``); all else is
 the same for all formats. Memory is bounded by the largest block; logs of other programs are held as a whole.
 """
 
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.field_logs.mcap_log import McapLog
-    from pipeline.field_logs.text_output import CsvLog, MessageLog
     from pipeline.model.compensation import Compensation
     from pipeline.records import Values
 
@@ -78,22 +76,6 @@ class LogProfile:
 
 
 @dataclass
-class Block:
-    """Samples of a log.
-
-    ``signals``: ``accelerometer`` and ``gyroscope``, (n, 3) arrays in g and deg/s, body axes; ``time``, s, and
-    ``temperature``, degC, (n,) arrays; absent signals are left out. ``file`` and, without lines, ``place`` stand in
-    messages. ``position``: bytes up to the end of the block. ``content``: what the format needs to write the block.
-    """
-
-    signals: dict[str, NDArray[Any]]
-    file: str
-    place: str
-    position: int
-    content: Any
-
-
-@dataclass
 class Result:
     """What was compensated with the calibration of ``unit``.
 
@@ -139,43 +121,62 @@ def compensate_log(
         If the log is damaged, cannot be read as the profile says, or would be overwritten; no output is left.
     """
     require_apart(source, target)
-    profile = profile or LogProfile()
-    checks, result = LogChecks(compensation.calibrated_range), Result(compensation.unit)
-    calibrated = {s for s in SENSORS if compensation.calibration(s) is not None}
+    profile, suffix = profile or LogProfile(), source.suffix.lower()
     with replacing(target) as out:
-        log: CsvLog | McapLog | MessageLog
-        if source.suffix.lower() == ".mcap":
+        if suffix == ".mcap":
             from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of both)
 
-            known = compensation.covariances
-            log = McapLog(source, out, profile, topic=topic, smoothing=smoothing, covariances=known)
-        else:
-            from pipeline.field_logs.text_output import CsvLog, MessageLog  # noqa: PLC0415
+            stream = LogStream(compensation, 0.0, progress)  # ``Temperatures`` smooths
+            return McapLog(source, out, profile, stream, topic, smoothing).compensate()
+        from pipeline.field_logs.text_output import CsvLog, compensate_messages  # noqa: PLC0415
 
-            is_text = source.suffix.lower() not in MESSAGE_FORMATS
-            log = (CsvLog if is_text else MessageLog)(source, out, profile, smoothing, block_bytes)
-        stream = compensation.stream(log.smoothing)
-        for block in log.blocks(stream.needs, checks):
-            given = {s: block.signals[s] for s in SENSORS if s in block.signals}
-            try:
-                found = stream.apply(**block.signals)
-            except PipelineError as error:
-                raise type(error)(error.message + block.place, block.file) from None
-            readings = {s: getattr(found, s) for s in given}
-            checks.add(given, readings, block.signals.get("time"), block.signals.get("temperature"))
-            log.write(block, readings, calibrated)
-            result.samples += len(next(iter(given.values())))
-            result.sensors = [s for s in SENSORS if s in {*result.sensors, *given}]
-            if progress is not None:
-                progress(result.samples, block.position)
-        result.warnings = checks.warnings(calibrated & set(result.sensors))
-        log.finish(result)
-    for sensor in SENSORS:
-        if sensor in calibrated and sensor not in result.sensors:
-            result.notes.append(f"the log holds no readings of the {sensor}, which is calibrated")
-        elif sensor in result.sensors and sensor not in calibrated:
-            result.notes.append(f"the calibration holds no {sensor}; its readings are unchanged")
-    return result
+        stream = LogStream(compensation, smoothing, progress)
+        if suffix in MESSAGE_FORMATS:
+            return compensate_messages(source, out, profile, stream)
+        return CsvLog(source, out, profile, stream).compensate(block_bytes)
+
+
+class LogStream:
+    """The samples of a log as they come: compensated, checked and counted."""
+
+    def __init__(
+        self, compensation: Compensation, smoothing: float, progress: Callable[[int, int], None] | None
+    ) -> None:
+        self.compensation, self.stream, self.progress = compensation, compensation.stream(smoothing), progress
+        self.calibrated = {s for s in SENSORS if compensation.calibration(s) is not None}
+        self.checks, self.result = LogChecks(compensation.calibrated_range), Result(compensation.unit)
+
+    def apply(self, signals: Mapping[str, NDArray[Any]], position: int, file: str, place: str = "") -> Readings:
+        """Return the calibrated readings of some samples.
+
+        ``signals``: ``accelerometer`` and ``gyroscope``, (n, 3) arrays in g and deg/s, body axes; ``time``, s, and
+        ``temperature``, degC, (n,) arrays; absent signals are left out. ``file`` and, without lines, ``place`` stand in
+        messages. ``position``: bytes up to the end of these samples.
+        """
+        given = {s: signals[s] for s in SENSORS if s in signals}
+        try:
+            found = self.stream.apply(**signals)
+        except PipelineError as error:
+            raise type(error)(error.message + place, file) from None
+        readings = {s: getattr(found, s) for s in given}
+        self.checks.add(given, readings, signals.get("time"), signals.get("temperature"))
+        self.result.samples += len(next(iter(given.values())))
+        self.result.sensors = [s for s in SENSORS if s in {*self.result.sensors, *given}]
+        if self.progress is not None:
+            self.progress(self.result.samples, position)
+        return readings
+
+    def finish(self, notes: Sequence[str]) -> Result:
+        """Return what was compensated, with notes on the log."""
+        result = self.result
+        result.warnings = self.checks.warnings(self.calibrated & set(result.sensors))
+        result.notes += notes
+        for sensor in SENSORS:
+            if sensor in self.calibrated and sensor not in result.sensors:
+                result.notes.append(f"the log holds no readings of the {sensor}, which is calibrated")
+            elif sensor in result.sensors and sensor not in self.calibrated:
+                result.notes.append(f"the calibration holds no {sensor}; its readings are unchanged")
+        return result
 
 
 def require_apart(source: Path, target: Path) -> None:

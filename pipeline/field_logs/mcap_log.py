@@ -17,7 +17,6 @@ import numpy as np
 from mcap.records import Channel, Metadata, Schema
 
 from pipeline.errors import IngestError, InputError
-from pipeline.field_logs.compensate import Block
 from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap_copy import McapCopy
 from pipeline.io.mcap_reader import McapReader
@@ -27,13 +26,11 @@ from pipeline.io.units import SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.log_motion import ExponentialRegression
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from mcap.records import McapRecord
 
-    from pipeline.field_logs.compensate import LogProfile, Output, Readings, Result
-    from pipeline.field_logs.log_checks import LogChecks
+    from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Result
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
     from pipeline.records import Integers, Values
@@ -47,32 +44,23 @@ METADATA = "imu_calibration"
 class McapLog:
     """An MCAP log and the log that is made of it."""
 
-    smoothing = 0.0  # ``Temperatures`` smooths
-
-    def __init__(
-        self,
-        source: Path,
-        out: Output,
-        profile: LogProfile,
-        *,
-        topic: str | None,
-        smoothing: float,
-        covariances: Mapping[str, Values],
+    def __init__(  # noqa: PLR0917  (of one call)
+        self, source: Path, out: Output, profile: LogProfile, stream: LogStream, topic: str | None, smoothing: float
     ) -> None:
-        self.source, self.profile, self.topic, self.covariances = source, profile, topic, covariances
+        self.source, self.profile, self.stream, self.topic, self.smoothing = source, profile, stream, topic, smoothing
         self.settings, self.copy = mcap_format(profile.ingest), McapCopy(out)
-        self.temperature_smoothing = smoothing
+        self.covariances = stream.compensation.covariances
         self.temperatures: Temperatures | None = None
         self.readings: TopicDecoder | None = None
         self.channels: dict[int, Channel] = {}  # of the readings' channels, those of the calibrated messages
         self.schema: Schema | None = None  # of the calibrated messages, where it is added
         self.origin_ns: int | None = None
 
-    def blocks(self, needs: set[str], checks: LogChecks) -> Iterator[Block]:
-        """Yield the readings run by run, and copy the runs."""
+    def compensate(self) -> Result:
+        """Copy the log run by run, with the calibrated readings of each run after it."""
         topic = self._named_topic()
-        if "temperature" in needs:
-            self.temperatures = Temperatures(self.settings, self.source, topic, self.temperature_smoothing)
+        if "temperature" in self.stream.stream.needs:
+            self.temperatures = Temperatures(self.settings, self.source, topic, self.smoothing)
         with self.source.open("rb") as stream:
             self.reader = McapReader(stream, str(self.source), allow_truncated=self.settings.allow_truncated)
             for run in self.reader.runs():
@@ -80,9 +68,14 @@ class McapLog:
                 if self.temperatures is not None:
                     self.temperatures.take(run.rows, self.reader)
                 for rows in run.rows:
-                    if self._holds_readings(rows, topic):
-                        yield self._block(rows)
-        self._check_topic(checks)
+                    if (decoder := self._decoder_of(rows, topic)) is not None:
+                        self._add_calibrated(rows, decoder)
+        if self.readings is None:
+            listed = ", ".join(text for _, text in listed_topics(self.reader))
+            message = f"no messages on {topic or f'a topic of type {IMU}'}; the file has {listed or 'none'}"
+            hint = "ingest.mcap.topics of a profile (--ingest) reads other types by their fields"
+            raise IngestError(message, str(self.source), code="missing_topic", hint=hint)
+        return self._finish(self.readings.topic)
 
     def _named_topic(self) -> str | None:
         """Return the topic that the profile names; None for the only Imu topic."""
@@ -98,26 +91,26 @@ class McapLog:
             raise IngestError(message, str(self.source), code="unsupported")
         return found[0]
 
-    def _holds_readings(self, rows: Rows, topic: str | None) -> bool:
-        """Return whether messages are the readings; the first Imu topic is them where the profile names none."""
+    def _decoder_of(self, rows: Rows, topic: str | None) -> TopicDecoder | None:
+        """Return the decoder of the readings; None of other messages. Without a name the first Imu topic holds them."""
         channel = self.reader.channels[rows.channel]
         is_imu = kind_of(channel.topic, self.reader.schemas.get(channel.schema_id), self.settings) == IMU
         if self.readings is None and (channel.topic == topic or (topic is None and is_imu)):
             kind = MAPPED if self.settings.topics else IMU
             self.readings = TopicDecoder(channel.topic, kind, self.settings, str(self.source))
         if self.readings is None or channel.topic == self.readings.topic:
-            return self.readings is not None
+            return self.readings
         if is_imu and topic is None:
             message = (
                 f"2 topics are of type {IMU}: {self.readings.topic}, {channel.topic}; choose one in "
                 "ingest.mcap.imu_topic"
             )
             raise IngestError(message, str(self.source), code="ambiguous")
-        return False
+        return None
 
-    def _block(self, rows: Rows) -> Block:
-        assert self.readings is not None  # noqa: S101  (``_holds_readings``)
-        batch = self.readings.read(rows, self.reader)
+    def _add_calibrated(self, rows: Rows, decoder: TopicDecoder) -> None:
+        """Add the calibrated messages of some readings."""
+        batch = decoder.read(rows, self.reader)
         time_ns = batch.times(rows)
         if self.origin_ns is None:
             self.origin_ns = int(time_ns[0]) if time_ns[0] > SINCE_1970_NS else 0
@@ -134,18 +127,13 @@ class McapLog:
             warmth = self.temperatures.at(rows.starts, signals["time"], warmth, self.origin_ns)
         if warmth is not None:
             signals["temperature"] = warmth
-        return Block(signals, str(self.source), f" ({rows.place})", self.reader.position, (rows, time_ns, turned))
-
-    def write(self, block: Block, readings: Readings, changed: set[str]) -> None:
-        """Add the calibrated messages of a block after its run."""
-        assert self.readings is not None  # noqa: S101  (it read the block)
-        rows, time_ns, turned = block.content
+        readings = self.stream.apply(signals, self.reader.position, str(self.source), f" ({rows.place})")
         channel, before = self._channel(rows.channel)
-        if self.readings.kind == MAPPED:
+        if decoder.kind == MAPPED:
             self.copy.add(new_imu(rows, readings, channel.id, time_ns, self.covariances), before, channel.id)
         else:
-            truths = {s: v for s, v in readings.items() if s in changed | turned}
-            copies = replaced(rows, self.readings.groups, truths, channel.id, self.covariances)
+            truths = {s: v for s, v in readings.items() if s in self.stream.calibrated | turned}
+            copies = replaced(rows, decoder.groups, truths, channel.id, self.covariances)
             self.copy.add(copies, before, channel.id)
 
     def _channel(self, source: int) -> tuple[Channel, list[McapRecord]]:
@@ -170,38 +158,27 @@ class McapLog:
         self.channels[source] = channel
         return channel, [*before, channel]
 
-    def _check_topic(self, checks: LogChecks) -> None:
-        """Refuse a log without readings, and note readings that this command has made."""
-        if self.readings is None:
-            listed = ", ".join(text for _, text in listed_topics(self.reader))
-            named = self._named_topic() or f"a topic of type {IMU}"
-            message = f"no messages on {named}; the file has {listed or 'none'}"
-            hint = "ingest.mcap.topics of a profile (--ingest) reads other types by their fields"
-            raise IngestError(message, str(self.source), code="missing_topic", hint=hint)
-        topic = self.readings.topic
-        made = {m.metadata.get("topic"): m.metadata.get("unit") for m in self.reader.metadata if m.name == METADATA}
-        if topic in made:
-            checks.compensated = f"topic {topic} was made by this command with unit {made[topic]}"
-        elif topic.endswith(SUFFIX):
-            checks.compensated = f"topic {topic} has the name of one that this command makes"
-
-    def finish(self, result: Result) -> None:
+    def _finish(self, topic: str) -> Result:
         """Write what was compensated with what, and what contradicts it, as metadata; then the summary."""
-        assert self.readings is not None  # noqa: S101  (``_check_topic``)
         reader, added = self.reader, list(self.channels.values())
+        made = {m.metadata.get("topic"): m.metadata.get("unit") for m in reader.metadata if m.name == METADATA}
+        if topic in made:
+            self.stream.checks.compensated = f"topic {topic} was made by this command with unit {made[topic]}"
+        elif topic.endswith(SUFFIX):
+            self.stream.checks.compensated = f"topic {topic} has the name of one that this command makes"
         schemas = [*reader.schemas.values(), *([self.schema] if self.schema else [])]
         taken = {c.id for c in added} & set(reader.channels)
         taken |= {self.schema.id} & set(reader.schemas) if self.schema else set()
         if taken:
             raise InputError(f"the log uses the id {min(taken)} itself, which the added topic needs", str(self.source))
+        notes = [f"{reader.truncated}; the output holds these"] if reader.truncated else []
+        notes += self.temperatures.notes() if self.temperatures is not None else []
+        result = self.stream.finish(notes)
         result.topic = added[-1].topic
-        entries = {"unit": result.unit, "topic": result.topic, "readings": self.readings.topic}
+        entries = {"unit": result.unit, "topic": result.topic, "readings": topic}
         self.copy.note(Metadata(name=METADATA, metadata={**entries, "warnings": "\n".join(result.warnings)}))
         self.copy.finish(schemas, [*reader.channels.values(), *added])
-        if reader.truncated:
-            result.notes.append(f"{reader.truncated}; the output holds these")
-        if self.temperatures is not None:
-            result.notes += self.temperatures.notes()
+        return result
 
 
 class Temperatures:

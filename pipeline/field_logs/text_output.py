@@ -18,7 +18,6 @@ from pyarrow import compute as pc
 from pyarrow import csv
 
 from pipeline.errors import InputError
-from pipeline.field_logs.compensate import Block
 from pipeline.field_logs.log_checks import DECIMALS
 from pipeline.io.arrow import text_scalar, times_as_decimals, to_arrow, to_numpy
 from pipeline.io.channel_table import in_house_unit
@@ -38,11 +37,9 @@ from pipeline.io.units import (
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
-    from pipeline.field_logs.compensate import LogProfile, Output, Readings, Result
-    from pipeline.field_logs.log_checks import LogChecks
+    from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Readings, Result
     from pipeline.io.ingest_settings import Column
     from pipeline.io.text_log import Head
     from pipeline.records import Integers, Values
@@ -52,9 +49,9 @@ SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 
 
 class CsvLog:
-    """A text log and the log that is made of it; ``smoothing`` of the temperature, s, as of ``Compensation.stream``."""
+    """A text log and the log that is made of it."""
 
-    def __init__(self, source: Path, out: Output, profile: LogProfile, smoothing: float, block_bytes: int) -> None:
+    def __init__(self, source: Path, out: Output, profile: LogProfile, stream: LogStream) -> None:
         formats = csv_formats(profile.ingest)
         if len(formats) > 1:
             raise InputError(
@@ -62,17 +59,15 @@ class CsvLog:
                 "or choose another profile by --ingest",
                 str(source),
             )
-        self.source, self.out, self.profile, self.settings = source, out, profile, formats[0]
-        self.smoothing, self.block_bytes = smoothing, block_bytes
+        self.source, self.out, self.profile, self.stream, self.settings = source, out, profile, stream, formats[0]
         self.columns = {c.channel: c for c in self.settings.columns}
         self.places: dict[str, list[int]] = {}  # of the columns of each signal
         self.origin = 0.0
-        self.notes: list[str] = []
 
-    def blocks(self, _needs: set[str], checks: LogChecks) -> Iterator[Block]:
-        """Yield the samples, and write the lines before them."""
+    def compensate(self, block_bytes: int) -> Result:
+        """Write the log with calibrated readings."""
         with self.source.open("rb") as raw:
-            log = TextLog(raw, str(self.source), self.settings, keep_open_line=True, block_bytes=self.block_bytes)
+            log = TextLog(raw, str(self.source), self.settings, keep_open_line=True, block_bytes=block_bytes)
             rows = 0
             for body, lines in log:
                 if rows == 0:
@@ -85,31 +80,27 @@ class CsvLog:
                     raise self._refusal(body, lines, str(error)) from None
                 if rows == 0:
                     readings = [cells[i] for s in SENSORS for i in self.places.get(s, [])]
-                    checks.check_decimals(readings, self.settings.decimal)
-                yield Block(signals, f"{self.source}:{lines[0]}", "", raw.tell(), (cells, b'"' in body))
+                    self.stream.checks.check_decimals(readings, self.settings.decimal)
+                calibrated = self.stream.apply(signals, raw.tell(), f"{self.source}:{lines[0]}")
+                self._replace(cells, signals, calibrated)
+                self.out.write(_lines_of(cells, self.layout.delimiter, quoted=b'"' in body))
                 rows += len(lines)
             if rows == 0:
                 self._begin(log.head)
-            self.notes = [note.detail for note in log.notes]
+            self.stream.result.sensors = [sensor for sensor in SENSORS if sensor in self.places]
+            return self.stream.finish([note.detail for note in log.notes])
 
-    def write(self, block: Block, readings: Readings, _changed: set[str]) -> None:
-        """Write the block with calibrated numbers instead of the raw ones; missing ones stay as they were written."""
-        columns, quoted = block.content
+    def _replace(self, columns: list[pa.Array], signals: Readings, readings: Readings) -> None:
+        """Put calibrated numbers in the place of the raw ones; missing ones stay as they were written."""
         for sensor, values in readings.items():
             for k, i in enumerate(self.places[sensor]):
                 text = pc.cast(to_arrow(np.round(values[:, k], DECIMALS) + 0.0), pa.string())
                 text = pc.replace_substring(text, ".", self.settings.decimal) if self.settings.decimal != "." else text
                 missing = ~np.isfinite(values[:, k])
                 if missing.any():
-                    written = pa.array(~np.isfinite(block.signals[sensor][:, k]))
+                    written = pa.array(~np.isfinite(signals[sensor][:, k]))
                     text = pc.if_else(pa.array(missing), pc.if_else(written, columns[i], ""), text)
                 columns[i] = text
-        self.out.write(_lines_of(columns, self.layout.delimiter, quoted=quoted))
-
-    def finish(self, result: Result) -> None:
-        """Add the notes on the text, and the sensors of a log without rows."""
-        result.sensors = [sensor for sensor in SENSORS if sensor in self.places]
-        result.notes += self.notes
 
     def _begin(self, head: Head | None) -> None:
         """Find the columns, and write the lines before the rows."""
@@ -186,48 +177,33 @@ class CsvLog:
         return out
 
 
-class MessageLog:
-    """A log of messages and the text that is made of it; ``smoothing`` of the temperature, s."""
+def compensate_messages(source: Path, out: Output, profile: LogProfile, stream: LogStream) -> Result:
+    """Write the readings of a log of messages, calibrated, as text."""
+    from pipeline.io.mcap import read_log  # noqa: PLC0415  (the decoder costs what a text log need not pay)
 
-    def __init__(self, source: Path, out: Output, profile: LogProfile, smoothing: float, _block_bytes: int) -> None:
-        self.source, self.out, self.profile, self.smoothing = source, out, profile, smoothing
-        self.notes: list[str] = []
-
-    def blocks(self, _needs: set[str], _checks: LogChecks) -> Iterator[Block]:
-        """Yield the samples, and write the header."""
-        from pipeline.io.mcap import read_log  # noqa: PLC0415  (the decoder costs what a text log need not pay)
-
-        table = read_log(self.source, mcap_format(self.profile.ingest))
-        self.notes = [f"{n.code}: {n.detail}" for n in table.notes]
-        readings = {
-            s: self.profile.to_body(s, np.column_stack([table.values[c] for c in triad]))
-            for s, triad in TRIADS.items()
-            if triad[0] in table.values
-        }
-        names = [c for s in readings for c in TRIADS[s]] + ["temperature"] * ("temperature" in table.values)
-        self.out.write((",".join(CANONICAL[c] for c in ("time", *names)) + "\n").encode())
-        origin = int(table.time_ns[0]) if table.time_ns[0] > SINCE_1970_NS else 0
-        for start in range(0, len(table.time_ns), BLOCK_ROWS):
-            rows = slice(start, start + BLOCK_ROWS)
-            signals = {s: v[rows] for s, v in readings.items()}
-            signals["time"] = (table.time_ns[rows] - origin) / 1e9
-            if "temperature" in table.values:
-                signals["temperature"] = table.values["temperature"][rows]
-            yield Block(signals, str(self.source), f" (row {start + 1})", 0, table.time_ns[rows])
-
-    def write(self, block: Block, readings: Readings, _changed: set[str]) -> None:
-        """Write the rows of a block with calibrated readings."""
+    table = read_log(source, mcap_format(profile.ingest))
+    origin = int(table.time_ns[0]) if table.time_ns[0] > SINCE_1970_NS else 0
+    signals = {
+        s: profile.to_body(s, np.column_stack([table.values[c] for c in triad]))
+        for s, triad in TRIADS.items()
+        if triad[0] in table.values
+    }
+    names = ["time", *(c for s in signals for c in TRIADS[s]), *(["temperature"] * ("temperature" in table.values))]
+    signals |= {"time": (table.time_ns - origin) / 1e9}
+    signals |= {"temperature": table.values["temperature"]} if "temperature" in table.values else {}
+    out.write((",".join(CANONICAL[c] for c in names) + "\n").encode())
+    for start in range(0, len(table.time_ns), BLOCK_ROWS):
+        block = {name: values[start : start + BLOCK_ROWS] for name, values in signals.items()}
+        readings = stream.apply(block, 0, str(source), f" (row {start + 1})")
         columns = [v for s in SENSORS if s in readings for v in readings[s].T]
-        columns += [block.signals["temperature"]] if "temperature" in block.signals else []
-        arrays = [times_as_decimals(block.content), *(to_arrow(np.round(v, DECIMALS) + 0.0) for v in columns)]
-        rows = pa.Table.from_arrays(arrays, [str(i) for i in range(len(arrays))])
+        columns += [block["temperature"]] if "temperature" in block else []
+        arrays = [times_as_decimals(table.time_ns[start : start + BLOCK_ROWS])]
+        arrays += [to_arrow(np.round(v, DECIMALS) + 0.0) for v in columns]
         sink = pa.BufferOutputStream()
+        rows = pa.Table.from_arrays(arrays, [str(i) for i in range(len(arrays))])
         csv.write_csv(rows, sink, csv.WriteOptions(include_header=False))
-        self.out.write(memoryview(sink.getvalue()))
-
-    def finish(self, result: Result) -> None:
-        """Add the notes of the reader."""
-        result.notes += self.notes
+        out.write(memoryview(sink.getvalue()))
+    return stream.finish([f"{n.code}: {n.detail}" for n in table.notes])
 
 
 def _index(column: Column, names: list[str]) -> int | None:
