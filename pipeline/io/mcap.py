@@ -53,7 +53,6 @@ class _Topic:
 
     decoder: TopicDecoder
     error: IngestError | None = None
-    recorder: bool = True  # whether the messages have times of the logger
     times: list[Integers] = field(default_factory=list)
     recorded: list[Integers] = field(default_factory=list)
     values: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
@@ -68,21 +67,20 @@ class _Topic:
             self.error = error
             return
         self.recorded.append(rows.heads["log_time"].astype(np.int64))
-        self.recorder = reader.has_recorder
         if batch.time_ns is not None:
             self.times.append(batch.time_ns)
         for name, column in batch.values.items():
             self.values.setdefault(name, []).append(column)
 
-    def series(self, settings: McapFormat, notes: list[Note]) -> ChannelTable:
-        """Return all messages in the order of their times."""
+    def series(self, settings: McapFormat, notes: list[Note], *, recorder: bool) -> ChannelTable:
+        """Return all messages in the order of their times; ``recorder``: whether the logger has times of its own."""
         if self.error is not None:
             raise self.error
         topic, path = self.decoder.topic, self.decoder.path
         values = {n: np.concatenate(self.values.pop(n)) for n in list(self.values)}
         recorded = np.concatenate(self.recorded)
         time = np.concatenate(self.times) if self.times else recorded
-        if not self.times and not self.recorder:
+        if not self.times and not recorder:
             message = f"topic {topic}: the format has no times of a recorder, which ingest.mcap.time_source asks for"
             raise IngestError(message, path, code="bad_time", hint="name the field of the time")
         if self.times:
@@ -90,7 +88,7 @@ class _Topic:
                 message = f"topic {topic}: all header stamps are 0; the sensor's own times are needed"
                 hint = "if the recorder's times are good enough, set ingest.mcap.time_source=log_time"
                 raise IngestError(message, path, code="bad_time", hint=hint)
-            check_plausible(topic, time, recorded, settings.clock_difference_s if self.recorder else None, path)
+            check_plausible(topic, time, recorded, settings.clock_difference_s if recorder else None, path)
         order, found = in_order(topic, time, list(values.values()), settings.reorder_s, path)
         notes += found
         if order is not None:
@@ -100,7 +98,9 @@ class _Topic:
         if self.decoder.varying:
             detail = f"messages on {topic} vary in length or texts, and those of one layout were decoded together"
             notes.append(Note("N-FALLBACK", self.decoder.varying, 0, 0, detail))
-        return ChannelTable(path, time, values, {"topic": topic, "rows": len(time)})
+        fields = self.decoder.fields.items()
+        counts = {c: 1.0 / abs(f.counts_per_unit) for c, f in fields if f.unit == COUNTS}
+        return ChannelTable(path, time, values, {"topic": topic, "rows": len(time)}, count_sizes=counts)
 
 
 class _Log:
@@ -110,7 +110,6 @@ class _Log:
         self.reader, self.path, self.settings = reader, reader.path, settings
         self.topics: dict[str, _Topic] = {}
         self.notes: list[Note] = []
-        self.count_sizes: dict[str, float] = {}
         self.table_logs: list[ChannelTable] = []  # of a table with a clock of its own
         self.end_ns = np.iinfo(np.int64).max  # the topics of a truncated file end at different times
 
@@ -120,20 +119,30 @@ class _Log:
             if topic is not None:
                 topic.read(rows, self.reader)
         self._note_container()
-        base, *others = (self._series(topic) for topic in self._chosen())
+        recorder = self.reader.has_recorder
+        base, *others = (t.series(self.settings, self.notes, recorder=recorder) for t in self._chosen())
         if self.settings.sensor_clock == OWN:
             base, others = self._slower_first(base, others)
-        values = dict(base.values)
+        values, counts = dict(base.values), dict(base.count_sizes)
         for series in others:
             values = self._at_rows(series, base) | values
-        self._check_finite(values, base)
+            counts |= series.count_sizes
+        for channel, numbers in values.items():
+            wrong = np.flatnonzero(~np.isfinite(numbers))
+            if wrong.size:
+                row = int(wrong[0])
+                message = (
+                    f"{channel} is {numbers[row]} at {base.time_ns[row] / 1e9:.9g} s ({wrong.size} such samples); "
+                    "finite numbers are expected"
+                )
+                raise IngestError(message, self.path, code="bad_message")
         ignored = [listed for name, listed in listed_topics(self.reader) if name not in self.topics]
         if ignored:
             self.notes.append(Note("N-IGNORED", len(ignored), 0, 0, f"topics not used: {', '.join(ignored)}"))
         time = base.time_ns[base.time_ns <= self.end_ns]
         values = {c: v[: len(time)] for c, v in values.items()}
         source = {"file": self.path, "sha256": self.reader.sha256, "rows": len(time)}
-        table = ChannelTable(self.path, time, values, source, None, self.count_sizes, tuple(self.notes))
+        table = ChannelTable(self.path, time, values, source, None, counts, tuple(self.notes))
         if self.table_logs:
             from pipeline.io.encoder_log import align  # noqa: PLC0415  (few logs need it)
 
@@ -187,20 +196,6 @@ class _Log:
         hint = "ingest.mcap.topics reads other types by their fields" if kind == IMU else ""
         raise IngestError(f"{what}; the file has {listed}", self.path, code="missing_topic", hint=hint)
 
-    def _series(self, topic: _Topic) -> ChannelTable:
-        fields = topic.decoder.fields.items()
-        self.count_sizes |= {c: 1.0 / abs(f.counts_per_unit) for c, f in fields if f.unit == COUNTS}
-        return topic.series(self.settings, self.notes)
-
-    def _temperature(self, series: ChannelTable, base: ChannelTable) -> Columns:
-        if np.array_equal(series.time_ns, base.time_ns):
-            return series.values
-        count = len(series.time_ns)
-        detail = f"temperature of {count} messages with stamps of their own, interpolated, held at the ends"
-        self.notes.append(Note("N-INTERPOLATED", len(base.time_ns), 0, 0, detail))
-        times, own = base.time_ns - base.time_ns[0], series.time_ns - base.time_ns[0]
-        return {n: np.interp(times, own, numbers) for n, numbers in series.values.items()}
-
     def _slower_first(self, base: ChannelTable, others: list[ChannelTable]) -> tuple[ChannelTable, list[ChannelTable]]:
         """Return the rows of the slower of two sensors with the averages of the faster one, and all else."""
         sensors = {triad[0] for triad in TRIADS.values()}
@@ -212,14 +207,12 @@ class _Log:
         topic = fast.source["topic"]
         rows = rows_covered(slow.time_ns, fast.time_ns, topic, self.path)
         values = {c: averaged(slow.time_ns, rows, fast.time_ns, v) for c, v in fast.values.items()}
-        for channel in fast.values:
-            self.count_sizes.pop(channel, None)
         lost = len(slow.time_ns) - len(rows)
         detail = f"{len(fast.time_ns)} messages on {topic} averaged over the intervals of {slow.source['topic']}"
         detail += f", {lost} of whose messages they do not cover" if lost else ""
         self.notes.append(Note("N-AVERAGED", len(rows), 0, 0, detail))
         values |= {c: v[rows] for c, v in slow.values.items()}
-        return replace(slow.select(rows), values=values), others
+        return replace(slow.select(rows), values=values), others  # an average of counts is no count
 
     def _at_rows(self, series: ChannelTable, base: ChannelTable) -> Columns:
         """Return the channels of a topic at the times of the rows; none of a table's with a clock of its own."""
@@ -227,9 +220,12 @@ class _Log:
         if self.settings.table_clock == OWN and channels <= set(TABLE_CHANNELS):  # aligned with the rows later
             self.table_logs.append(series)
             return {}
-        return self._temperature(series, base) if channels == {"temperature"} else self._matched(series, base)
-
-    def _matched(self, series: ChannelTable, base: ChannelTable) -> Columns:
+        if channels == {"temperature"} and not np.array_equal(series.time_ns, base.time_ns):
+            count = len(series.time_ns)
+            detail = f"temperature of {count} messages with stamps of their own, interpolated, held at the ends"
+            self.notes.append(Note("N-INTERPOLATED", len(base.time_ns), 0, 0, detail))
+            times, own = base.time_ns - base.time_ns[0], series.time_ns - base.time_ns[0]
+            return {n: np.interp(times, own, numbers) for n, numbers in series.values.items()}
         topic = series.source["topic"]
         index = np.minimum(np.searchsorted(series.time_ns, base.time_ns), len(series.time_ns) - 1)
         if self.reader.truncated:
@@ -252,17 +248,6 @@ class _Log:
             detail = f"messages on {topic} between the Imu's were not used"
             self.notes.append(Note("N-UNMATCHED", extra, 0, 0, detail))
         return {c: numbers[index] for c, numbers in series.values.items()}
-
-    def _check_finite(self, values: Columns, base: ChannelTable) -> None:
-        for channel, numbers in values.items():
-            wrong = np.flatnonzero(~np.isfinite(numbers))
-            if wrong.size:
-                row = int(wrong[0])
-                message = (
-                    f"{channel} is {numbers[row]} at {base.time_ns[row] / 1e9:.9g} s ({wrong.size} such samples); "
-                    "finite numbers are expected"
-                )
-                raise IngestError(message, self.path, code="bad_message")
 
     def _note_container(self) -> None:
         self.notes += self.reader.notes

@@ -141,7 +141,13 @@ def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
     if starts is None:
         starts, more = _followed(run.data, first)
         others += more
-    return others, _by_channel(run, data, starts)
+    heads = _heads(data, starts)
+    rows = []
+    for channel in np.unique(heads["channel"]).tolist():
+        own = heads["channel"] == channel
+        sizes = heads["length"][own].astype(np.int64) - MESSAGE_HEAD
+        rows.append(Rows(channel, data, heads[own], starts[own] + HEAD.itemsize, sizes, 0, run.name, run.offset))
+    return others, rows
 
 
 def _followed(
@@ -195,16 +201,6 @@ def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> Integers | None:
 
 def _heads(data: NDArray[np.uint8], starts: Integers) -> NDArray[np.void]:
     return np.asarray(sliding_window_view(data, HEAD.itemsize)[starts].view(HEAD)[:, 0])
-
-
-def _by_channel(run: Run, data: NDArray[np.uint8], starts: Integers) -> list[Rows]:
-    heads = _heads(data, starts)
-    rows = []
-    for channel in np.unique(heads["channel"]).tolist():
-        own = heads["channel"] == channel
-        sizes = heads["length"][own].astype(np.int64) - MESSAGE_HEAD
-        rows.append(Rows(channel, data, heads[own], starts[own] + HEAD.itemsize, sizes, 0, run.name, run.offset))
-    return rows
 
 
 class _Content(ReadDataStream):

@@ -80,11 +80,7 @@ class MessageReader:
 
 
 class McapReader(MessageReader):
-    """One pass over an MCAP file.
-
-    ``allow_truncated``: whether the complete chunks of a file without end are read. ``chunks``: byte at which each
-    begins. ``position``: bytes read so far.
-    """
+    """One pass over an MCAP file; ``allow_truncated``: whether the complete chunks of a file without end are read."""
 
     def __init__(self, stream: BinaryIO, path: str, *, allow_truncated: bool = False) -> None:
         super().__init__(path)
@@ -95,8 +91,8 @@ class McapReader(MessageReader):
         self.header: Header | None = None
         self.attachments: list[Attachment] = []
         self.metadata: list[Metadata] = []
-        self.chunks: list[int] = []
-        self.position = 0
+        self.chunks: list[int] = []  # byte at which each begins
+        self.position = 0  # bytes read so far
         self._statistics: Statistics | None = None
         self._chunk_index: list[int] = []  # bytes at which chunks begin, by the summary
         self._crc, self._sha = 0, hashlib.sha256()

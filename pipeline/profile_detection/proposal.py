@@ -51,20 +51,15 @@ Entries = dict[str, dict[str, Any]]
 
 @dataclass
 class Proposal:
-    """A proposed profile.
+    """A proposed profile; ``???`` stands for what has to be filled in."""
 
-    ``files``: of a recording in parts, the file of each. ``csv``: the section without columns. ``columns``: of each
-    part, channel to its entry; ``???`` stands for what has to be filled in. ``evidence``: by key of ``csv``, ``time``,
-    sensor or channel. ``remarks``: what has to be decided, or is odd. ``seen``: of each part, column to what it holds.
-    """
-
-    files: list[str]
+    files: list[str]  # of a recording in parts, the file of each
     logs: list[Log]
-    csv: dict[str, Any]
-    columns: list[Entries]
-    evidence: dict[str, str]
-    seen: list[dict[str | int, str]]
-    remarks: list[str] = field(default_factory=list)
+    csv: dict[str, Any]  # the section without columns
+    columns: list[Entries]  # of each part, channel to its entry
+    evidence: dict[str, str]  # by key of ``csv``, ``time``, sensor or channel
+    seen: list[dict[str | int, str]]  # of each part, column to what it holds
+    remarks: list[str] = field(default_factory=list)  # what has to be decided, or is odd
 
     @property
     def parts(self) -> list[str]:
@@ -107,28 +102,22 @@ def propose(logs: Sequence[Log], sensor: dict[str, Any] | None = None) -> list[P
 
     ``sensor``: its configuration, where the user states one; counts that the log does not tell are taken from it.
     """
-    found = [find_columns(log) for log in logs]
+    recordings: list[list[Columns]] = []  # of one file each, or of two with the same times and one sensor each
+    for columns in map(find_columns, logs):
+        other = next((parts for parts in recordings if len(parts) == 1 and _belong_together(parts[0], columns)), None)
+        if other is None:
+            recordings.append([columns])
+        else:
+            other.append(columns)
     proposals: list[Proposal] = []
-    for columns in _joined(found):
-        new = _proposal(columns, sensor or {})
+    for parts in recordings:
+        new = _proposal(parts, sensor or {})
         twin = next((p for p in proposals if _alike(p, new)), None)
         if twin is None:
             proposals.append(new)
         else:
             _fill_in(twin, new)
     return proposals
-
-
-def _joined(found: list[Columns]) -> list[list[Columns]]:
-    """Return the columns of each recording: of one file, or of two with the same times and one sensor each."""
-    out: list[list[Columns]] = []
-    for columns in found:
-        other = next((g for g in out if len(g) == 1 and _belong_together(g[0], columns)), None)
-        if other is None:
-            out.append([columns])
-        else:
-            other.append(columns)
-    return out
 
 
 def _belong_together(one: Columns, two: Columns) -> bool:
@@ -145,16 +134,12 @@ def _alike(one: Proposal, two: Proposal) -> bool:
         return False
     if [log.names for log in one.logs] == [log.names for log in two.logs] and one.csv == two.csv:
         return True
-    if one.csv.get("header") is not True or _without_delimiter(one) != _without_delimiter(two):
+    if one.csv["header"] is not True or one.csv | {"delimiter": None} != two.csv | {"delimiter": None}:
         return False
     first, second = one.columns[0], two.columns[0]
     shared = first.keys() & second.keys()
     other = [entry for c, entry in {**first, **second}.items() if c not in shared]
     return all(first[c]["column"] == second[c]["column"] for c in shared) and all(e.get("optional") for e in other)
-
-
-def _without_delimiter(proposal: Proposal) -> dict[str, Any]:
-    return {key: value for key, value in proposal.csv.items() if key != "delimiter"}
 
 
 def _fill_in(proposal: Proposal, other: Proposal) -> None:

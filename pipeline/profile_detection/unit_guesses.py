@@ -47,16 +47,12 @@ FEWEST_RESTS_FOR_A_SPHERE = 9  # twice the four unknowns, and one
 
 @dataclass(frozen=True)
 class Guess:
-    """What may be said of a column.
+    """What may be said of a column."""
 
-    ``entry`` of a profile; ``???`` stands for what has to be filled in. ``second_s``: length of a time's unit in s.
-    ``centre``: (3,), of the sphere on which rests lie, offset and bias; zeros where it is not known.
-    """
-
-    entry: dict[str, Any]
+    entry: dict[str, Any]  # of a profile; ``???`` stands for what has to be filled in
     evidence: str
-    second_s: float | None = None
-    centre: Values = field(default_factory=lambda: np.zeros(3))
+    second_s: float | None = None  # length of a time's unit
+    centre: Values = field(default_factory=lambda: np.zeros(3))  # of the sphere on which rests lie: offset and bias
 
 
 def whole(values: Values) -> bool:
