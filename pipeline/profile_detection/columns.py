@@ -36,21 +36,9 @@ AXIS_WORDS = ("x", "y", "z", "0", "1", "2", "3")
 SENSOR_WORDS = {
     "accelerometer": {"a", "ac", "acc", "accl", "accel", "accelerometer", "acceleration", "f", "force"},
     "gyroscope": {
-        "g",
-        "gy",
-        "gyr",
-        "gyro",
-        "gyroscope",
-        "w",
-        "om",
-        "omega",
-        "rotation",
-        "rot",
-        "angular",
-        "rate",
-        "rates",
+        "g", "gy", "gyr", "gyro", "gyroscope", "w", "om", "omega", "rotation", "rot", "angular", "rate", "rates",
     },
-}
+}  # fmt: skip
 NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
 TIME_FIRST = {
     "t", "ts", "sec", "secs", "ms", "us", "ns", "msec", "usec", "nsec", "tow", "utc", "epoch", "elapsed", "date",
