@@ -74,20 +74,18 @@ class _Columns:
             raise Problem(f"units have no column {column!r}{nearest(column, self.known)}")
         return str(self.of_unit[unit].get(column, ""))
 
-    def units(self, names: Any) -> list[str]:  # noqa: ANN401  (the user's)
-        if not isinstance(names, list):
-            raise Problem(f"a list of units is expected, got {names!r}")
-        for name in map(str, names):
+    def select(self, wanted: Any, among: Sequence[str]) -> list[str]:  # noqa: ANN401  (the user's)
+        """Return the units of a list of names, or those whose columns have the values of a mapping."""
+        if isinstance(wanted, dict):
+            values = {str(c): _names(v) for c, v in wanted.items()}
+            return [u for u in among if all(self.cell(u, c) in those for c, those in values.items())]
+        if not isinstance(wanted, list):
+            form = "columns and their values, for example {method: staged}"
+            raise Problem(f"a list of units is expected, or {form}, got {wanted!r}")
+        for name in map(str, wanted):
             if name not in self.of_unit:
                 raise Problem(f"no unit {name!r} in units.csv{nearest(name, self.of_unit)}")
-        return [str(n) for n in names]
-
-    def select(self, where: Any, among: Sequence[str]) -> list[str]:  # noqa: ANN401  (the user's)
-        """Return the units whose columns have the values of ``where``."""
-        if not isinstance(where, dict):
-            raise Problem(f"columns and their values are expected, for example {{method: staged}}, got {where!r}")
-        wanted = {str(c): _names(v) for c, v in where.items()}
-        return [u for u in among if all(self.cell(u, c) in values for c, values in wanted.items())]
+        return [str(n) for n in wanted]
 
 
 def _comparison(entry: Any, number: int, columns: _Columns) -> JSON:  # noqa: ANN401  (the user's)
@@ -123,15 +121,13 @@ def _groups(entry: JSON, columns: _Columns) -> list[JSON]:
     among, content = columns.select(entry.get("where") or {}, list(columns.of_unit)), entry[given[0]]
     if given[0] == "by":
         groups = _by(_names(content), str(entry.get("x", "")), among, columns)
-    elif given[0] == "units":
-        groups = [_group(unit, [unit]) for unit in columns.units(content)]
-    elif isinstance(content, dict):
-        found = {
-            str(n): columns.select(g, among) if isinstance(g, dict) else columns.units(g) for n, g in content.items()
-        }
-        groups = [_group(name, units) for name, units in found.items()]
     else:
-        raise Problem(f"groups: a mapping of names to units or columns is expected, got {content!r}")
+        if given[0] == "units":
+            content = {unit: [unit] for unit in columns.select(content, among)}
+        if not isinstance(content, dict):
+            raise Problem(f"groups: a mapping of names to units or columns is expected, got {content!r}")
+        found = {str(name): columns.select(wanted, among) for name, wanted in content.items()}
+        groups = [{"name": name, "series": "", "label": name, "units": units} for name, units in found.items()]
     seen: dict[str, str] = {}
     for group in groups:
         if not group["units"]:
@@ -154,7 +150,7 @@ def _by(names: list[str], x: str, among: list[str], columns: _Columns) -> list[J
         if all(values):
             found.setdefault(values, []).append(unit)
     return [
-        _group(", ".join(v), units) | {"series": ", ".join(v[:along] + v[along + 1 :]), "label": v[along]}
+        {"name": ", ".join(v), "series": ", ".join(v[:along] + v[along + 1 :]), "label": v[along], "units": units}
         for v, units in found.items()
     ]
 
@@ -172,10 +168,6 @@ def _x(column: str, members: list[str], by: list[str], columns: _Columns) -> JSO
         if not math.isfinite(values[unit]):
             raise Problem(f"x: unit {unit} has {text!r} in column {column!r}, which is no number")
     return {"label": column, "values": values, "named": column not in by}
-
-
-def _group(name: str, units: list[str]) -> JSON:
-    return {"name": name, "series": "", "label": name, "units": units}
 
 
 def _names(value: Any) -> list[str]:  # noqa: ANN401  (the user's)

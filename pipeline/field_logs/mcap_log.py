@@ -176,7 +176,7 @@ class McapLog:
         result = self.stream.finish(notes)
         result.topic = added[-1].topic
         entries = {"unit": result.unit, "topic": result.topic, "readings": topic}
-        self.copy.note(Metadata(name=METADATA, metadata={**entries, "warnings": "\n".join(result.warnings)}))
+        self.copy.add_record(Metadata(name=METADATA, metadata={**entries, "warnings": "\n".join(result.warnings)}))
         self.copy.finish(schemas, [*reader.channels.values(), *added])
         return result
 

@@ -194,7 +194,10 @@ def _refine(sensed: SensorSignals, signals: Signals, offset: float) -> ClockFit:
         if abs(change[0]) + abs(change[1]) * sensed.time[-1] < ROUNDING_S:
             break
     floor = RESOLVED * signals.interval * np.array([1.0, 1.0 / max(sensed.time[-1], 1e-9)])
-    spread = np.hypot(_standard_uncertainties(J, e, sensed), floor)
+    inverse = np.linalg.lstsq(np.linalg.qr(J, mode="r"), np.eye(2), rcond=None)[0]
+    by_blocks = [_uncertainties_by_blocks(J, e, sensed, inverse @ inverse.T, length) for length in BLOCKS_S]
+    spread = np.max([np.linalg.norm(inverse, axis=1) * np.sqrt(np.mean(e**2)), *by_blocks], axis=0)
+    spread = np.hypot(spread, floor)
     return ClockFit(d, k, float(spread[0]), float(spread[1]), middle, correlation)
 
 
@@ -226,16 +229,7 @@ def _linearised(
     return np.concatenate(derivatives), np.concatenate(residuals), weight, correlation
 
 
-def _standard_uncertainties(J: Values, e: Values, sensed: SensorSignals) -> Values:
-    R = np.asarray(np.linalg.qr(J, mode="r"))
-    inverse = np.linalg.lstsq(R, np.eye(2), rcond=None)[0]
-    found: Values = np.linalg.norm(inverse, axis=1) * np.sqrt(np.mean(e**2))
-    for length in BLOCKS_S:
-        found = np.maximum(found, _by_blocks(J, e, sensed, inverse @ inverse.T, length))
-    return found
-
-
-def _by_blocks(J: Values, e: Values, sensed: SensorSignals, covariance: Values, length: float) -> Values:
+def _uncertainties_by_blocks(J: Values, e: Values, sensed: SensorSignals, covariance: Values, length: float) -> Values:
     channels = sensed.readings.shape[1]
     starts = np.flatnonzero(np.diff(np.floor(sensed.time / length), prepend=-1.0))
     scores = np.add.reduceat((J * e[:, None]).reshape(channels, len(sensed.time), 2).sum(axis=0), starts)

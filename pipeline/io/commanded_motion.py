@@ -42,7 +42,10 @@ def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) ->
     """
     pause = {"rest_s": BEFORE_S}
     commanded = Program([pause, *_flat(program), pause])
-    fit = fit_clocks(table, _as_log(table, commanded))
+    own = np.arange(0.0, commanded.duration, STEP_S)
+    angle, rate, *_ = commanded.at(own)
+    log = {"table_angle": angle, "table_rate": rate}
+    fit = fit_clocks(table, ChannelTable(table.path, np.rint(own * 1e9).astype(np.int64), log, table.source))
     t = seconds_of(table)
     placed = _place(table, commanded, t, fit.table_time(t))
     angle, rate, *_ = commanded.at(placed.tau(t))
@@ -113,13 +116,6 @@ def _flat(program: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
     for step in program:
         for _ in range(int(step.get("repeat", 1))):
             yield from _flat(step["steps"]) if "repeat" in step else [step]
-
-
-def _as_log(table: ChannelTable, program: Program) -> ChannelTable:
-    own = np.arange(0.0, program.duration, STEP_S)
-    angle, rate, *_ = program.at(own)
-    values = {"table_angle": angle, "table_rate": rate}
-    return ChannelTable(table.path, np.rint(own * 1e9).astype(np.int64), values, table.source)
 
 
 @dataclass(frozen=True)

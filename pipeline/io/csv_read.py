@@ -88,8 +88,18 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
         for body, lines in log:
             reader.add(body, lines)
         rows = reader.rows(checks)
+    values, count_sizes = {}, {}
+    for column, index in rows.layout.columns:
+        if column.channel != "time":
+            numbers = rows.numbers[index]
+            values[column.channel] = in_house_unit(column, numbers)
+            if column.unit == COUNTS and bool(np.all(numbers == np.rint(numbers))):
+                count_sizes[column.channel] = 1.0 / abs(column.counts_per_unit)
+    source = {"file": log.path, "sha256": log.sha256}
     try:
-        table = in_order(_converted(log, rows, times_of(rows, settings)), rows, settings, checks)
+        time_ns = times_of(rows, settings)
+        table = ChannelTable(log.path, time_ns, values, source, rows.lines, count_sizes, rows.notes)
+        table = in_order(table, rows, settings, checks)
     except IngestError as error:
         raise also(rows.refused, error) if rows.refused else error from None
     if rows.refused:
@@ -99,19 +109,6 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
         return table
     detail = f"no time column: rows counted at {settings.rate_hz:g} Hz"
     return replace(table, notes=(*table.notes, Note("N-SYNTHTIME", len(table.time_ns), 0, 0, detail)))
-
-
-def _converted(log: TextLog, rows: Rows, time_ns: Integers) -> ChannelTable:
-    """Return the rows of a log with their numbers in the units of the package."""
-    values, count_sizes = {}, {}
-    for column, index in rows.layout.columns:
-        if column.channel != "time":
-            numbers = rows.numbers[index]
-            values[column.channel] = in_house_unit(column, numbers)
-            if column.unit == COUNTS and bool(np.all(numbers == np.rint(numbers))):
-                count_sizes[column.channel] = 1.0 / abs(column.counts_per_unit)
-    source = {"file": log.path, "sha256": log.sha256}
-    return ChannelTable(log.path, time_ns, values, source, rows.lines, count_sizes, rows.notes)
 
 
 def also(first: IngestError, second: IngestError) -> IngestError:
@@ -267,17 +264,13 @@ class _RowReader:
         ):
             dropped = [f for f in others if (f.kind != "not_finite") == finite]
             if dropped:
-                detail = f"{what}, each a gap; the longest run is {_longest_run(dropped)} long; the first: "
+                lines = [f.line for f in dropped]
+                ends = np.flatnonzero(np.diff([*lines, lines[-1] + 2]) > 1)
+                longest = int(np.diff(ends, prepend=-1).max())  # lines that follow each other directly
+                detail = f"{what}, each a gap; the longest run is {longest} long; the first: "
                 detail += dropped[0].message
                 notes.append(Note(code, len(dropped), dropped[0].line, dropped[-1].line, detail))
         return notes, len(others), None
-
-
-def _longest_run(faults: list[Fault]) -> int:
-    """Return how many bad lines follow each other directly at most."""
-    lines = [f.line for f in faults]
-    ends = np.flatnonzero(np.diff([*lines, lines[-1] + 2]) > 1)
-    return int(np.diff(ends, prepend=-1).max())
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:

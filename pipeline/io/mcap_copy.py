@@ -128,16 +128,15 @@ class McapCopy:
             compression=self.compression, data=_compressed(data, self.compression), uncompressed_size=len(data),
             uncompressed_crc=zlib.crc32(data), message_start_time=int(times.min()), message_end_time=int(times.max()),
         )  # fmt: skip
-        written = bytes_of([chunk])
-        self._record(written[:RECORD_HEAD], written[RECORD_HEAD:])
+        self.add_record(chunk)
         for channel, (log_times, starts) in entries.items():
             table = np.stack([log_times.astype("<u8"), starts.astype("<u8")], axis=1).tobytes()
             content = struct.pack("<HI", channel, len(table)) + table
             self._record(struct.pack("<BQ", Opcode.MESSAGE_INDEX, len(content)), content)
 
-    def note(self, metadata: Metadata) -> None:
-        """Add a record of metadata."""
-        written = bytes_of([metadata])
+    def add_record(self, record: McapRecord) -> None:
+        """Add a record of the data section."""
+        written = bytes_of([record])
         self._record(written[:RECORD_HEAD], written[RECORD_HEAD:])
 
     def finish(self, schemas: Sequence[Schema], channels: Sequence[Channel]) -> None:

@@ -55,11 +55,6 @@ class Field:
     type: str
     count: int | None = None
 
-    @property
-    def sequence(self) -> bool:
-        """Whether the number of values is sent before them."""
-        return self.count == _SEQUENCE
-
 
 Definitions = dict[str, tuple[Field, ...]]
 
@@ -264,7 +259,7 @@ class _LayoutFinder:
 
     def field(self, item: Field, path: str, depth: int) -> None:
         self.count()
-        count = self.length() if item.sequence else item.count
+        count = self.length() if item.count == _SEQUENCE else item.count
         if count is not None and count > len(self.sample):
             raise ValueError(f"{path} claims {count} elements in a message of {len(self.sample)} bytes")
         if item.type in NUMBERS:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.channel_table import ChannelTable
     from pipeline.io.ingest_settings import Checks
-    from pipeline.records import Index, Integers, Mask, Note, Values
+    from pipeline.records import Index, Integers, Mask, Note
 
 GAP, CLIPPED, STUCK, REPAIRED = np.uint16(1), np.uint16(2), np.uint16(4), np.uint16(8)  # bits of ``Recording.flags``
 GAP_INTERVALS = 1.5  # half way to one missing sample
@@ -109,26 +109,18 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
                 f"ingest.csv.columns.{channel}.unit or sensor.{sensor}.full_scale"
             )
             raise IngestError(message, table.place(row), code="beyond_full_scale")
-        rows = np.flatnonzero(_at_rail(size, full_scale, count))
+        # Many sensors read on past their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth: a
+        # largest value beyond it that occurs more than once is a rail too.
+        clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (size <= (1.0 + BEYOND) * full_scale)
+        at_largest = size >= size.max() - 1.5 * count
+        if size.max() > full_scale and at_largest.sum() > 1:
+            clipped |= at_largest
+        rows = np.flatnonzero(clipped)
         if rows.size:
             flags[rows] |= CLIPPED
             detail = f"{channel} reaches the full scale of {full_scale:g} {SENSOR_UNITS[sensor]} and may be clipped"
             notes.append(table.note("N-CLIP", rows, detail))
     return notes
-
-
-def _at_rail(size: Values, full_scale: float, count: float) -> Mask:
-    """Return which sizes lie at full scale, or at a largest value beyond it that occurs more than once.
-
-    Many sensors read on past their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth.
-    """
-    clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (size <= (1.0 + BEYOND) * full_scale)
-    largest = size.max()
-    if largest > full_scale:
-        at_largest = size >= largest - 1.5 * count
-        if at_largest.sum() > 1:
-            clipped |= at_largest
-    return np.asarray(clipped)
 
 
 def find_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
