@@ -103,11 +103,7 @@ class Campaign:
 def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     """Load and check a campaign; raises ``ConfigurationError`` with one message for everything that is wrong.
 
-    Parameters
-    ----------
-    settings : mapping
-        What ``snakemake --config`` gave: ``campaign``, ``results``, ``overrides``, ``unit_overrides``,
-        ``python_effects``.
+    ``settings`` are those of ``snakemake --config``, as named below.
     """
     valid = ("campaign", "results", "overrides", "unit_overrides", PYTHON)
     unknown = sorted(set(settings) - set(valid))

@@ -64,14 +64,8 @@ OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone
 class Composer:
     """Composes configurations for the units of one campaign.
 
-    Raises ``ConfigurationError`` if an effect of the user's own is not as it should be.
-
-    Parameters
-    ----------
-    campaign : Path
-        The campaign's directory; its ``configs/<group>/*.yaml`` are options too, its ``effects/*.yaml`` effects.
-    python_effects : sequence of str
-        Python files with effects that the command line names.
+    The files ``configs/<group>/*.yaml`` of the campaign's directory are options too, its ``effects/*.yaml`` effects, as
+    are the Python files that the command line names. ``ConfigurationError``: one of them is not as it should be.
     """
 
     def __init__(self, campaign: Path, python_effects: Sequence[str] = ()) -> None:

@@ -104,21 +104,11 @@ def compensate_log(
 ) -> Result:
     """Compensate a log: MCAP by its suffix ``.mcap``, the formats of ``MESSAGE_FORMATS`` by theirs, else text.
 
-    Parameters
-    ----------
-    profile : LogProfile, optional
-        By default the canonical CSV, or the only Imu topic.
-    topic : str, optional
-        Of the calibrated messages in an MCAP log; that of the readings and ``_calibrated`` by default.
-    smoothing : float, s
-        Memory of the line through the temperature's past; 0 takes the temperature as it is.
-    progress : callable, optional
-        Called with the samples done and the bytes read.
-
-    Raises
-    ------
-    InputError
-        If the log is damaged, cannot be read as the profile says, or would be overwritten; no output is left.
+    ``profile``: by default the canonical CSV, or the only Imu topic. ``topic``: of the calibrated messages in an MCAP
+    log; that of the readings and ``_calibrated`` by default. ``smoothing``: memory of the line through the
+    temperature's past, s; 0 takes the temperature as it is. ``progress`` is called with the samples done and the bytes
+    read. ``InputError``: the log is damaged, cannot be read as the profile says, or would be overwritten; no output is
+    left.
     """
     require_apart(source, target)
     profile, suffix = profile or LogProfile(), source.suffix.lower()

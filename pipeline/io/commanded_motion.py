@@ -70,15 +70,9 @@ class Program:
     A turn by the angle D at the rate r with acceleration a ramps for r/a, holds r and ramps down; where |D| < r^2/a it
     never reaches r, and the ramps meet in the middle.
 
-    Attributes
-    ----------
-    steps : list of dict
-        ``{rest_s}`` and ``{turn_deg, rate_dps, acceleration_dps2}``.
-    knots : (1 + 4 n, 4) array
-        Time t_k (s), angle A_k (deg), rate W_k (deg/s) and acceleration a_k (deg/s^2); four rows for each of n moves.
-    stops : (n + 1,) array, deg
-        Angles before each move and after the last.
-    duration : float, s
+    ``steps``: ``{rest_s}`` and ``{turn_deg, rate_dps, acceleration_dps2}``. ``knots``: (1 + 4 n, 4) array of time t_k
+    (s), angle A_k (deg), rate W_k (deg/s) and acceleration a_k (deg/s^2), four rows for each of n moves. ``stops``:
+    (n + 1,) array of the angles before each move and after the last, deg. ``duration``: in s.
     """
 
     def __init__(self, steps: Iterable[Mapping[str, Any]]) -> None:

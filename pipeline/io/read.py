@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import os
 from dataclasses import replace
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,14 +19,14 @@ from pipeline.errors import IngestError, MissingInputError
 from pipeline.io.channel_table import STRAIGHT, axis_maps, to_body_axes
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.io.encoder_log import unwrapped
-from pipeline.io.files import MESSAGE_FORMATS, candidate_files, recording_files
+from pipeline.io.files import MESSAGE_FORMATS, candidate_files
 from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_format
 from pipeline.io.quality_flags import examine
 from pipeline.io.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording, rate_of_attitude
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
     from pipeline.errors import InputError
@@ -44,39 +43,39 @@ def read_recordings(
 ) -> list[Recording]:
     """Read all recordings of a unit, in the order of the procedure; optional ones that do not exist are left out.
 
-    Parameters
-    ----------
-    procedure, ingest, sensor : mapping
-        Sections of the unit's configuration.
-    folder : Path
-        Where the unit's recordings lie.
-
-    Raises
-    ------
-    MissingInputError
-        If files that are not optional do not exist; one error names all.
-    InputError
-        If files cannot be used; ``file`` holds the path of the first, and line where there is one.
+    ``procedure``, ``ingest`` and ``sensor`` are sections of the unit's configuration. Raises ``MissingInputError`` if
+    files that are not optional do not exist, ``InputError`` if files cannot be used; one error names all.
     """
-    files = recording_files(procedure, ingest, folder)
-    wanted = candidate_files(procedure, ingest)
-    refused = _missing(procedure, files, wanted, folder)
-    checks, formats = checks_of(ingest), cache(lambda: csv_formats(ingest))
-    recordings = []
-    for name, paths in files.items():
-        there = [f for c in wanted[name] for f in c if os.path.exists(f"{folder}/{f}")]  # noqa: PTH110  (fast)
-        other = [f for f in there if folder / f not in paths]
+    checks, layouts = checks_of(ingest), csv_formats(ingest) if ingest.get("csv") else None
+    found, missing = set[str](), list[str]()
+    recordings: list[Recording] = []
+    refused: list[InputError] = []
+    for name, candidates in candidate_files(procedure, ingest).items():
         entry = procedure["recordings"][name]
+        there = [[f for f in files if os.path.exists(f"{folder}/{f}")] for files in candidates]  # noqa: PTH110  (fast)
+        files, wanted = next(((f, c) for f, c in zip(there, candidates, strict=True) if f), ([], []))
+        if not files:
+            missing += [] if entry.get("optional", False) else [f"{name} (tried {_tried(candidates)})"]
+            continue
+        found.add(name)
+        if files != wanted:
+            missing += [f"{name} ({file})" for file in wanted if file not in files]
+            continue
         try:
-            table = read_table(paths, ingest, formats, entry.get("session"))
+            table = read_table([folder / f for f in files], ingest, layouts, entry.get("session"))
             recording = to_recording(name, entry, table, sensor, checks)
         except IngestError as error:
             refused.append(error)
             continue
+        other = [f for existing in there for f in existing if f not in files]
         if other:
             detail = f"{', '.join(other)} exists too and was not read"
             recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(other), 0, 0, detail)))
         recordings.append(recording)
+    if missing:
+        reason = "" if folder.is_dir() else "; the folder does not exist"
+        message = f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, found)}"
+        refused.insert(0, MissingInputError(message, str(folder)))
     if refused:
         first, *others = refused
         if others:
@@ -91,10 +90,10 @@ def read_recordings(
 def read_table(
     paths: Sequence[Path],
     ingest: Mapping[str, Any],
-    formats: Callable[[], list[CsvFormat]] | None = None,
+    layouts: Sequence[CsvFormat] | None = None,
     session: int | None = None,
 ) -> ChannelTable:
-    """Read the file or files of one recording, by their suffix; ``formats`` returns ``csv_formats(ingest)``.
+    """Read the file or files of one recording, by their suffix; ``layouts`` are ``csv_formats(ingest)``.
 
     ``session``: which part, from 1, of a text log that was restarted.
     """
@@ -106,34 +105,11 @@ def read_table(
 
     if paths[0].suffix == ".gcsv":
         return read_gcsv(paths[0], checks_of(ingest))
-    layouts = formats() if formats else csv_formats(ingest)
+    layouts = layouts or csv_formats(ingest)
     if session is None:
         return read_csv(paths, layouts, checks_of(ingest))
     table = read_csv(paths, [f.model_copy(update={"session": session}) for f in layouts], checks_of(ingest))
     return replace(table, source={**table.source, "session": session})
-
-
-def _missing(
-    procedure: Mapping[str, Any], files: dict[str, list[Path]], wanted: Mapping[str, list[list[str]]], folder: Path
-) -> list[InputError]:
-    """Return an error that names all missing files; recordings that lack a part are taken out of ``files``."""
-    missing, incomplete = [], []
-    for name, candidates in wanted.items():
-        if name not in files:
-            if not procedure["recordings"][name].get("optional", False):
-                missing.append(f"{name} (tried {_tried(candidates)})")
-            continue
-        taken = next(c for c in candidates if any(folder / f in files[name] for f in c))
-        lacking = [f"{name} ({f})" for f in taken if folder / f not in files[name]]
-        missing += lacking
-        incomplete += [name] if lacking else []
-    if not missing:
-        return []
-    reason = "" if folder.is_dir() else "; the folder does not exist"
-    message = f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, files)}"
-    for name in incomplete:
-        files.pop(name)
-    return [MissingInputError(message, str(folder))]
 
 
 def _tried(candidates: Sequence[Sequence[str]]) -> str:
@@ -147,7 +123,7 @@ def _tried(candidates: Sequence[Sequence[str]]) -> str:
     return ", ".join(texts)
 
 
-def _of_one_sensor(procedure: Mapping[str, Any], files: Mapping[str, list[Path]]) -> str:
+def _of_one_sensor(procedure: Mapping[str, Any], files: Collection[str]) -> str:
     """Return how a unit with one sensor is described, where all recordings of one sensor are missing."""
     entries = procedure["recordings"].items()
     there = {sensor: [n in files for n, e in entries if e["role"] == sensor] for sensor in TRIADS}

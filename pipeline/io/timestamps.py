@@ -211,12 +211,9 @@ def blocks_error(table: ChannelTable, code: str) -> IngestError | None:
 
 
 def rows_covered(slow: Integers, fast: Integers, topic: str, path: str) -> Index:
-    """Return the messages of the slower sensor whose whole interval the faster one covers without a gap.
+    """Return the messages of the slower sensor whose whole interval the faster one, on ``topic``, covers without a gap.
 
-    Raises
-    ------
-    IngestError
-        If there are none; ``topic`` is that of the faster sensor.
+    ``IngestError``: there are none.
     """
     found = np.zeros(0, np.intp)
     if len(slow) >= FEWEST and len(fast) >= FEWEST:
