@@ -154,7 +154,7 @@ def test_bias_and_scale_agree_with_those_that_the_authors_published(shipped: Ben
     assert np.abs(16384 * np.array(found["accelerometer"]["bias"]) - AUTHORS["bias"]).max() < 21
     force, rate = (np.diag(found[name]["matrix"]) / AUTHORS[name] - 1 for name in ("accelerometer", "gyroscope"))
     assert np.abs(force).max() < 6e-4
-    assert np.abs(rate[1:]).max() < 7e-4
+    assert np.abs(rate[1:]).max() < 9e-4
     assert rate[0] == pytest.approx(-0.017, abs=1e-3)  # their moves hold clipped readings of x
 
 
