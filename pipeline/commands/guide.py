@@ -12,14 +12,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.commands import parser_of
-from pipeline.commands.readings import campaign_of, config_of_log, recordings_of_files
+from pipeline.commands.readings import campaign_of, config_of_log, grouped, recordings_of_files
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.io.files import MESSAGE_FORMATS, recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
-from pipeline.planning.guide import MOST, Turn, in_words, most_informative_turn, next_face_or_turn, progress_of, propose
+from pipeline.planning.guide import (
+    MOST,
+    Turn,
+    default_goal,
+    in_words,
+    most_informative_turn,
+    next_face_or_turn,
+    progress_of,
+    propose,
+)
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.rests import WINDOW_S, find_rests
 from pipeline.simulation.description import BY_HAND
@@ -35,7 +44,6 @@ if TYPE_CHECKING:
 POLL_S = 1.0  # between two looks at a growing log: short against a rest
 STILL_RESTING_S = 1.0  # from a rest's end to that of the log, below which the rest may go on
 FIRST = Turn(0, 2, 180.0)  # about x, while nothing of the gyroscope is known
-WANDERS = 2.0  # bias wanders in the default goal: a calibration says nothing of the bias of another hour to less (95 %)
 EPILOG = """\
 The next rest is the one that reduces the uncertainty of the accelerometer's calibration most. The goal is reached when
 the largest expanded uncertainty (95 %) of the bias, in mg, and of the matrix, in mg at 1 g, is below --goal. With
@@ -66,7 +74,8 @@ class Source:
             procedure = self.config["procedure"]
             found = recording_files(procedure, self.config["ingest"], self.folder)
             return {name: (_whole(procedure["recordings"][name]), files) for name, files in found.items()}
-        return {f.stem: ({"role": "rests", "axis": None}, [f]) for f in self.files if f.exists()}
+        groups = [group for group in grouped(self.files, self.config["ingest"]) if all(f.exists() for f in group)]
+        return {group[0].stem: ({"role": "rests", "axis": None}, group) for group in groups}
 
     def read(self, *, growing: bool) -> list[Recording]:
         """Return the recordings; of a growing log the complete rows or chunks."""
@@ -89,14 +98,18 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(argv)
     source = _source(arguments)
     sensor_config = source.config["sensor"]["accelerometer"]
-    goal = 1e-3 * arguments.goal if arguments.goal is not None else WANDERS * float(sensor_config["bias_wander"])
+    gravity = float(source.config["table"].get("gravity_g") or 1.0)
+    goal = 1e-3 * arguments.goal if arguments.goal else default_goal(sensor_config, gravity, arguments.dwell)
     goals = Goals(goal, arguments.gyroscope_goal)
+    if arguments.goal is None and not source.config["procedure"].get("faces"):
+        name = source.config["sensor"]["name"]
+        print(f"goal: {1e3 * goal:g} mg, what 24 rests 45 deg apart reach with the noise of the sensor file {name}")
     if not arguments.follow:
         missing = [str(f) for f in source.files if not f.exists()]
         if missing:
             raise ConfigurationError(f"there is no file {', '.join(missing)}; --follow waits for one")
         advice = _advice(source.read(growing=False), source.config, goals, arguments.dwell)
-        print("\n".join([*advice.rests, *advice.words]))
+        print("\n".join([*(rest.text for rest in advice.rests), *advice.words]))
         return 0
     try:
         _follow(source, goals, arguments.dwell)
@@ -110,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("files", type=Path, nargs="+", metavar="RECORDING", help="recordings of one unit, made by hand")
     add("--follow", action="store_true", help="read the log while it grows, until the goal is reached (Ctrl-C ends it)")
-    wanted = "wanted expanded uncertainty, mg (default: twice the bias wander in the sensor's file)"
+    wanted = "wanted expanded uncertainty, mg (default: what orientations_24 reaches with the noise of the sensor file)"
     add("--goal", type=float, metavar="MG", help=wanted)
     wanted = "wanted expanded uncertainty of the gyroscope's matrix (default: only the accelerometer is guided)"
     add("--gyroscope-goal", type=float, metavar="PERCENT", help=wanted)
@@ -165,11 +178,25 @@ def _complete_rows(file: Path, folder: Path) -> Path:
     return copy
 
 
+class RestLine(NamedTuple):
+    """What is printed of a rest."""
+
+    recording: str
+    start: float  # s
+    used: bool
+    text: str
+
+    def told_in(self, advice: Advice) -> bool:
+        """Return whether an advice has the same rest; more of the log may shift its start and its number."""
+        same = (rest for rest in advice.rests if (rest.recording, rest.used) == (self.recording, self.used))
+        return any(abs(rest.start - self.start) < WINDOW_S for rest in same)
+
+
 class Advice(NamedTuple):
     """Return the messages on the recordings so far."""
 
     enough: bool
-    rests: list[str]  # a line each
+    rests: list[RestLine]
     words: list[str]
 
 
@@ -186,8 +213,13 @@ def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goal
         return Advice(done, [], words)
     progress = progress_of(recordings, config, dwell)
     rows = zip(progress.rests, progress.up, progress.held_out, strict=True)
-    lines = [f"{k:>4}  {_described(*pair, up, held=held)}" for k, (pair, up, held) in enumerate(rows, start=1)]
-    lines += [f"   -  {r.name} {r.time[rest.start]:.1f} s: left out: {rest.reason}" for r, rest in progress.left_out]
+    lines = [
+        RestLine(r.name, r.time[rest.start], used=True, text=f"{k:>4}  {_described(r, rest, up, held=held)}")
+        for k, ((r, rest), up, held) in enumerate(rows, start=1)
+    ]
+    for r, rest in progress.left_out:
+        text = f"   -  {r.name} {r.time[rest.start]:.1f} s: left out: {rest.reason}"
+        lines.append(RestLine(r.name, r.time[rest.start], used=False, text=text))
     done, words = _next(progress, goals.accelerometer, dwell)
     if done and goals.gyroscope is not None:
         done, words = _next_turn(recordings, config, progress, goals.gyroscope, dwell)
@@ -259,18 +291,14 @@ def _follow(source: Source, goals: Goals, dwell: float) -> None:
         if problem and problem != waiting:
             print(f"waiting: {problem}", flush=True)
         waiting = problem
-        if advice is not None and (told is None or len(advice.rests) != len(told.rests) or _new(advice, told)):
-            known = len(told.rests) if told is not None and len(told.rests) <= len(advice.rests) else 0
-            print("\n".join([*advice.rests[known:], *advice.words]) + bell, flush=True)
-            told = advice
-            if advice.enough:
-                return
+        if advice is not None:
+            new = [rest.text for rest in advice.rests if told is None or not rest.told_in(told)]
+            if new or told is None or (not advice.rests and advice.words != told.words):
+                print("\n".join([*new, *advice.words]) + bell, flush=True)
+                told = advice
+                if advice.enough:
+                    return
         time.sleep(POLL_S)
-
-
-def _new(advice: Advice, told: Advice) -> bool:
-    """Return whether there are messages on faces and turns, beside those on rests."""
-    return not advice.rests and advice.words != told.words
 
 
 def _without_last_rest(recording: Recording, dwell: float) -> Recording:

@@ -19,6 +19,13 @@ n - 1: rests are added one by one, and each planned rest is exchanged for a bett
 ``log(1 + J F^-1 J^T / s^2)``. The attitudes are the 26 in which a face, an edge or a corner of the case points up,
 since a person finds them by a few words.
 
+The goal, where none is given, is what the 24 orientations of ``orientations_24`` reach by the sensor file:
+
+    F = J^T (s^2 I + sum_c q^2 (n_c n_c^T) * R)^-1 J,    R_ij = exp(-|t_i - t_j| / tau)
+
+with white noise s of the mean of a rest, bias wander q and tau, rests one after the other, and the vertical n_i in the
+body.
+
 Faces and turns (procedure ``ferraris``): each of the six faces needs a rest, and each body axis a turn by the stated
 angle from rest to rest; where turns are held out, enough of them that one is. They are recognised as in the fit.
 
@@ -182,6 +189,20 @@ def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dw
         expanded=expanded,
         reason=reason,
     )
+
+
+def default_goal(sensor_config: Mapping[str, Any], gravity: float, dwell: float) -> float:
+    """Return the largest U that ``orientations_24`` reaches by the noise of the sensor file, g, to two digits."""
+    angle = np.radians(np.arange(0.0, 360.0, 45.0))
+    turn = gravity * np.column_stack([np.zeros(8), np.cos(angle), np.sin(angle)])
+    up = np.concatenate([np.roll(turn, axis, axis=1) for axis in range(3)])
+    time = dwell * np.arange(len(up))
+    R = np.exp(-np.abs(time[:, None] - time) / float(sensor_config["wander_time_s"]))
+    white = float(sensor_config["noise_density"]) ** 2 / (2.0 * dwell)
+    C = white * np.eye(len(up)) + (float(sensor_config["bias_wander"]) / gravity) ** 2 * (up @ up.T) * R
+    J = derivative_of(up, IDEAL)
+    variance = np.diag(np.linalg.inv(J.T @ np.linalg.solve(C, J)))
+    return float(f"{coverage_factor(len(up) - J.shape[1]) * np.sqrt(np.max(variance)):.2g}")
 
 
 def derivative_of(y: Values, values: Values) -> Values:

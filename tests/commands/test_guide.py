@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 from pipeline.__main__ import main
@@ -79,6 +80,42 @@ def test_a_growing_log_is_followed_until_it_is_enough(
     numbers = [int(line.split()[0]) for line in lines if line.startswith("   ") and line.split()[0].isdigit()]
     assert numbers == sorted(set(numbers))  # each rest once
     assert out.count("next: ") > 3
+
+
+def test_a_rest_that_is_left_out_is_told_once_and_hides_no_later_one(
+    rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header, *rows = rests.read_text().splitlines()
+    table = np.array([row.split(",")[:7] for row in rows], float)
+    leans = (table[:, 0] - table[0, 0] > 16.6) & (table[:, 0] - table[0, 0] < 20.6)
+    table[leans, 1] += np.linspace(-0.1, 0.1, np.count_nonzero(leans))
+    lines = [",".join(header.split(",")[:7]), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    log, sizes = tmp_path / "log.csv", iter(range(100, len(lines), 60))
+    monkeypatch.setattr(guide.time, "sleep", lambda _: log.write_text("\n".join(lines[: next(sizes)]) + "\n"))
+    assert main(["guide", str(log), "--sensor", "mpu6050", "--goal", "0.9", "--follow"]) == 0
+    told = capsys.readouterr().out.splitlines()
+    left_out = [line for line in told if "left out" in line]
+    assert len(left_out) == len(set(left_out)) >= 1
+    starts = [line.split()[2] for line in told if line[:4].strip().isdigit()]
+    assert len(starts) == len(set(starts))
+    assert len(starts) > 12  # the rests after it
+    assert told[-1] == "enough: the goal is reached"
+
+
+def test_a_log_of_two_files_is_guided_by_its_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(3)
+    rests = [np.tile(up, (90, 1)) for up in (*np.eye(3), *-np.eye(3))]
+    force = np.concatenate([part for rest in rests for part in (rest, rng.standard_normal((10, 3)))])
+    force += 1e-3 * rng.standard_normal(force.shape)
+    for name, counts in (("accelerometer", 32768 + 4070 * force), ("gyroscope", 32768 + 0 * force)):
+        np.savetxt(tmp_path / f"{name}.txt", np.column_stack([0.05 * np.arange(len(force)), counts]), fmt="%.2f")
+    profile = ["--ingest", "xsens_mti_multi_position"]
+    assert main(["guide", str(tmp_path / "accelerometer.txt"), *profile]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("goal: 0.4 mg, what 24 rests 45 deg apart reach with the noise of the sensor file generic")
+    assert "   1  accelerometer 0.5 to 4." in out
+    assert main(["guide", str(tmp_path / "accelerometer.txt"), str(tmp_path / "gyroscope.txt"), *profile]) == 0
+    assert capsys.readouterr().out == out
 
 
 def test_faces_and_turns_that_lack_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

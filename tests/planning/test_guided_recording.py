@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations, product
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.planning.guide import TURNS_DEG, Turn, attitudes, in_words, most_informative_turn, progress_of, propose
+from pipeline.planning.guide import (
+    TURNS_DEG,
+    Turn,
+    attitudes,
+    default_goal,
+    in_words,
+    most_informative_turn,
+    progress_of,
+    propose,
+)
 from pipeline.records import Recording, SensorCalibration
 from pipeline.simulation.description import read_config
 
@@ -25,7 +35,7 @@ WHITE, RATE, DWELL = 8e-4, 20.0, 4.0
 AXES = {f"{s}{a}": sign * np.eye(3)[i] for i, a in enumerate("xyz") for s, sign in (("+", 1.0), ("-", -1.0))}
 
 
-def recorded(attitudes: Sequence[Any], rng: np.random.Generator) -> Recording:
+def recorded(attitudes: Sequence[Any], rng: np.random.Generator, white: float = WHITE) -> Recording:
     """Return rests in the attitudes, of a sensor with a bias and scale factors, and quick moves between them."""
     force = []
     for up in attitudes:
@@ -33,7 +43,7 @@ def recorded(attitudes: Sequence[Any], rng: np.random.Generator) -> Recording:
         still = np.tile(np.asarray(up) / np.linalg.norm(up), (int((DWELL + 0.5) * RATE), 1))
         force.append(np.concatenate([shaken, still]))
     reading = np.array([0.03, -0.02, 0.01]) + np.concatenate(force) * [1.01, 0.99, 1.005]
-    reading += WHITE * rng.standard_normal(reading.shape)
+    reading += white * rng.standard_normal(reading.shape)
     time = np.round(np.arange(len(reading)) / RATE * 1e9).astype(np.int64)
     return Recording("recording", "rests", None, time, accelerometer=reading)
 
@@ -73,6 +83,24 @@ def test_a_plan_is_as_good_as_a_design_that_is_known_to_be_optimal() -> None:
     assert _largest(done) < 1.3 * _largest(icosahedron)
     random = [_largest(rng.standard_normal((12, 3))) for _ in range(200)]
     assert _largest(done) < np.quantile(random, 0.02)
+
+
+@pytest.mark.parametrize("sensor", ["mpu6050", "stim300", "bmi270"])
+def test_the_default_goal_is_what_24_rests_45_deg_apart_give(sensor: str) -> None:
+    sheets, angles = read_config("sensor", sensor), np.radians(np.arange(8) * 45.0)
+    sheet = sheets["accelerometer"]
+    turns = [np.roll([0.0, np.cos(a), np.sin(a)], axis) for axis in range(3) for a in angles]
+    found = []
+    for seed in range(6):
+        rng = np.random.default_rng([4, seed])
+        quiet = recorded(turns, rng, white=sheet["noise_density"] * np.sqrt(RATE / 2))
+        assert quiet.accelerometer is not None
+        keep, wander = np.exp(-1 / RATE / sheet["wander_time_s"]), [rng.standard_normal(3)]
+        for step in np.sqrt(1 - keep**2) * rng.standard_normal((quiet.samples - 1, 3)):
+            wander.append(keep * wander[-1] + step)
+        log = replace(quiet, accelerometer=quiet.accelerometer + sheet["bias_wander"] * np.array(wander))
+        found.append(progress_of([log], {**SETTINGS, "sensor": sheets}, DWELL).expanded)
+    assert default_goal(sheet, 1.0, DWELL) == pytest.approx(np.median(found), rel=0.25)
 
 
 def test_the_number_of_rests_and_the_uncertainty_come_true() -> None:
