@@ -13,7 +13,7 @@ from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import read_effect_files, register
 from pipeline.planning.changes import Gain, best_changes, helps_most
-from pipeline.planning.plan import plan_of, plan_text, side_by_side
+from pipeline.planning.plan import plan_of, plan_text
 from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description
 
 if TYPE_CHECKING:
@@ -47,8 +47,7 @@ def main(argv: Sequence[str]) -> int:
         print(json.dumps({**document, **more}, indent=1))
         return 0
     helps = helps_most(gains)
-    lines = plan_text(document) if second is None else side_by_side(document, second)
-    print("\n".join([*lines, *(["", *helps] if helps else [])]))
+    print("\n".join([*plan_text(document, second), *(["", *helps] if helps else [])]))
     return 0
 
 

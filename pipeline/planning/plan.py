@@ -30,7 +30,7 @@ from pipeline.model.effects.base import unit_of
 from pipeline.model.sensor_file import assumed_figures
 from pipeline.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
 from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
-from pipeline.report.numbers import aligned
+from pipeline.report.pages import template
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, course_of, read_config
 
@@ -215,33 +215,23 @@ def _warnings(simulated: SimulatedProcedure, sensor: str) -> list[str]:
     return found
 
 
-def plan_text(document: Mapping[str, Any]) -> list[str]:
-    """Return a plan (``plan_of``) as lines."""
-    lines = [_heading(document), *(f"note: {text}" for text in document["warnings"])]
-    for sensor in SENSORS:
-        lines += ["", *_of_sensor(sensor, document[sensor])]
-    return lines
+def plan_text(document: Document, second: Document | None = None) -> list[str]:
+    """Return a plan (``plan_of``) as lines, or two plans side by side."""
+    text: str = template("plan.txt").render(
+        first=document,
+        second=second,
+        sensors=SENSORS,
+        rows=_rows,
+        hidden=lambda part: [[entry["effect"], entry["reason"]] for entry in part["not_observable"]],
+        both=_compared,
+    )
+    return text.splitlines()
 
 
-def _heading(document: Mapping[str, Any]) -> str:
-    """Return what is planned, as a line."""
-    what = f"{document['sensor']} on {document['table']}, {document['procedure']}"
-    where = " at the table" if document["at_a_table"] else ""
-    return f"{what}: {document['minutes']:.1f} min{where}, {document['samples']} samples"
-
-
-def _of_sensor(sensor: str, part: Mapping[str, Any]) -> list[str]:
-    if part["reason"]:
-        return [f"{sensor}: nothing can be planned: {part['reason']}"]
-    noise, unit = part["noise"], part["unit"]
-    lines = [f"{sensor} (noise {noise['white']:.2g} {unit} a sample, bias wander {noise['wander']:.2g} {unit})"]
+def _rows(part: Mapping[str, Any]) -> list[list[str]]:
+    """Return what is planned of a sensor as a table; nothing where no effect is observable."""
     head = ["effect", "smallest size", "of limit", "similar signal", "note"]
-    if part["effects"]:
-        lines += aligned([head, *(_row(entry) for entry in part["effects"])])
-    if part["not_observable"]:
-        lines.append("  not observable:")
-        lines += aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
-    return lines
+    return [head, *(_row(entry) for entry in part["effects"])] if part["effects"] else []
 
 
 def _row(entry: Mapping[str, Any]) -> list[str]:
@@ -279,31 +269,16 @@ def share_text(value: float | None) -> str:
     return f"{100.0 * value:.2g} %" if value >= 1e-3 else "< 0.1 %"
 
 
-def side_by_side(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
-    """Return two plans as lines, side by side."""
-    lines = [f"A: {_heading(first)}", f"B: {_heading(second)}"]
-    a, b = first["course"], second["course"]
-    lines += [f"   {name}: {a[name]} in A, {b[name]} in B" for name in a if a[name] != b[name]]
-    for name, document in (("A", first), ("B", second)):
-        lines += [f"note on {name}: {text}" for text in document["warnings"]]
-    for sensor in SENSORS:
-        lines += ["", sensor, *_compared(first[sensor], second[sensor])]
-    return lines
-
-
-def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
-    reasons = [f"  {n}: nothing can be planned: {p['reason']}" for n, p in (("A", first), ("B", second)) if p["reason"]]
+def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[list[str]]:
+    """Return what two plans say of a sensor as a table; nothing where no effect is known."""
     a, b = ({entry["effect"]: entry for entry in part["effects"]} for part in (first, second))
-    rows = [["effect", "smallest in A", "of limit", "smallest in B", "of limit", "B / A"]]
+    rows = []
     hidden = {e["effect"] for part in (first, second) for e in part["not_observable"]}
     for name in sorted(a.keys() | b.keys() | hidden):
         cells = [name]
         for found in (a.get(name), b.get(name)):
-            cells += (
-                [size_text(found["smallest"], found["unit"]), share_text(found["share_of_limit"])]
-                if found
-                else ["-", ""]
-            )
+            known = [size_text(found["smallest"], found["unit"]), share_text(found["share_of_limit"])] if found else []
+            cells += known or ["-", ""]
         both = name in a and name in b
         rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
-    return [*reasons, *(aligned(rows) if len(rows) > 1 else [])]
+    return [["effect", "smallest in A", "of limit", "smallest in B", "of limit", "B / A"], *rows] if rows else []

@@ -13,19 +13,20 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
-from pipeline.report.numbers import measured, number, percent, percent_change, plain, probability, typeset, unit_text
+from pipeline.report import numbers
 from pipeline.report.parameters import monte_carlo_of, parameter_texts, stage_details
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
 
 FOLDER = Path(__file__).parent / "templates"
+OF_NUMBERS = ("aligned", "measured", "number", "percent", "percent_change", "probability", "typeset")  # filters
 PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # of a campaign's page
 
 
 def _figure(value: object) -> str:
     """Return a number for a cell, empty where there is none."""
-    return number(value) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
+    return numbers.number(value) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
 
 
 @cache
@@ -37,10 +38,10 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    functions = (number, measured, percent, percent_change, probability, typeset, parameter_texts)
-    environment.filters |= {function.__name__: function for function in functions}
-    environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text, "numeric": "#{}".format}
-    environment.filters |= {"script_data": script_data, "details": stage_details, "monte_carlo": monte_carlo_of}
+    environment.filters |= {name: getattr(numbers, name) for name in OF_NUMBERS}
+    environment.filters |= {"words": numbers.plain, "figure": _figure, "unit": numbers.unit_text}
+    environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
+    environment.filters |= {"script_data": script_data, "numeric": "#{}".format}
     environment.globals |= {"asset": asset, "unit_link": unit_link}
     return environment
 
