@@ -16,9 +16,9 @@ import pandas as pd
 from pipeline.outcome import VERDICTS, findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart
-from pipeline.report.fleet import Table
+from pipeline.report.fleet import parameter_table, wide
 from pipeline.report.held_out_section import FAR
-from pipeline.report.numbers import number, percent, plain
+from pipeline.report.numbers import number, percent, plain, unit_text
 from pipeline.report.pages import script_data, template
 from pipeline.report.summary import COLUMNS
 
@@ -46,7 +46,7 @@ def render(
     *,
     twins: Sequence[tuple[Sequence[str], Sequence[Sequence[str]]]] = (),
     statistics: JSON | None = None,
-    placed: Table | None = None,
+    parameters: pd.DataFrame | None = None,
     history: JSON | None = None,
     settings: JSON | None = None,
     published: Collection[str] | None = None,
@@ -65,7 +65,7 @@ def render(
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     fleet = [told for sensor in SENSORS for told in _fleet_figure(sensor, frame)]
-    plots = strips(rows, placed or Table.of({row["unit"]: {} for row in rows}, 2))
+    plots = strips(rows, parameter_table({}) if parameters is None else parameters)
     text: str = template("campaign.html").render(
         campaign=campaign,
         published=published,
@@ -225,7 +225,7 @@ ROW, LEFT = 17, 130  # px
 SPREAD, HALF = 0.6, 0.42  # of a row: over which the units stand in their order, and half of its bar's height
 
 
-def strips(rows: Sequence[JSON], placed: Table) -> list[Told]:
+def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[Told]:
     """Return the strip plots of a campaign, each with the text of its dots.
 
     ``rows``: one a unit, as of ``summary_row``, in the order of the page; ``placed``: of ``against_limits``, value and
@@ -238,22 +238,21 @@ def strips(rows: Sequence[JSON], placed: Table) -> list[Told]:
     out: list[Told] = []
     units = [row["unit"] for row in rows]
     for (model, method), members in siblings.items():
-        values, limits = placed.some([units[i] for i in members])
-        for sensor in SENSORS:
-            own = [name for name in values if name.startswith(sensor)]
-            known = values[own].notna().any(axis="columns").to_numpy(bool)
-            if known.sum() >= FEWEST_SIBLINGS:
-                title = f"{sensor.capitalize()}, {model}, {plain(method)}"
-                shown = Table([values.loc[known, own], limits.loc[known, own]], placed.units)
-                out.append(_strip(f"strip-{len(out) + 1}", title, units, np.array(members)[known], shown))
+        placed = parameters[parameters["limit"].notna() & parameters["unit"].isin([units[i] for i in members])]
+        for sensor, own in placed.groupby("sensor"):
+            known = set(own["unit"])
+            numbers = np.array([i for i in members if units[i] in known])
+            if len(numbers) >= FEWEST_SIBLINGS:
+                title = f"{str(sensor).capitalize()}, {model}, {plain(method)}"
+                out.append(_strip(f"strip-{len(out) + 1}", title, units, numbers, own))
     return out
 
 
-def _strip(name: str, title: str, units: list[str], numbers: Index, placed: Table) -> Told:
-    """Return the plot of some siblings and the text of each dot."""
-    value, limit = (frame.to_numpy(float) for frame in placed.frames)
-    labels = [column.partition(" ")[2] for column in placed.frames[0]]
-    measures = [placed.units[column] for column in placed.frames[0]]
+def _strip(name: str, title: str, units: list[str], numbers: Index, own: pd.DataFrame) -> Told:
+    """Return the plot of some siblings and the text of each dot; ``own``: their parameters with limits."""
+    frames = wide(own, [units[i] for i in numbers], "label", "value", "limit")
+    labels, (value, limit) = [*frames[0]], (frame.to_numpy(float) for frame in frames)
+    measures = dict(zip(own["label"], map(unit_text, own["measure"]), strict=True))
     share = value / limit
     at = len(labels) - np.arange(len(labels), dtype=float)  # the first row on top
     down = SPREAD * (0.5 - (np.arange(len(numbers)) + 0.5) / len(numbers))
@@ -273,7 +272,7 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, placed: Tabl
             dots.append(Dots(x, at[j] + down[i], colour, units=tuple((numbers[i] + 1).tolist())))
             legend.append((f"c{colour}", words))
             values[f"c{colour}"] = [
-                _told(labels[b], value[a, b], limit[a, b], measures[b]) for a, b in zip(i, j, strict=True)
+                _told(labels[b], value[a, b], limit[a, b], measures[labels[b]]) for a, b in zip(i, j, strict=True)
             ]
     worst, column = np.unravel_index(np.nanargmax(np.abs(share)), share.shape)
     farthest = f"{units[numbers[worst]]}, {labels[column].lower()} ({percent(float(abs(share[worst, column])))})"

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import io
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -35,7 +35,7 @@ import pyarrow.parquet as pq
 
 from pipeline.files import write_atomically
 from pipeline.records import MEDIAN_SIZE, SENSORS
-from pipeline.report.summary import COLUMNS
+from pipeline.report.summary import COLUMNS, PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -50,97 +50,77 @@ DAYS_OF_A_YEAR = 365.25
 SIBLINGS = ["sensor", "method"]
 
 
-class Table(NamedTuple):
-    """Figures of parameters: frames of a row a unit and a column a parameter, and the unit of measurement of each."""
-
-    frames: list[pd.DataFrame]
-    units: dict[str, str]
-
-    @classmethod
-    def of(cls, parameters: Mapping[str, Mapping[str, Sequence[Any]]], figures: int) -> Table:
-        """Return the parameters of some units: by name their figures, and their unit of measurement."""
-        units = {name: p[-1] for own in parameters.values() for name, p in own.items()}
-        absent = (None,) * figures
-        table = [[own.get(name, absent) for name in units] for own in parameters.values()]
-        values = ([[p[i] for p in row] for row in table] for i in range(figures))
-        return cls([pd.DataFrame(v, list(parameters), list(units), float) for v in values], units)
-
-    @classmethod
-    def joined(cls, parts: Sequence[Table]) -> Table:
-        """Return the parameters of all parts."""
-        units = {name: unit for part in parts for name, unit in part.units.items()}
-        return cls([pd.concat(frames) for frames in zip(*(part.frames for part in parts), strict=True)], units)
-
-    def some(self, units: Sequence[str]) -> list[pd.DataFrame]:
-        """Return the figures of some units: parameters by sensor, in the order in which the units first have them."""
-        first = self.frames[0].loc[units].dropna(axis="columns", how="all")
-        known, names = first.notna().to_numpy(), first.columns
-        order = np.lexsort((known.argmax(axis=0), [name.startswith("gyroscope") for name in names]))
-        return [frame.loc[units, names[order]] for frame in self.frames]
+def parameter_table(units: Mapping[str, Sequence[Sequence[Any]]]) -> pd.DataFrame:
+    """Return the parameters of some units, as of ``unit_parameters``, as one table: ``unit`` and ``PARAMETERS``."""
+    rows = [(unit, *row) for unit, own in units.items() for row in own]
+    kinds = dict.fromkeys(("value", "u", "U", "limit"), float) | {"fitted": bool}
+    return pd.DataFrame(rows, columns=["unit", *PARAMETERS]).astype(kinds)
 
 
-def fleet_statistics(rows: Sequence[JSON], fitted: Table) -> JSON:
+def wide(parameters: pd.DataFrame, units: Sequence[str], name: str, *figures: str) -> list[pd.DataFrame]:
+    """Return a frame for each figure: a row a unit, a column a parameter, which the column ``name`` names."""
+    names = parameters.drop_duplicates(name).sort_values("sensor", kind="stable")[name].tolist()
+    cells = parameters.set_index(["unit", name]).reindex(pd.MultiIndex.from_product([units, names]))
+    return [pd.DataFrame(cells[f].to_numpy().reshape(len(units), len(names)), units, names) for f in figures]
+
+
+def fleet_statistics(rows: Sequence[JSON], parameters: pd.DataFrame) -> JSON:
     """Return the statistics of a fleet, ``fleet.json``: a list of dicts for each statistic, and ``missing``.
 
-    ``rows``: one a unit, as of ``summary_row``; ``fitted``: of ``unit_parameters``, none of units that failed.
+    ``rows``: one a unit, as of ``summary_row``; ``parameters``: of ``parameter_table``, none of units that failed.
     """
-    units = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).set_index("unit").replace("", None)
-    out: JSON = {key: [] for key in (*STATISTICS, "repeatability")}
-    known = fitted.frames[0].loc[units.index].notna().any(axis="columns").to_numpy(bool)
-    for (model, method), siblings in units[known].groupby(SIBLINGS, sort=False):
-        values, *stated = fitted.some(list(siblings.index))
-        statistics = {key: statistic(values, siblings) for key, statistic in STATISTICS.items()}
-        statistics["repeatability"] = _repeatability(values, siblings, *stated)
-        for key, results in statistics.items():
-            for name, found in results:
-                about = {"sensor": model, "method": method, "parameter": name, "unit": fitted.units[name]}
-                out[key].append(about | found)
+    units = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).replace("", None)
+    units = units.rename(columns={"sensor": "model"}).dropna(subset=["model", "method"])
+    units["day"] = (pd.to_datetime(units["date"], format="%Y-%m-%d", errors="coerce") - pd.Timestamp(0)).dt.days
+    known = units.merge(parameters[parameters["fitted"]], on="unit")
+    out: JSON = {key: [] for key in STATISTICS}
+    for (model, method), siblings in known.groupby(["model", "method"], sort=False):
+        of_siblings = siblings.sort_values("sensor", kind="stable").groupby("parameter", sort=False)
+        for name, own in of_siblings:
+            about = {"sensor": model, "method": method, "parameter": name, "unit": own["measure"].iloc[0]}
+            for key, statistic in STATISTICS.items():
+                out[key] += [about | found for found in statistic(own, len(of_siblings))]
     out["far"].sort(key=lambda f: -abs(f["z"]))
     out["missing"] = _missing_effects(rows)
     return out
 
 
-def _spread(values: pd.DataFrame) -> pd.Series:
+def _spread(values: pd.Series[float]) -> float:
     """Return 1.4826 times the median absolute deviation: the standard deviation where the values are normal."""
-    return MEDIAN_SIZE * (values - values.median()).abs().median()
+    return float(MEDIAN_SIZE * (values - values.median()).abs().median())
 
 
-def _distributions(values: pd.DataFrame, _: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
-    spread = _spread(values)
-    for name, v in values.items():
-        low, middle, high = v.quantile([0.05, 0.5, 0.95]).tolist()
-        found = {"units": int(v.count()), "median": middle, "robust_standard_deviation": float(spread[name])}
-        ends = {"smallest": float(v.min()), "largest": float(v.max())}
-        yield str(name), found | {"quantile_05": low, "quantile_95": high} | ends
+def _distributions(own: pd.DataFrame, _: int) -> Iterable[JSON]:
+    v = own["value"]
+    low, middle, high = v.quantile([0.05, 0.5, 0.95]).tolist()
+    found = {"units": int(v.count()), "median": middle, "robust_standard_deviation": _spread(v)}
+    yield found | {"quantile_05": low, "quantile_95": high, "smallest": float(v.min()), "largest": float(v.max())}
 
 
-def _far(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
-    many = values.loc[:, values.count() >= FEWEST]
-    z = (many - many.median()) / _spread(many).replace(0.0, np.nan)
-    for name in many:
-        for unit in z.index[z[name].abs() > FAR]:
-            lot = siblings.loc[unit, "lot"]
-            found = {"name": unit, "lot": lot if isinstance(lot, str) else None, "value": float(values.loc[unit, name])}
-            yield name, found | {"z": float(z.loc[unit, name])}
+def _far(own: pd.DataFrame, _: int) -> Iterable[JSON]:
+    v, spread = own["value"], _spread(own["value"])
+    if v.count() >= FEWEST and spread > 0.0:
+        far = own.assign(z=(v - v.median()) / spread)
+        for unit in far[far["z"].abs() > FAR].to_dict("records"):
+            lot = unit["lot"] if isinstance(unit["lot"], str) else None
+            yield {"name": unit["unit"], "lot": lot, "value": unit["value"], "z": unit["z"]}
 
 
-def _drift(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
-    days = (pd.to_datetime(siblings["date"], format="%Y-%m-%d", errors="coerce") - pd.Timestamp(0)).dt.days
-    for name in values:
-        known = pd.DataFrame({"day": days, "value": values[name]}).dropna()
-        if len(known) < FEWEST or known.nunique().min() == 1:  # dates or values that are all the same
-            continue
-        from scipy import stats  # noqa: PLC0415  (0.3 s that few fleets need)
+def _drift(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
+    known = own[["day", "value"]].dropna()
+    if len(known) < FEWEST or known.nunique().min() == 1:  # dates or values that are all the same
+        return
+    from scipy import stats  # noqa: PLC0415  (0.3 s that few fleets need)
 
-        rho, p = stats.spearmanr(known["day"], known["value"])
-        if p * len(values.columns) < LEVEL:
-            some = known.iloc[:: -(-len(known) // MOST_PAIRED)]
-            slope = float(stats.theilslopes(some["value"], some["day"]).slope)
-            found = {"rank_correlation": float(rho), "p_value": float(p), "per_year": slope * DAYS_OF_A_YEAR}
-            yield name, found | {"units": len(known)}
+    rho, p = stats.spearmanr(known["day"], known["value"])
+    if p * parameters < LEVEL:
+        some = known.iloc[:: -(-len(known) // MOST_PAIRED)]
+        slope = float(stats.theilslopes(some["value"], some["day"]).slope)
+        found = {"rank_correlation": float(rho), "p_value": float(p), "per_year": slope * DAYS_OF_A_YEAR}
+        yield found | {"units": len(known)}
 
 
-def _lots(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
+def _lots(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
     """Find the parameters that differ between lots, by the test of Kruskal and Wallis (JASA 47, 1952, 583-621).
 
     Its statistic, with the correction for ties, is ``(n - 1)`` times the share of the variance of all n ranks that the
@@ -148,39 +128,29 @@ def _lots(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, J
     """
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only lots need)
 
-    for name in values.columns[values.count() >= FEWEST]:
-        lots = {lot: v.dropna() for lot, v in values[name].groupby(siblings["lot"])}
-        lots = {lot: v for lot, v in lots.items() if len(v) >= 3}
-        if len(lots) < 2 or np.ptp(values[name].dropna()) == 0.0:
-            continue
-        ranks = pd.concat(lots).rank()
-        share = ranks.groupby(level=0).transform("mean").var() / ranks.var()
-        p = float(chdtrc(len(lots) - 1, (len(ranks) - 1) * share))
-        if p * len(values.columns) < LEVEL:
-            medians, middle = {lot: float(v.median()) for lot, v in lots.items()}, float(values[name].median())
-            lot = max(medians, key=lambda lot: abs(medians[lot] - middle))
-            yield name, {"p_value": p, "lot": lot, "lot_median": medians[lot], "median": middle}
-
-
-def _repeatability(
-    values: pd.DataFrame, siblings: pd.DataFrame, standard: pd.DataFrame, expanded: pd.DataFrame
-) -> Iterable[tuple[str, JSON]]:
-    """Return how the calibrations of a device scatter, where some were calibrated more than once."""
-    serial = siblings["serial"].dropna()
-    serial = serial[serial.duplicated(keep=False)]
-    if serial.empty:
+    values = own["value"].dropna()
+    lots = {lot: v for lot, v in values.groupby(own["lot"]) if len(v) >= 3}
+    if len(values) < FEWEST or len(lots) < 2 or np.ptp(values) == 0.0:
         return
-    devices = values.loc[serial.index].groupby(serial)
-    counts = devices.count()
-    counts = counts.where(counts > 1)
-    squares = ((values.loc[serial.index] - devices.transform("mean")) ** 2).sum()
-    for name in values:
-        repeated, calibrations = int(counts[name].count()), int(counts[name].sum())
-        if repeated:
-            deviation = math.sqrt(squares[name] / (calibrations - repeated))
-            found = {"devices": repeated, "calibrations": calibrations, "standard_deviation": deviation}
-            known = pd.DataFrame({"value": values[name], "u": standard[name], "U": expanded[name], "serial": serial})
-            yield name, found | _against_stated(known.dropna(), len(values.columns))
+    ranks = pd.concat(lots).rank()
+    share = ranks.groupby(level=0).transform("mean").var() / ranks.var()
+    p = float(chdtrc(len(lots) - 1, (len(ranks) - 1) * share))
+    if p * parameters < LEVEL:
+        medians, middle = {lot: float(v.median()) for lot, v in lots.items()}, float(values.median())
+        lot = max(medians, key=lambda lot: abs(medians[lot] - middle))
+        yield {"p_value": p, "lot": lot, "lot_median": medians[lot], "median": middle}
+
+
+def _repeatability(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
+    """Return how the calibrations of a device scatter, where some were calibrated more than once."""
+    own = own.dropna(subset=["serial", "value"])
+    own = own[own["serial"].duplicated(keep=False)]
+    if own.empty:
+        return
+    devices = own.groupby("serial")["value"]
+    squares, freedom = float(((own["value"] - devices.transform("mean")) ** 2).sum()), len(own) - devices.ngroups
+    found = {"devices": devices.ngroups, "calibrations": len(own), "standard_deviation": math.sqrt(squares / freedom)}
+    yield found | _against_stated(own.dropna(subset=["u", "U"]), parameters)
 
 
 def _against_stated(known: pd.DataFrame, parameters: int) -> JSON:
@@ -207,6 +177,7 @@ STATISTICS = {
     "far": _far,
     "drift": _drift,
     "lots": _lots,
+    "repeatability": _repeatability,
 }
 
 
@@ -232,7 +203,7 @@ def _missing_effects(rows: Sequence[JSON]) -> list[str]:
     return sentences
 
 
-def write_parameters(path: Path, rows: Sequence[JSON], fitted: Table) -> None:
+def write_parameters(path: Path, rows: Sequence[JSON], parameters: pd.DataFrame) -> None:
     """Write ``parameters.parquet``: a row a unit with everything of ``summary.csv`` and every fitted parameter.
 
     Columns of a parameter: ``<name>`` and ``<name>_expanded_uncertainty``, with the unit in the column's metadata.
@@ -242,11 +213,13 @@ def write_parameters(path: Path, rows: Sequence[JSON], fitted: Table) -> None:
         values = pa.array([row.get(column) for row in rows])
         arrays.append(values if values.type != pa.null() else values.cast(pa.string()))
         fields.append(pa.field(column, arrays[-1].type))
-    value, _, expanded = fitted.some([row["unit"] for row in rows])
+    fitted = parameters[parameters["fitted"]]
+    measures = dict(zip(fitted["parameter"], fitted["measure"], strict=True))
+    value, expanded = wide(fitted, [row["unit"] for row in rows], "parameter", "value", "U")
     for name in value:
         for suffix, frame in (("", value), ("_expanded_uncertainty", expanded)):
             arrays.append(pa.array(frame[name], pa.float64(), from_pandas=True))
-            fields.append(pa.field(name + suffix, pa.float64(), metadata={"unit": fitted.units[name]}))
+            fields.append(pa.field(name + suffix, pa.float64(), metadata={"unit": measures[name]}))
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), buffer, compression="zstd")
     write_atomically(path, buffer.getvalue())

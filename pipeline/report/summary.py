@@ -11,7 +11,6 @@ from typing import Any
 from pipeline.model.calibration_file import beyond_uncertainty, left_out
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import first_and_last_step, passes
-from pipeline.report.numbers import unit_text
 from pipeline.report.parameters import fitted_parameters, parameter_rows
 
 JSON = dict[str, Any]
@@ -22,6 +21,17 @@ SENSOR_COLUMNS = (
 )  # fmt: skip
 OF_CALIBRATION = tuple(f"{s}_{c}" for c in ("implausible", "not_in_uncertainty") for s in SENSORS)
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, "left_out")
+PARAMETERS = (
+    "sensor",
+    "parameter",
+    "label",
+    "measure",
+    "value",
+    "u",
+    "U",
+    "limit",
+    "fitted",
+)  # value u U limit: figures
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 
 
@@ -68,28 +78,20 @@ def sheet_columns(row: JSON) -> dict[str, str]:
     return {k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in COLUMNS)}
 
 
-def unit_parameters(calibration: JSON) -> dict[str, tuple[float | str | None, ...]]:
-    """Return every fitted parameter of a unit: ``<sensor>_bias_x``, ``<sensor>_<effect>_<symbol>``.
+def unit_parameters(calibration: JSON, sensor_configs: JSON) -> list[tuple[Any, ...]]:
+    """Return the parameters of a unit, a row each with the figures of ``PARAMETERS``; none of a failed unit.
 
-    Value, standard uncertainty, expanded uncertainty, unit; an uncertainty is None where the method states none.
+    They are those that are fitted, and the elements of K that a sensor file limits. ``sensor_configs``: the section
+    ``sensor`` of the configuration.
     """
-    return {
-        f"{sensor}_{p.name.replace('.', '_')}": (p.value, p.standard_uncertainty, p.expanded_uncertainty, p.unit)
-        for sensor in SENSORS
-        if calibration.get(sensor)
-        for p in fitted_parameters(calibration[sensor])
-    }
-
-
-def against_limits(calibration: JSON, sensor_config: JSON) -> dict[str, tuple[float, float, str]]:
-    """Return value, limit and unit of the parameters that the sensor file limits: ``<sensor> Bias x``.
-
-    ``sensor_config`` is the section ``sensor`` of the configuration.
-    """
-    return {
-        f"{sensor} {row['name']}": (row["p"].value, row["limit"], unit_text(row["p"].unit))
-        for sensor in SENSORS
-        if calibration.get(sensor)
-        for row in parameter_rows(calibration[sensor], sensor_config.get(sensor) or {})
-        if row["limit"]
-    }
+    rows = []
+    for sensor in [s for s in SENSORS if calibration.get(s)]:
+        fitted = fitted_parameters(calibration[sensor])
+        limits = {row["p"]: row for row in parameter_rows(calibration[sensor], sensor_configs.get(sensor) or {})}
+        limits = {p: row for p, row in limits.items() if row["limit"]}
+        for p in dict.fromkeys([*fitted, *limits]):
+            label, limit = (limits[p]["name"], limits[p]["limit"]) if p in limits else (None, None)
+            name = f"{sensor}_{p.name.replace('.', '_')}"
+            figures = p.value, p.standard_uncertainty, p.expanded_uncertainty, limit
+            rows.append((sensor, name, label, p.unit, *figures, p in fitted))
+    return rows

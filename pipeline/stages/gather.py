@@ -13,12 +13,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pandas as pd
+
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record
 from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison_section import against_truth, section
-from pipeline.report.fleet import Table, fleet_statistics, write_parameters, write_summary
+from pipeline.report.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
 from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
 from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
     from pipeline.stages.batch import Job
 
 JSON = dict[str, Any]
-FIGURES = {"parameters": 3, "placed": 2}  # of a unit in its summary, and how many figures each parameter has
 NEW = ".new"  # folder of the new set, below the results
 
 
@@ -51,7 +52,7 @@ def gather_batch(job: Job) -> None:
     known = (results / "calibrations").glob("*.json") if any((results / PACKS).glob("*")) else ()
     asked = {file.stem for file in known}  # by ``unpack``
     found: dict[str, JSON] = {}
-    parts: dict[str, list[Table]] = {key: [] for key in FIGURES}
+    parts: list[pd.DataFrame] = []
     with flushed_together(results):
         for name, units in run["batches"].items():
             folder = job.output.parent / name
@@ -60,13 +61,12 @@ def gather_batch(job: Job) -> None:
             batch = Batch(folder)
             for unit in units:
                 found[unit] = _gather_unit(batch, unit, new, publish=not packed or unit in asked)
-            for key, figures in FIGURES.items():
-                parts[key].append(Table.of({unit: found[unit].pop(key) for unit in units}, figures))
+            parts.append(parameter_table({unit: found[unit].pop("parameters") for unit in units}))
             for stage in (*STAGES, *([WITH_PRIOR] if batch.combined else [])) if packed else ():
                 _link(folder / f"{stage}.zip", new / PACKS / name / f"{stage}.zip")
         units = {unit: found[unit] for unit in run["order"]}
-        tables = {key: Table.joined(of_batches) for key, of_batches in parts.items()}
-        _write_campaign(job, units, tables, new, packed=packed)
+        parameters = pd.DataFrame({"unit": run["order"]}).merge(pd.concat(parts), on="unit")
+        _write_campaign(job, units, parameters, new, packed=packed)
     publish_all(new, results)
     record_output(job, results, PUBLISHED)
     write_json(job.output, [u["failure"] for u in units.values() if u["failure"]])
@@ -114,10 +114,10 @@ def _figures(job: Job, units: Mapping[str, JSON]) -> list[JSON]:
     return found
 
 
-def _statistics(job: Job, units: Mapping[str, JSON], fitted: Table, new: Path) -> JSON:
+def _statistics(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, new: Path) -> JSON:
     """Return the statistics of the fleet; write the joint estimates."""
     rows = [u["row"] for u in units.values()]
-    statistics = fleet_statistics(rows, fitted)
+    statistics = fleet_statistics(rows, parameters)
     if job.run["combine"] == "lot":
         from pipeline.stages.prior import TOLD  # noqa: PLC0415  (only where a lot is the prior)
 
@@ -134,16 +134,16 @@ def _statistics(job: Job, units: Mapping[str, JSON], fitted: Table, new: Path) -
     return statistics
 
 
-def _write_campaign(
-    job: Job, units: Mapping[str, JSON], tables: Mapping[str, Table], new: Path, *, packed: bool
-) -> None:
+def _write_campaign(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, new: Path, *, packed: bool) -> None:
     """Write the files about all units."""
-    fitted = tables["parameters"]
     run, rows = job.run, [u["row"] for u in units.values()]
-    failures, statistics = [u["failure"] for u in units.values() if u["failure"]], _statistics(job, units, fitted, new)
+    failures, statistics = (
+        [u["failure"] for u in units.values() if u["failure"]],
+        _statistics(job, units, parameters, new),
+    )
     write_summary(new / "summary.csv", rows)
     write_json(new / "failures.json", failures)
-    write_parameters(new / "parameters.parquet", rows, fitted)
+    write_parameters(new / "parameters.parquet", rows, parameters)
     write_json(new / "fleet.json", statistics)
     figures = _figures(job, units) if run["compare"] else []
     entries = record(job.results, {name: u["state"] for name, u in units.items()}, run["run"], run["sections"])
@@ -156,7 +156,7 @@ def _write_campaign(
         run["page"],
         twins=same_files({name: u["state"]["recordings"] for name, u in units.items()}),
         statistics=statistics,
-        placed=tables["placed"],
+        parameters=parameters,
         history=runs_data(entries, run["run"]),
         settings=run["run"],
         published={page.stem for page in (new / "reports").glob("*.html")} if packed else None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import PipelineError
 from pipeline.history import unit_state
 from pipeline.report.pages import failure_page
-from pipeline.report.summary import against_limits, sheet_columns, summary_row, unit_parameters
+from pipeline.report.summary import sheet_columns, summary_row, unit_parameters
 
 if TYPE_CHECKING:
     from pipeline.pack import Files, Pack
@@ -63,8 +63,7 @@ def summary(
         "row": summary_row(calibration["unit"], *documents, settings["row"]),
         "failure": failure,
         "state": unit_state(*documents, settings["overrides"], settings["config"]),
-        "parameters": unit_parameters(calibration),
-        "placed": against_limits(calibration, settings.get("sensor", {})),
+        "parameters": unit_parameters(calibration, settings.get("sensor", {})),
     }
 
 

@@ -6,11 +6,12 @@ from datetime import date, timedelta
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from scipy import stats
 
-from pipeline.report.fleet import Table, _missing_effects, fleet_statistics, write_parameters
+from pipeline.report.fleet import _missing_effects, fleet_statistics, parameter_table, write_parameters
 from pipeline.report.summary import unit_parameters
 
 if TYPE_CHECKING:
@@ -29,10 +30,9 @@ def fleet(values: NDArray[np.float64], model: str = "mpu6050", lots: int = 5) ->
         }
         for i in range(len(values))
     ]  # fmt: skip
-    found = {
-        row["unit"]: {"gyroscope_bias_x": (float(v), 0.05, 0.1, "deg/s")} for row, v in zip(rows, values, strict=True)
-    }
-    return rows, Table.of(found, 3)
+    about = ("gyroscope", "gyroscope_bias_x", None, "deg/s")
+    found = {row["unit"]: [(*about, float(v), 0.05, 0.1, None, True)] for row, v in zip(rows, values, strict=True)}
+    return rows, parameter_table(found)
 
 
 def test_a_unit_far_from_its_siblings_is_named_and_no_other() -> None:
@@ -53,8 +53,8 @@ def test_units_of_another_model_are_no_siblings() -> None:
     one, two = fleet(rng.normal(0.0, 1.0, 30)), fleet(rng.normal(100.0, 1.0, 30), "stim300")
     for row in two[0]:
         row["unit"] = "V" + row["unit"]
-    second = Table([frame.rename(index=lambda unit: "V" + unit) for frame in two[1].frames], two[1].units)
-    told = fleet_statistics([*one[0], *two[0]], Table.joined([one[1], second]))
+    second = two[1].assign(unit="V" + two[1]["unit"])
+    told = fleet_statistics([*one[0], *two[0]], pd.concat([one[1], second]))
     assert told["far"] == []
     assert [d["sensor"] for d in told["distributions"]] == ["mpu6050", "stim300"]
 
@@ -69,11 +69,10 @@ def test_few_fleets_in_which_nothing_is_wrong_are_said_to_have_something() -> No
 def test_a_fleet_without_serials_lots_and_dates_has_distributions_only() -> None:
     rows, found = fleet(np.random.default_rng(8).normal(0.0, 1.0, 25))
     rows = [row | {"serial": None, "lot": None, "date": ""} for row in rows]
-    failed = Table.of({"failed": {}}, 3)
     row = {"unit": "failed", "sensor": "mpu6050", "method": None}
-    told = fleet_statistics([*rows, row], Table.joined([failed, found]))
+    told = fleet_statistics([*rows, row], found)
     assert [key for key, value in told.items() if value] == ["distributions"]
-    assert fleet_statistics([row], failed)["distributions"] == []
+    assert fleet_statistics([row], parameter_table({"failed": []}))["distributions"] == []
 
 
 def test_a_parameter_that_no_unit_fits_is_in_the_distributions_only() -> None:
@@ -146,7 +145,7 @@ def test_the_table_holds_every_parameter_with_its_uncertainty_and_unit(tmp_path:
     p = {"b_x": {"value": 0.5, "unit": "g/degC", "expanded_uncertainty": 0.05}}
     document = {"accelerometer": fit | {"effects": [{"name": "bias_temperature", "parameters": p}]}, "gyroscope": None}
     rows = [{"unit": "U1", "lot": None, "pass": True, "accelerometer_error_after": 0.5}, {"unit": "U2"}]
-    write_parameters(tmp_path / "p.parquet", rows, Table.of({"U1": unit_parameters(document), "U2": {}}, 3))
+    write_parameters(tmp_path / "p.parquet", rows, parameter_table({"U1": unit_parameters(document, {}), "U2": []}))
     table = pq.read_table(tmp_path / "p.parquet")
     first, second = table.to_pylist()
     assert first["accelerometer_bias_y"] == 2.0

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from pipeline.report.campaign_page import ENDS, strips
-from pipeline.report.fleet import Table
-from pipeline.report.summary import against_limits
+from pipeline.report.fleet import parameter_table
+from pipeline.report.summary import unit_parameters
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SHEET = {"accelerometer": {"bias": 0.08, "scale_factor": 0.03, "cross_axis": 0.02}}
 NAMES = ["Bias x", "Bias y", "Bias z", *(f"Scale factor error {a}" for a in "xyz")]
 NAMES += [f"{a} reads of {b}" for a in "xyz" for b in "xyz" if a != b]
 
 
-def campaign(count: int) -> tuple[list[dict[str, Any]], Table, np.ndarray]:
+def campaign(count: int) -> tuple[list[dict[str, Any]], pd.DataFrame, np.ndarray]:
     """Return units with random biases and sensitivities, and the shares of the limits that follow."""
     rng = np.random.default_rng(3)
     rows, placed, shares = [], {}, []
@@ -25,10 +28,10 @@ def campaign(count: int) -> tuple[list[dict[str, Any]], Table, np.ndarray]:
         bias, K = rng.normal(0.0, 0.06, 3), np.eye(3) + rng.normal(0.0, 0.01, (3, 3))
         part = {"unit": "g", "bias": bias.tolist(), "matrix": np.linalg.inv(K).tolist()}
         rows.append({"unit": f"U{i}", "status": "ok", "sensor": "mpu6050", "method": "staged"})
-        placed[f"U{i}"] = against_limits({"accelerometer": part, "gyroscope": None}, SHEET)
+        placed[f"U{i}"] = unit_parameters({"accelerometer": part, "gyroscope": None}, SHEET)
         beside = K[~np.eye(3, dtype=bool)]
         shares.append([*bias / 0.08, *(np.diag(K) - 1.0) / 0.03, *beside / 0.02])
-    return rows, Table.of(placed, 2), np.array(shares)
+    return rows, parameter_table(placed), np.array(shares)
 
 
 def drawn(svg: str) -> list[tuple[str, int, str, float]]:
