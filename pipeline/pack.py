@@ -157,32 +157,26 @@ class Batch:
 
     def files(self, unit: str) -> Iterator[tuple[str, bytes]]:
         """Yield the path and the content of each file that is published of a unit."""
-        report, export, diagnose = (self.packs[stage] for stage in ("report", "export", "diagnose"))
-        if failed := self._of_failed(unit):
-            yield f"reports/{unit}.html", failed.read(f"{unit}.html")
-            yield f"calibrations/{unit}.json", failed.read(f"{unit}.calibration.json")
-            return
-        yield f"reports/{unit}.html", report.read(f"{unit}.html")
-        for folder in DOCUMENTS:
-            yield f"{folder}/{unit}.json", self.packs[STAGE_OF[folder]].read(f"{unit}.json")
-        for part in diagnose.json(f"{unit}.json").values():
-            if isinstance(part, dict) and (name := part.get("suggested_file")):
-                yield f"diagnoses/{name}", diagnose.read(name)
-        for name in (f"certificates/{unit}.{kind}" for kind in ("json", "html", "xml")):
-            if name in report:  # no .xml where what its schema demands was not stated
-                yield name, report.read(name)
-        for name in export.names():
-            if name.startswith(f"{unit}/"):
-                yield f"exports/{name}", export.read(name)
-        yield from self._with_prior(unit)
+        for path in dict.fromkeys(self._paths(unit)):
+            pack, name = self.member(path, unit)
+            yield path, pack.read(name)
 
-    def _with_prior(self, unit: str) -> Iterator[tuple[str, bytes]]:
-        """Yield the files that the prior of a lot adds, or that replace those without it."""
-        if not (combined := self.combined):
+    def _paths(self, unit: str) -> Iterator[str]:
+        """Yield the paths below the results of the files of a unit, those that the prior of its lot adds last."""
+        yield f"reports/{unit}.html"
+        if self._of_failed(unit):
+            yield f"calibrations/{unit}.json"
             return
-        for name in combined.names():
-            if name.startswith(f"{unit}/"):
-                yield name.removeprefix(f"{unit}/"), combined.read(name)
+        yield from (f"{folder}/{unit}.json" for folder in DOCUMENTS)
+        parts = self.packs["diagnose"].json(f"{unit}.json").values()
+        yield from (
+            f"diagnoses/{p['suggested_file']}" for p in parts if isinstance(p, dict) and p.get("suggested_file")
+        )
+        certificates = (f"certificates/{unit}.{kind}" for kind in ("json", "html", "xml"))
+        yield from (path for path in certificates if path in self.packs["report"])  # no .xml where something lacks
+        yield from (f"exports/{name}" for name in self.packs["export"].names() if name.startswith(f"{unit}/"))
+        names = self.combined.names() if self.combined else ()
+        yield from (name.removeprefix(f"{unit}/") for name in names if name.startswith(f"{unit}/"))
 
 
 def batches_of(results: Path) -> dict[str, Batch]:
