@@ -34,59 +34,25 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """What a format can hold: the keys above the line ``---`` of a template.
+    """What a format can hold: the keys above the line ``---`` of a template."""
 
-    Attributes
-    ----------
-    consumer, equation, source : str
-        Who reads the file, how it corrects a reading, and where that is documented.
-    file : str
-        Name of the file, in which ``{unit}`` is the name of the unit; by default that of the template.
-    sensor_endings : dict
-        Sensor to what its name adds to the stem of the file, where each sensor has a file of its own.
-    units : dict
-        Sensor to the unit of readings: g or m/s^2, deg/s or rad/s. A sensor without a unit is not in the format.
-    required, required_counts : list of str
-        Sensors that must be calibrated (``board``: the unit must be the reference chip of a board), and sensors whose
-        counts per unit must be known; without them no file is written.
-    matrix : dict
-        Sensor to what the format holds of its matrix; ``full`` by default.
-    effects : list of str
-        Effects that the format holds in addition to bias and matrix; ``all``: its text writes or names each of them.
-    effects_in_part : dict of str to str
-        Effect that the format approximates, to how well.
-    opening_remarks : list of str
-        Lines before all other remarks. They may contain ``{unit}, {sensor}, {counts[...]}, {sensors[0]...}``.
-    closing_remarks : list of str
-        Lines after those on what is left out.
-    temperature_remarks : list of str
-        Lines after these, only where a bias of the unit depends on the temperature.
-    noise : bool
-        Whether the format holds noise parameters: remarks state their origin, interval and the effective density.
-    error_sentence : str
-        Sentence in which ``{}`` is a held-out error. By default it says whether the error is that of the export or of
-        the full calibration.
-    read_back : dict
-        How ``convert`` reads the file (``pipeline.exports.reading``); empty where it holds no calibration.
-    """
-
-    consumer: str
-    equation: str
-    source: str
-    file: str
-    opening_remarks: list[str]
-    units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]
-    sensor_endings: dict[str, str] = field(default_factory=dict)
-    required: list[str] = field(default_factory=list)
-    required_counts: list[str] = field(default_factory=list)
-    matrix: dict[str, Literal["full", "diagonal", "none"]] = field(default_factory=dict)
-    effects: list[str] = field(default_factory=list)
-    effects_in_part: dict[str, str] = field(default_factory=dict)
-    closing_remarks: list[str] = field(default_factory=list)
-    temperature_remarks: list[str] = field(default_factory=list)
-    noise: bool = False
-    error_sentence: str | None = None
-    read_back: JSON = field(default_factory=dict)
+    consumer: str  # who reads the file
+    equation: str  # how that corrects a reading
+    source: str  # where that is documented
+    file: str  # name of the file, in which {unit} is the name of the unit; by default that of the template
+    units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]  # of readings; a sensor without one is not in the format
+    sensor_endings: dict[str, str] = field(default_factory=dict)  # of the names of files that hold one sensor each
+    required: list[str] = field(default_factory=list)  # sensors that must be calibrated; "board": the reference chip
+    required_counts: list[str] = field(default_factory=list)  # sensors whose counts per unit must be known
+    matrix: dict[str, Literal["full", "diagonal", "none"]] = field(default_factory=dict)  # what it holds; full
+    effects: list[str] = field(default_factory=list)  # that it holds too; "all": its text writes or names each of them
+    effects_in_part: dict[str, str] = field(default_factory=dict)  # effect that it approximates, to how well
+    opening_remarks: list[str]  # before all others; with {unit}, {sensor}, {counts[...]}, {sensors[0]...}
+    closing_remarks: list[str] = field(default_factory=list)  # after those on what is left out
+    temperature_remarks: list[str] = field(default_factory=list)  # only where a bias depends on the temperature
+    noise: bool = False  # whether it holds noise parameters: remarks state their origin, interval, effective density
+    error_sentence: str | None = None  # {}: a held-out error; by default: of the export or of the full calibration
+    read_back: JSON = field(default_factory=dict)  # how ``convert`` reads it (``reading``); empty: no calibration
 
 
 @cache

@@ -48,28 +48,14 @@ ROUNDING = 1e-12  # of the formats' own arithmetic, relative to the largest numb
 
 @dataclass(frozen=True)
 class ImportedCalibration:
-    """A calibration as a file holds it.
-
-    Attributes
-    ----------
-    format_name, unit : str
-        Name of the format, and that of the unit: the stem of the file where the format holds none.
-    sensors : dict of str to SensorCalibration
-        Those that the file holds; the covariance is None where it states no uncertainty.
-    noise : dict
-        Kalibr's four noise parameters (``pipeline.exports.sensors``), as far as the file states them.
-    notes : list of str
-        What was assumed, and what was not read.
-    document : dict or None
-        ``calibrations/<unit>.json``, where the file is one.
-    """
+    """A calibration as a file holds it."""
 
     format_name: str
-    unit: str
-    sensors: dict[str, SensorCalibration]
-    noise: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    document: dict[str, Any] | None = None
+    unit: str  # the stem of the file where the format holds no name
+    sensors: dict[str, SensorCalibration]  # the covariance is None where the file states no uncertainty
+    noise: dict[str, float] = field(default_factory=dict)  # of Kalibr's four parameters those that it states
+    notes: list[str] = field(default_factory=list)  # what was assumed, and what was not read
+    document: dict[str, Any] | None = None  # ``calibrations/<unit>.json``, where the file is one
 
 
 def read_any(
