@@ -111,24 +111,7 @@ def in_body_axes(axis_map: Sequence[str], readings: Values) -> Values:
     return turned
 
 
-def to_body_axes(table: ChannelTable, maps: Mapping[str, Sequence[str]]) -> ChannelTable:
-    """Rotate readings into the body's axes, by the axis map of each sensor.
-
-    A left-handed map is used as it stands, with a note: no rotation does that, only a sensor with such axes.
-    """
-    values, notes = dict(table.values), table.notes
-    matrices = {sensor: axis_matrix(maps[sensor]) for sensor in TRIADS}
-    if all(np.array_equal(m, np.eye(3)) for m in matrices.values()):
-        return table
-    for sensor, triad in TRIADS.items():
-        matrix = matrices[sensor]
-        for row, body in enumerate(triad):
-            reading = triad[int(np.flatnonzero(matrix[row])[0])]
-            sign = matrix[row].sum()
-            if reading in table.values:
-                values[body] = table.values[reading] if sign > 0 else -table.values[reading]
-    left = [s for s, m in matrices.items() if np.linalg.det(m) < 0 and TRIADS[s][0] in table.values]
-    if left:
-        detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left)
-        notes = (*notes, Note("N-LEFTHANDED", len(left), 0, 0, f"left-handed axis map: {detail}"))
-    return replace(table, values=values, notes=notes)
+def map_of_orientation(text: str) -> tuple[str, ...]:
+    """Return the axis map of an orientation such as YxZ: body axis j is the reading named by letter j."""
+    found = {name.lower(): ("+" if name.isupper() else "-") + body for name, body in zip(text, AXES, strict=True)}
+    return tuple(found[axis] for axis in AXES)

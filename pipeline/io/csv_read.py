@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.channel_table import ChannelTable, in_house_unit, to_body_axes
+from pipeline.io.channel_table import ChannelTable, in_house_unit
 from pipeline.io.csv_layout import Fault, Layout, column_notes, find_columns, find_faults, refusal
 from pipeline.io.csv_times import (
     EXACT_BELOW_S,
@@ -301,10 +301,13 @@ def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
 
 
 def read_gcsv(path: Path, checks: Checks) -> ChannelTable:
-    """Return the channels of a ``.gcsv`` file in the axes of its orientation; raw counts stay integers."""
+    """Return the channels of a ``.gcsv`` file in the sensor's axes; ``source`` states its orientation."""
     names, facts, line = _read_head(path)
+    text = facts.get("orientation", "XYZ")
+    if sorted(text.lower()) != ["x", "y", "z"]:
+        message = f"orientation is {text!r}; it names X, Y and Z once each, small where turned round"
+        raise IngestError(message, str(path), code="gcsv")
     table = _read_one(path, _format(names, facts, line, path), checks)
-    table = to_body_axes(table, dict.fromkeys(TRIADS, _orientation(facts, path)))
     kept = {k: v for k, v in facts.items() if k in ("id", "note", "fwversion", "vendor", "orientation")}
     return replace(table, source={**table.source, "gcsv": kept})
 
@@ -354,15 +357,3 @@ def _number(facts: dict[str, str], key: str, path: Path) -> str:
         message = f"{key} {what}; a positive number is expected in the head of the file"
         raise IngestError(message, str(path), code="gcsv")
     return text
-
-
-def _orientation(facts: dict[str, str], path: Path) -> tuple[str, str, str]:
-    """Return the axis map of an orientation: body axis j is the reading named by letter j."""
-    text = facts.get("orientation", "XYZ")
-    if sorted(text.lower()) != ["x", "y", "z"]:
-        message = f"orientation is {text!r}; it names X, Y and Z once each, small where turned round"
-        raise IngestError(message, str(path), code="gcsv")
-    found = {
-        letter.lower(): ("+" if letter.isupper() else "-") + body for letter, body in zip(text, "xyz", strict=True)
-    }
-    return found["x"], found["y"], found["z"]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError, MissingInputError
-from pipeline.io.channel_table import STRAIGHT, axis_maps, to_body_axes
+from pipeline.io.channel_table import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.io.encoder_log import unwrapped
 from pipeline.io.files import MESSAGE_FORMATS, candidate_files
@@ -146,17 +146,25 @@ def to_recording(
         table = follow_program(table, entry["program"])
     table = unwrapped(table)
     flags, notes = examine(table, sensor, checks)
-    maps = axis_maps(sensor)
+    maps, values = axis_maps(sensor), table.values
     stated = table.source.get("gcsv", {}).get("orientation", "XYZ")
-    other = [m for m in maps.values() if m != STRAIGHT]
-    if stated != "XYZ" and other:
-        message = f"the file states its orientation ({stated}) and sensor.axis_map is [{', '.join(other[0])}]"
-        hint = "one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]"
-        raise IngestError(message, table.path, code="gcsv", hint=hint)
-    table = to_body_axes(table, maps)
-    values = table.values
-    for lacking in (s for s, triad in TRIADS.items() if triad[0] not in values):
-        detail = f"the file has no column that the profile assigns to the {lacking}: it cannot calibrate this sensor"
+    if stated != "XYZ":
+        if other := [m for m in maps.values() if m != STRAIGHT]:
+            message = f"the file states its orientation ({stated}) and sensor.axis_map is [{', '.join(other[0])}]"
+            hint = "one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]"
+            raise IngestError(message, table.path, code="gcsv", hint=hint)
+        maps = dict.fromkeys(TRIADS, map_of_orientation(stated))
+    left = [s for s, m in maps.items() if np.linalg.det(axis_matrix(m)) < 0 and TRIADS[s][0] in values]
+    if left:  # no rotation does that, only a sensor with such axes: the map is used as it stands
+        detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left)
+        notes.insert(0, Note("N-LEFTHANDED", len(left), 0, 0, f"left-handed axis map: {detail}"))
+    readings: dict[str, Values | None] = dict.fromkeys(TRIADS)
+    for which, triad in TRIADS.items():
+        stacked = _stack(values, triad)
+        if stacked is not None:
+            readings[which] = in_body_axes(maps[which], stacked)
+            continue
+        detail = f"the file has no column that the profile assigns to the {which}: it cannot calibrate this sensor"
         notes.append(Note("N-ABSENT", len(table.time_ns), 0, 0, detail))
     recording = Recording(
         name=name,
@@ -164,8 +172,8 @@ def to_recording(
         axis=entry.get("axis"),
         setup=entry.get("setup") or "",
         time_ns=table.time_ns,
-        accelerometer=_stack(values, TRIADS["accelerometer"]),
-        gyroscope=_stack(values, TRIADS["gyroscope"]),
+        accelerometer=readings["accelerometer"],
+        gyroscope=readings["gyroscope"],
         temperature=values.get("temperature"),
         table_angle=values.get("table_angle"),
         table_rate=values.get("table_rate"),
