@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from pipeline.exports import exports
-from pipeline.io.parquet import from_parquet, to_parquet
+from pipeline.io.arrow import from_parquet, to_parquet
 from pipeline.pack import Pack, as_bytes, new_pack
 
 if TYPE_CHECKING:

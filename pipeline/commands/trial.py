@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.config.campaign import Campaign, cut_batches
 from pipeline.config.stage_settings import settings_of_jobs
-from pipeline.io.parquet import from_parquet
+from pipeline.io.arrow import from_parquet
 from pipeline.model.effects import forget, register_user_effects
 from pipeline.pack import Pack, as_bytes, new_pack
 from pipeline.stages import MODULES

@@ -12,7 +12,7 @@ between moves is followed from rest to rest. Lost steps of the motors are not ob
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,13 +47,12 @@ def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) ->
     log = {"table_angle": angle, "table_rate": rate}
     fit = fit_clocks(table, ChannelTable(table.path, np.rint(own * 1e9).astype(np.int64), log, table.source))
     t = seconds_of(table)
-    placed = _place(table, commanded, t, fit.table_time(t))
-    angle, rate, *_ = commanded.at(placed.tau(t))
-    shifts = placed.shifts
-    begun, farthest = round(placed.begun, 3) + 0.0, float(np.abs(shifts).max())
+    tau, shifts, drift, begun = _place(table, commanded, t, fit.table_time(t))
+    angle, rate, *_ = commanded.at(tau)
+    begun, farthest = round(begun, 3) + 0.0, float(np.abs(shifts).max())
     detail = (
         f"the table is followed from its program: {len(shifts)} move{'s'[: len(shifts) > 1]}, begun {begun:.3f} "
-        f"s after the first sample by a clock that gains {placed.drift * 1e6:.3g} ppm, each placed by the gyroscope "
+        f"s after the first sample by a clock that gains {drift * 1e6:.3g} ppm, each placed by the gyroscope "
         f"(up to {farthest:.2g} s off the program; correlation {fit.correlation:.5f}); angles and rates are those "
         "commanded"
     )
@@ -112,57 +111,37 @@ def _flat(program: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
             yield from _flat(step["steps"]) if "repeat" in step else [step]
 
 
-@dataclass(frozen=True)
-class _Placed:
-    """The moves of a program, placed: which move each sample is near to, and m_j, t_j, d_j and k."""
+def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> tuple[Values, Values, float, float]:
+    """Place each move by the readings of the gyroscope about it.
 
-    near: Index
-    middle: Values
-    time: Values
-    shifts: Values
-    drift: float
-    low: Values  # end of the move before, by the program
-    high: Values  # begin of the move after
-
-    @property
-    def begun(self) -> float:
-        """The sensor's time at which the program began, s."""
-        since = float(self.middle[0] + self.shifts[0]) - BEFORE_S
-        return float(self.time[0]) - since / (1.0 + self.drift)
-
-    def tau(self, t: Values) -> Values:
-        """Return the program's time of times of the sensor, s."""
-        j = self.near
-        tau: Values = self.middle[j] + (1.0 + self.drift) * (t - self.time[j]) + self.shifts[j]
-        return np.clip(tau, self.low[j], self.high[j])
-
-
-def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> _Placed:
-    """Place each move by the readings of the gyroscope about it."""
+    Returns the program's time of times of the sensor, s; the deviation of each move, s; the drift; and the sensor's
+    time at which the program began, s. ``tau`` is the program's time by the clocks alone.
+    """
     begin, end = program.knots[1::4, 0], program.knots[4::4, 0]
     gaps = begin[1:] - end[:-1]
     middle, n = (begin + end) / 2, len(begin)
-    near = np.searchsorted(end[:-1] + gaps / 2, tau)
-    low, high = np.append(-np.inf, end[:-1]), np.append(begin[1:], np.inf)
-    placed = _Placed(near, middle, np.interp(middle, tau, t), np.zeros(n), 0.0, low, high)
+    near = np.searchsorted(end[:-1] + gaps / 2, tau)  # the move that each sample is near to
+    low, high = np.append(-np.inf, end[:-1])[near], np.append(begin[1:], np.inf)[near]  # between its neighbours
+    at = np.interp(middle, tau, t)
+    since = t - at[near]
     reach = FARTHEST * np.minimum(np.append(np.inf, gaps), np.append(gaps, np.inf))
     reach = np.minimum(reach, end - begin + 1.0)
+    shifts, drift = np.zeros(n), 0.0
     for _ in range(ROUNDS):
-        now = placed.tau(t)
+        now = np.clip(middle[near] + (1.0 + drift) * since + shifts[near], low, high)
         commanded = program.at(now)[1]
         sensed = _about_the_moves(table, commanded)
         slope = (program.at(now + STEP_S)[1] - program.at(now - STEP_S)[1]) / (2 * STEP_S)
         off = slope * (sensed - commanded)
         info = np.bincount(near, slope**2, n)
         change = np.divide(np.bincount(near, off, n), info, out=np.zeros(n), where=info > 0)
-        since = t - placed.time[near]
         lever = since - np.divide(np.bincount(near, slope**2 * since, n), info, out=np.zeros(n), where=info > 0)[near]
-        gain = float(np.sum(off * lever)) / max(float(np.sum((slope * lever) ** 2)), 1e-300)
-        shifts = np.clip(placed.shifts + change, -reach, reach)
-        placed = replace(placed, shifts=shifts, drift=placed.drift + gain)
+        drift += float(np.sum(off * lever)) / max(float(np.sum((slope * lever) ** 2)), 1e-300)
+        shifts = np.clip(shifts + change, -reach, reach)
         if float(np.abs(change).max()) < 1e-6:
             break
-    return placed
+    begun = float(at[0]) - (float(middle[0] + shifts[0]) - BEFORE_S) / (1.0 + drift)
+    return np.clip(middle[near] + (1.0 + drift) * since + shifts[near], low, high), shifts, drift, begun
 
 
 def _about_the_moves(table: ChannelTable, commanded: Values) -> Values:

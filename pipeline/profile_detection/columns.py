@@ -16,7 +16,6 @@ import numpy as np
 from pipeline.errors import IngestError
 from pipeline.io.ingest_settings import COMMENTED
 from pipeline.io.units import BRACKETS, CHANNELS, SPELLINGS, TRIADS, UNITS, unit_in_brackets
-from pipeline.profile_detection.unit_guesses import whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -92,6 +91,11 @@ class Columns:
         """Return the columns of numbers that hold nothing known."""
         used = {self.time, self.counter, self.arrival, *self.others.values(), *sum(self.triads.values(), ())}
         return [i for i in self.log.numbers if i not in used]
+
+
+def whole(values: Values) -> bool:
+    """Return whether numbers are integers."""
+    return bool(np.all(values == np.rint(values)))
 
 
 def words_of(name: str) -> list[str]:

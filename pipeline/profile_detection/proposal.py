@@ -21,22 +21,24 @@ from pipeline.profile_detection.columns import (
     Columns,
     find_columns,
     stated_unit,
+    whole,
     words_of,
 )
-from pipeline.profile_detection.table_encoder import CENTIDEGREES, find_encoder, unit_by_table
 from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
+    CENTIDEGREES,
     OF_SENSOR,
     UNKNOWN,
     Guess,
     counts_of_sensor,
     even_steps,
+    find_encoder,
     force_unit,
     other_range,
     rate_unit,
     temperature_counts,
     time_unit,
-    whole,
+    unit_by_table,
 )
 
 if TYPE_CHECKING:

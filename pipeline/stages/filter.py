@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.io.parquet import to_parquet
+from pipeline.io.arrow import to_parquet
 from pipeline.signal.filters import apply_filter
 from pipeline.stages.unit_files import noise_file, recordings_of
 

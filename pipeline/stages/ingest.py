@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import IngestError, PipelineError
+from pipeline.io.arrow import to_parquet
 from pipeline.io.files import candidate_files, recording_files, unchanged
-from pipeline.io.parquet import to_parquet
 from pipeline.io.read import read_recordings
 from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
 from pipeline.preprocessing.checks import check_recordings

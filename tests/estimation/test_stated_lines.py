@@ -14,7 +14,7 @@ from table_turns import SHEETS, Bench, settings
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.estimation.uncertainty_budget import covariance_beside_reference
-from pipeline.io.parquet import to_parquet
+from pipeline.io.arrow import to_parquet
 from pipeline.model.calibration_file import beyond_uncertainty
 from pipeline.records import FittedEffect, Note
 from pipeline.stages import batch

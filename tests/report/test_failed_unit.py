@@ -7,7 +7,7 @@ from hand_session import hand_held
 from stage_files import documents, write_pack
 
 from pipeline.config.compose import Composer
-from pipeline.io.parquet import to_parquet
+from pipeline.io.arrow import to_parquet
 from pipeline.pack import Pack
 from pipeline.stages import batch
 

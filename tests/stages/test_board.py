@@ -8,7 +8,7 @@ import numpy as np
 from board_simulator import by_hand, draw_chip, hand_board
 from stage_files import write_pack
 
-from pipeline.io.parquet import to_parquet
+from pipeline.io.arrow import to_parquet
 from pipeline.pack import FAILED, Pack
 from pipeline.stages.batch import Job
 from pipeline.stages.calibration import _on_board

@@ -9,7 +9,7 @@ from bench_session import Session, record
 from stage_files import documents, write_pack
 
 from pipeline.config.compose import Composer
-from pipeline.io.parquet import to_parquet
+from pipeline.io.arrow import to_parquet
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.stages import batch
 
