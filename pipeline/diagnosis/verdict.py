@@ -251,11 +251,16 @@ def _next_step(verdict: str, document: Mapping[str, Any], e: Evidence) -> str:
     """Return what to do next where that is not what the selection says; empty otherwise."""
     if verdict == "unexplained" and e.implausible:
         step = "check that every recording is of this unit in one mounting, and check its range and units"
-        return f"{step}; then {of_unknown(document['unexplained'])}" if document["unexplained"] else step
+        return (
+            f"{step}; then {of_unknown(document['unexplained'], on_table=e.on_table)}"
+            if document["unexplained"]
+            else step
+        )
     if verdict == "unexplained" != e.found:
-        return of_unknown(document["unexplained"])
+        return of_unknown(document["unexplained"], on_table=e.on_table)
     if verdict == "reference_in_doubt":
-        return "check the table's log and the mounting as said above, and record the recordings concerned again"
+        what = "the table's log and the mounting" if e.on_table else "the rests and turns"
+        return f"check {what} as said above, and record the recordings concerned again"
     if verdict == "floor_in_doubt":
         return "record static again: ten minutes or more at rest, on a base that does not shake"
     if verdict != "left_by_method":

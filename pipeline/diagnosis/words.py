@@ -32,6 +32,10 @@ FAR_OFF = (
     "check the table against its log first (steps, backlash, rate, vibration) and the mounting: the residual is far "
     "above the noise and does not depend on any recorded quantity"
 )
+UNSTEADY = (
+    "check that the unit rested firmly before and after each move, without sliding, and that no samples are missing: "
+    "the residual is above the noise and does not depend on any recorded quantity"
+)
 PLUS_MINUS = (
     "+- is two standard uncertainties by the noise of these recordings, as the selection estimates it. A calibration "
     "with the effect estimates the noise anew, adds the accuracies of the bench, and states coverage factors for 95 %."
@@ -127,7 +131,7 @@ def _experiment(name: str, *, on_table: bool) -> str:
 def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: Findings) -> str:
     """Return the experiment that would show most, as one sentence."""
     if verdict == "unexplained":
-        return of_unknown(found.unknown) if found.unknown else found.advice(verdict)
+        return of_unknown(found.unknown, on_table=found.on_table) if found.unknown else found.advice(verdict)
     if not found.selected:
         return found.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
     entries = {entry["effect"]: entry for entry in ranking}
@@ -142,9 +146,9 @@ def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: F
     return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
 
 
-def of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:
+def of_unknown(unknown: Sequence[Mapping[str, Any]], *, on_table: bool) -> str:
     """Return the experiment that would show on which quantity the residual depends, from entries ``unexplained``."""
     if not unknown:
-        return FAR_OFF
+        return FAR_OFF if on_table else UNSTEADY
     covariate = str(unknown[0]["covariate"])
     return f"to find other quantities than {plain(covariate)} on which the residual depends: {UNKNOWN[covariate]}"

@@ -74,6 +74,17 @@ def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any])
     return {r.name: list(split_rests(r, every).held_out) for r in recordings if r.role == "rests"}
 
 
+def advice_on_held_out(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> str:
+    """Return how a fit gets the rests that are held out of it, as a clause; empty where none is."""
+    held = sum(map(len, held_out_rests(recordings, settings).values()))
+    if not held:
+        return ""
+    return (
+        f". There is no recording for validation, so {held} rests, each with the move before it, are held out of the "
+        "fit: record validation, or use them by procedure.holdout_every=0"
+    )
+
+
 def rests_by_use(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Return the rests of the recordings of role ``rests``: which a fit would use, and which not, with the reason.
 

@@ -85,7 +85,8 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
         lack = "none of them logs the table's angle" if own else f"no recording of role {sensor} holds its readings"
         raise CannotCalibrateError(
             f"{method} needs the table's motion for the {sensor}, and {lack}: record turns about x, y and z with "
-            "table_angle_deg, or choose a method that needs no table"
+            "table_angle_deg, or rests in many attitudes, which need no table (procedure=multi_position, "
+            "method=rests_and_moves)"
         )
     return parts
 

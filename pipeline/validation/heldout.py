@@ -97,7 +97,9 @@ def validate(
         part["expected_rms_error"] = expected
         part["notes"] += notes
         if part["held_out"] and expected is not None:
-            part["worse_than_raw"] = _worse_than_raw(calibration, samples, expected[1], other)
+            part["worse_than_raw"] = _worse_than_raw(
+                calibration, samples, expected[1], other, on_table=settings["table"].get("motion") != "none"
+            )
         bins = residuals_over_temperature(calibration, samples, other)
         samples_of = "the held-out samples" if part["held_out"] else "the samples of the fit"
         if bins is None and part["held_out"] and _is_swept(recordings):
@@ -267,7 +269,12 @@ def _choose(
 
 
 def _worse_than_raw(
-    calibration: SensorCalibration, samples: Sequence[Samples], allowed: float, other: SensorCalibration | None
+    calibration: SensorCalibration,
+    samples: Sequence[Samples],
+    allowed: float,
+    other: SensorCalibration | None,
+    *,
+    on_table: bool,
 ) -> str | None:
     """Return why a calibration must not be used, as one sentence; None where it may: its error is ``allowed``."""
     errors = [last_error_of_magnitude(calibration, s, other) for s in samples]
@@ -290,7 +297,7 @@ def _worse_than_raw(
     return (
         f"the calibration makes held-out motion worse: {sizes[0]:.3g} {unit} rms before it, {sizes[1]:.3g} {unit} "
         f"after, where noise and stated uncertainties leave at most {allowed:.3g} {unit}. Check that fit and "
-        "held-out recordings are of this unit in the same mounting, and what the table logged"
+        f"held-out recordings are of this unit in the same mounting{', and what the table logged' * on_table}"
     )
 
 

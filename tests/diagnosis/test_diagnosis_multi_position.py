@@ -176,7 +176,7 @@ def test_a_part_is_json_and_is_told_in_words() -> None:
     assert "there is no table" in text
     assert "What is missing, with 95 % probability: quadratic nonlinearity" in text
     doubted = " ".join(in_words(part | {"verdict": "unexplained"}, "accelerometer"))
-    assert "all of which the verdict doubts: quadratic nonlinearity" in doubted
+    assert "tried explains the residual; the most probable of them: quadratic nonlinearity" in doubted
     assert "What is missing" not in doubted
 
 

@@ -20,6 +20,7 @@ from pipeline.study.run import calibrated, settings_of
 
 INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
 NOTHING = Evidence("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, method="reference_least_squares")
+BY_HAND = replace(NOTHING, method="rests_and_moves", on_table=False)
 MISSING = replace(NOTHING, found="missing_effect", selected=("g_sensitivity",), over_noise=9.0, left_over_noise=1.0)
 STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
 
@@ -38,6 +39,10 @@ def held_out(after: float) -> dict[str, float]:
         (replace(NOTHING, published=None), "nothing_missing", ""),
         (replace(NOTHING, published=ABOVE), "reference_in_doubt", "contradict each other"),
         (replace(NOTHING, published=ABOVE, free=INSIDE), "reference_in_doubt", "contradict each other"),
+        (replace(BY_HAND, published=ABOVE), "reference_in_doubt", "held-out rests are of this unit"),
+        (replace(BY_HAND, doubts=("face +x is 9.0 deg off",)), "reference_in_doubt", "reference: face +x"),
+        (replace(BY_HAND, moves=(2.9, 0.5)), "unexplained", "2.9 deg (rms); noise and stated uncertainties explain at"),
+        (replace(BY_HAND, moves=(2.9, 3.5)), "nothing_missing", ""),
         (replace(NOTHING, published=ABOVE, over_noise=4.0), "unexplained", "4 times the noise"),
         (replace(NOTHING, published=BELOW), "floor_in_doubt", "estimate is too large"),
         (replace(NOTHING, over_noise=0.1), "floor_in_doubt", "0.1 times the noise"),
@@ -85,6 +90,8 @@ def test_the_first_that_applies_is_said_with_its_numbers(evidence: Evidence, ver
     step = said["next_experiment"]
     assert (step == "none is needed") == (verdict in {"nothing_missing", "missing_effect"} or verdict == evidence.found)
     assert bool(said["override"]) == (verdict == "missing_effect")
+    if not evidence.on_table:
+        assert "table" not in step + reason
     if evidence.method == "reference_least_squares":
         assert "reference_least_squares" not in step + reason
 

@@ -218,7 +218,8 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: f
 
 def _left(rows: Orientations) -> str:
     left_out, held_out = len(rows.left_out), len(rows.held_out)
-    return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation"
+    unless = " (procedure.holdout_every=0 uses them)" if held_out else ""
+    return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation{unless}"
 
 
 def _fitted(rows: Orientations, gravity_g: float, prior: Prior, by_limit: Mask, limit: float) -> _Solved:

@@ -23,7 +23,7 @@ from pipeline.estimation.multi_position.likelihood import NEW, prior_hypotheses
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import noise_of, prior_of
-from pipeline.estimation.rest_means import ROLE, is_multi_position
+from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position
 from pipeline.records import Recording, SensorCalibration, Values
 
 if TYPE_CHECKING:
@@ -53,15 +53,15 @@ def fit(
             "rests and moves need the accelerometer's readings beside the gyroscope's: gravity before and after each "
             "move tells by how much the unit turned. A gyroscope alone needs a rate table"
         )
-    noise = noise_of("gyroscope", recordings, settings)
+    noise, advice = noise_of("gyroscope", recordings, settings), ADVICE + advice_on_held_out(recordings, settings)
     model = model_of(recordings, None, noise, settings)
     if model is None or (model.moves is None and model.turns is None):
         raise NotObservableError(
             f"the gyroscope's matrix needs at least {FEWEST_MOVES} moves between rests, without gaps or clipped "
-            f"readings: {ADVICE}"
+            f"readings: {advice}"
         )
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
-    _require_determined(model.equations(start).base)
+    _require_determined(model.equations(start).base, advice)
     prior = prior_of("gyroscope", recordings, settings)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     fitted = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
@@ -73,7 +73,7 @@ def fit(
         assert model is not None  # noqa: S101
         model, found, outlying = fit_robustly(model, partial(fitted, start=found.state), recordings)
     moves = model.moves.count if model.moves else 0
-    _require_known(found.covariance, moves)
+    _require_known(found.covariance, moves, advice)
     apart = found.residual[model.of_moves] * found.error[model.of_moves]
     details: dict[str, Any] = {
         "rests": len(model.rests.time),
@@ -97,19 +97,19 @@ def fit(
     return after_stage(before, NAME, details, model, found, settings, correction)
 
 
-def _require_known(covariance: Values, moves: int) -> None:
+def _require_known(covariance: Values, moves: int, advice: str) -> None:
     """Refuse a matrix of which only the noise of the readings says something: no sensor is so far off."""
     u = np.sqrt(np.diag(covariance))
     weak = [name for name, one in zip(BASE_NAMES[3:], u[3:], strict=True) if one > UNKNOWN]
     if weak:
         raise NotObservableError(
             f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u[3:].max()):.2g} "
-            f"(standard uncertainty), as if all were about one axis: {ADVICE}"
+            f"(standard uncertainty), as if all were about one axis: {advice}"
         )
 
 
-def _require_determined(base: Values) -> None:
+def _require_determined(base: Values, advice: str) -> None:
     if ScaledColumns.of(base, NEW).rank < base.shape[1]:
         raise NotObservableError(
-            f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {ADVICE}"
+            f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {advice}"
         )

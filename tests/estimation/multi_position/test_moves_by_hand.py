@@ -104,5 +104,19 @@ def test_without_rests_by_hand_the_gyroscope_is_left_null_with_the_reason() -> N
 
 def test_too_few_moves_are_refused() -> None:
     unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=0)
-    with pytest.raises(NotObservableError, match="at least 6 moves"):
+    with pytest.raises(NotObservableError, match="at least 6 moves") as refused:
         rests_and_moves.fit(unit.recordings, None, unit.settings)
+    assert "holdout_every" not in str(refused.value)
+    unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=3)
+    with pytest.raises(
+        CannotCalibrateError, match=r"2 are held out for validation \(procedure.holdout_every=0 uses them"
+    ):
+        rests_and_moves.fit(unit.recordings, None, unit.settings)
+    unit = hand_held("mpu6050", 6)
+    few = [
+        replace(r.select(slice(0, int(0.27 * r.samples))), role="rests") for r in unit.recordings if r.role == "rests"
+    ]
+    with pytest.raises(
+        NotObservableError, match=r"so 3 rests, .* are held out .* use them by procedure.holdout_every=0"
+    ):
+        rests_and_moves.fit(few, None, unit.settings)
