@@ -126,43 +126,9 @@ def adjusted(p_values: Sequence[float]) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Group:
-    """A group of a comparison and the figures of its units for one sensor.
-
-    ``series, label``: its curve and its name on that curve; ``asked``: how many units it has, failed ones included;
-    ``figures``: rows of ``unit_figures`` by unit, those that were calibrated.
-    """
-
-    name: str
-    series: str
-    label: str
-    asked: int
-    figures: pd.DataFrame
-
-    def logarithms(self, measure: str) -> pd.DataFrame:
-        """Return ``value`` and ``u`` of ln(measure) for each unit that has it."""
-        value, u = (pd.to_numeric(self.figures[name]) for name in (measure, f"u_{measure}"))
-        known = value > 0.0
-        return pd.DataFrame({"value": np.log(value[known]), "u": u[known] / value[known]})
-
-    def mean(self, name: str) -> float | None:
-        """Return the geometric mean of a figure."""
-        values = pd.to_numeric(self.figures[name])
-        values = values[values > 0.0]
-        return float(np.exp(np.log(values).mean())) if len(values) else None
-
-    def parameter(self, name: str) -> pd.DataFrame:
-        """Return ``value`` and ``u`` of a fitted parameter for each unit that has it."""
-        found = {unit: each[name] for unit, each in self.figures["parameters"].items() if name in each}
-        rows = [(p.value, p.standard_uncertainty) for p in found.values()]
-        return pd.DataFrame(rows, list(found), ["value", "u"], dtype=float)
-
-
-@dataclass(frozen=True)
 class Compared:
     """The mean logarithm of a group, and its difference from the reference group with the adjusted p-value."""
 
-    group: Group
     logarithm: Estimate
     difference: Estimate | None
     p_value: float
@@ -187,39 +153,42 @@ class Compared:
             return "not told apart"
         return "smaller" if self.difference.value < 0 else "larger"
 
-    @property
-    def verdicts(self) -> pd.Series[int]:
-        """How many units have each verdict."""
-        verdicts = self.group.figures["verdict"]
-        return verdicts[verdicts != ""].value_counts(sort=False)
+
+def logarithms(figures: pd.DataFrame, measure: str) -> pd.DataFrame:
+    """Return ``value`` and ``u`` of ln(measure) for each unit that has it; ``figures``: a row a unit."""
+    value, u = (pd.to_numeric(figures[name]) for name in (measure, f"u_{measure}"))
+    known = value > 0.0
+    return pd.DataFrame({"value": np.log(value[known]), "u": u[known] / value[known]})
 
 
 def compare(
-    groups: Sequence[Group], measure: str, against: str, pairs: Mapping[str, str] | None = None
-) -> list[Compared]:
-    """Compare each group's measure (``before``, ``after``, ``truth``) with that of the group ``against``.
+    groups: Mapping[str, pd.DataFrame], against: str, pairs: Mapping[str, str] | None = None
+) -> dict[str, Compared]:
+    """Compare the logarithms of each group, as of ``logarithms``, with those of the group ``against``.
 
-    Groups without the measure are left out; without a group of that name there are no differences.
+    Groups without values are left out; without a group of that name there are no differences.
     """
-    own = {g.name: values for g in groups if len(values := g.logarithms(measure))}
-    known = [g for g in groups if g.name in own]
-    apart = [against in own and g.name != against for g in known]
-    changes = [difference(own[g.name], own[against], pairs) if a else None for g, a in zip(known, apart, strict=True)]
-    p_values = adjusted([change.p_value if change else math.nan for change in changes])
-    return [
-        Compared(g, mean_of(own[g.name]["value"], own[g.name]["u"]), change, p)
-        for g, change, p in zip(known, changes, p_values, strict=True)
-    ]
+    known = {name: values for name, values in groups.items() if len(values)}
+    changes = {
+        name: difference(values, known[against], pairs) if against in known and name != against else None
+        for name, values in known.items()
+    }
+    p_values = adjusted([change.p_value if change else math.nan for change in changes.values()])
+    return {
+        name: Compared(mean_of(values["value"], values["u"]), changes[name], p)
+        for (name, values), p in zip(known.items(), p_values, strict=True)
+    }
 
 
-def finding(groups: Sequence[Group], measure: str, pairs: Mapping[str, str] | None) -> str:
+def finding(groups: Mapping[str, pd.DataFrame], pairs: Mapping[str, str] | None) -> str:
     """Return which group has the smallest mean, and which are not told apart from it."""
-    best = min(compare(groups, measure, ""), key=lambda c: c.mean)
-    low, high = best.interval
-    said = f"Smallest with {best.group.name}: {number(best.mean)}"
+    compared = compare(groups, "")
+    best = min(compared, key=lambda name: compared[name].mean)
+    low, high = compared[best].interval
+    said = f"Smallest with {best}: {number(compared[best].mean)}"
     said += f" ({number(low)} to {number(high)})" if low < high else ""
-    others = [c for c in compare(groups, measure, best.group.name, pairs) if c.result]
-    near = [c.group.name for c in others if c.p_value > LEVEL]
+    others = {name: c for name, c in compare(groups, best, pairs).items() if c.result}
+    near = [name for name, c in others.items() if c.p_value > LEVEL]
     if not others:
         return said
     if not near:

@@ -26,7 +26,7 @@ import pandas as pd
 
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Figure
-from pipeline.report.comparison import LEVEL, Compared, Group, compare, difference, finding, mean_of
+from pipeline.report.comparison import LEVEL, Compared, compare, difference, finding, logarithms, mean_of
 from pipeline.report.group_charts import COLOURS, Point, bars, curves
 from pipeline.report.held_out_section import first_and_last_step
 from pipeline.report.numbers import measured, number
@@ -103,28 +103,18 @@ def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
     against, pairs, sensors = comparison["against"], comparison["pairs"], []
     for sensor in comparison["sensors"]:
         known, unit = frame[frame["sensor"] == sensor], SENSOR_UNITS[sensor]
-        groups = [
-            Group(
-                g["name"],
-                g["series"],
-                g["label"],
-                len(g["units"]),
-                known.loc[[u for u in g["units"] if u in known.index]],
-            )
-            for g in comparison["groups"]
-        ]
-        compared = {m: c for m in MEASURES if (c := compare(groups, m, against, pairs))}
-        measures = [
-            {
-                "name": m,
-                "title": MEASURES[m],
-                "figure": _figure(c, comparison, m, f"{MEASURES[m]}, {unit}", f"{name}-{sensor}-{m}"),
-                "rows": c,
-            }
-            for m, c in compared.items()
-        ]
+        units = {g["name"]: known.loc[[u for u in g["units"] if u in known.index]] for g in comparison["groups"]}
+        measures = []
+        for m, title in MEASURES.items():
+            groups = {name: logarithms(own, m) for name, own in units.items()}
+            compared = compare(groups, against, pairs)
+            rows = [_row(g, units[g["name"]], c, m) for g in comparison["groups"] if (c := compared.get(g["name"]))]
+            if rows:
+                told = finding(groups, pairs)
+                figure = _figure(rows, told, comparison, f"{title}, {unit}", f"{name}-{sensor}-{m}")
+                measures.append({"name": m, "title": title, "figure": figure, "rows": rows})
         if measures:
-            parameters = _parameters(groups, against, pairs)
+            parameters = _parameters(units, against, pairs)
             sensors.append({"sensor": sensor, "unit": unit, "measures": measures, "parameters": parameters})
     return {
         "title": comparison["title"],
@@ -136,13 +126,34 @@ def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
     }
 
 
-def _figure(compared: list[Compared], comparison: JSON, measure: str, title: str, name: str) -> Figure:
+def _row(group: JSON, units: pd.DataFrame, compared: Compared, measure: str) -> JSON:
+    """Return what the page shows of a group and a measure; ``units``: the figures of its calibrated units."""
+    verdicts = units["verdict"]
+    return {
+        "name": group["name"],
+        "measure": measure,
+        "group": group,
+        "units": units,
+        "compared": compared,
+        "verdicts": verdicts[verdicts != ""].value_counts(sort=False),
+        "floor": _mean(units["noise_floor"]) if measure == "after" else None,
+        **{name: _mean(units[name]) for name in ("before", "table_time")},
+    }
+
+
+def _mean(values: pd.Series[float]) -> float | None:
+    """Return the geometric mean of the positive values."""
+    values = pd.to_numeric(values)
+    values = values[values > 0.0]
+    return float(np.exp(np.log(values).mean())) if len(values) else None
+
+
+def _figure(rows: Sequence[JSON], told: str, comparison: JSON, title: str, name: str) -> Figure:
     """Draw a measure: along the axis that the comparison names, or in rows."""
     x = comparison["x"]
-    points = [p for c in compared if (p := _point(c, measure, x)) is not None]
+    points = [p for row in rows if (p := _point(row, x)) is not None]
     words = ["Mean of each group with its 95 % interval; faint, its units."] * any(len(p.units) > 1 for p in points)
     words += ["Dashed: the error that noise alone gives."] * any(p.floor for p in points)
-    told = finding([c.group for c in compared], measure, comparison["pairs"])
     figure = Figure(name, told, " ".join(words))
     if x is None:
         return bars(figure, points, title)
@@ -151,41 +162,47 @@ def _figure(compared: list[Compared], comparison: JSON, measure: str, title: str
     return curves(replace(figure, legend=legend), points, title, x["label"], named=x["named"])
 
 
-def _point(c: Compared, measure: str, x: JSON | None) -> Point | None:
+def _point(row: JSON, x: JSON | None) -> Point | None:
     """Return the point of a group; None where its place on the axis is not known."""
-    at: float | None = 0.0
-    if x is not None and x["values"] is None:
-        at = c.group.mean("table_time")
-    elif x is not None:
-        at = fmean(x["values"][u] for u in c.group.figures.index)
+    units, compared, at = row["units"], row["compared"], 0.0
+    if x is not None:
+        at = row["table_time"] if x["values"] is None else fmean(x["values"][u] for u in units.index)
     if at is None:
         return None
-    units = tuple(v for v in c.group.figures[measure] if v and v > 0.0)
-    floor = c.group.mean("noise_floor") if measure == "after" else None
-    return Point(c.group.label, c.mean, 0, c.interval, units, floor, at, c.group.series)
+    each, group = tuple(v for v in units[row["measure"]] if v and v > 0.0), row["group"]
+    return Point(group["label"], compared.mean, 0, compared.interval, each, row["floor"], at, group["series"])
 
 
-def _parameters(groups: Sequence[Group], against: str, pairs: Mapping[str, str] | None) -> JSON:
+def _parameters(units: Mapping[str, pd.DataFrame], against: str, pairs: Mapping[str, str] | None) -> JSON:
     """Return each group's mean parameters, and their differences over the standard uncertainty.
 
     ``names`` of the parameters, and ``rows`` of ``name`` and ``cells``: value, difference over its standard
     uncertainty, and whether equal parameters would exceed it in less than 5 % of cases.
     """
-    names = list(dict.fromkeys(n for g in groups for each in g.figures["parameters"] for n in each))
-    reference = next(g for g in groups if g.name == against)
+    names = list(dict.fromkeys(n for own in units.values() for each in own["parameters"] for n in each))
     rows = []
-    for group in groups:
+    for group, own in units.items():
         cells = []
         for name in names:
-            own = group.parameter(name)
-            mean, change = mean_of(own["value"], own["u"]), difference(own, reference.parameter(name), pairs)
+            values = _of_units(own, name)
+            mean, change = (
+                mean_of(values["value"], values["u"]),
+                difference(values, _of_units(units[against], name), pairs),
+            )
             U = mean.expanded_uncertainty
-            if group is reference:
+            if group == against:
                 change = replace(change, standard_uncertainty=math.nan)
             cells.append({
                 "value": measured(mean.value, U) if U > 0.0 else number(mean.value),
                 "significance": "" if math.isnan(change.significance) else number(change.significance, 2),
                 "beyond": change.p_value < LEVEL,
             })  # fmt: skip
-        rows.append({"name": group.name, "cells": cells})
+        rows.append({"name": group, "cells": cells})
     return {"names": names, "rows": rows}
+
+
+def _of_units(figures: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Return ``value`` and ``u`` of a fitted parameter for each unit that has it."""
+    found = {unit: each[name] for unit, each in figures["parameters"].items() if name in each}
+    rows = [(p.value, p.standard_uncertainty) for p in found.values()]
+    return pd.DataFrame(rows, list(found), ["value", "u"], dtype=float)

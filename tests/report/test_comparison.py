@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from pipeline.report.campaign_page import render
-from pipeline.report.comparison import Group, adjusted, compare, difference, finding, mean_of
+from pipeline.report.comparison import adjusted, compare, difference, finding, logarithms, mean_of
 from pipeline.report.comparison_section import against_truth, section, unit_figures
 from pipeline.report.numbers import number
 from pipeline.report.parameters import Parameter
@@ -22,10 +22,10 @@ def quantities(values: Iterable[float], prefix: str = "U", u: float = math.nan) 
     return pd.DataFrame({"value": found, "u": u}, index=[f"{prefix}{i}" for i in range(len(found))])
 
 
-def group(name: str, errors: Iterable[float]) -> Group:
+def group(name: str, errors: Iterable[float]) -> pd.DataFrame:
     values = [float(e) for e in errors]
     figures = pd.DataFrame({"after": values, "u_after": None}, index=[f"{name}{i}" for i in range(len(values))])
-    return Group(name, "", name, len(values), figures)
+    return logarithms(figures, "after")
 
 
 def test_the_difference_of_two_groups_is_that_of_welchs_test() -> None:
@@ -69,8 +69,9 @@ def test_groups_of_equal_units_are_seldom_told_apart_and_different_ones_nearly_a
     rng = np.random.default_rng(3)
     wrong = found = 0
     for _ in range(150):
-        groups = [group(n, np.exp(rng.normal(m, 1.0, 6))) for n, m in (("a", 0.0), ("b", 0.0), ("c", 0.0), ("d", 4.0))]
-        told = {c.group.name: c.p_value < 0.05 for c in compare(groups, "after", "a")}
+        means = {"a": 0.0, "b": 0.0, "c": 0.0, "d": 4.0}
+        groups = {n: group(n, np.exp(rng.normal(m, 1.0, 6))) for n, m in means.items()}
+        told = {name: c.p_value < 0.05 for name, c in compare(groups, "a").items()}
         wrong += told["b"] or told["c"]
         found += told["d"]
     assert wrong / 150 < 0.05 + 3.0 * math.sqrt(0.05 * 0.95 / 150)
@@ -138,13 +139,13 @@ def test_the_page_tells_each_group_with_its_interval_and_its_difference(x: dict[
     (sensor,) = made["sensors"]
     (after,) = sensor["measures"]
     slow, fast = after["rows"]
-    assert (number(slow.mean), slow.group.mean("table_time")) == ("0.0107", pytest.approx(720.0))
-    assert slow.verdicts.to_dict() == {"nothing_missing": 4}
+    assert (number(slow["compared"].mean), slow["table_time"]) == ("0.0107", pytest.approx(720.0))
+    assert slow["verdicts"].to_dict() == {"nothing_missing": 4}
     logs = {n: np.log([level + 0.0005 * i for i in range(4)]) for n, level in (("slow", 0.010), ("fast", 0.020))}
     theirs = stats.ttest_ind(logs["fast"], logs["slow"], equal_var=False)
     low, high = (100.0 * math.expm1(v) for v in theirs.confidence_interval(0.95))
     change = 100.0 * math.expm1(logs["fast"].mean() - logs["slow"].mean())
-    assert fast.result == "larger"
+    assert fast["compared"].result == "larger"
     assert after["figure"].finding == "Smallest with slow: 0.0107 (0.00976 to 0.0118); all others are larger"
     assert sensor["parameters"]["rows"][1]["cells"][0]["value"] == "0.120"
     page = render("bench", [], [], [made])
@@ -157,8 +158,8 @@ def test_the_page_tells_each_group_with_its_interval_and_its_difference(x: dict[
 
 def test_a_finding_names_the_groups_that_are_not_told_apart_from_the_best() -> None:
     values = {"a": [1.0, 1.2, 1.1], "b": [1.1, 1.3, 1.15], "c": [5.0, 5.2, 5.1]}
-    groups = [group(name, errors) for name, errors in values.items()]
-    assert finding(groups, "after", None) == "Smallest with a: 1.10 (0.875 to 1.38); not told apart from it: b"
+    groups = {name: group(name, errors) for name, errors in values.items()}
+    assert finding(groups, None) == "Smallest with a: 1.10 (0.875 to 1.38); not told apart from it: b"
 
 
 def test_a_mean_of_nothing_is_nothing_and_of_one_its_own() -> None:
