@@ -15,7 +15,7 @@ import pandas as pd
 
 from pipeline.outcome import VERDICTS, findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
-from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart
+from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart, sentences
 from pipeline.report.fleet import parameter_table, wide
 from pipeline.report.held_out_section import FAR
 from pipeline.report.numbers import number, percent, plain, unit_text
@@ -55,8 +55,8 @@ def render(
 
     ``rows``: one a unit, as of ``summary_row``, in the order of ``units.csv``; ``failures``: ``unit, stage, code,
     message, file`` of each failed unit; ``comparisons``: as of ``comparison_section.section``; ``page``: name of a
-    further page; ``twins``: as of ``gather.same_files``; ``statistics``: as of ``fleet_statistics``; ``placed``: of
-    ``against_limits`` of all units; ``history``: as of ``runs_data``; ``settings``: of the run, for the commands to
+    further page; ``twins``: as of ``gather.same_files``; ``statistics``: as of ``fleet_statistics``; ``parameters``:
+    of ``parameter_table`` of all units; ``history``: as of ``runs_data``; ``settings``: of the run, for the commands to
     continue with; ``published``: units that have a page of their own where pages are published on request only, None:
     all.
     """
@@ -228,8 +228,7 @@ SPREAD, HALF = 0.6, 0.42  # of a row: over which the units stand in their order,
 def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[Told]:
     """Return the strip plots of a campaign, each with the text of its dots.
 
-    ``rows``: one a unit, as of ``summary_row``, in the order of the page; ``placed``: of ``against_limits``, value and
-    limit of the parameters of each unit.
+    ``rows``: one a unit, as of ``summary_row``, in the order of the page; ``parameters``: of ``parameter_table``.
     """
     siblings: dict[tuple[str, str], list[int]] = {}
     for i, row in enumerate(rows):
@@ -275,17 +274,18 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, own: pd.Data
                 _told(labels[b], value[a, b], limit[a, b], measures[labels[b]]) for a, b in zip(i, j, strict=True)
             ]
     worst, column = np.unravel_index(np.nanargmax(np.abs(share)), share.shape)
-    farthest = f"{units[numbers[worst]]}, {labels[column].lower()} ({percent(float(abs(share[worst, column])))})"
-    count = int(beyond.any(axis=1).sum())
-    said = f"{count} of {len(numbers)} units are beyond" if count else f"all {len(numbers)} units are within"
-    caption = "Each unit a dot, as a share of the sensor file's limit; shaded: within the limit."
-    if many:
-        caption += f" Grey bars: 5 to 95 % of the units; dots: the {ENDS} smallest and largest."
-    if np.nanmax(np.abs(share)) > EDGE:
-        caption += f" Shares above {percent(EDGE)} stand at the edge."
-    figure = Figure(name, f"{title}: {said} the sensor file's limits; farthest: {farthest}", caption, tuple(legend))
-    medians = zip(labels, np.nanmedian(share, axis=0), strict=True)
-    description = "Median share of the limit. " + "; ".join(f"{k}: {percent(float(m))}" for k, m in medians)
+    finding, caption, description = sentences(
+        "strip",
+        title=title,
+        beyond=int(beyond.any(axis=1).sum()),
+        count=len(numbers),
+        farthest=f"{units[numbers[worst]]}, {labels[column].lower()}",
+        share=float(abs(share[worst, column])),
+        ends=ENDS if many else 0,
+        edge=EDGE if np.nanmax(np.abs(share)) > EDGE else 0,
+        medians=[*zip(labels, np.nanmedian(share, axis=0).tolist(), strict=True)],
+    )
+    figure = Figure(name, finding, caption, tuple(legend))
     panel = Panel([*layers, *dots], "", ROW * len(labels), limits=(0.4, at[0] + 0.6), rows=labels[::-1])
     label = "share of the sensor file's limit, %"
     return chart(figure, description, [panel], label, margin=0.03, left=LEFT, units="units"), values

@@ -13,16 +13,18 @@ from -32767 at the low end of the axis to 32767, -32768 where there is no value;
 
 from __future__ import annotations
 
+import re
 from base64 import b64encode
 from dataclasses import dataclass, replace
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.axis import SUBDIVISION, Axis
 from pipeline.report.numbers import typeset
+from pipeline.report.pages import template
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -66,6 +68,13 @@ class Figure:
             f'<desc id="{name}-d">{escape(typeset(description))}</desc>{content}</svg>'
         )
         return replace(self, svg=svg, finding=finding, caption=typeset(self.caption))
+
+
+def sentences(figure: str, **values: Any) -> tuple[str, str, str]:  # noqa: ANN401
+    """Return the sentences of a chart by its macro in ``templates/figures.txt``: finding, caption, description."""
+    told = str(getattr(template("figures.txt").module, figure)(**values))
+    finding, caption, *description = (re.sub(r"[ \n]+", " ", part).strip() for part in told.split("---\n"))
+    return finding, caption, " ".join(description)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, parameter_limits
 from pipeline.records import AXES, SENSOR_UNITS, Values
 from pipeline.report.axis import LINEAR_TO
-from pipeline.report.chart import Dots, Figure, Layer, Line, Panel, chart
+from pipeline.report.chart import Dots, Figure, Layer, Line, Panel, chart, sentences
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import measured, number, percent, plain, unit_text
 
@@ -76,15 +76,8 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
     shown = [row for row in rows if row["share"]]
     if not shown:
         return None
-    count, beyond = len(shown), sum(row["share"] >= 1.0 for row in shown)
-    verb = "is" if count - beyond == 1 else "are"
-    finding = f"{count - beyond} of {count} effects that were not selected {verb} excluded at the sensor file's limit"
-    caption = (
-        "Upper limits (95 %) of the largest parameter of each effect, were it there, over the sensor file's limit: "
-        "left of the line the recordings exclude an effect of that size."
-    )
-    if rest := count - MOST_LIMITS:
-        caption += f" {rest} more are lower, listed below." if rest > 0 else ""
+    excluded = sum(row["share"] < 1.0 for row in shown)
+    finding, caption, _ = sentences("limits", count=len(shown), excluded=excluded, others=len(shown) - MOST_LIMITS)
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
     figure = Figure(f"{sensor}-limits", finding, caption)
     return bars(figure, points, "upper limit over the sensor file's limit", levels={"limit of the sensor file": 1.0})
@@ -113,21 +106,22 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
     shown = helpful if len(helpful) >= FEWEST else entries[:FEWEST]
     rows = [_ranking_row(r, selected) for r in shown]
     brackets = _brackets(shown, selected)
-    caption = (
-        "ΔBIC of each effect beyond the configured model: of a selected effect when it was added, of the others alone. "
-        "Right of the threshold the evidence is strong."
+    best = max((r for r in entries if r["effect"] not in selected), key=_evidence, default=None)
+    value = _evidence(next((r for r in entries if r["effect"] == (selected or [None])[0]), {}))
+    finding, caption, _ = sentences(
+        "ranking",
+        selected=selected,
+        value=value,
+        best=best,
+        close=best is not None and _evidence(best) > CLOSE * value,
+        passes=best is not None and _evidence(best) > GATE,
+        brackets=brackets,
+        others=len(entries) - len(shown),
+        hidden=len(hidden[MOST_HIDDEN:]),
     )
-    if brackets:
-        caption += (
-            " Brackets join effects with similar signals, with the share of the signal that the other reproduces."
-        )
-    if rest := len(entries) - len(shown):
-        caption += f" {rest} more {'has' if rest == 1 else 'have'} less evidence; see the tables below."
-    if rest := len(hidden[MOST_HIDDEN:]):
-        caption += f" {rest} more {'is' if rest == 1 else 'are'} not observable, listed below."
     legend = tuple((f"c{c}", t) for c, t in COLOURS.items() if c in {row.colour for row in rows})
     rows += [Point(f"{plain(h['effect'])}: not observable", None, note=h["reason"]) for h in hidden[:MOST_HIDDEN]]
-    figure = Figure(f"{sensor}-ranking", _ranking_finding(entries, selected), caption, legend)
+    figure = Figure(f"{sensor}-ranking", finding, caption, legend)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"
     return bars(figure, rows, label, levels={f"threshold {GATE:g}": GATE}, kind="symlog", brackets=brackets)
 
@@ -142,23 +136,6 @@ def _ranking_row(entry: JSON, selected: Sequence[str]) -> Point:
     beyond = " (beyond the sensor file's limits)" if value > GATE and not entry.get("plausible", True) else ""
     note = "like " + ", ".join(f"{plain(a['effect'])} {percent(a['share'])}" for a in alike) if alike else ""
     return Point(plain(entry["effect"]) + beyond, value, colour, note=note)
-
-
-def _ranking_finding(entries: Sequence[JSON], selected: Sequence[str]) -> str:
-    best = max((r for r in entries if r["effect"] not in selected), key=_evidence, default=None)
-    nearest = f"{plain(best['effect'])} reaches {number(_evidence(best))}" if best else ""
-    if not selected:
-        none = best is None or _evidence(best) <= GATE
-        head = "No effect passes the threshold" if none else "No effect is selected"
-        return f"{head}: at best, {nearest}" if nearest else head
-    value = _evidence(next((r for r in entries if r["effect"] == selected[0]), {}))
-    head, close = plain(selected[0]).capitalize(), best is not None and _evidence(best) > CLOSE * value
-    if len(selected) > 1:
-        head += f", before {', '.join(plain(n) for n in selected[1:])},"
-    head += f" is selected with ΔBIC {number(value)}" if close else f" stands out: ΔBIC {number(value)}"
-    if not nearest:
-        return head
-    return f"{head}, but {nearest}" if close else f"{head}; of the others, {nearest}"
 
 
 def _brackets(shown: Sequence[JSON], selected: Sequence[str]) -> list[dict[int, str]]:
@@ -193,22 +170,22 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
         left, total = left + float(off.sum()), total + float(np.sum((mean / error) ** 2))
     straight = max(scatter) < ON_THE_LINE or 1.0 - left / max(total, 1e-300) > MOST_EXPLAINED
     best = max(shown["panels"], key=lambda p: abs(p["value"]) / max(p["standard_uncertainty"], 1e-300))
-    finding = f"{effect.capitalize()} shows: {_coefficient(best)}"
-    finding += ", and the points follow the line" if straight else "; some points leave the line"
     what = best["parameter"] if len({p["parameter"] for p in shown["panels"]}) == 1 else "each parameter"
-    slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
-    x_unit = _column_unit(best["unit"], unit)
-    caption = (
-        "Readings minus what bias, matrix, other effects and bias wander explain, in bins with ±2 standard errors; the "
-        f"slope of the line is the parameter ({slopes}; ±: two standard uncertainties by the noise)."
+    slopes, x_unit = (
+        "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"])),
+        _column_unit(best["unit"], unit),
     )
-    return chart(
-        Figure(f"{sensor}-added-variable", finding, caption, (("c5", "slope = parameter"),)),
-        f"Added-variable plot of {effect}. Slopes: {slopes}. Mean square of the points about the line, in standard "
-        f"errors: {', '.join(number(s, 2) for s in scatter)}.",
-        panels,
-        f"column of {what}, minus all other columns" + (f", {x_unit}" if x_unit else ""),
+    finding, caption, description = sentences(
+        "added_variable",
+        effect=effect,
+        coefficient=_coefficient(best),
+        slopes=slopes,
+        straight=straight,
+        scatter=scatter,
     )
+    figure = Figure(f"{sensor}-added-variable", finding, caption, (("c5", "slope = parameter"),))
+    label = f"column of {what}, minus all other columns" + (f", {x_unit}" if x_unit else "")
+    return chart(figure, description, panels, label)
 
 
 def _points(panel: JSON) -> tuple[Values, Values, Values]:
@@ -259,20 +236,15 @@ def _unexplained(sensor: str, shown: JSON, entry: JSON) -> Figure:
             layers.insert(0, Line(curve_x, curve, 5, "model"))
             off.append(float(np.mean(((mean - np.interp(x, curve_x, curve)) / error) ** 2)))
         panels.append(Panel(layers, f"{panel['axis']}, {unit}", 76, {"": 0.0}))
-    finding = f"The residual depends on {plain(shown['covariate'])}"
-    finding += f": {entry['shape']}" if entry.get("shape") else ""
     reaches = [f"{p['axis']} up to {number(float(np.abs(p['mean']).max()))} {unit}" for p in shown["panels"]]
-    caption = "Residual in bins, with ±2 standard errors of white noise and the expected bias wander"
-    if off:
-        caption += "; the line is the suggested shape, fitted together with bias, matrix and effects"
-    if entry.get("delta_bic"):
-        caption += f" (ΔBIC {number(entry['delta_bic'])})"
     follow = all(mean_square < ON_THE_LINE for mean_square in off)
-    caption += ". No effect of the catalogue explains it." if follow else ". The points do not follow it well."
+    finding, caption, description = sentences(
+        "unexplained", covariate=shown["covariate"], entry=entry, fitted=off, follow=follow, reaches=reaches
+    )
     legend = (("c5", "suggested shape"),) if off else ()
     return chart(
         Figure(f"{sensor}-unexplained-{shown['covariate']}", finding, caption, legend),
-        f"Binned means of the residual: {', '.join(reaches)}.",
+        description,
         panels,
         SIGNALS.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}"),
         kind="angle" if shown["signal"] == "angle" else "",

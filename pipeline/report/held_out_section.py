@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.records import SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration, Values
-from pipeline.report.chart import Area, Figure, Layer, Line, Panel, Samples, chart
+from pipeline.report.chart import Area, Figure, Layer, Line, Panel, Samples, chart, sentences
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
 from pipeline.validation.error_breakdown import with_known_effects
@@ -73,26 +73,21 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
     if vector or all(s.get("vector_rms_error") is None for s in steps):
         added = _steps_if_added(found, reached)
     kind = "vector" if vector else "magnitude"
-    finding = f"The error of the {kind} ends at {number(reached)} {unit}"
-    if reached and floor:
-        finding += f", {number(reached / floor)} × the noise floor"
-    if added:
-        finding += f"; with the missing effects, at {number(added[-1].value)}"
+    keys = ("source", "wander_source", "correlation_time_source") if "noise" in held_out else ()
+    finding, caption, _ = sentences(
+        "staircase",
+        kind=kind,
+        reached=reached,
+        floor=floor,
+        unit=unit,
+        added=added,
+        held_out=held_out.get("held_out", True),
+        sources=[SOURCES[held_out["noise"][key]] for key in keys],
+    )
     words = "if it were added" + (" with the suggested shape" if found.get("suggested_effect") else "")
-    whose = "Held-out error" if held_out.get("held_out", True) else "Error on the samples of the fit,"
-    caption = f"{whose} of the {kind} after each step; the line is the error that noise alone gives."
-    caption += _sources(held_out["noise"]) if "noise" in held_out else ""
     figure = Figure(f"{sensor}-staircase-{kind}", finding, caption, (("c4", words),) if added else ())
     label = f"root mean square error, {unit} (logarithmic)"
     return bars(figure, rows + added, label, levels={f"noise floor {number(floor)}": floor or 0.0})
-
-
-def _sources(noise: JSON) -> str:
-    """Return a sentence on where the noise of the noise floor comes from."""
-    white, wander, time = (SOURCES[noise[key]] for key in ("source", "wander_source", "correlation_time_source"))
-    if white == wander == time:
-        return f" White noise and bias wander are those of {white}."
-    return f" White noise is that of {white}, bias wander that of {wander}, its correlation time that of {time}."
 
 
 def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
@@ -144,15 +139,9 @@ def held_out_over_time(
         Panel([Samples(x, raw, 3), Samples(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),
         Panel([Area(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),
     ]
-    rms = [number(float(np.sqrt(np.nanmean(v**2)))) for v in (raw, calibrated)]
-    finding = f"In {recording.name} the error goes from {rms[0]} to {rms[1]} {unit}"
-    what = "specific force minus gravity" if sensor == "accelerometer" else "angular rate minus that of the rate table"
-    caption = (
-        f"Magnitude of the {what}, before and after calibration, in a recording that no fit used. Below: after "
-        "calibration, with a band of ±2 noise floors."
-    )
-    figure = Figure(name, finding, caption, BEFORE_AFTER)
-    return chart(figure, f"Root mean square {rms[0]} {unit} before, {rms[1]} after.", panels, "time, s")
+    rms = [float(np.sqrt(np.nanmean(v**2))) for v in (raw, calibrated)]
+    finding, caption, description = sentences("held_out", name=recording.name, sensor=sensor, rms=rms, unit=unit)
+    return chart(Figure(name, finding, caption, BEFORE_AFTER), description, panels, "time, s")
 
 
 def attitude_over_time(found: JSON) -> Figure | None:
@@ -160,22 +149,11 @@ def attitude_over_time(found: JSON) -> Figure | None:
     curve = found.get("curve")
     if not curve:
         return None
-    drift, tilt = found["drift_deg"], found.get("tilt_rms_deg")
-    after = "one minute" if found["seconds"] == 60.0 else f"{number(found['seconds'])} s"
-    finding = f"After {after} the attitude is {number(drift['after'])}° off, uncalibrated {number(drift['before'])}°"
     panels = [_attitude_panel(curve, "drift", "gyroscope alone, deg")]
-    words = f"Gyroscope alone after {after}: {number(drift['before'])} deg before, {number(drift['after'])} deg after."
-    caption = (
-        f"Angle to the attitude of the rate table in {found['recording']}, which no fit used, on a logarithmic axis. "
-        f"Above: the gyroscope integrated from this attitude at the start (the figure of {after} is the root mean "
-        "square over all starts)."
-    )
-    if tilt:
+    if found.get("tilt_rms_deg"):
         panels.append(_attitude_panel(curve, "tilt", "fused tilt, deg"))
-        before, now = number(tilt["before"]), number(tilt["after"])
-        words += f" Tilt of the fused attitude, rms: {before} deg before, {now} deg after."
-        caption += " Below: the vertical of a complementary filter that also uses the accelerometer."
-    return chart(Figure("attitude-error", finding, caption, BEFORE_AFTER), words, panels, "time, s")
+    finding, caption, description = sentences("attitude", found=found)
+    return chart(Figure("attitude-error", finding, caption, BEFORE_AFTER), description, panels, "time, s")
 
 
 def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:

@@ -14,7 +14,7 @@ from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
 from pipeline.estimation.noise_terms import UNITS, allan_variance, each_term
 from pipeline.model.sensor_file import as_stated
 from pipeline.records import AXES, SENSOR_UNITS
-from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, chart
+from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, chart, sentences
 from pipeline.report.numbers import number, percent, plain
 
 JSON = dict[str, Any]
@@ -48,17 +48,17 @@ def allan(sensor: str, noise: JSON | None, sensor_config: JSON, wander: JSON | N
         legend.append(("c3", "sensor file"))
         layers.append(Line(tau, _stated_deviation(sensor_config, tau), 3, "dashed"))
     mean = np.mean([part["allan"]["deviation"] for part in axes.values()], axis=0)
-    told = ", ".join(f"{number(float(mean[k]))} {unit} at {number(float(tau[k]))} s" for k in (0, len(tau) // 2, -1))
-    where = f"{', '.join(noise['recordings'][:3])}, {number(noise['length_s'])} s at rest, before any filter"
-    caption = f"{where}: dots, measured; lines, the sum of the terms with its 95 % band."
+    finding, caption, description = sentences(
+        "allan",
+        **_white(axes, sensor_config),
+        unit=unit,
+        noise=noise,
+        wander=wander,
+        mean=[(float(mean[k]), float(tau[k])) for k in (0, len(tau) // 2, -1)],
+    )
     return chart(
-        Figure(
-            f"{sensor}-allan",
-            _finding(axes, sensor_config, unit),
-            " ".join([caption, *_needed(wander, unit)]),
-            tuple(legend),
-        ),
-        f"Allan deviation, mean of the axes: {told}.",
+        Figure(f"{sensor}-allan", finding, caption, tuple(legend)),
+        description,
         [Panel(layers, f"Allan deviation, {unit}", 190, logarithmic=True)],
         "averaging time, s",
         kind="log",
@@ -151,38 +151,17 @@ def _stated_deviation(
     return np.asarray(np.sqrt(variance + allan_variance("gauss_markov", wander, tau)))
 
 
-def _finding(axes: JSON, sensor_config: JSON, unit: str) -> str:
+def _white(axes: JSON, sensor_config: JSON) -> JSON:
     """Return the white noise, its ratio to that of the sensor file with a likely cause, and the other terms."""
     terms = [part["terms"] for part in axes.values()]
     seen = [name for name in SYMBOLS if name != "white" and any(n == name for t in terms for n, _ in each_term(t))]
-    others = f"; also {', '.join(plain(name) for name in seen)}" if seen else ""
     densities = [t["white"]["value"] for t in terms if t["white"]["value"]]
-    if not densities:
-        return f"No white noise seen{others}"
-    white = float(np.sqrt(np.mean(np.square(densities))))
-    head = f"White noise N = {number(white)} {unit}/sqrt(Hz)"
-    if not sensor_config.get("noise_density"):
-        return head + others
-    ratio = white / (float(sensor_config["noise_density"]) / np.sqrt(2.0))
-    if 1.0 / NEAR < ratio < NEAR:
-        return f"{head}, as the sensor file says{others}"
-    cause = ""
-    if ratio > FAR:
+    white = float(np.sqrt(np.mean(np.square(densities)))) if densities else None
+    stated = float(sensor_config.get("noise_density") or 0.0) / np.sqrt(2.0)
+    ratio, cause = white / stated if white and stated else None, ""
+    if ratio and ratio > FAR:
         cause = ": vibration at rest, another range, or a column in another unit"
-    elif ratio < 1.0 / FAR:
+    elif ratio and ratio < 1.0 / FAR:
         cause = ": a filter in the sensor, smoothed or repeated samples, or a column in another unit"
-    return f"{head}, {number(ratio, 2)} × that of the sensor file{cause}{others}"
-
-
-def _needed(wander: JSON | None, unit: str) -> list[str]:
-    if not wander or wander.get("standard_deviation") is None:
-        return []
-    if not wander.get("ratio"):
-        return ["The fit of the calibration needs no bias wander."]
-    needed = f"The fit of the calibration needs a wander of {number(wander['standard_deviation'])} {unit}, "
-    needed += f"correlation time {number(wander.get('time_s'))} s"
-    if wander.get("expected") is not None:
-        needed += f", against {number(wander['expected'])} expected"
-    if wander.get("inflated"):
-        needed += ": it is inflated; the noise model may contain a slow effect that is missing in the model"
-    return [f"{needed}."]
+    as_stated = ratio is not None and 1.0 / NEAR < ratio < NEAR
+    return {"white": white, "ratio": ratio, "as_stated": as_stated, "cause": cause, "others": seen}

@@ -53,7 +53,7 @@ def template(name: str) -> Template:
 
 def compile_templates() -> None:
     """Compile all templates, for the processes that are forked from this one."""
-    for file in FOLDER.glob("*.html"):
+    for file in (*FOLDER.glob("*.html"), *FOLDER.glob("*.txt")):
         template(file.name)
 
 

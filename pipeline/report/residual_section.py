@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.model.kinematics import table_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, Integers, Motion, Recording, SensorCalibration, Values
-from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, Samples, chart
+from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, Samples, chart, sentences
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
 from pipeline.signal.encoder_rate import rate_by_angle
@@ -277,19 +277,21 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
         panels.append(Panel(layers, f"{axis}, {unit}", height=56, limits=(-top, top)))
     rms = np.sqrt(np.mean(residual.error**2, axis=0))
     ratio, outside = float((rms / sigma).max()), float(np.mean(np.abs(residual.error) > 2 * sigma))
-    finding = f"{name}: reading minus model is {number(ratio)} × the noise"
-    finding += "" if ratio > NOISE else ", so nothing is left"
-    caption = f"{100 * outside:.1f} % of the residuals lie outside the band; white noise alone puts 4.6 % there."
-    if known and residual.reference_noise.any():
-        most = int(np.argmax(residual.reference_noise))
-        caption += (
-            f" On {AXES[most]} the noise includes {number(float(residual.reference_noise[most]), 2)} {unit} rms of the "
-            "reference: the steps of the encoder, not the sensor, limit what this recording shows of the rate."
-        )
-    caption += "" if known else " Its σ is taken from the sample-to-sample scatter."
+    most, vague = AXES[int(np.argmax(residual.reference_noise))], float(residual.reference_noise.max())
+    finding, caption, description = sentences(
+        "model",
+        name=name,
+        ratio=ratio,
+        outside=outside,
+        reference=(most, vague) if known and vague else None,
+        known=known,
+        rms=rms.tolist(),
+        unit=unit,
+        noise=NOISE,
+    )
     return chart(
         Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model"))),
-        f"Root mean square of the residual: {', '.join(map(number, rms.tolist()))} {unit} on x, y, z.",
+        description,
         panels,
         "angle of the rate table, deg" if turns else "time, s",
         kind="angle" if turns else "",
