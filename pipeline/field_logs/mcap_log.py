@@ -20,9 +20,9 @@ from pipeline.errors import IngestError, InputError
 from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap_copy import McapCopy
 from pipeline.io.mcap_reader import McapReader
-from pipeline.io.message_decoder import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
+from pipeline.io.message_decoder import MAPPED, Topics, listed_topics, topic_of
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, new_imu, replaced
-from pipeline.io.units import SECOND_NS, SINCE_1970_NS, TRIADS
+from pipeline.io.units import ACCELEROMETER, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.log_motion import ExponentialRegression
 
 if TYPE_CHECKING:
@@ -33,12 +33,14 @@ if TYPE_CHECKING:
     from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Result
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.message_decoder import TopicDecoder
     from pipeline.records import Integers, Values
 
 
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, those of recorders up from 0
 SUFFIX = "_calibrated"
 METADATA = "imu_calibration"
+READINGS = {*ACCELEROMETER, *GYROSCOPE}
 
 
 class McapLog:
@@ -49,6 +51,7 @@ class McapLog:
     ) -> None:
         self.source, self.profile, self.stream, self.topic, self.smoothing = source, profile, stream, topic, smoothing
         self.settings, self.copy = mcap_format(profile.ingest), McapCopy(out)
+        self.topics = Topics(self.settings, str(source))
         self.covariances = stream.compensation.covariances
         self.temperatures: Temperatures | None = None
         self.readings: TopicDecoder | None = None
@@ -58,9 +61,19 @@ class McapLog:
 
     def compensate(self) -> Result:
         """Copy the log run by run, with the calibrated readings of each run after it."""
-        topic = self._named_topic()
-        if "temperature" in self.stream.stream.needs:
-            self.temperatures = Temperatures(self.settings, self.source, topic, self.smoothing)
+        topic, needed = self.settings.imu_topic, "temperature" in self.stream.stream.needs
+        if self.settings.topics:
+            found = [t for t, fields in self.settings.topics.items() if READINGS & set(fields)]
+            if len(found) != 1:
+                message = (
+                    f"the profile takes the readings from {len(found)} topics ({', '.join(found)}); apply needs both "
+                    "sensors in the same messages"
+                )
+                raise IngestError(message, str(self.source), code="unsupported")
+            topic = found[0]
+        if needed:
+            beside = topic is not None and "temperature" in self.settings.topics.get(topic, ())
+            self.temperatures = Temperatures(self.settings, self.source, self.smoothing, beside_readings=beside)
         with self.source.open("rb") as stream:
             self.reader = McapReader(stream, str(self.source), allow_truncated=self.settings.allow_truncated)
             for run in self.reader.runs():
@@ -68,7 +81,8 @@ class McapLog:
                 if self.temperatures is not None:
                     self.temperatures.take(run.rows, self.reader)
                 for rows in run.rows:
-                    if (decoder := self._decoder_of(rows, topic)) is not None:
+                    decoder = self.topics.decoder_of(rows, self.reader)
+                    if decoder is not None and READINGS & set(decoder.fields):
                         self._add_calibrated(rows, decoder)
         if self.readings is None:
             listed = ", ".join(text for _, text in listed_topics(self.reader))
@@ -77,39 +91,13 @@ class McapLog:
             raise IngestError(message, str(self.source), code="missing_topic", hint=hint)
         return self._finish(self.readings.topic)
 
-    def _named_topic(self) -> str | None:
-        """Return the topic that the profile names; None for the only Imu topic."""
-        if not self.settings.topics:
-            return self.settings.imu_topic
-        sensors = {c for triad in TRIADS.values() for c in triad}
-        found = [t for t, fields in self.settings.topics.items() if sensors & set(fields)]
-        if len(found) != 1:
-            message = (
-                f"the profile takes the readings from {len(found)} topics ({', '.join(found)}); apply needs both "
-                "sensors in the same messages"
-            )
-            raise IngestError(message, str(self.source), code="unsupported")
-        return found[0]
-
-    def _decoder_of(self, rows: Rows, topic: str | None) -> TopicDecoder | None:
-        """Return the decoder of the readings; None of other messages. Without a name the first Imu topic holds them."""
-        channel = self.reader.channels[rows.channel]
-        is_imu = kind_of(channel.topic, self.reader.schemas.get(channel.schema_id), self.settings) == IMU
-        if self.readings is None and (channel.topic == topic or (topic is None and is_imu)):
-            kind = MAPPED if self.settings.topics else IMU
-            self.readings = TopicDecoder(channel.topic, kind, self.settings, str(self.source))
-        if self.readings is None or channel.topic == self.readings.topic:
-            return self.readings
-        if is_imu and topic is None:
-            message = (
-                f"2 topics are of type {IMU}: {self.readings.topic}, {channel.topic}; choose one in "
-                "ingest.mcap.imu_topic"
-            )
-            raise IngestError(message, str(self.source), code="ambiguous")
-        return None
-
     def _add_calibrated(self, rows: Rows, decoder: TopicDecoder) -> None:
         """Add the calibrated messages of some readings."""
+        self.readings = self.readings or decoder
+        if decoder is not self.readings:
+            both = f"{self.readings.topic}, {decoder.topic}"
+            message = f"2 topics are of type {IMU}: {both}; choose one in ingest.mcap.imu_topic"
+            raise IngestError(message, str(self.source), code="ambiguous")
         batch = decoder.read(rows, self.reader)
         time_ns = batch.times(rows)
         if self.origin_ns is None:
@@ -184,23 +172,20 @@ class McapLog:
 class Temperatures:
     """Temperatures of a log, run by run; the log is read first up to its first temperature.
 
-    ``readings`` is the topic of the readings, ``smoothing`` the memory, s, of the line through the temperature's past;
-    0 takes the last temperature. A log without temperature is refused.
+    ``smoothing`` is the memory, s, of the line through the temperature's past; 0 takes the last temperature.
+    ``beside_readings``: whether the messages of the readings hold it. A log without temperature is refused.
     """
 
-    def __init__(self, settings: McapFormat, path: Path, readings: str | None, smoothing: float) -> None:
-        self.settings, self.path, self.smoothing = settings, path, smoothing
+    def __init__(self, settings: McapFormat, path: Path, smoothing: float, *, beside_readings: bool) -> None:
+        self.settings, self.path, self.smoothing, self.beside_readings = settings, path, smoothing, beside_readings
         self.line = ExponentialRegression(smoothing or 1.0)
-        mapped = [t for t, f in settings.topics.items() if "temperature" in f]
-        self.topic = mapped[0] if mapped else topic_of(TEMPERATURE, settings)
-        self.decoder: TopicDecoder | None = None
+        self.topics = Topics(settings, str(path))
         self.early = self.count = 0
         self.span = [np.inf, -np.inf]
         self.last = self.first = float("nan")
-        self.beside_readings = bool(mapped) and self.topic == readings
-        if not self.beside_readings:
+        if not beside_readings:
             self.first = self._first()
-        self.decoder = None
+            self.topics = Topics(settings, str(path))
 
     def _first(self) -> float:
         """Return the first temperature of the file, for the messages that stand before it."""
@@ -211,9 +196,9 @@ class Temperatures:
                 known = self.values[np.isfinite(self.values)]
                 if known.size:
                     return float(known[0])
-        message = (
-            f"the calibration has effects of temperature, but the log holds no messages of {self.topic or TEMPERATURE}"
-        )
+        mapped = [t for t, fields in self.settings.topics.items() if "temperature" in fields]
+        topic = mapped[0] if mapped else topic_of(TEMPERATURE, self.settings) or TEMPERATURE
+        message = f"the calibration has effects of temperature, but the log holds no messages of {topic}"
         hint = "name the topic in ingest.mcap.temperature_topic of a profile (--ingest)"
         raise IngestError(message, str(self.path), code="missing_topic", hint=hint)
 
@@ -221,18 +206,11 @@ class Temperatures:
         """Decode the temperatures of a run."""
         found: list[tuple[Integers, Integers, Values]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
         for rows in run if not self.beside_readings else []:
-            channel = reader.channels[rows.channel]
-            if self.decoder is None:
-                kind = kind_of(channel.topic, reader.schemas.get(channel.schema_id), self.settings)
-                if channel.topic != self.topic and (self.topic is not None or kind != TEMPERATURE):
-                    continue
-                self.topic = channel.topic
-                kind = kind if channel.topic in self.settings.topics else TEMPERATURE
-                self.decoder = TopicDecoder(channel.topic, kind, self.settings, str(self.path))
-            if channel.topic != self.topic:
-                continue
-            batch = self.decoder.read(rows, reader)
-            found.append((rows.starts, batch.times(rows), batch.values["temperature"]))
+            decoder = self.topics.decoder_of(rows, reader)
+            of_temperature = [d for d in self.topics.decoders.values() if "temperature" in d.fields]
+            if decoder is not None and decoder in of_temperature[:1]:
+                batch = decoder.read(rows, reader)
+                found.append((rows.starts, batch.times(rows), batch.values["temperature"]))
         self.places, self.times, self.values = map(np.concatenate, zip(*found, strict=True))
 
     def at(self, starts: Integers, time: Values, beside: Values | None, origin_ns: int) -> Values:

@@ -16,7 +16,7 @@ from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
 from pipeline.io.files import unchanged
 from pipeline.io.ingest_settings import HEADER, OWN
-from pipeline.io.message_decoder import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
+from pipeline.io.message_decoder import MAPPED, TopicDecoder, Topics, listed_topics, topic_of
 from pipeline.io.message_logs import open_reader
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.io.timestamps import averaged, check_fine, check_plausible, in_order, rows_covered
@@ -114,10 +114,11 @@ class _Log:
         self.end_ns = np.iinfo(np.int64).max  # the topics of a truncated file end at different times
 
     def table(self) -> ChannelTable:
+        decoders = Topics(self.settings, self.path)
         for rows in self.reader.rows():
-            topic = self._topic(self.reader.channels[rows.channel].topic, rows.channel)
-            if topic is not None:
-                topic.read(rows, self.reader)
+            decoder = decoders.decoder_of(rows, self.reader)
+            if decoder is not None:
+                self.topics.setdefault(decoder.topic, _Topic(decoder)).read(rows, self.reader)
         self._note_container()
         recorder = self.reader.has_recorder
         base, *others = (t.series(self.settings, self.notes, recorder=recorder) for t in self._chosen())
@@ -149,18 +150,6 @@ class _Log:
             for log in self.table_logs:
                 table = align(table, log)
         return table
-
-    def _topic(self, name: str, channel: int) -> _Topic | None:
-        """Return the topic of some messages; None if it is not read."""
-        if name not in self.topics:
-            schema = self.reader.schemas.get(self.reader.channels[channel].schema_id)
-            kind = kind_of(name, schema, self.settings)
-            if not kind or (kind == IMU and self.settings.topics):
-                return None
-            if kind != MAPPED and topic_of(kind, self.settings) not in {None, name}:
-                return None
-            self.topics[name] = _Topic(TopicDecoder(name, kind, self.settings, self.path))
-        return self.topics[name]
 
     def _only(self, kind: str, *, required: bool) -> list[_Topic]:
         """Return the named topic, or the only topic of a type; none if there is none and none is required."""

@@ -103,13 +103,6 @@ def _stamp_places(path: FieldPath | None, layout: MessageLayout) -> dict[str, tu
     return {SECONDS: place}
 
 
-def kind_of(topic: str, schema: Schema | None, settings: McapFormat) -> str:
-    """Return the kind of a topic; empty for a type that is not read."""
-    if topic in settings.topics:
-        return MAPPED
-    return KINDS.get(short_name(schema.name), "") if schema else ""
-
-
 def topic_of(kind: str, settings: McapFormat) -> str | None:
     """Return the topic that the profile names for a ROS type; None stands for the only one."""
     topics = (settings.imu_topic, settings.temperature_topic, settings.joint_topic, settings.attitude_topic)
@@ -315,6 +308,28 @@ class TopicDecoder:
             what = f"{name} is absent (covariance -1)" if covariance else f"{self._paths[name].text} is empty"
             message = f"{what} in some messages on {self.topic}, see message {self.count + int(own[changed[0]]) + 1}"
             raise IngestError(message, self.path, code="absent" if covariance else "bad_message")
+
+
+class Topics:
+    """The topics of a log that are read: those of the profile, or those of known types."""
+
+    def __init__(self, settings: McapFormat, path: str) -> None:
+        self.settings, self.path = settings, path
+        self.decoders: dict[str, TopicDecoder] = {}
+
+    def decoder_of(self, rows: Rows, reader: MessageReader) -> TopicDecoder | None:
+        """Return the decoder of some messages; None if their topic is not read."""
+        channel = reader.channels[rows.channel]
+        name, schema = channel.topic, reader.schemas.get(channel.schema_id)
+        if name not in self.decoders:
+            kind = KINDS.get(short_name(schema.name), "") if schema else ""
+            known = kind and not (kind == IMU and self.settings.topics)
+            if name in self.settings.topics:
+                kind = MAPPED
+            elif not known or topic_of(kind, self.settings) not in {None, name}:
+                return None
+            self.decoders[name] = TopicDecoder(name, kind, self.settings, self.path)
+        return self.decoders[name]
 
 
 def _fields_of(kind: str, settings: McapFormat) -> dict[str, MappedField]:
