@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import csv
 import difflib
+import io
 import os
 import re
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, default_option, nearest, parse
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
-from pipeline.io.files import not_regular, wrong_name
+from pipeline.io.files import not_regular, read_text, wrong_name
 from pipeline.io.yaml_file import read_yaml
 
 if TYPE_CHECKING:
@@ -103,26 +104,14 @@ def read_units_table(path: Path) -> UnitsTable:
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str | Any, Any]]]]:
     """Return the columns, and each row with the line on which it ends."""
+    text = read_text(path, LARGEST_BYTES, "a units table")
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:
-        other = not_regular(path)
-        if other:
-            raise ConfigurationError(other, str(path))
-        if path.stat().st_size > LARGEST_BYTES:
-            raise ConfigurationError(f"is larger than {LARGEST_BYTES} bytes, the limit for a units table", str(path))
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.DictReader(stream, strict=True)
-            columns = [c.strip() for c in reader.fieldnames or []]
-            reader.fieldnames = columns
-            return columns, [(reader.line_num, row) for row in reader]
-    except UnicodeDecodeError as error:
-        reason = (
-            "it is UTF-16" if error.object[:2] in (b"\xff\xfe", b"\xfe\xff") else f"byte {error.start} is not UTF-8"
-        )
-        raise ConfigurationError(f"cannot be read: {reason}; save it as CSV in UTF-8", str(path)) from error
+        columns = [c.strip() for c in reader.fieldnames or []]
+        reader.fieldnames = columns
+        return columns, [(reader.line_num, row) for row in reader]
     except csv.Error as error:
         raise ConfigurationError(f"cannot be read after line {reader.line_num}: {error}", str(path)) from error
-    except OSError as error:
-        raise ConfigurationError(f"cannot be read: {error}", str(path)) from error
 
 
 def _why(columns: list[str]) -> str:

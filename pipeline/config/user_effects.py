@@ -17,7 +17,8 @@ from pipeline.config.schema import OF_BENCH
 from pipeline.errors import ConfigurationError, PipelineError
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
-from pipeline.io.files import not_regular
+from pipeline.io.files import read_text
+from pipeline.io.yaml_file import LARGEST_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -78,7 +79,8 @@ def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[
         folder: [
             f
             for f in sorted(folder.glob("*.yaml"))
-            if not _ships(f) or (f.resolve().is_relative_to(own) and f.resolve().parent != shipped)
+            if not re.search(BUILT_IN, read_text(f, LARGEST_BYTES, "an effect"))
+            or (f.resolve().is_relative_to(own) and f.resolve().parent != shipped)
         ]
         for folder in folders
     }
@@ -128,17 +130,6 @@ def effects_for(stage: str, sensor: str, configs: Iterable[Mapping[str, Any]]) -
             "python": [e for e in section["python"] if everything or Path(e["path"]).stem in wanted],
         }
     return {"user_effects": section} if section["formulas"] or section["python"] else {}
-
-
-def _ships(file: Path) -> bool:
-    """Return whether a file is that of a built-in effect."""
-    try:
-        other = not_regular(file)
-        if other:
-            raise ConfigurationError(other, str(file))
-        return re.search(BUILT_IN, file.read_text(encoding="utf-8", errors="replace")) is not None
-    except OSError as error:
-        raise ConfigurationError(f"cannot be read: {error}", str(file)) from None
 
 
 def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str, Any]:

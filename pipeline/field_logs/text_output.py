@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Readings, Result
-    from pipeline.io.ingest_settings import Column
     from pipeline.io.text_log import Head
     from pipeline.records import Integers, Values
 
@@ -121,7 +120,7 @@ class CsvLog:
     def _find(self, names: list[str], where: str) -> None:
         for signal, channels in SIGNALS.items():
             wanted = [self.columns[c] for c in channels if c in self.columns]
-            present = [c for c in wanted if _index(c, names) is not None]
+            present = [c for c in wanted if c.index(names) is not None]
             twice = [c.column for c in present if names.count(str(c.column)) > 1]
             if twice:
                 raise InputError(f"the header names {twice[0]} more than once", where)
@@ -130,7 +129,7 @@ class CsvLog:
                 message = f"the header names {', '.join(str(c.column) for c in present)}, but not {missing}"
                 raise InputError(message, where)
             if present:
-                self.places[signal] = [i for c in present if (i := _index(c, names)) is not None]
+                self.places[signal] = [i for c in present if (i := c.index(names)) is not None]
         if not any(sensor in self.places for sensor in SENSORS):
             told = "--ingest names the profile, or its file, that describes this log"
             if {CANONICAL[c] for c in (*ACCELEROMETER, *GYROSCOPE)} & set(names):
@@ -204,12 +203,6 @@ def compensate_messages(source: Path, out: Output, profile: LogProfile, stream: 
         csv.write_csv(rows, sink, csv.WriteOptions(include_header=False))
         out.write(memoryview(sink.getvalue()))
     return stream.finish([f"{n.code}: {n.detail}" for n in table.notes])
-
-
-def _index(column: Column, names: list[str]) -> int | None:
-    if isinstance(column.column, int):
-        return column.column if column.column < len(names) else None
-    return names.index(column.column) if column.column in names else None
 
 
 def _lines_of(columns: list[pa.Array], delimiter: str, *, quoted: bool) -> memoryview:

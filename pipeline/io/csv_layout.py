@@ -55,9 +55,8 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
     found: list[tuple[Column, int]] = []
     lacking: list[Column] = []
     for column in settings.columns:
-        name = column.column
-        index = name if isinstance(name, int) else names.index(name) if name in names else len(names)
-        if index < len(names):
+        index = column.index(names)
+        if index is not None:
             others += _contradiction(column, names[index])
             found.append((column, index))
         elif not column.optional:

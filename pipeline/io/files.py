@@ -163,12 +163,16 @@ def read_text(path: Path, largest: int, what: str) -> str:
             raise ConfigurationError(other, str(path))
         with path.open("rb") as stream:
             content = stream.read(largest + 1)
-        text = content.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise ConfigurationError(f"cannot be read: {error}", str(path)) from None
     if len(content) > largest:
         raise ConfigurationError(f"has more than {largest} bytes, the limit for {what}", str(path))
-    return text
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        utf_16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
+        reason = "it is UTF-16" if utf_16 else f"byte {error.start} is not UTF-8"
+        raise ConfigurationError(f"cannot be read: {reason}; save it as UTF-8 text", str(path)) from None
 
 
 @contextmanager

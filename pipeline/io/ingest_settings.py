@@ -101,6 +101,12 @@ class Column(ChannelSource):
     column: str | int = Field(default="", validate_default=True)
     optional: bool = Field(default=False, description="true or false")
 
+    def index(self, names: Sequence[str]) -> int | None:
+        """Return the index of the column in a file with these names; None where it is missing."""
+        if isinstance(self.column, int):
+            return self.column if self.column < len(names) else None
+        return names.index(self.column) if self.column in names else None
+
     @classmethod
     def units(cls, channel: str) -> list[str]:
         """Return the units that are allowed for a channel."""

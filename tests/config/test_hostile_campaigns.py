@@ -144,7 +144,7 @@ def test_references_to_settings_stay_and_do_not_multiply(tmp_path: Path) -> None
         ("unit\nU1.failed\n", "a name cannot end in .failed"),
         ("unit,note\nU1,a\0b\n", "line 2: column 'note' holds a control character"),
         (f"unit,note\nU1,{'x' * 200_000}\n", "field larger than field limit"),
-        ("unit,note\nU1,gr\u00fcn\n".encode("latin-1"), "byte 15 is not UTF-8; save it as CSV in UTF-8"),
+        ("unit,note\nU1,gr\u00fcn\n".encode("latin-1"), "byte 15 is not UTF-8; save it as UTF-8 text"),
         ("unit\nU1\n".encode("utf-16"), "it is UTF-16"),
     ],
 )
