@@ -81,7 +81,7 @@ class Composer:
         self.user_effects: UserEffects = load_user_effects(campaign, [*self.searchpath, CONFIGS], python_effects)
         self.effects = {f.stem for f in (CONFIGS / "effect").glob("*.yaml")} | set(self.user_effects.effects)
         self._bases: dict[Groups, tuple[dict[str, Any], bool]] = {}
-        self._checked_bases: dict[int, dict[str, Any]] = {}
+        self._checked_bases: dict[int, dict[str, Any]] = {}  # by the identity of a section of ``_bases``
         self._resolved: dict[str, dict[str, Any]] = {}
         self._valid_ingest: set[str] = set()
 
@@ -143,20 +143,12 @@ class Composer:
                 merged = with_references(merged, merged)
             except ConfigurationError as error:
                 raise Problem(error.message) from error
-        shared = self._checked_bases.setdefault(id(base), {})
         checked, findings = {}, []
         for section, content in merged.items():
-            of_base = content is base.get(section)
-            if of_base and section in shared:
-                checked[section] = shared[section]
-                continue
             try:
-                checked[section] = self._checked(section, content)
+                checked[section] = self._checked(section, content, of_base=content is base.get(section))
             except ValidationError as error:
                 findings += [{**e, "loc": (section, *e["loc"])} for e in error.errors()]
-                continue
-            if of_base:
-                shared[section] = checked[section]
         if findings:
             raise Problem("\n".join(_explain(e, merged) for e in findings))
         checked["method"] = self._with_stages(checked["method"])
@@ -164,13 +156,17 @@ class Composer:
         self._check_meaning(checked)
         return checked | self.user_effects.section()
 
-    def _checked(self, section: str, content: Any) -> dict[str, Any]:  # noqa: ANN401  (the user's)
-        """Return a section as the schema has it; raises ``ValidationError``."""
+    def _checked(self, section: str, content: Any, *, of_base: bool) -> dict[str, Any]:  # noqa: ANN401  (the user's)
+        """Return a section as the schema has it, one of a base as before; raises ``ValidationError``."""
+        if of_base and id(content) in self._checked_bases:
+            return self._checked_bases[id(content)]
         if section not in SECTIONS:
             raise ValidationError.from_exception_data("", [{"type": "extra_forbidden", "loc": (), "input": content}])
         checked = SECTIONS[section].model_validate(content).model_dump()
         if section == "sensor":
             self.user_effects.add_limits(checked)
+        if of_base:
+            self._checked_bases[id(content)] = checked
         return checked
 
     def complete(self, groups: dict[str, str]) -> dict[str, str]:
