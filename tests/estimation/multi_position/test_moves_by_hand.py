@@ -114,7 +114,9 @@ def test_too_few_moves_are_refused() -> None:
         rests_and_moves.fit(unit.recordings, None, unit.settings)
     unit = hand_held("mpu6050", 6)
     few = [
-        replace(r.select(slice(0, int(0.27 * r.samples))), role="rests") for r in unit.recordings if r.role == "rests"
+        replace(r.select(slice(int(0.5 * r.samples), int(0.7 * r.samples))), role="rests")
+        for r in unit.recordings
+        if r.role == "rests"
     ]
     with pytest.raises(
         NotObservableError, match=r"so 3 rests, .* are held out .* use them by procedure.holdout_every=0"
