@@ -210,9 +210,9 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: f
     if weak.any():
         raise NotObservableError(
             f"the {count} orientations are nearly degenerate: they leave {', '.join(NAMES[weak])} open to "
-            f"{float(u[weak].max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled columns; "
-            f"{_left(rows)}). Record rests with each axis up, down and level, spread evenly, not all in one plane or "
-            "direction"
+            f"{float(u[weak].max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled "
+            f"columns; {_left(rows)}). Record rests with each axis up, down and level, spread evenly, not all in one "
+            "plane or direction"
         )
     return solved
 
