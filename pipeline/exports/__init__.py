@@ -1,4 +1,4 @@
-"""Exports: a calibration in the formats of the programs that use it. One template in ``templates/`` is one format.
+"""Exports: a calibration in the formats of the programs that use it. One ``templates/*.j2`` is one format.
 
 A template has two parts, separated by a line ``---``: a declaration (``Format``: what the format can hold, in which
 units, and how ``convert`` reads it back), and the text of the file in Jinja2. The text has the variables

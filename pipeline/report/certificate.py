@@ -12,7 +12,9 @@ then there is no such file, and the report says why.
 from __future__ import annotations
 
 import re
+from functools import reduce
 from itertools import repeat
+from operator import getitem
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
@@ -196,7 +198,7 @@ def _wanted(document: JSON, stated: JSON) -> Iterator[tuple[str, str, str, Any]]
         "serial in units.csv": document["administrativeData"]["items"][0]["identifications"][0]["value"],
     }
     for what, clause, key in ASKED:
-        yield what, clause, key, known[key] if key in known else _setting(stated, key)
+        yield what, clause, key, known[key] if key in known else reduce(getitem, key.split(".")[1:], stated)
     if any(r["name"] == "accelerometer" for r in results):
         accuracy = conditions[0]["accuracy of local gravity, g"]
         yield "accuracy of local gravity", "7.8.4.1 a", "table.gravity_accuracy_g", accuracy is not None
@@ -207,14 +209,6 @@ def _wanted(document: JSON, stated: JSON) -> Iterator[tuple[str, str, str, Any]]
     if any(r["conformity"]["checks"] for r in results):
         for what, key in (("specification", "specification"), ("decision rule", "decision_rule")):
             yield what, "7.8.6.2", f"certificate.conformity.{key}", stated["conformity"][key]
-
-
-def _setting(stated: JSON, key: str) -> Any:  # noqa: ANN401  (any setting)
-    """Return a setting by its key: ``certificate.laboratory.name``."""
-    value: Any = stated
-    for name in key.split(".")[1:]:
-        value = value[name]
-    return value
 
 
 def certificate_page(unit: str, report: JSON) -> str:
@@ -264,7 +258,11 @@ def digital_certificate(unit: str, report: JSON) -> str | None:
     results = [{**r, "quantities": [_quantity(q) for q in r["results"]], "tables": _tables(r)}
                for r in report["measurementResults"]]  # fmt: skip
     text: str = template("dcc.xml").render(
-        unit=unit, report=report, results=results, place=place if place in PLACES else "other", filled=_filled
+        unit=unit,
+        report=report,
+        results=results,
+        place=place if place in PLACES else "other",
+        filled=lambda value: " ".join(str(value).split()),
     )
     return text
 
@@ -324,8 +322,3 @@ def _tables(result: JSON) -> list[JSON]:
             columns.append({"name": words, "values": [b[key] * factor for b in swept["bins"]], "unit": unit})
         tables.append({"name": f"residual over temperature, {swept['samples_of']}", "columns": columns})
     return [t for t in tables if t["columns"]]
-
-
-def _filled(value: object) -> str:
-    """Return a text without space at its ends, as the schema asks of a string that is not empty."""
-    return " ".join(str(value).split())

@@ -67,7 +67,7 @@ def render(
         passed=passes(calibration, validation),
         checks=checks(validation),
         left_out=left_out(calibration.get("inputs")),
-        sensors=sorted(sensors, key=_order),
+        sensors=sorted(sensors, key=lambda s: 99 if s["part"] is None else place(s["diagnosis"].get("verdict"))),
         attitude=attitude if attitude.get("curve") else None,
         attitude_figure=attitude_over_time(attitude),
         moves=moves if moves.get("moves") else None,
@@ -124,8 +124,3 @@ def _sensor(
         "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),
     }
-
-
-def _order(sensor: JSON) -> int:
-    """Return the place of a sensor: missing or in doubt before explained, one without a fit last."""
-    return 99 if sensor["part"] is None else place(sensor["diagnosis"].get("verdict"))

@@ -180,7 +180,8 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
     table, settings = bench.table, dict(bench.imperfections)
     trajectory = plan.trajectory
     if isinstance(trajectory, Turn) and table["motion"] != "none":
-        if plan.role == "accelerometer" and _stops_and_goes(trajectory):
+        stops_and_goes = np.all(np.abs(np.diff(trajectory.program.stops)) < 180.0)
+        if plan.role == "accelerometer" and stops_and_goes:
             settings["rate_error"] = (0.0, 0.0, 0.0)  # motors lose steps in fast turns only
         errors = random_errors(trajectory.program, rng, settings, trajectory.axis)
         shaft = settings.get("sense", 1) if table.get("azimuth_of") == "turn_axis" else 0
@@ -190,10 +191,6 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
     earth = earth_rate(table["latitude_deg"], table["azimuth_deg"]) if placed else None
     mounting = rotation_by(np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float))
     return Scene(trajectory, start, plan.axis, table["gravity_g"], up, earth, mounting=mounting)
-
-
-def _stops_and_goes(turn: Turn) -> bool:
-    return bool(np.all(np.abs(np.diff(turn.program.stops)) < 180.0))
 
 
 def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:

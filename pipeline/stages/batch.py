@@ -74,7 +74,8 @@ def main(stage: str, argv: Sequence[str]) -> int:
     if hasattr(module, f"{stage}_batch"):
         getattr(module, f"{stage}_batch")(job)
         return 0
-    last, edited = last_output(job.output), _edited(job)
+    last = last_output(job.output)
+    edited = job.run.get("again", 0) != repetitions(job.results, _below(job, job.output))[0]
     with new_pack(job.output) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
@@ -110,11 +111,6 @@ def forget_last_outputs(results: Path) -> None:
     """Delete the links to what jobs wrote last, so that every unit is computed again."""
     for last in (results / "batches").rglob(".*.last"):
         last.unlink()
-
-
-def _edited(job: Job) -> bool:
-    """Return whether a job is repeated because its output was edited."""
-    return bool(job.run.get("again", 0) != repetitions(job.results, _below(job, job.output))[0])
 
 
 def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:

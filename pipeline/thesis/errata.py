@@ -159,7 +159,7 @@ def agreements(printed: Path, results: Results) -> pd.DataFrame:
         found.append(("O M S of the accelerometer, from the truth", title, 0.005, product))
     rows = _on_precise_table(printed, "gyro_parameters")
     for title, method in reversed(GYROSCOPE.items()):
-        fits = list(_fits(rows, results, "gyroscope", method))
+        fits = [(row, *results.calibration(f"{row['set']}-{method}", "gyroscope")) for row in rows.to_dict("records")]
         off = [bias - values(row, "b_{}_dps") for row, bias, _ in fits]
         change = [matrix.T - matrix_of(row, "M") for row, _, matrix in fits]
         found.append(("Bias of the gyroscope, deg/s, from the printed", title, 0.02, off))
@@ -177,11 +177,6 @@ def agreements(printed: Path, results: Results) -> pd.DataFrame:
 def _on_precise_table(printed: Path, name: str) -> pd.DataFrame:
     rows = read_printed(printed, name)
     return rows[rows["rate_table"] == "acutronic"]
-
-
-def _fits(rows: pd.DataFrame, results: Results, sensor: str, method: str) -> Iterator[tuple[JSON, Values, Values]]:
-    for row in rows.to_dict("records"):
-        yield row, *results.calibration(f"{row['set']}-{method}", sensor)
 
 
 def _cholesky(results: Results) -> Iterator[Values]:
