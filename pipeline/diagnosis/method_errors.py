@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.diagnosis.words import template
 from pipeline.estimation.generalized_least_squares import Fit, fit_terms
 from pipeline.estimation.observations import filtered_motion
 from pipeline.model.effects import effect_of
@@ -36,47 +37,6 @@ if TYPE_CHECKING:
 FREE = ("reference_least_squares", "effects")  # stages that leave bias and matrix free
 LEAST_SHARE = 0.02  # of the mean square: a part that adds less than 1 % to the rms error is not named
 SURE = 5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
-COSINES = (
-    "the stages orthogonality and misalignment multiply readings by cosines, which changes a scale factor a little and "
-    "turns nothing (Sudsanguan 2019, eqs 3.15-3.37): the matrix stays diagonal"
-)
-MEANINGS = {
-    ("accelerometer", "orthogonality", "non_orthogonality"): (
-        f"the sensor's axes are not at right angles, and {COSINES}"
-    ),
-    ("accelerometer", "orthogonality", "rotation"): f"the sensor is turned against the table's axes, and {COSINES}",
-    ("accelerometer", "orthogonality", "scale_factor"): (
-        "the scale factors come from the extremes of each axis alone (eqs 3.40-3.43), with the cosines of the stages "
-        "orthogonality and misalignment in them"
-    ),
-    ("accelerometer", "orthogonality", "bias"): (
-        "the bias is the mean reading of an axis where it is level (eqs 3.38-3.39), which a table that is off level or "
-        "another axis' reading shifts"
-    ),
-    ("accelerometer", "orthogonality", "two_sided"): (
-        "the positive and the negative side get scale factors of their own (eqs 3.40-3.43)"
-    ),
-    ("accelerometer", "nonlinear_least_squares", "rotation"): (
-        "nine parameters from the length of gravity say nothing of how the sensor is mounted: its x axis is taken for "
-        "the body's"
-    ),
-    ("gyroscope", "orthogonality_and_misalignment", "bias"): (
-        "the bias is the mean of the rests before and after the turns (eqs 3.47-3.48), wherever it has wandered since"
-    ),
-    ("gyroscope", "cholesky_lu", "bias"): "the bias is the mean of the rests before and after the turns",
-}
-PLAIN = {
-    "bias": "the method's bias is not that of a free fit of the same recordings",
-    "scale_factor": "the method's scale factors are not those of a free fit of the same recordings",
-    "non_orthogonality": "the method leaves a part of the angles between the sensor's axes",
-    "rotation": "the method leaves the sensor turned against the body",
-    "two_sided": "the method fits a scale factor for each side, which these recordings do not ask for",
-}
-GIVEN = "the given calibration differs by it from a free fit of these recordings"
-PRINTED = "; the equations are taken as printed (as_printed), errata included"
-FORWARD = (
-    "as printed, the forward matrix is applied as if it were the correction (Sudsanguan 2019, tables 5.25 and 5.26)"
-)
 
 
 def method_errors(
@@ -162,7 +122,15 @@ def given_differences(
     size = 1.0 if sensor == "accelerometer" else float(np.sqrt(np.nanmean(np.concatenate(rates))))
     rms = {"bias": float(np.linalg.norm(d))}
     rms |= {name: size * float(np.linalg.norm(part)) / np.sqrt(3.0) for name, part in parts.items()}
-    return _named(difference, rms, difference.certain([]), recordings, lambda _: GIVEN, {}, {})
+    return _named(
+        difference,
+        rms,
+        difference.certain([]),
+        recordings,
+        lambda name: _meaning(name, sensor, ["given"], recordings, printed=False),
+        {},
+        {},
+    )
 
 
 def _parts_of(E: Values) -> dict[str, Values]:
@@ -307,16 +275,7 @@ def _fastest(recording: Recording) -> float:
 
 def _meaning(name: str, sensor: str, stages: Sequence[str], recordings: Sequence[Recording], *, printed: bool) -> str:
     """Return what an error is, as the end of a sentence."""
-    if name == "filter_delay":
-        delay = max(float(r.filter.get("delay_s", 0.0)) for r in recordings)
-        used = next(r.filter["name"] for r in recordings if r.filter["name"] != "none")
-        return (
-            f"the filter {used} delays readings by {delay:.2g} s and smooths them, so that in a continuous turn the "
-            "angle is late by rate times delay (Sudsanguan 2019, eqs 3.3-3.14)"
-        )
-    if "given" in stages:
-        return f"{GIVEN}; another mounting looks the same" if name == "rotation" else GIVEN
-    if printed and "cholesky_lu" in stages:
-        return FORWARD
-    text = next((MEANINGS[sensor, s, name] for s in stages if (sensor, s, name) in MEANINGS), PLAIN[name])
-    return text + (PRINTED if printed else "")
+    filters = [r.filter for r in recordings if r.filter["name"] != "none"] or [{"name": "none"}]
+    delay = max(float(each.get("delay_s", 0.0)) for each in filters)
+    told = template("method_errors.txt").module.meaning(name, sensor, stages, printed, filters[0]["name"], delay)  # type: ignore[attr-defined]
+    return " ".join(told.split())

@@ -84,7 +84,7 @@ def _prepare() -> None:
     built_in()
     formats()
     compile_templates()
-    for name in ("diagnosis.txt", "reasons.txt"):
+    for name in ("diagnosis.txt", "method_errors.txt", "reasons.txt"):
         words.template(name)
 
 
