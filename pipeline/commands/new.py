@@ -64,7 +64,9 @@ def main(argv: Sequence[str]) -> int:
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)
     folder.mkdir(parents=True, exist_ok=True)
     (arguments.directory / "README.md").write_text(text, encoding="utf-8")
-    (arguments.directory / "campaign.yaml").write_text(_campaign(sensor_name, sensor, ranges), encoding="utf-8")
+    (arguments.directory / "campaign.yaml").write_text(
+        _campaign(procedure_name, sensor_name, sensor, ranges), encoding="utf-8"
+    )
     row = f"{arguments.unit},,,,{sensor_name},{table_name},{procedure_name},"
     units_table.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
     print(f"{units_table}: one row for each unit; put the recordings into {folder}")
@@ -113,7 +115,7 @@ def _ranges_of(sensor: dict[str, Any]) -> list[float]:
     return [float(sensor[s]["full_scale"]) for s in SENSORS if sensor.get(s)]
 
 
-def _campaign(name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
+def _campaign(procedure: str, name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
     """Return ``campaign.yaml``: the settings of the ranges are comments where they are those of the sensor's file."""
     held = [(s, sensor[s]["full_scale"], SENSOR_UNITS[s]) for s in SENSORS if sensor.get(s)]
     other = [
@@ -124,6 +126,7 @@ def _campaign(name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
         listed = [float(r) for r in sensor[s].get("ranges") or ()] or [2.0 * full_scale]
         larger.append(min((r for r in listed if r > full_scale), default=full_scale))
     text: str = template("campaign.yaml").render(
+        procedure=procedure,
         sensor=name,
         held=held,
         settings=settings_of_ranges(sensor, [*other, *wanted[len(other) :]]),

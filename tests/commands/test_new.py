@@ -44,6 +44,13 @@ def test_without_a_choice_the_table_of_the_procedure_is_written_down(
     assert load_campaign({"campaign": str(tmp_path / "b")}).units["U1"].config["table"]["name"] == "hand"
 
 
+@pytest.mark.parametrize("procedure", ["multi_position", "orientations_24", "ferraris"])
+def test_a_campaign_by_hand_calibrates_both_sensors(tmp_path: Path, procedure: str) -> None:
+    assert main([str(tmp_path / "a"), "--procedure", procedure]) == 0
+    method = load_campaign({"campaign": str(tmp_path / "a")}).units["U1"].config["method"]
+    assert (method["accelerometer"], method["gyroscope"]) == ("nonlinear_least_squares", "rests_and_moves")
+
+
 def test_other_ranges_need_no_overrides_by_hand(tmp_path: Path) -> None:
     assert main([str(tmp_path / "a"), "--sensor", "mpu6050", "--range", "8"]) == 0
     sensor = load_campaign({"campaign": str(tmp_path / "a")}).units["U1"].config["sensor"]
