@@ -15,7 +15,7 @@ from pipeline.records import Note, Recording
 SETTINGS = {
     "table": {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None},
     "procedure": {"holdout_every": 0},
-    "sensor": {"accelerometer": {"bias_wander": 1e-4, "wander_time_s": 100.0}},
+    "sensor": {"accelerometer": {"bias_wander": 1e-4, "wander_time_s": 100.0, "cross_axis": 0.02}},
 }
 METHODS = {"reference": "reference_least_squares", "magnitude": "nonlinear_least_squares"}
 

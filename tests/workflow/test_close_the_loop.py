@@ -112,9 +112,10 @@ def test_the_run_its_repetition_explain_and_the_page_show_the_same_command(loop:
     command = f"python -m pipeline add 'my demo' {HIDDEN} gyroscope.g_sensitivity"
     assert loop.said["page"] == command
     for when in ("first", "again"):
-        assert loop.said[when].rstrip().splitlines()[-4:] == [
+        assert loop.said[when].rstrip().splitlines()[-5:] == [
             "units calibrated: 2; look at results/my demo/index.html",
             f"gyroscope, g_sensitivity missing: {HIDDEN}",
+            f"accelerometer, U does not include local gravity, up to 0.44 % of the matrix: {OTHER}, {HIDDEN}",
             f"to add what is missing: {command}",
             "for the evidence: python -m pipeline explain 'my demo'",
         ]
