@@ -13,7 +13,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through
-from pipeline.records import SensorCalibration
+from pipeline.records import LIMIT, SensorCalibration
 from pipeline.report.parameters import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
@@ -107,6 +107,17 @@ def test_methods_by_hand_and_on_a_table_run_it_beside_their_budget() -> None:
         page = monte_carlo_of(calibration.to_json()["uncertainty_budget"])
         assert page is not None
         assert page["rows"] == np.flatnonzero(known).tolist()
+
+
+def test_in_six_positions_the_squares_of_the_misalignments_are_in_both() -> None:
+    unit = hand_held("mpu6050", 3, procedure="six_positions", holdout_every=0)
+    budget = nonlinear_least_squares.fit(unit.recordings, None, asked(unit.settings)).budget or {}
+    run, u = budget["monte_carlo"], np.array(budget["standard_uncertainty"])
+    known = u > 0.0
+    shift = np.array(run["mean"]) - run["estimate"]  # half the variance of a misalignment, which is not corrected
+    assert np.hypot(run["standard_uncertainty"], shift)[known] == pytest.approx(u[known], rel=0.12)
+    (limit,) = (line for line in budget["contributions"] if line["source"] == LIMIT)
+    assert limit["contribution"][3] > 0.5 * u[3]  # of the scale factor of x
 
 
 def test_without_the_switch_there_is_no_run() -> None:
