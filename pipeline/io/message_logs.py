@@ -102,8 +102,7 @@ def _as_messages(log: LogReader) -> Iterator[Rows]:
         metadata = {STATED + name: unit for name, unit in topic.units.items() if unit}
         channel = log.define(topic.name, ARRAYS, (log.kind, ARRAYS, json.dumps(places).encode()), metadata)
         times = np.zeros(count) if topic.recorded_ns is None else topic.recorded_ns
-        data = table.view(np.uint8).reshape(-1) if size else np.empty(0, np.uint8)
-        yield _rows(channel, data, np.arange(count, dtype=np.int64) * size, np.full(count, size), times)
+        yield _rows(channel, table.tobytes(), np.full(count, size, np.int64), times)
 
 
 def _of_bag(log: LogReader) -> Iterator[Rows]:
@@ -120,11 +119,15 @@ def _of_bag(log: LogReader) -> Iterator[Rows]:
             run = waiting[connection.id]
             run.append((time, data))
             if len(run) == RUN_SIZE:
-                yield _joined(numbers[connection.id], run)
+                yield _run_of(numbers[connection.id], run)
                 run.clear()
-        for key, run in waiting.items():
-            if run:
-                yield _joined(numbers[key], run)
+        yield from (_run_of(numbers[key], run) for key, run in waiting.items() if run)
+
+
+def _run_of(channel: int, run: list[tuple[int, bytes]]) -> Rows:
+    times, messages = zip(*run, strict=True)
+    sizes = np.array([*map(len, messages)], np.int64)
+    return _rows(channel, b"".join(messages), sizes, np.array(times, np.int64))
 
 
 def _definition(connection: Any, version: int) -> str:  # noqa: ANN401  (rosbags.interfaces.Connection)
@@ -137,18 +140,13 @@ def _definition(connection: Any, version: int) -> str:  # noqa: ANN401  (rosbags
     return store.generate_msgdef(name, ros_version=2)[0] if name in store.fielddefs else ""
 
 
-def _joined(channel: int, run: list[tuple[int, bytes]]) -> Rows:
-    sizes = np.array([len(data) for _, data in run], np.int64)
-    data = np.frombuffer(b"".join(data for _, data in run), np.uint8)
-    return _rows(channel, data, np.cumsum(sizes) - sizes, sizes, np.array([time for time, _ in run], np.int64))
-
-
-def _rows(channel: int, data: NDArray[np.uint8], starts: Integers, sizes: Integers, times: NDArray[Any]) -> Rows:
-    """Return messages in ``data`` as ``McapReader`` does; ``times`` are the recorder's, ns."""
-    heads = np.zeros(len(starts), HEAD)
+def _rows(channel: int, data: bytes | memoryview, sizes: Integers, times: NDArray[Any]) -> Rows:
+    """Return messages, one after the other in ``data``, as ``McapReader`` does; ``times`` are the recorder's, ns."""
+    heads = np.zeros(len(sizes), HEAD)
     heads["channel"], heads["log_time"] = channel, times
-    same = len(sizes) and bool((sizes == sizes[0]).all()) and bool((np.diff(starts) == sizes[0]).all())
-    return Rows(channel, data, heads, starts, sizes, int(sizes[0]) if same else 0, "the log", 0)
+    stride = int(sizes[0]) if len(sizes) and bool((sizes == sizes[0]).all()) else 0
+    starts = np.cumsum(sizes) - sizes
+    return Rows(channel, np.frombuffer(data, np.uint8), heads, starts, sizes, stride, "the log", 0)
 
 
 @contextlib.contextmanager
