@@ -89,6 +89,9 @@ def test_a_run_that_drops_an_effect_is_told_with_what_it_cost_and_how_to_keep_it
     (results / "validations" / "U1.json").write_text(
         json.dumps({"accelerometer": None, "gyroscope": {"reason": reason}})
     )
+    (results / "calibrations").mkdir()
+    lack = {"accelerometer": {"not_determined": "the rests do not determine it"}, "gyroscope": {"not_determined": ""}}
+    (results / "calibrations" / "U1.json").write_text(json.dumps(lack))
     add = f"python -m pipeline add bench U1 gyroscope.g_sensitivity --results {tmp_path}"
     told = outcome(results, SETTINGS, of_this_run=True).splitlines()
     assert told[:2] == [
@@ -96,13 +99,15 @@ def test_a_run_that_drops_an_effect_is_told_with_what_it_cost_and_how_to_keep_it
         "gyroscope, g_sensitivity missing: U1",
     ]
     assert told.pop(2) == f"gyroscope, {reason}: U1"
+    assert told.pop(2) == "accelerometer, the rests do not determine it: U1"
     assert told.pop(2) == "gyroscope, U does not include time base, up to 1 % of the matrix: U1"
     assert told[2:5] == [
         "U1, gyroscope: - g_sensitivity; held-out error 0.011 -> 0.12 deg/s, 12 times the noise floor",
         f"U1: this run no longer has gyroscope.g_sensitivity, which run 2 had; to have it in every run: {add}",
         f"to add what is missing: {add}",
     ]
-    assert len(outcome(results, SETTINGS, of_this_run=False).splitlines()) == len(told)  # without that of the effect
+    # Without the two lines of this run, with the three that were taken out of told.
+    assert len(outcome(results, SETTINGS, of_this_run=False).splitlines()) == len(told) - 2 + 3
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"run": "one", "units": {}}'])

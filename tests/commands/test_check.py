@@ -402,3 +402,11 @@ def test_a_command_that_cannot_read_a_log_names_the_one_that_proposes_a_profile(
     (tmp_path / "log.csv").write_text("t,ax,ay,az\n" + "".join(f"{0.01 * i:.2f},0,0,1\n" for i in range(100)))
     assert main(["guide", str(tmp_path / "log.csv")]) == 2
     assert "pipeline check FILE --save PROFILE.yaml proposes how to read it" in capsys.readouterr().err
+
+
+def test_what_rests_by_hand_do_not_determine_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    unit = {"unit": "U", "table": "hand", "procedure": "six_positions", "interval_s": 0.05}
+    write_campaign(description_from({"seed": 5, "units": [unit]}, "test"), tmp_path)
+    checked = Checked(capsys, "--campaign", tmp_path)
+    assert checked.code == 0
+    assert "accelerometer the rests do not determine misalignment_yx, misalignment_zx, misalignment_zy" in checked.words

@@ -56,6 +56,14 @@ def test_a_parameter_beyond_the_data_sheet_is_told(results: Path, capsys: pytest
     assert said in capsys.readouterr().out
 
 
+def test_what_the_rests_do_not_determine_is_told(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (results / "bench" / "calibrations").mkdir()
+    lack = {"accelerometer": None, "gyroscope": {"not_determined": "the rests do not determine it"}}
+    (results / "bench" / "calibrations" / "U1.json").write_text(json.dumps(lack))
+    main([str(results / "bench"), "U1"])
+    assert "  Gyroscope: the rests do not determine it.\n" in capsys.readouterr().out
+
+
 def test_why_the_error_is_not_that_of_held_out_motion_is_told(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -155,6 +155,15 @@ def test_the_campaign_page_names_failures_and_compares_units_of_one_serial(unit:
     assert not [link for link in Text(page).links if "//" in link]
 
 
+def test_what_the_limit_of_the_sensor_file_determines_alone_is_said(unit: Unit) -> None:
+    convergence = {"cosine": 1e-9, "condition": 11.0, "rank": 8, "parameters": 9}
+    lack = {"not_determined": "the rests do not determine misalignment_yx", "convergence": convergence}
+    calibration = unit.calibration | {"accelerometer": {**unit.calibration["accelerometer"], **lack}}
+    text = Text(render(calibration, unit.validation, unit.diagnosis, [], unit.settings)).text
+    assert "Uncertainty: the rests do not determine misalignment_yx." in text
+    assert "8 of 9 determined, the others by the limit of the sensor file" in text
+
+
 def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_summary(unit: Unit) -> None:
     entry = {"parameter": "scale_factor_x", "value": -0.5, "unit": "1", "limit": 0.03, "ratio": 16.7}
     entries = [{**entry, "likely_cause": "readings 0.5 times the truth"}]
