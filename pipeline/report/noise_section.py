@@ -110,26 +110,6 @@ def remarks(noise: JSON | None) -> list[str]:
     return said + [f"{', '.join(axes)}: {line}." for line, axes in by_axis.items()]
 
 
-def in_motion(effective: JSON | None) -> list[str]:
-    """Return how much more averages scatter in the held-out motion than at rest, and by which effects."""
-    if not effective:
-        return []
-    motion, unit = effective["motion"], effective["unit"]
-    moving = [
-        f"{number(value)} {name} rms"
-        for value, name in ((motion["rate_dps"], "deg/s"), (motion["force_change_g"], "g"))
-        if value is not None
-    ]
-    parts = []
-    for entry in effective["densities"]:
-        of = [f"{plain(e['effect'])} {number(e['density'])}" for e in entry["effects"] if e["density"]]
-        text = f"{number(entry['density'])} over {entry['averaging_time_s']:g} s"
-        text += f" ({number(entry['over_white'], 2)} × white noise" if entry["over_white"] else " ("
-        parts.append(text + (f"; {', '.join(of)}, not compensated)" if of else ")"))
-    where = f"{', '.join(effective['recordings'])}, {', '.join(moving)}"
-    return [f"Effective density of the calibrated readings in motion ({where}), {unit}: {', '.join(parts)}."]
-
-
 def _text(part: JSON | None) -> str:
     """Return a value with its interval, or the upper limit."""
     if part is None:

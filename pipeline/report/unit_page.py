@@ -24,7 +24,7 @@ from pipeline.report.held_out_section import (
     passes,
     step_label,
 )
-from pipeline.report.noise_section import allan, in_motion, remarks, term_rows
+from pipeline.report.noise_section import allan, remarks, term_rows
 from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters, parameter_rows
 from pipeline.report.recording_section import environment, recording_rows, rest_rows, rests_logged, segments
@@ -109,7 +109,7 @@ def _sensor(
         "residual_figures": residual_figures(sensor, traces, noise),
         "noise_figure": allan(sensor, at_rest, sensor_config, found.get("wander")),
         "noise_terms": term_rows(at_rest),
-        "noise_remarks": remarks(at_rest) + in_motion(found.get("effective_noise")),
+        "noise_remarks": remarks(at_rest),
         "matrix": fitted_parameters(part)[3:12],
         "parameters": parameter_rows(part, sensor_config),
         "rests": rest_rows(part),
