@@ -250,7 +250,7 @@ class TopicDecoder:
         empty, columns = np.full(len(own), np.nan), {}
         for name in self._paths:
             columns[name] = found[name].astype(np.float64) if name in found else empty
-            absent = columns[name] == -1.0 if name in VECTORS else np.full(len(own), name not in found)
+            absent = columns[name] == -1.0 if name in VECTORS else np.array([name not in found])  # the same in all
             self._note_absent(name, absent, own)
         return Batch(time_ns, columns)
 
