@@ -120,16 +120,15 @@ class CsvLog:
     def _find(self, names: list[str], where: str) -> None:
         for signal, channels in SIGNALS.items():
             wanted = [self.columns[c] for c in channels if c in self.columns]
-            present = [c for c in wanted if c.index(names) is not None]
-            twice = [c.column for c in present if names.count(str(c.column)) > 1]
+            found = {str(c.column): index for c in wanted if (index := c.index(names)) is not None}
+            twice = [name for name in found if names.count(name) > 1]
             if twice:
                 raise InputError(f"the header names {twice[0]} more than once", where)
-            if present and len(present) < len(wanted):
-                missing = ", ".join(str(c.column) for c in wanted if c not in present)
-                message = f"the header names {', '.join(str(c.column) for c in present)}, but not {missing}"
-                raise InputError(message, where)
-            if present:
-                self.places[signal] = [i for c in present if (i := c.index(names)) is not None]
+            if found and len(found) < len(wanted):
+                missing = ", ".join(str(c.column) for c in wanted if str(c.column) not in found)
+                raise InputError(f"the header names {', '.join(found)}, but not {missing}", where)
+            if found:
+                self.places[signal] = [*found.values()]
         if not any(sensor in self.places for sensor in SENSORS):
             told = "--ingest names the profile, or its file, that describes this log"
             if {CANONICAL[c] for c in (*ACCELEROMETER, *GYROSCOPE)} & set(names):

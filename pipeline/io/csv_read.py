@@ -46,7 +46,7 @@ from pipeline.io.csv_times import (
 from pipeline.io.files import refuse_foreign, unchanged
 from pipeline.io.ingest_settings import AUTO, DROP, GAP, Checks, Column, CsvFormat
 from pipeline.io.text_log import TextLog
-from pipeline.io.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TRIADS, UNITS
+from pipeline.io.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TABLE_TIME, TRIADS, UNITS
 from pipeline.records import Note
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ if TYPE_CHECKING:
 
     from pipeline.records import Integers, Values
 
-TABLE_TIME = "table_time"
 FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
 LONGEST_HEADER = 1 << 16  # bytes that are searched for the line of names
 LAST_VERSION = "1.3"

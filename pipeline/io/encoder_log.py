@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.units import ATTITUDE, TABLE_CHANNELS
+from pipeline.io.units import ATTITUDE, TABLE_CHANNELS, TABLE_TIME
 from pipeline.records import Note, conjugate_product, continuous, level_in_body
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Values
 
 
-TABLE_TIME = "table_time"
 FEWEST_ROWS = 6  # the quintic spline needs them
 FINEST_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
 MOST_POINTS = 1 << 18  # bounds memory and the cost of correlation; a power of 2 for the transform

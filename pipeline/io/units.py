@@ -19,6 +19,7 @@ SECOND_NS = 1_000_000_000
 SINCE_1970_NS = 100_000_000 * SECOND_NS  # 3 years: a later time does not count from power-on
 DEGREES = 180.0 / math.pi
 COUNTS = "counts"
+TABLE_TIME = "table_time"  # the time of a table's own clock, in the rows of the sensor
 
 ACCELEROMETER = ("accel_x", "accel_y", "accel_z")
 GYROSCOPE = ("gyro_x", "gyro_y", "gyro_z")
