@@ -24,7 +24,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -83,10 +83,10 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
     """Return the channels of one file; an ``IngestError`` names the line."""
     with unchanged(path), path.open("rb") as stream:
         log = TextLog(stream, str(path), settings)
-        reader = _RowReader(log)
+        rows = Rows(log)
         for body, lines in log:
-            reader.add(body, lines)
-        rows = reader.rows(checks)
+            rows.add(body, lines)
+        rows.finish(checks)
     values, count_sizes = {}, {}
     for column, index in rows.layout.columns:
         if column.channel != "time":
@@ -96,13 +96,12 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
                 count_sizes[column.channel] = 1.0 / abs(column.counts_per_unit)
     source = {"file": log.path, "sha256": log.sha256}
     try:
-        time_ns = times_of(rows, settings)
-        table = ChannelTable(log.path, time_ns, values, source, rows.lines, count_sizes, rows.notes)
-        table = in_order(table, rows, settings, checks)
+        table = ChannelTable(log.path, times_of(rows), values, source, rows.lines, count_sizes, tuple(rows.notes))
+        table = in_order(table, rows, checks)
     except IngestError as error:
-        raise also(rows.refused, error) if rows.refused else error from None
-    if rows.refused:
-        raise rows.refused
+        raise also(rows.refusal, error) if rows.refusal else error from None
+    if rows.refusal:
+        raise rows.refusal
     table.source["rows"] = len(table.time_ns)
     if settings.rate_hz is None:
         return table
@@ -119,79 +118,70 @@ def also(first: IngestError, second: IngestError) -> IngestError:
     return both
 
 
-class Rows(NamedTuple):
-    """The rows of a text log as numbers.
-
-    ``numbers``: the columns in use, by index. ``lines``: the line of each row, counted from 1. ``exact_ns``: times from
-    their decimal digits, where doubles are too coarse. ``repaired``: rows that were dropped, which count against
-    ``repaired_rows``. ``restarts``: rows before which the header was repeated. ``refused``: the refusal of lines that
-    are no rows, which is raised once the times are read, to name their faults as well.
-    """
-
-    layout: Layout
-    numbers: dict[int, Values]
-    lines: Integers
-    exact_ns: Integers | None
-    notes: tuple[Note, ...]
-    repaired: int
-    restarts: list[int]
-    refused: IngestError | None = None
-
-
-class _RowReader:
-    """Numbers of a text log, gathered block by block."""
+class Rows:
+    """The rows of a text log as numbers, gathered block by block."""
 
     def __init__(self, log: TextLog) -> None:
         self.log, self.path, self.settings = log, log.path, log.settings
-        self.allowed = {"not_finite"} if self.settings.nan == GAP else set()
-        if self.settings.bad_rows == DROP:
-            self.allowed |= {"bad_row", "nul", "not_a_number", "decimal_comma"}
-        if self.settings.session is not None:
-            self.allowed.add("restarted")
-        self.layout: Layout | None = None
+        self.numbers: dict[int, Values] = {}  # the columns in use, by index
+        self.lines: Integers = np.zeros(0, np.int64)  # of each row, counted from 1
+        self.exact_ns: Integers | None = None  # times from their decimal digits, where doubles are too coarse
         self.notes: list[Note] = []
-        self.row_count = 0  # bad ones as well
-        self.blocks: list[dict[int, NDArray[Any]]] = []  # columns of the valid rows
-        self.faults: list[Fault] = []
-        self.refused: list[Fault] = []
-        self.last_row: tuple[int, str] | None = None
+        self.repaired = 0  # rows that were dropped, which count against ``repaired_rows``
+        self.restarts: list[int] = []  # rows before which the header was repeated
+        self.refusal: IngestError | None = None  # of lines that are no rows, raised once the times are read as well
+        self._allowed = {"not_finite"} if self.settings.nan == GAP else set()
+        if self.settings.bad_rows == DROP:
+            self._allowed |= {"bad_row", "nul", "not_a_number", "decimal_comma"}
+        if self.settings.session is not None:
+            self._allowed.add("restarted")
+        self._layout: Layout | None = None
+        self._row_count = 0  # bad ones as well
+        self._blocks: list[dict[int, NDArray[Any]]] = []  # columns of the valid rows
+        self._faults: list[Fault] = []
+        self._refused: list[Fault] = []
+        self._last_row: tuple[int, str] | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """Which column holds which channel; refuses a log without rows."""
+        if self._layout is None:
+            raise self.log.no_rows()
+        return self._layout
 
     def add(self, body: bytes, lines: Integers) -> None:
         """Add a block of rows with these numbers of lines."""
-        layout = self.layout = self.layout or self._find_layout(body, lines)
+        layout = self._layout = self._layout or self._find_layout(body, lines)
         numbers = layout.numbers(body, len(lines))
-        self.row_count += len(lines)
+        self._row_count += len(lines)
         if numbers is None:
             body, lines, numbers = self._valid_rows(layout, body, lines)
         else:
-            self.last_row = int(lines[-1]), body[body.rfind(b"\n", 0, -1) + 1 : -1].decode("utf-8", "replace")
+            self._last_row = int(lines[-1]), body[body.rfind(b"\n", 0, -1) + 1 : -1].decode("utf-8", "replace")
         if numbers:
-            self.blocks.append(numbers | {LINES: lines} | self._exact_times(layout, body, numbers))
+            self._blocks.append(numbers | {LINES: lines} | self._exact_times(layout, body, numbers))
 
-    def rows(self, checks: Checks) -> Rows:
-        """Return all rows, without those that may be dropped."""
-        if self.layout is None:
-            raise self.log.no_rows()
-        columns = {
-            k: np.concatenate([b.pop(k) for b in self.blocks]) for k in list(self.blocks[0] if self.blocks else ())
-        }
-        parted = [f.line for f in self.faults if f.parted_before]
+    def finish(self, checks: Checks) -> None:
+        """Join the blocks, and leave out rows that may be dropped."""
+        layout, blocks = self.layout, self._blocks
+        columns = {k: np.concatenate([b.pop(k) for b in blocks]) for k in list(blocks[0] if blocks else ())}
+        parted = [f.line for f in self._faults if f.parted_before]
         if parted and columns:
             keep = ~np.isin(columns[LINES], parted)
             columns = {k: values[keep] for k, values in columns.items()}
         if not columns or not columns[LINES].size:
-            raise refusal(self.layout, self.faults)
-        lines, exact_ns = columns.pop(LINES), columns.pop(EXACT, None)
-        restarts = np.searchsorted(lines, [f.line for f in self.faults if f.kind == "restarted"])
-        rows = Rows(self.layout, columns, lines, exact_ns, (), 0, restarts.tolist())
-        if self.faults and self.settings.session is not None:
-            part = lines[rows_of_session(rows, times_of(rows, self.settings), self.settings)]
+            raise refusal(layout, self._faults)
+        self.lines, self.exact_ns, self.numbers = columns.pop(LINES), columns.pop(EXACT, None), columns
+        self.restarts = np.searchsorted(self.lines, [f.line for f in self._faults if f.kind == "restarted"]).tolist()
+        if self._faults and self.settings.session is not None:
+            part = self.lines[rows_of_session(self, times_of(self))]
             within = range(int(part[0]), int(part[-1]) + 1)
-            self.faults, self.refused = (
-                [f for f in found if f.line in within] for found in (self.faults, self.refused)
+            self._faults, self._refused = (
+                [f for f in found if f.line in within] for found in (self._faults, self._refused)
             )
-        notes, repaired, refused = self._drop_faults(self.layout, checks, int(lines[-1]))
-        return rows._replace(notes=(*self.log.notes, *self.notes, *notes), repaired=repaired, refused=refused)
+        self.notes = [*self.log.notes, *self.notes]
+        if self._faults:
+            self._drop_faults(layout, checks)
 
     def _find_layout(self, body: bytes, lines: Integers) -> Layout:
         """Return which column holds which channel."""
@@ -208,15 +198,15 @@ class _RowReader:
     def _valid_rows(self, layout: Layout, body: bytes, lines: Integers) -> tuple[bytes, Integers, dict[int, Values]]:
         """Return the valid rows of a block, and keep the faults of the others."""
         found = []
-        for fault in find_faults(layout, body, lines, self.last_row):
+        for fault in find_faults(layout, body, lines, self._last_row):
             found.append(fault)
-            self.refused += [fault] if fault.kind not in self.allowed else []
-            if len(self.refused) > MOST_REFUSED:
-                raise refusal(layout, self.refused, more=True)
-        self.faults += found
+            self._refused += [fault] if fault.kind not in self._allowed else []
+            if len(self._refused) > MOST_REFUSED:
+                raise refusal(layout, self._refused, more=True)
+        self._faults += found
         bad = np.isin(lines, [f.line for f in found if not f.parted_before])
         parts = body.split(b"\n")
-        self.last_row = None if bad[-1] else (int(lines[-1]), parts[-2].decode("utf-8", "replace"))
+        self._last_row = None if bad[-1] else (int(lines[-1]), parts[-2].decode("utf-8", "replace"))
         body = b"".join(part + b"\n" for part, other in zip(parts, bad.tolist(), strict=False) if not other)
         lines = lines[~bad]
         numbers = layout.numbers(body, len(lines)) if len(lines) else {}
@@ -231,29 +221,29 @@ class _RowReader:
             return {}
         column, index = time_column(layout)
         largest = float(np.abs(numbers[index]).max()) * seconds_per_unit(column.unit)
-        if not (self.blocks and EXACT in self.blocks[0]):
+        if not (self._blocks and EXACT in self._blocks[0]):
             if largest < EXACT_BELOW_S:
                 return {}
-            for block in self.blocks:
+            for block in self._blocks:
                 block[EXACT] = whole_times(block[index], column.unit)
         out_of_range = largest >= LONGEST_S  # refused later
         return {EXACT: np.zeros(len(numbers[index]), np.int64) if out_of_range else exact_times(layout, body)}
 
-    def _drop_faults(self, layout: Layout, checks: Checks, last: int) -> tuple[list[Note], int, IngestError | None]:
-        """Return notes on the lines that are dropped, how many count against the limit of repairs, and a refusal."""
-        if not self.faults:
-            return [], 0, None
-        final = self.faults[-1]
-        end = max(final.line, last)
+    def _drop_faults(self, layout: Layout, checks: Checks) -> None:
+        """Note the lines that are dropped and count those that are repaired, or keep the refusal."""
+        final = self._faults[-1]
+        end = max(final.line, int(self.lines[-1]))
         cut = {final.line} if final.short and final.line == end else set()
-        tail = [f for f in self.faults if f.line in cut or f.parted_before in cut]
-        others = [f for f in self.faults if f not in tail and f.kind != "restarted"]
-        refused = [f for f in self.refused if f not in tail]
+        tail = [f for f in self._faults if f.line in cut or f.parted_before in cut]
+        others = [f for f in self._faults if f not in tail and f.kind != "restarted"]
+        refused = [f for f in self._refused if f not in tail]
         if refused:
-            return [], 0, refusal(layout, refused)
-        if len(others) > checks.repaired_rows * self.row_count:
-            raise over_budget(refusal(layout, others), len(others), self.row_count, checks)
-        notes = [
+            self.refusal = refusal(layout, refused)
+            return
+        if len(others) > checks.repaired_rows * self._row_count:
+            raise over_budget(refusal(layout, others), len(others), self._row_count, checks)
+        self.repaired = len(others)
+        self.notes += [
             Note("N-TAIL", 1, f.line, f.line, f"the last line is cut, so it was dropped: {f.text[:200]!r}")
             for f in tail
         ]
@@ -268,8 +258,7 @@ class _RowReader:
                 longest = int(np.diff(ends, prepend=-1).max())  # lines that follow each other directly
                 detail = f"{what}, each a gap; the longest run is {longest} long; the first: "
                 detail += dropped[0].message
-                notes.append(Note(code, len(dropped), dropped[0].line, dropped[-1].line, detail))
-        return notes, len(others), None
+                self.notes.append(Note(code, len(dropped), dropped[0].line, dropped[-1].line, detail))
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:

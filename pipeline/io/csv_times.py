@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pipeline.io.channel_table import ChannelTable
     from pipeline.io.csv_layout import Layout
     from pipeline.io.csv_read import Rows
-    from pipeline.io.ingest_settings import Checks, Column, CsvFormat
+    from pipeline.io.ingest_settings import Checks, Column
     from pipeline.records import Index, Integers, Values
 
 EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
@@ -78,8 +78,9 @@ def whole_times(values: Values, unit: str, tick_ns: Fraction | None = None) -> I
     return np.asarray(np.rint(values * scale).astype(np.int64))
 
 
-def times_of(rows: Rows, settings: CsvFormat) -> Integers:
+def times_of(rows: Rows) -> Integers:
     """Return the time of each row, ns; refuse times out of range, or that have lost their digits."""
+    settings = rows.settings
     if settings.rate_hz is not None:
         return np.asarray(np.rint(np.arange(len(rows.lines)) * (1e9 / settings.rate_hz)).astype(np.int64))
     column, index = time_column(rows.layout)
@@ -115,18 +116,18 @@ def _refuse_coarse(values: Values, exact_ns: Integers, unit: str, name: str, pat
         raise IngestError(message, path, code="coarse_time", hint="log them as integers")
 
 
-def in_order(table: ChannelTable, rows: Rows, settings: CsvFormat, checks: Checks) -> ChannelTable:
+def in_order(table: ChannelTable, rows: Rows, checks: Checks) -> ChannelTable:
     """Return a log in the order of its times, each time once.
 
     A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time
     that differ, and more repairs than ``checks`` allows.
     """
-    tick_ns, restarts = _tick_ns(rows, settings), rows.restarts
-    if settings.session is not None:
+    tick_ns, restarts, session = _tick_ns(rows), rows.restarts, rows.settings.session
+    if session is not None:
         starts, count = _starts(table.time_ns, restarts, tick_ns), len(table.time_ns)
-        index = rows_of_session(rows, table.time_ns, settings)
+        index = rows_of_session(rows, table.time_ns)
         note = table.note("N-SESSION", index, "")
-        detail = f"session {settings.session} of {len(starts)}: lines {note.first} to {note.last} were read"
+        detail = f"session {session} of {len(starts)}: lines {note.first} to {note.last} were read"
         table = table.select(index, replace(note, count=count - index.size, detail=detail))
         restarts = []
     if bool(np.all(np.diff(table.time_ns) > 0)):
@@ -285,14 +286,14 @@ def _starts(time_ns: Integers, restarts: list[int], tick_ns: float) -> list[int]
     return sorted({0, *resets, *restarts} - {len(time_ns)})
 
 
-def _tick_ns(rows: Rows, settings: CsvFormat) -> float:
-    unit = "s" if settings.rate_hz is not None else time_column(rows.layout)[0].unit
-    return float(settings.tick_ns or UNITS["time"][unit][0])
+def _tick_ns(rows: Rows) -> float:
+    unit = "s" if rows.settings.rate_hz is not None else time_column(rows.layout)[0].unit
+    return float(rows.settings.tick_ns or UNITS["time"][unit][0])
 
 
-def rows_of_session(rows: Rows, time_ns: Integers, settings: CsvFormat) -> Index:
+def rows_of_session(rows: Rows, time_ns: Integers) -> Index:
     """Return the rows of the part that is read of a log that was restarted."""
-    starts, session = _starts(time_ns, rows.restarts, _tick_ns(rows, settings)), settings.session or 1
+    starts, session = _starts(time_ns, rows.restarts, _tick_ns(rows)), rows.settings.session or 1
     if session > len(starts):
         message = f"session is {session}, and the log was started {len(starts)} times"
         raise IngestError(message, rows.layout.path, code="session")
