@@ -20,6 +20,7 @@ from pipeline.model.calibration_file import beyond_uncertainty, left_out, senten
 from pipeline.outcome import Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
+from pipeline.report.held_out_section import FAR
 from pipeline.report.pages import template
 
 if TYPE_CHECKING:
@@ -107,6 +108,7 @@ def explain(found: Selection) -> str:
             "name": name,
             "words": {s: in_words(document.get(s), s) for s in SENSORS},
             "validation": validation,
+            "verdicts": {s: (document.get(s) or {}).get("verdict") for s in SENSORS},
             "commands": {s: commands_of(document.get(s) or {}, s, name, settings, results) for s in SENSORS},
             "notes": [
                 *(line for s in SENSORS for line in sentences(s, calibration.get(s))),
@@ -134,6 +136,7 @@ def explain(found: Selection) -> str:
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
     failed = [f"failed: {', '.join(found.failures)}"] if found.failures else []
     text: str = template("explain.txt").render(
+        far=FAR,
         counted=f"{len(findings)} sensors of {len(found.diagnoses)} units: {counted}",
         groups=[*lines_of(verdict_groups(findings)), *failed],
         commands=next_commands(findings, settings, results)[:-1],  # the last is this command

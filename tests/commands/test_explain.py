@@ -64,6 +64,20 @@ def test_what_the_rests_do_not_determine_is_told(results: Path, capsys: pytest.C
     assert "  Gyroscope: the rests do not determine it.\n" in capsys.readouterr().out
 
 
+def test_an_error_far_above_the_noise_is_told_with_that_of_held_out_moves(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (results / "bench" / "validations").mkdir()
+    judged = {"steps": [{"rms_error": 0.1}], "noise_floor": 0.01, "unit": "deg/s", "held_out": True}
+    moves = {"moves": 1, "rms_deg": {"before": 100.0, "after": 2.9}, "largest_expected_rms_deg": 8.8}
+    document = {"accelerometer": None, "gyroscope": judged, "gravity_direction": moves}
+    (results / "bench" / "validations" / "U1.json").write_text(json.dumps(document))
+    main([str(results / "bench"), "U1"])
+    said = capsys.readouterr().out
+    assert "explains an error so far above the noise; it does not show that the calibration is good" in said
+    assert "direction of gravity by 2.9 deg (rms); noise and stated uncertainties explain at most 8.8 deg" in said
+
+
 def test_why_the_error_is_not_that_of_held_out_motion_is_told(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
