@@ -23,7 +23,7 @@ import io
 import json
 import re
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from pipeline.io.files import MessageFormat
     from pipeline.records import Integers
 
+    Columns = Mapping[str, NDArray[Any]]
+
 RUN_SIZE = 4096  # messages of one topic of a bag that are decoded together
 ELEMENT = re.compile(r"(.+)\[(\d+)\]")
 MARKED = 3  # bytes of a DataFlash message before its fields: two marks and its type
@@ -61,7 +63,8 @@ class LogReader(MessageReader):
 
     def __init__(self, path: Path, known: MessageFormat) -> None:
         super().__init__(str(path))
-        self.file, self.kind, self.messages = path, known.kind, _of_bag if known.extra == "ros" else _as_messages
+        self.file, self.kind = path, known.kind
+        self.messages = {"ros": _of_bag, "ulog": _of_ulog, "ardupilot": _of_dataflash}.get(known.extra, _of_arrays)
         with path.open("rb") as stream:
             self.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -86,23 +89,26 @@ class LogReader(MessageReader):
         return number
 
 
-def _as_messages(log: LogReader) -> Iterator[Rows]:
-    """Yield the arrays of each topic as messages."""
-    suffix = log.file.suffix.lower()
-    arrays = _of_ulog(log) if suffix == ".ulg" else _of_dataflash(log) if suffix == ".bin" else _of_arrays(log.file)
-    for topic in arrays:
-        log.has_recorder &= topic.recorded_ns is not None
-        codes = {n: f"<{a.dtype.kind}{a.dtype.itemsize}" for n, a in topic.columns.items()}
-        kind = np.dtype([(n, codes[n], a.shape[1:]) for n, a in topic.columns.items()])
-        count, size = len(next(iter(topic.columns.values()))), kind.itemsize
-        table, fields, places = np.empty(count, kind), dict(kind.fields or {}), []
-        for name, array in topic.columns.items():
-            table[name] = array
-            places.append([name, fields[name][1], codes[name], array.shape[1] if array.ndim > 1 else None])
-        metadata = {STATED + name: unit for name, unit in topic.units.items() if unit}
-        channel = log.define(topic.name, ARRAYS, (log.kind, ARRAYS, json.dumps(places).encode()), metadata)
-        times = np.zeros(count) if topic.recorded_ns is None else topic.recorded_ns
-        yield _rows(channel, table.tobytes(), np.full(count, size, np.int64), times)
+def _of_columns(
+    log: LogReader, name: str, columns: Columns, units: Mapping[str, str], recorded_ns: Integers | None = None
+) -> Rows:
+    """Return the arrays of a topic, (n,) or (n, k) numbers by field, as messages.
+
+    ``units`` are those that the file states, ``recorded_ns`` the times of the logger. Where a log holds a topic several
+    times, its name is ``name[1]``, ``name[2]`` from the second one on.
+    """
+    log.has_recorder &= recorded_ns is not None
+    codes = {n: f"<{a.dtype.kind}{a.dtype.itemsize}" for n, a in columns.items()}
+    kind = np.dtype([(n, codes[n], a.shape[1:]) for n, a in columns.items()])
+    count = len(next(iter(columns.values())))
+    table, fields, places = np.empty(count, kind), dict(kind.fields or {}), []
+    for field, array in columns.items():
+        table[field] = array
+        places.append([field, fields[field][1], codes[field], array.shape[1] if array.ndim > 1 else None])
+    metadata = {STATED + field: unit for field, unit in units.items() if unit}
+    channel = log.define(name, ARRAYS, (log.kind, ARRAYS, json.dumps(places).encode()), metadata)
+    times = np.zeros(count) if recorded_ns is None else recorded_ns
+    return _rows(channel, table.tobytes(), np.full(count, kind.itemsize, np.int64), times)
 
 
 def _of_bag(log: LogReader) -> Iterator[Rows]:
@@ -170,19 +176,7 @@ def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[Messag
     yield LogReader(path, known)
 
 
-class Topic(NamedTuple):
-    """The messages of one topic as arrays: (n,) or (n, k) numbers by field, with the units that the file states.
-
-    Where a log holds a topic several times, its name is ``name[1]``, ``name[2]`` from the second one on.
-    """
-
-    name: str
-    columns: Mapping[str, NDArray[Any]]
-    units: Mapping[str, str]
-    recorded_ns: Integers | None = None  # times of the logger
-
-
-def _of_ulog(log: LogReader) -> Iterator[Topic]:
+def _of_ulog(log: LogReader) -> Iterator[Rows]:
     from pyulog import ULog  # noqa: PLC0415  (an extra)
 
     with log.file.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()) as said:
@@ -203,7 +197,8 @@ def _of_ulog(log: LogReader) -> Iterator[Topic]:
             else:
                 columns[name] = values
         columns = {n: np.column_stack(v) if isinstance(v, list) else v for n, v in columns.items()}
-        yield Topic(_instance(data.name, data.multi_id), columns, {}, data.data["timestamp"].astype(np.int64) * 1000)
+        times = data.data["timestamp"].astype(np.int64) * 1000
+        yield _of_columns(log, _instance(data.name, data.multi_id), columns, {}, times)
 
 
 def _instance(name: str, number: int) -> str:
@@ -229,7 +224,7 @@ def _check_chain(content: bytes, log: LogReader) -> None:
         log.notes.append(Note("N-TRUNCATED", 1, 0, 0, f"{what}; the complete messages were used"))
 
 
-def _of_dataflash(log: LogReader) -> Iterator[Topic]:
+def _of_dataflash(log: LogReader) -> Iterator[Rows]:
     """Yield the topics of a log; refuse one in which other bytes stand between messages."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT, DFReader_binary  # noqa: PLC0415  (an extra)
 
@@ -258,20 +253,21 @@ def _of_dataflash(log: LogReader) -> Iterator[Topic]:
         for sensor in np.unique(instance).tolist():
             own = instance == sensor
             times = table[TIME][own].astype(np.int64) * 1000
-            yield Topic(_instance(known.name, sensor), {n: c[own] for n, c in columns.items()}, units, times)
+            part = {n: c[own] for n, c in columns.items()}
+            yield _of_columns(log, _instance(known.name, sensor), part, units, times)
 
 
-def _of_arrays(path: Path) -> Iterator[Topic]:
-    if is_mat_5(path):
+def _of_arrays(log: LogReader) -> Iterator[Rows]:
+    if is_mat_5(log.file):
         from scipy.io import loadmat  # noqa: PLC0415  (few logs need it)
 
-        content = loadmat(path, simplify_cells=True)
-        yield from _of_group("", {n: v for n, v in content.items() if not n.startswith("__")})
+        content = loadmat(log.file, simplify_cells=True)
+        yield from _of_group(log, "", {n: v for n, v in content.items() if not n.startswith("__")})
     else:
         import h5py  # noqa: PLC0415  (an extra)
 
-        with h5py.File(path, "r") as file:
-            yield from _of_group("", _tree(file))
+        with h5py.File(log.file, "r") as file:
+            yield from _of_group(log, "", _tree(file))
 
 
 def _tree(group: Any) -> dict[str, Any]:  # noqa: ANN401  (h5py.Group)
@@ -286,31 +282,31 @@ def _tree(group: Any) -> dict[str, Any]:  # noqa: ANN401  (h5py.Group)
     return found
 
 
-def _of_group(place: str, tree: Mapping[str, Any]) -> Iterator[Topic]:
+def _of_group(log: LogReader, place: str, tree: Mapping[str, Any]) -> Iterator[Rows]:
     """Yield the topics of a group, and of those in it."""
     arrays: dict[str, NDArray[Any]] = {}
     units: dict[str, str] = {}
     for name, item in tree.items():
         if isinstance(item, dict):
-            yield from _of_group(f"{place}/{name}", item)
+            yield from _of_group(log, f"{place}/{name}", item)
             continue
         value, unit = item if isinstance(item, tuple) else (item, "")
         array = np.asarray(value)
         if array.dtype.names:  # a table of named columns
             columns = {n: c for n in array.dtype.names if (c := _samples(array[n])) is not None}
-            yield from _by_length(f"{place}/{name}", columns, {})
+            yield from _by_length(log, f"{place}/{name}", columns, {})
         elif (samples := _samples(array)) is not None:
             arrays[name], units[name] = samples, unit
-    yield from _by_length(place, arrays, units)
+    yield from _by_length(log, place, arrays, units)
 
 
-def _by_length(place: str, arrays: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> Iterator[Topic]:
+def _by_length(log: LogReader, place: str, arrays: Columns, units: Mapping[str, str]) -> Iterator[Rows]:
     """Yield the arrays of a group, those of one length together."""
     lengths = sorted({len(a) for a in arrays.values()})
     for length in lengths:
         own = {n: a for n, a in arrays.items() if len(a) == length}
         name = (place or "/") if len(lengths) == 1 else f"{place}/{min(own)}"
-        yield Topic(name, own, {n: u for n, u in units.items() if n in own})
+        yield _of_columns(log, name, own, {n: u for n, u in units.items() if n in own})
 
 
 def _samples(array: NDArray[Any]) -> NDArray[Any] | None:
