@@ -91,7 +91,7 @@ def test_big_endian_messages_are_read_right(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("other", [{"frame": "imu_link_2"}, {"frame": "imu_lonk"}, {"little_endian": False}])
-def test_frame_or_byte_order_that_changes_within_a_chunk_is_read_one_by_one(
+def test_frame_or_byte_order_that_changes_within_a_chunk_is_read_by_layout(
     tmp_path: Path, other: dict[str, Any]
 ) -> None:
     messages = [cdr_imu(i, **(other if i in (3, 4) else {})) for i in range(7)]
@@ -99,6 +99,17 @@ def test_frame_or_byte_order_that_changes_within_a_chunk_is_read_one_by_one(
     table = read(tmp_path / "a.mcap")
     assert_is_the_imu(table, 7)
     assert [(n.code, n.count) for n in table.notes] == [("N-FALLBACK", 7)]
+
+
+def test_messages_that_all_differ_in_layout_are_read(tmp_path: Path) -> None:
+    """More layouts than are looked for in the rest of a run, of several lengths and in turns."""
+    for name, frames in (("a.mcap", [f"imu_{i % 50}" for i in range(120)]), ("b.mcap", ["imu"] * 120)):
+        messages = [cdr_imu(i, frame=frame) for i, frame in enumerate(frames)]
+        write(tmp_path / name, ("/imu", "cdr", ROS2_IMU, messages))
+    varied, alike = read(tmp_path / "a.mcap"), read(tmp_path / "b.mcap")
+    assert varied.time_ns.tolist() == alike.time_ns.tolist() == [(i + 1) * SECOND + 7 for i in range(120)]
+    assert {c: v.tolist() for c, v in varied.values.items()} == {c: v.tolist() for c, v in alike.values.items()}
+    assert [(n.code, n.count) for n in varied.notes] == [("N-FALLBACK", 120)]
 
 
 @pytest.mark.parametrize("kind", [0x02, 0x03, 0x06, 0x07, 0x09, 0x0B])
