@@ -351,13 +351,16 @@ def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
 def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     """Return the sources that U of a sensor does not include and that can exceed it: source and size, and the reason.
 
+    An error of the matrix is relative; it changes the scale factors most, and is compared with their U.
+
     ``part``: of ``calibrations/<unit>.json``.
     """
     found = []
     part = part or {}
     for entry in (part.get("uncertainty_budget") or {}).get("not_included", []):
         for key, size in entry.get("up_to", {}).items():
-            if size > max(u or 0.0 for u in np.ravel(part["expanded_uncertainty"][key])):
+            U = part["expanded_uncertainty"][key]
+            if size > max(u or 0.0 for u in (U if key == "bias" else np.diag(U))):
                 of = f"{size:.2g} {part['unit']} of bias" if key == "bias" else f"{100.0 * size:.2g} % of the matrix"
                 found.append((f"{entry['source']}, up to {of}", entry["reason"]))
     return found

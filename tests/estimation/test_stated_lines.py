@@ -179,3 +179,9 @@ def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:
     u = [np.sqrt(np.diag(np.array(found["covariance"]["values"])))[:3] for found in (first, last_one)]
     assert u[0].max() < 0.005  # the bias of the rest, without what is stated
     assert u[1] == pytest.approx(np.full(3, 0.02), rel=0.05)
+
+
+def test_a_wide_misalignment_does_not_hide_what_the_scale_factors_do_not_include() -> None:
+    document = by_angle("accelerometer", counted=False)[0].to_json()
+    document["expanded_uncertainty"]["matrix"][1][0] = 0.03  # by the limit of the sensor file
+    assert any("local gravity" in source for source, _ in beyond_uncertainty(document))

@@ -122,6 +122,7 @@ def test_the_run_its_repetition_explain_and_the_page_show_the_same_command(loop:
     lines = [line.strip() for line in loop.said["explain"].splitlines()]
     assert lines[0] == "4 sensors of 2 units: 3 nothing missing, 1 missing effect"
     assert lines[lines.index("To add it:") + 1] == command
+    assert any(line.startswith("U of the accelerometer does not include local gravity") for line in lines)
 
 
 def test_the_held_out_error_falls_to_its_floor_and_the_other_unit_stays(loop: Loop) -> None:
