@@ -151,6 +151,7 @@ def evidence_of(
         document["residual_over_noise"],
         found.left_over_noise if found else None,
         published=published,
+        agreement=(validation or {}).get("agreement"),
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=[

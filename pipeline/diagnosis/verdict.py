@@ -24,6 +24,7 @@ SURE = 0.9  # the same where the held-out error is at the noise floor with what 
 WORSE = 0.3  # of the noise's mean square, by which what was selected may raise the held-out error's at most
 HELPFUL = 0.1  # share of the held-out error's mean square that each effect worth a try takes away
 LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms of 3 x 1000 samples
+DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null families was 0.006
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 FREE = ("reference_least_squares", "nonlinear_least_squares", "cholesky_lu")  # methods that leave bias and matrix free
@@ -61,6 +62,7 @@ class Evidence:
     moves: tuple[float, float] | None = None  # rms error of held-out moves, and the largest that is expected, deg
     free: HeldOut | None = None  # of a free fit of the same recordings; filtered ones against the filtered reference
     full: HeldOut | None = None  # of the free fit with the selected effects
+    agreement: Mapping[str, Any] | None = None  # of matrix and held-out motion (``pipeline.validation.agreement``)
     doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
     approximations: Sequence[str] = ()  # what the method's matrix and bias lack (``pipeline.diagnosis.method_errors``)
     unknown: Sequence[str] = ()  # covariates on which the residual depends, given what was selected
@@ -118,6 +120,12 @@ class Evidence:
         """Whether the residual is below what the noise estimate makes possible."""
         quiet = self.on_table and self.found == "nothing_missing" and self.over_noise is not None
         return quiet and float(self.over_noise or 0.0) < QUIET
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether held-out motion contradicts the matrix, and nothing else is found."""
+        known = self.agreement is not None and self.found == "nothing_missing"
+        return known and (self.agreement or {})["p_value"] < DISAGREES
 
     @property
     def given(self) -> bool:
@@ -193,6 +201,7 @@ RULES: tuple[tuple[str, str, Callable[[Evidence], object]], ...] = (
     ("unexplained", "unexplained", lambda e: e.unexplained),
     ("unexplained", "moves", lambda e: e.moves and e.moves[0] > e.moves[1] and not e.missing),
     ("missing_effect", "beyond", lambda e: e.missing),
+    ("reference_in_doubt", "disagreement", lambda e: e.disagrees),
     ("floor_in_doubt", "below", lambda e: e.published and e.published.below),
     ("floor_in_doubt", "too_quiet", lambda e: e.too_quiet),
     ("left_by_method", "approximations", lambda e: e.found == "nothing_missing" and e.approximations),

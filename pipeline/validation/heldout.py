@@ -23,6 +23,7 @@ from pipeline.estimation.rest_means import held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.model.measurement import linear_truth
+from pipeline.validation.agreement import agreement
 from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude, left_out
 from pipeline.validation.expected_error import expected_rms_error, linearized
 from pipeline.validation.samples import Samples, samples_of_motion, samples_of_rests, squared_norm_errors
@@ -60,9 +61,10 @@ def validate(
     The part has ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor,
     vector_noise_floor, steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit),
     ``reason`` (why), ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why
-    the calibration must not be used, or None), ``over_temperature`` (``residuals_over_temperature``; only where the
-    temperature was swept), ``limits`` and ``pass``. ``vector_rms_error`` is the root of the mean squared length of the
-    difference to the reference. Raises ``ConfigurationError`` if a limit's name is unknown.
+    the calibration must not be used, or None), ``agreement`` (``pipeline.validation.agreement``),
+    ``over_temperature`` (``residuals_over_temperature``; only where the temperature was swept), ``limits``, ``pass``.
+    ``vector_rms_error`` is the root of the mean squared length of the difference to the reference. Raises
+    ``ConfigurationError`` if a limit's name is unknown.
     """
     sensor = calibration.sensor
     samples, reason = _choose(sensor, recordings, noise, settings)
@@ -88,6 +90,7 @@ def validate(
         "notes": [],
         "expected_rms_error": None,
         "worse_than_raw": None,
+        "agreement": None,
     }
     if count:
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
@@ -97,6 +100,7 @@ def validate(
         part["expected_rms_error"] = expected
         part["notes"] += notes
         if part["held_out"] and expected is not None:
+            part["agreement"] = agreement(calibration, recordings, noise, settings, other)
             part["worse_than_raw"] = _worse_than_raw(
                 calibration, samples, expected[1], other, on_table=settings["table"].get("motion") != "none"
             )

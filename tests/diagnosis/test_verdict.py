@@ -25,6 +25,7 @@ MISSING = replace(NOTHING, found="missing_effect", selected=("g_sensitivity",), 
 STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
 
 
+OFF = {"p_value": 1e-5, "reads": "x", "of": "y", "error": 3e-4, "expanded_uncertainty": 1e-4}
 BEYOND = replace(MISSING, implausible=("g_sensitivity",))
 
 
@@ -45,6 +46,9 @@ def held_out(after: float) -> dict[str, float]:
         (replace(BY_HAND, moves=(2.9, 3.5)), "nothing_missing", ""),
         (replace(NOTHING, published=ABOVE, over_noise=4.0), "unexplained", "4 times the noise"),
         (replace(NOTHING, published=BELOW), "floor_in_doubt", "estimate is too large"),
+        (replace(NOTHING, agreement=OFF), "reference_in_doubt", "x reads +0.0003 of the truth along y"),
+        (replace(NOTHING, agreement={**OFF, "p_value": 1e-3}), "nothing_missing", ""),
+        (replace(MISSING, agreement=OFF), "missing_effect", ""),
         (replace(NOTHING, over_noise=0.1), "floor_in_doubt", "0.1 times the noise"),
         (replace(MISSING, published=ABOVE, free=ABOVE, full=INSIDE), "missing_effect", ""),
         (

@@ -1,0 +1,85 @@
+"""Whether held-out motion contradicts a matrix by less than shows in the rms error: simulated units, changed there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.diagnosis.diagnose import diagnose
+from pipeline.diagnosis.verdict import DISAGREES
+from pipeline.estimation import effects, reference_least_squares
+from pipeline.estimation.noise import estimate_noise
+from pipeline.records import Recording, SensorCalibration
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.validation.heldout import validate
+
+SETTINGS: dict[str, Any] = {
+    "sensor": read_config("sensor", "mpu6050"),
+    "table": read_config("table", "acutronic"),
+    "procedure": {"holdout_every": 3},
+    "limits": {},
+    "effects": {"accelerometer": [], "gyroscope": []},
+    "method": {"gyroscope": "reference_least_squares", "accelerometer": "reference_least_squares"},
+    "diagnosis": {"depth": "standard"},
+}
+TURN = np.array([[0.0, -5e-4, 0.0], [5e-4, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+@cache
+def unit(hidden: str = "") -> tuple[Recording, ...]:
+    course = {"rates_dps": (30.0, 60.0), "both_directions": True}
+    recordings, _ = simulate_unit(UnitDescription("U", course=course, effects=dict.fromkeys(hidden.split())), 8, 0)
+    return tuple(recordings)
+
+
+def held_out(sensor: str, change: np.ndarray, configured: tuple[str, ...] = (), hidden: str = "") -> tuple[Any, Any]:
+    """Return validation and fit of a unit whose readings are multiplied by 1 + ``change`` in held-out motion alone."""
+    recordings = [
+        replace(r, **{sensor: r.reading(sensor) @ (np.eye(3) + change).T}) if r.role == "validation" else r
+        for r in unit(hidden)
+    ]
+    settings = SETTINGS | {"effects": {sensor: list(configured)}}
+    noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
+    settings |= {"noise": {sensor: noise}}
+    found = reference_least_squares.fit(sensor, recordings, None, settings)
+    found = effects.fit(sensor, recordings, found, settings) if configured else found
+    return validate(found, recordings, noise, settings), (found, recordings, noise, settings)
+
+
+@pytest.mark.parametrize("sensor", ["accelerometer", "gyroscope"])
+def test_held_out_motion_of_the_same_unit_agrees(sensor: str) -> None:
+    part, _ = held_out(sensor, np.zeros((3, 3)))
+    assert part["agreement"]["p_value"] > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "size"), [(6e-4 * np.diag([0.0, 1.0, 0.0]), 6e-4), (TURN, 5e-4)], ids=["scale of y", "turned about z"]
+)
+def test_a_matrix_that_changed_between_fit_and_held_out_motion_is_doubted(change: np.ndarray, size: float) -> None:
+    part, (found, recordings, noise, settings) = held_out("gyroscope", change)
+    low, high = part["expected_rms_error"]
+    assert low < part["steps"][-1]["rms_error"] < high  # the size of the error does not show it
+    told = part["agreement"]
+    assert told["p_value"] < DISAGREES
+    assert abs(told["error"]) == pytest.approx(size, abs=2.0 * told["expanded_uncertainty"])
+    row, column = ("xyz".index(told[key]) for key in ("reads", "of"))
+    assert change[row, column] == pytest.approx(told["error"], abs=2.0 * told["expanded_uncertainty"])
+    said = diagnose(found, recordings, noise, settings, None, validation=part)
+    assert said["verdict"] == "reference_in_doubt"
+    assert f"the calibrated {told['reads']} reads" in said["reason"]
+    assert diagnose(found, recordings, noise, settings, None, validation=part | {"agreement": None})["verdict"] == (
+        "nothing_missing"
+    )
+
+
+def test_effects_of_the_calibration_are_no_disagreement() -> None:
+    hidden = ("gyroscope.g_sensitivity", "g_sensitivity")
+    part, (found, *_) = held_out("gyroscope", np.zeros((3, 3)), hidden[1:], hidden[0])
+    assert isinstance(found, SensorCalibration)
+    assert [e.name for e in found.effects] == ["g_sensitivity"]
+    assert part["agreement"]["p_value"] > 1e-3
