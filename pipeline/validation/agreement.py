@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError
+from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.uncertainty_budget import covariance_beside_reference
 from pipeline.io.quality_flags import STUCK
@@ -64,11 +64,12 @@ def agreement(
         part = linearized(calibration, samples, found[2], other)
         if part is None:
             return None
-        columns = np.column_stack([np.ones(len(part.truth)), part.truth])
-        per_parameter = np.einsum("jn,nip->ijp", np.linalg.pinv(columns)[1:], part.derivative)
+        rows = np.isfinite(part.truth).all(axis=1)
+        columns = np.column_stack([np.ones(np.count_nonzero(rows)), part.truth[rows]])
+        per_parameter = np.einsum("jn,nip->ijp", np.linalg.pinv(columns)[1:], part.derivative[rows])
         slopes += part.number * per_parameter.reshape(9, -1)
         count += part.number
-        known = samples.known & np.isfinite(found[0]).all(axis=1)
+        known = samples.known & np.isfinite(np.hstack([found[0], found[2]])).all(axis=1)
         flags = np.zeros(len(known), np.uint16) if recording.flags is None else recording.flags
         flags = np.where(known, flags, flags | STUCK)
         values: dict[str, Any] = {"role": sensor, "flags": flags, sensor: np.nan_to_num(found[0])}
@@ -77,7 +78,7 @@ def agreement(
     plain = {"table": {**table, **dict.fromkeys(bench_priors().values())}, "sensor": settings.get("sensor") or {}}
     try:
         fit = reference_least_squares.fit(sensor, [*calibrated, *rest], None, plain | {"noise": {sensor: noise}})
-    except CannotCalibrateError:
+    except (CannotCalibrateError, NotObservableError):
         return None
     slopes /= count
     error = np.linalg.inv(fit.matrix).ravel() - np.eye(3).ravel()

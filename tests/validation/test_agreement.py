@@ -77,6 +77,16 @@ def test_a_matrix_that_changed_between_fit_and_held_out_motion_is_doubted(change
     )
 
 
+def test_held_out_motion_that_does_not_move_says_nothing_of_the_matrix() -> None:
+    recordings = [r for r in unit() if r.role != "validation"]
+    still = next(r for r in recordings if r.role == "static")
+    attitude = np.tile([1.0, 0.0, 0.0, 0.0], (still.samples, 1))
+    held = replace(still, name="validation", role="validation", table_attitude=attitude, table_rate=attitude[:, 1])
+    noise = estimate_noise("gyroscope", recordings, SETTINGS["sensor"]["gyroscope"])
+    found = reference_least_squares.fit("gyroscope", recordings, None, SETTINGS)
+    assert validate(found, [*recordings, held], noise, SETTINGS)["agreement"] is None
+
+
 def test_effects_of_the_calibration_are_no_disagreement() -> None:
     hidden = ("gyroscope.g_sensitivity", "g_sensitivity")
     part, (found, *_) = held_out("gyroscope", np.zeros((3, 3)), hidden[1:], hidden[0])
