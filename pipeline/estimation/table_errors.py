@@ -47,8 +47,8 @@ TIMED_BY_SENSOR = (
     "of 100 ppm of that clock is one of 100 ppm of the matrix"
 )
 CLOCK_OF_TABLE = (
-    "the log holds no rate; the rate is the change of the angle over the time by the table's own clock, which counts "
-    "as exact"
+    "the log holds no rate; the rate is the change of the angle over the time by the table's own clock, whose error is "
+    "part of table.rate_accuracy"
 )
 
 
