@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 import textwrap
 from dataclasses import replace
@@ -17,7 +18,7 @@ from pipeline.config.campaign import find_campaign, load_campaign
 from pipeline.config.options import nearest
 from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError
 from pipeline.files import write_atomically
-from pipeline.io.files import SUFFIXES, recording_files
+from pipeline.io.files import FILE, SUFFIXES, recording_files
 from pipeline.model.calibration_file import LEFT_OUT
 from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.profile_detection.columns import find_layout
@@ -79,6 +80,8 @@ Told = tuple[str, list[Refused]]  # what is printed of a log or a unit, and what
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline check FILE...``."""
     arguments = _parser().parse_args(argv)
+    if arguments.save and arguments.save.suffix != ".yaml":
+        raise ConfigurationError(f"--save {arguments.save}: the name of a profile's file ends in .yaml")
     tasks = _tasks(arguments)
     countdown, refused = Countdown(len(tasks)), list[Refused]()
     alike: dict[str, list[str]] = {}
@@ -357,11 +360,25 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
         if save is not None:
             write_atomically(save, text)
             print(f"Saved as {save}. No configuration uses it yet.")
-        print("\n".join([*not_found(proposal), NEXT.format(name=name)]))
+        print("\n".join([*not_found(proposal), _next_step(proposal, name, save)]))
 
 
-NEXT = """\
-If every line is right, save it (--save FILE) as configs/ingest/{name}.yaml of your campaign, and check it by
-python -m pipeline check FILE --ingest {name}. A run uses it with the override ingest={name}, or with {name} in the
-column ingest of units.csv.
-"""
+def _next_step(proposal: Proposal, name: str, save: Path | None) -> str:
+    """Return how a proposed profile is saved, checked and used, and where files go that are joined."""
+    profile = save or Path("my_bench", "configs", "ingest", f"{name}.yaml")
+    todo = "check it by" if save else f"save it in your campaign (--save {profile}), and check it by"
+    lines = [
+        f"If every line is right, {todo}",
+        f"python -m pipeline check {shlex.join(proposal.files[:MOST_IN_FULL])} --ingest {shlex.quote(str(profile))}",
+        f"A run uses it from configs/ingest of the campaign, with the override ingest={name}, or with {name} in the",
+        "column ingest of units.csv.",
+    ]
+    if proposal.parts:
+        names, text = " and ".join(proposal.parts), " and ".join(FILE + f"_{part}" for part in proposal.parts)
+        words = (
+            f"{names} are one recording: place both in raw/<unit>/ under these names. They stand for the only required "
+            "recording of the procedure; no other file is needed for it. For a procedure with several recordings, "
+            f"write {FILE}, the name of a recording, into the names of the profile, for example {text}."
+        )
+        lines.append(textwrap.fill(words, WIDTH))
+    return "\n".join(lines) + "\n"

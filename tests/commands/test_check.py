@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -160,6 +161,48 @@ def test_a_saved_proposal_is_used_when_it_is_named(
     Path("mine.yaml").write_text((bench / "mine.yaml").read_text() + "# another\n")
     assert main(["check", "log.csv", "--ingest", "mine"]) == 2
     assert "--ingest mine is one of" in capsys.readouterr().err
+
+
+def test_the_advice_after_saving_leads_to_the_saved_file_beside_others_of_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("my log.csv").write_text("t,ax,ay,az\n" + "".join(f"{0.01 * i:.2f},0,0,1\n" for i in range(100)))
+    for bench in ("one", "two"):
+        folder = tmp_path / bench / "configs" / "ingest"
+        folder.mkdir(parents=True)
+        (folder / "mine.yaml").write_text(f"name: {bench}\n")
+    checked = Checked(capsys, "my log.csv", "--save", "two/configs/ingest/mine.yaml")
+    assert "save it" not in checked.out
+    (advice,) = re.findall(r"^python -m pipeline (check .*)$", checked.out, re.MULTILINE)
+    assert main(shlex.split(advice)) == 0
+    assert "ingest=mine" in capsys.readouterr().out
+    assert main(["check", "my log.csv", "--save", "mine"]) == 2
+    assert "ends in .yaml" in capsys.readouterr().err
+
+
+def test_files_of_one_recording_are_calibrated_where_the_advice_places_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    description = {"units": [{"unit": "U1", "procedure": "multi_position", "table": "hand"}]}
+    write_campaign(description_from(description, "bench"), tmp_path / "bench")
+    monkeypatch.chdir(tmp_path)
+    folder = Path("bench", "raw", "U1")
+    (whole,) = folder.glob("recording.*")
+    table = np.genfromtxt(whole, delimiter=",", names=True)
+    data = np.column_stack([table[name] for name in table.dtype.names])
+    for name, columns in (("acc.txt", [0, 1, 2, 3]), ("gyr.txt", [0, 4, 5, 6])):
+        np.savetxt(folder / name, data[:, columns], fmt="%.9f")
+    whole.unlink()
+    names = [str(folder / name) for name in ("acc.txt", "gyr.txt")]
+    checked = Checked(capsys, *names, "--ingest", "canonical_csv", "--save", "bench/configs/ingest/mine.yaml")
+    assert "place both in raw/<unit>/ under these names" in checked.words
+    units = Path("bench", "units.csv")
+    header, row = units.read_text().splitlines()
+    units.write_text(f"{header},ingest\n{row},mine\n")
+    checked = Checked(capsys, "--campaign", "bench")
+    assert checked.code == 0, checked.out
+    assert "unit U1: 1 recording, no refusal" in checked.out
 
 
 def test_files_alike_share_one_proposal_which_is_printed_last(
