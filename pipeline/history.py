@@ -95,7 +95,7 @@ def unit_state(
         "error": (calibration.get("error") or {}).get("code"),
         "config_sha256": calibration.get("config_sha256"),
         "config": dict(config or {}),
-        "recordings": {f["file"]: str(f.get("sha256"))[:DIGITS] for f in calibration.get("inputs") or []},
+        "recordings": {f["file"]: _digest(f) for f in calibration.get("inputs") or []},
         "overrides": dict(overrides),
     }
     for sensor in SENSORS:
@@ -111,6 +111,13 @@ def unit_state(
             "uncertainty": _largest(fitted.get("expanded_uncertainty") or {}),
         }
     return state
+
+
+def _digest(entry: JSON) -> str:
+    """Return the digest of a recording: of its file, or of all files that are joined to it."""
+    digests = [str(file.get("sha256")) for file in (entry, *entry.get("joined", []))]
+    found = digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
+    return found[:DIGITS]
 
 
 def _largest(uncertainty: Mapping[str, Any]) -> dict[str, float]:

@@ -26,6 +26,16 @@ def state(effects: list[str], error: float, **overrides: str) -> dict[str, Any]:
     return unit_state(calibration, validation, {"gyroscope": {"verdict": "unexplained"}}, overrides)
 
 
+def test_a_recording_is_another_where_a_joined_file_is() -> None:
+    def recordings(**joined: Any) -> dict[str, str]:
+        inputs = [{"file": "acc.txt", "sha256": "ab", **joined}]
+        return unit_state({"inputs": inputs, "accelerometer": None, "gyroscope": None}, None, None, {})["recordings"]
+
+    found = [recordings(), *(recordings(joined=[{"file": "gyr.txt", "sha256": text}]) for text in ("cd", "ef"))]
+    assert all(set(names) == {"acc.txt"} for names in found)
+    assert len({names["acc.txt"] for names in found}) == 3
+
+
 def test_a_run_is_recorded_with_the_units_that_it_changed_and_only_then(tmp_path: Path) -> None:
     units = {f"U{i}": state([], 0.12) for i in range(3)}
     assert [e["run"] for e in record(tmp_path, units, SETTINGS)] == [1]

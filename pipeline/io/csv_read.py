@@ -282,7 +282,7 @@ def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
     return replace(
         first,
         values={k: v for t in tables for k, v in t.values.items()},
-        source={**first.source, "parts": [t.source for t in tables]},
+        source={**first.source, "joined": [t.source for t in others]},
         count_sizes={k: v for t in tables for k, v in t.count_sizes.items()},
         notes=tuple(n for t in tables for n in t.notes),
     )

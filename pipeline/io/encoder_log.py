@@ -151,11 +151,12 @@ def _merged(  # noqa: PLR0917  (parts of one table)
 ) -> ChannelTable:
     same, found = log.source is sensor.source, interpolators(log)
     part = sensor.select(rows, *(() if same else log.notes), *notes)
+    joined = {} if same else {"joined": [*sensor.source.get("joined", []), log.source]}
     own = {c: v for c, v in part.values.items() if c not in log.values and c != TABLE_TIME}
     return replace(
         part,
         values=own | {channel: at(tau) for channel, at in found.items()},
-        source=sensor.source | ({"table_clock": clock} if clock else {}) | ({} if same else {"table_log": log.source}),
+        source=sensor.source | ({"table_clock": clock} if clock else {}) | joined,
     )
 
 

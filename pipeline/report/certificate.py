@@ -24,6 +24,7 @@ from pipeline.records import SENSORS
 from pipeline.report.held_out_section import first_and_last_step
 from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters
+from pipeline.report.recording_section import files_read
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -75,7 +76,7 @@ def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temp
         "source": {
             "calibration": f"calibrations/{calibration['unit']}.json",
             "config_sha256": calibration.get("config_sha256"),
-            "inputs": [{k: i.get(k) for k in ("file", "sha256", "rows")} for i in calibration.get("inputs") or []],
+            "inputs": files_read(calibration.get("inputs")),
             "command": run_command(settings["run"]) if settings.get("run") else None,
         },
     }

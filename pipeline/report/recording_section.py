@@ -22,6 +22,12 @@ STILL = 0.02  # deg/s, below which a table's log is noise of its rate
 MARKS = ("after a gap", "clipped", "stuck", "repaired")  # of samples, by the bits of their flags
 
 
+def files_read(inputs: list[JSON] | None) -> list[JSON]:
+    """Return file, hash and rows of each file of ``inputs`` of a calibration, also of those that were joined."""
+    files = [file for entry in inputs or [] for file in (entry, *entry.get("joined", []))]
+    return [{key: file.get(key) for key in ("file", "sha256", "rows")} for file in files]
+
+
 def rests_logged(recordings: list[Recording]) -> dict[str, list[Rest]]:
     """Return the rests that a table's log shows, by recording."""
     return {r.name: rests_from_table(r) for r in recordings}

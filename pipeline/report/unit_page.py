@@ -27,7 +27,14 @@ from pipeline.report.held_out_section import (
 from pipeline.report.noise_section import allan, remarks, term_rows
 from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters, parameter_rows
-from pipeline.report.recording_section import environment, recording_rows, rest_rows, rests_logged, segments
+from pipeline.report.recording_section import (
+    environment,
+    files_read,
+    recording_rows,
+    rest_rows,
+    rests_logged,
+    segments,
+)
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
 
 JSON = dict[str, Any]
@@ -67,6 +74,7 @@ def render(
         passed=passes(calibration, validation),
         checks=checks(validation),
         left_out=left_out(calibration.get("inputs")),
+        files_read=files_read(calibration.get("inputs")),
         sensors=sorted(sensors, key=lambda s: 99 if s["part"] is None else place(s["diagnosis"].get("verdict"))),
         attitude=attitude if attitude.get("curve") else None,
         attitude_figure=attitude_over_time(attitude),

@@ -18,7 +18,7 @@ from pipeline.signal.segments import cut, held_out_windows
 from pipeline.stages.batch import Job, failure_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from pipeline.records import Recording
 
@@ -85,7 +85,7 @@ def ingest_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
         except PipelineError as error:
             error.message, error.file = error.message.replace(root, ""), error.file and error.file.replace(root, "")
             raise
-        named = [replace(r, source=r.source | {"file": r.source["file"].removeprefix(root)}) for r in ingested]
+        named = [replace(r, source=_named(r.source, lambda file: file.removeprefix(root))) for r in ingested]
         return {f"{unit}.parquet": to_parquet(named)}
 
 
@@ -100,9 +100,14 @@ def _ingested(directory: Path, folder: Path, settings: dict[str, Any]) -> list[R
             recordings += cut(read, turns, found=True) if turns else [read]
         else:
             recordings += cut(read, windows) if read.role == "session" else [read]
-    named = []
-    for recording in check_recordings(recordings, settings):
-        path = Path(recording.source["file"])
-        file = str(path.relative_to(directory)) if path.is_relative_to(directory) else str(path)
-        named.append(replace(recording, source=recording.source | {"file": file}))
-    return named
+
+    def below(file: str) -> str:
+        return str(Path(file).relative_to(directory)) if Path(file).is_relative_to(directory) else file
+
+    return [replace(r, source=_named(r.source, below)) for r in check_recordings(recordings, settings)]
+
+
+def _named(source: Mapping[str, Any], name: Callable[[str], str]) -> dict[str, Any]:
+    """Return the source of a recording with other names of its file and of those joined with it."""
+    joined = {"joined": [_named(other, name) for other in source["joined"]]} if "joined" in source else {}
+    return {**source, "file": name(source["file"]), **joined}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from typing import Any
 
@@ -83,6 +84,18 @@ def test_the_page_tells_clock_program_and_segments(done: Bench) -> None:
         ("windows", "accelerometer about x, from 0.00 to 49"),
     ):
         assert told in (done.results / "reports" / f"{unit}.html").read_text(), unit
+
+
+def test_every_file_that_was_read_is_listed_with_its_hash(done: Bench) -> None:
+    page = (done.results / "reports" / "file.html").read_text()
+    inputs = result(done, "calibrations", "file")["inputs"]
+    listed = {f["file"]: f["sha256"] for entry in inputs for f in (entry, *entry["joined"])}
+    files = sorted(f for f in (done.campaign / "raw" / "file").iterdir() if f.suffix == ".csv")
+    assert sorted(listed) == [str(f.relative_to(done.campaign)) for f in files]
+    for file in files:
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()
+        assert listed[str(file.relative_to(done.campaign))] == digest
+        assert digest in page
 
 
 def test_windows_in_the_configuration_take_the_place_of_what_is_found(done: Bench) -> None:
