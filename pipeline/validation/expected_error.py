@@ -17,9 +17,12 @@ determine the noise exactly, so the interval is that of a mixture over factors o
 
     wander      exp(2 s z), z standard normal, s = sqrt(correlation time / length of static rest and fit)
     drift       z^2: its size is hardly known
-    parameters  nu / chi^2(nu), nu the degrees of freedom of the calibration
+    parameters  nu / chi^2(nu),   1 / sqrt(nu) = sum_i s_i / sqrt(nu_i)
 
-and the variance of white noise has the relative uncertainty ``sqrt(2 / n)`` of the n samples that determined it.
+with the degrees of freedom nu_i of each parameter, and its share s_i of the mean squared error by all: a rest shows the
+bias of a gyroscope alone, of which few moves say nothing. The estimates of the variances, of relative uncertainty
+``sqrt(2 / nu_i)``, count as wholly correlated, which makes the interval rather too wide. The variance of white noise has
+the relative uncertainty ``sqrt(2 / n)`` of the n samples that determined it.
 """
 
 from __future__ import annotations
@@ -163,7 +166,8 @@ def expected_rms_error(
     if form.cumulants(np.ones((4, 1)))[0, 0] <= 0.0:
         return 0.0, 0.0
     observed_s = noise.length + (fitted_s if residual_wander is not None else 0.0)
-    factors = [_factors(calibration, noise, observed_s, upper=upper) for upper in (False, True)]
+    nu = form.freedom(_freedom(calibration))
+    factors = [_factors(nu, noise, observed_s, upper=upper) for upper in (False, True)]
     low, high = (_quantile(form, *f, p) for f, p in zip(factors, (TAIL, 1.0 - TAIL), strict=True))
     return float(np.sqrt(low)), float(np.sqrt(high))
 
@@ -197,16 +201,36 @@ def _covariance(calibration: SensorCalibration, table: Mapping[str, Any]) -> Val
     return out
 
 
+def _freedom(calibration: SensorCalibration) -> Values:
+    """Return the degrees of freedom of the covariance of ``_covariance``: (p + 1,) array.
+
+    By Welch and Satterthwaite, without the variance of exact size that the reference shares.
+    """
+    if calibration.covariance is None:
+        return np.full(len(calibration.parameter_names()) + 1, np.inf)
+    variance, own = np.diag(calibration.covariance), np.diag(covariance_beside_reference(calibration))
+    left = np.clip(own / np.where(variance > 0.0, variance, 1.0), 0.0, 1.0)
+    with np.errstate(invalid="ignore"):  # of a parameter without variance
+        nu = np.where(left > 0.0, calibration.effective_freedom() * left**2, np.inf)
+    return np.append(np.maximum(nu, 1.0), np.inf)
+
+
 @dataclass(frozen=True)
 class _QuadraticForm:
     """Traces of the form of the mean squared error."""
 
+    by_parameter: Values  # (p + 1,): mean squared error by the uncertainty of each parameter alone
     white: Values  # (2,): tr Q and tr Q^2 of white noise
     within: Values  # (2,): of wander within blocks
     doubt: float  # one over the number of samples that determined the white noise
     first: Values  # (3,): tr Q of parameters, of wander and of drift
     second: Values  # (3, 3): traces of products of two
     third: Values  # (3, 3, 3): of three
+
+    def freedom(self, each: Values) -> float:
+        """Return the degrees of freedom of the error by all parameters, of those of each: (p + 1,)."""
+        vague = float(self.by_parameter @ each**-0.5)
+        return (float(self.by_parameter.sum()) / vague) ** 2 if vague > 0.0 else float("inf")
 
     def cumulants(self, factor: Values) -> Values:
         """Return k_1 to k_3, (3, k), for factors of the variances of parameters, wander, drift, white noise: (4, k)."""
@@ -271,7 +295,8 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
         for l, trace in enumerate(transposed @ (Q[i, :, held] @ Q[j, held]).ravel()):
             for order in permutations((i, j, l)):
                 third_order[order] = trace
-    return _QuadraticForm(white, within, 1.0 / determined, first_order, second_order, third_order)
+    by_parameter = np.diag(of_parameters) * np.diag(uncertain.covariance)
+    return _QuadraticForm(by_parameter, white, within, 1.0 / determined, first_order, second_order, third_order)
 
 
 def _traces_of(Q: Values) -> Values:
@@ -291,7 +316,7 @@ def _weights(M: Values, each: LinearizedSamples, uncertain: _Uncertain) -> Value
     return np.asarray((1.0 - g) * u[:, :, None] * u[:, None, :] + g * np.eye(3))
 
 
-def _factors(calibration: SensorCalibration, noise: Noise, observed_s: float, *, upper: bool) -> tuple[Values, Values]:
+def _factors(nu: float, noise: Noise, observed_s: float, *, upper: bool) -> tuple[Values, Values]:
     """Return the factors that are mixed, (4, k), and their probabilities (k,).
 
     The lower end leaves out drift and errors of parameters, and takes the wander as the sensor file states it: none of
@@ -308,7 +333,6 @@ def _factors(calibration: SensorCalibration, noise: Noise, observed_s: float, *,
     wander = np.exp(2.0 * width * z)
     drift = 2.0 * gammaincinv(0.5, LEVELS) if upper else np.zeros(len(z))
     white = np.ones(len(z)) if noise.source != "data_sheet" else np.exp(2.0 * STATED_WIDTH * z)
-    nu = max(calibration.degrees_of_freedom, 1.0)
     parameters, weights = np.full(1, float(upper)), np.ones(1)
     if upper and nu < EXACT_FREEDOM:
         parameters, weights = 0.5 * nu / gammaincinv(0.5 * nu, 1.0 - LEVELS), WEIGHTS

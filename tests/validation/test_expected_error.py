@@ -47,12 +47,19 @@ def test_the_interval_holds_99_percent_of_units_whose_noise_is_known(size: float
     assert high < 1.35 * np.quantile(rms, 0.995)  # what is known needs no wide interval
 
 
-def interval(truth: np.ndarray, noise: Noise, bias: float, freedom: float = np.inf) -> tuple[float, float]:
-    covariance = np.zeros((12, 12))
+def interval(
+    truth: np.ndarray, noise: Noise, bias: float, freedom: float = np.inf, scale: float = 0.0, of_scale: float = np.inf
+) -> tuple[float, float]:
+    """Return the interval; ``bias, scale``: standard uncertainties, of ``freedom`` and ``of_scale``."""
+    covariance, J = np.zeros((12, 12)), np.zeros((SAMPLES, 3, 12))
     covariance[:3, :3] = bias**2 * np.eye(3)
-    found = SensorCalibration("gyroscope", covariance=covariance, degrees_of_freedom=freedom)
-    J = np.zeros((SAMPLES, 3, 12))
     J[:, :, :3] = -np.eye(3)
+    for axis in range(3):
+        covariance[3 + 4 * axis, 3 + 4 * axis] = scale**2
+        J[:, axis, 3 + 4 * axis] = truth[:, axis]
+    each = np.repeat([freedom, of_scale], [3, 9])
+    smallest = min(freedom, of_scale)
+    found = SensorCalibration("gyroscope", covariance=covariance, degrees_of_freedom=smallest, freedom=each)
     spread = [np.broadcast_to(v**2, (SAMPLES, 3)) for v in (noise.white, noise.wander)]
     held_out = LinearizedSamples(INTERVAL * np.arange(SAMPLES), *spread, truth, J, SAMPLES)
     return expected_rms_error(found, [held_out], noise, {})
@@ -68,6 +75,19 @@ def test_what_is_less_known_widens_the_interval() -> None:
         assert high > 1.05 * known[1]
     few, many = interval(truth, noise, WHITE, freedom=3.0), interval(truth, noise, WHITE)
     assert few[1] > 1.2 * many[1]
+
+
+def test_degrees_of_freedom_are_those_of_the_parameters_that_the_samples_show() -> None:
+    """Few moves say little of the noise of a matrix, and a rest of a gyroscope shows the bias alone."""
+    rng, freedom = np.random.default_rng(7), 22.0
+    scatter = np.sqrt(rng.chisquare(freedom, UNITS) / freedom)  # the uncertainty that a fit states over the true one
+    rms = np.linalg.norm(rng.standard_normal((UNITS, 3)), axis=1) / scatter
+    nothing = Noise(np.full(3, 1e-6), np.zeros(3), TAU, "static", length=1e9)
+    _, high = interval(truth_of(0.0), nothing, 1.0, freedom, scale=0.1, of_scale=1.9)
+    assert np.mean(rms > high) < 0.01
+    assert high < 1.35 * np.quantile(rms, 0.995)
+    _, turning = interval(truth_of(10.0), nothing, 1e-6, freedom, scale=0.1, of_scale=1.9)
+    assert turning > 3.0 * interval(truth_of(10.0), nothing, 1e-6, freedom, scale=0.1, of_scale=freedom)[1]
 
 
 def test_without_noise_or_uncertainty_nothing_is_expected() -> None:
