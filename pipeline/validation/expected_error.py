@@ -21,8 +21,8 @@ determine the noise exactly, so the interval is that of a mixture over factors o
 
 with the degrees of freedom nu_i of each parameter, and its share s_i of the mean squared error by all: a rest shows the
 bias of a gyroscope alone, of which few moves say nothing. The estimates of the variances, of relative uncertainty
-``sqrt(2 / nu_i)``, count as wholly correlated, which makes the interval rather too wide. The variance of white noise has
-the relative uncertainty ``sqrt(2 / n)`` of the n samples that determined it.
+``sqrt(2 / nu_i)``, count as wholly correlated, which makes the interval rather too wide. The variance of white noise
+has the relative uncertainty ``sqrt(2 / n)`` of the n samples that determined it.
 """
 
 from __future__ import annotations

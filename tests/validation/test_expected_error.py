@@ -48,7 +48,13 @@ def test_the_interval_holds_99_percent_of_units_whose_noise_is_known(size: float
 
 
 def interval(
-    truth: np.ndarray, noise: Noise, bias: float, freedom: float = np.inf, scale: float = 0.0, of_scale: float = np.inf
+    truth: np.ndarray,
+    noise: Noise,
+    bias: float,
+    freedom: float = np.inf,
+    *,
+    scale: float = 0.0,
+    of_scale: float = np.inf,
 ) -> tuple[float, float]:
     """Return the interval; ``bias, scale``: standard uncertainties, of ``freedom`` and ``of_scale``."""
     covariance, J = np.zeros((12, 12)), np.zeros((SAMPLES, 3, 12))
