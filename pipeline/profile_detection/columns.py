@@ -29,6 +29,9 @@ FEWEST_RISES = 4  # of a time for each fall; a noisy reading falls as often as i
 SCATTER = 0.2  # of intervals over their median: times of arrival, not of sampling
 TEMPERATURE_RANGE = (-60.0, 130.0)  # degC, of electronics and their tests
 
+OFFSETS = (32768.0, 8192.0, 2048.0)  # middle of 16, 14 and 12 bits without a sign
+NEAR_OFFSET = 1 / 16  # of it, within which the median rates lie: 16 deg/s of +-250 deg/s, above usual biases
+
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
 MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|om|omega|rot|rate)([xyz])")
 AXIS_WORDS = ("x", "y", "z", "0", "1", "2", "3")
@@ -263,12 +266,22 @@ def _sensor_of_file(log: Log, triad: Triad) -> str:
     stem = Path(log.path).stem.lower()
     if "gyr" in stem or "angular" in stem or "rotation" in stem:
         return "gyroscope"
-    return "accelerometer" if "acc" in stem or _spread(log, triad) < 0.5 else "gyroscope"
+    return "accelerometer" if "acc" in stem or _spread(log, triad, _offset(log, [triad])) < 0.5 else "gyroscope"
 
 
-def _spread(log: Log, triad: Triad) -> float:
-    """Return the relative spread of a vector's length, which is small for gravity."""
-    norm = np.linalg.norm(np.column_stack([log.numbers[i] for i in triad]), axis=1)
+def _offset(log: Log, triads: Sequence[Triad]) -> float:
+    """Return the offset of counts without a sign, about which the readings of one sensor lie; 0 for other numbers."""
+    readings = np.array([[log.numbers[i] for i in triad] for triad in triads])
+    medians, unsigned = np.median(readings, axis=2), whole(readings) and readings.min() >= 0.0
+    for offset in OFFSETS if unsigned and readings.max() < 2.0 * OFFSETS[0] else ():
+        if np.abs(medians - offset).max(axis=1).min() < NEAR_OFFSET * offset:
+            return offset
+    return 0.0
+
+
+def _spread(log: Log, triad: Triad, offset: float) -> float:
+    """Return the relative spread of a vector's length over an offset, which is small for gravity."""
+    norm = np.linalg.norm(np.column_stack([log.numbers[i] for i in triad]) - offset, axis=1)
     low, middle, high = np.quantile(norm, [0.16, 0.5, 0.84])
     return float((high - low) / max(middle, 1e-30))
 
@@ -283,12 +296,13 @@ def _find_triads_without_names(found: Columns) -> None:
         found.triads[sensor] = groups[0]
         found.remarks.append(f"no names: columns {groups[0]} are taken as the {sensor}'s x, y, z; check it")
     elif groups:
-        first = min(range(len(groups)), key=lambda i: _spread(log, groups[i]))
-        found.triads["accelerometer"] = groups[first]
-        found.triads["gyroscope"] = next(g for i, g in enumerate(groups) if i != first)
+        offset = _offset(log, groups)
+        force = min(groups, key=lambda group: _spread(log, group, offset))
+        rate = next(group for group in groups if group != force)
+        found.triads |= {"accelerometer": force, "gyroscope": rate}
         found.remarks.append(
-            f"no names: columns {groups[first]} are taken as the accelerometer's x, y, z, for their length varies by "
-            f"{_spread(log, groups[first]):.1%} only, {found.triads['gyroscope']} as the gyroscope's; check it"
+            f"no names: columns {force} are taken as the accelerometer's x, y, z, for their length varies by "
+            f"{_spread(log, force, offset):.1%} only, {rate} as the gyroscope's; check it"
         )
 
 

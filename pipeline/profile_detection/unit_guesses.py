@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from pipeline.io.gravity_rotation import misfit_deg, rests_of
 from pipeline.io.units import COUNTS, DEGREES, FORCE_UNITS, UNITS
-from pipeline.profile_detection.columns import NO_SENSOR, stated_unit, whole, words_of
+from pipeline.profile_detection.columns import NO_SENSOR, OFFSETS, stated_unit, whole, words_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,7 +38,6 @@ USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
 EVEN = 0.02  # of the span, off a straight line
-OFFSETS = (0.0, 32768.0, 8192.0, 2048.0)  # middle of 16, 14 and 12 bits without a sign
 SCALES = np.geomspace(1.0, 1000.0, 481)  # counts per deg/s that are tried, 1.4 % apart
 ASSUMED_HZ = 100.0  # where the time is not known
 CONVINCING_DEG = 12.0  # below half of the residual angle of the next usual scale in a quarter turn
@@ -124,7 +123,7 @@ def force_unit(force: Values, interval_s: float) -> Guess:
 def _counts_per_g(rests: int, centre: Values, radius: float, size: float, where: str) -> Guess:
     """Return counts per g: the usual number that is near, else the radius of the sphere through the rests."""
     middle = float(np.mean(centre))
-    offset = min(OFFSETS, key=lambda o: abs(middle - o))
+    offset = min((0.0, *OFFSETS), key=lambda o: abs(middle - o))
     if offset and abs(middle - offset) > 0.5 * radius:
         offset = 0.0
     if offset:

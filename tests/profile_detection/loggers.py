@@ -143,6 +143,19 @@ LOGGERS = {
         whole=True,
         offset=32768.0,
     ),
+    **{
+        f"an offset of 2^15 counts without names, columns {order}": Logger(
+            "",
+            (1e6, 4070.0, 83.2),
+            {"time": {"column": 0, "unit": "us"},
+             **triads({"column": force_x, "offset": 32768.0}, {"column": rate_z, "offset": 32768.0})},
+            delimiter="whitespace",
+            order=order,
+            whole=True,
+            offset=32768.0,
+        )
+        for order, force_x, rate_z in (("tag", 1, 6), ("tga", 4, 3))
+    },
     "PX4's names": Logger(
         "timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],accelerometer_m_s2[0],accelerometer_m_s2[1],"
         "accelerometer_m_s2[2]",
