@@ -25,12 +25,14 @@ other cells stay as they are. Of an MCAP log, all messages stay byte for byte, a
 is added. Logs of other formats give CSV with the columns time_s, accel_x_g .. gyro_z_dps, temperature_degc.
 
 Columns, units, counts and axes of the log are those of the recordings with which the unit was calibrated, unless
---ingest names another profile, or its file. CSV and MCAP are read in a stream; logs of other formats are held in
-memory.
+--ingest names another profile, or its file. Where the profile joins files of one recording (the accelerometer in one,
+the gyroscope in the other), name one or all of them; the output is a CSV as of other formats. CSV and MCAP are read in
+a stream; logs of other formats and joined files are held in memory.
 
 examples:
   python -m pipeline apply --calibration results/demo/calibrations/U1.json drive.csv -o drive_calibrated.csv
   python -m pipeline apply --calibration U1.json drive.mcap -o drive_calibrated.mcap
+  python -m pipeline apply --calibration U1.json drive/accelerometer.txt drive/gyroscope.txt -o drive.csv
   python -m pipeline apply --calibration U1.json counts.csv --ingest arduino_counts -o out.csv
   python -m pipeline apply --calibration U1.json log.csv --ingest my_bench/configs/ingest/my_logger.yaml -o out.csv
 """
@@ -42,7 +44,8 @@ def main(argv: Sequence[str]) -> int:
     if arguments.smoothing < 0:
         raise ConfigurationError(f"--temperature-smoothing is {arguments.smoothing:g} s; it cannot be negative")
     compensation = load(arguments.calibration, arguments.python_effects)
-    require_apart(arguments.log, arguments.output)
+    for log in arguments.logs:
+        require_apart(log, arguments.output)
     if (
         arguments.output.exists()
         and arguments.calibration.exists()
@@ -50,11 +53,12 @@ def main(argv: Sequence[str]) -> int:
     ):
         message = "the output would overwrite the calibration; choose another file for -o"
         raise InputError(message, str(arguments.output))
-    profile = _profile(arguments.calibration, arguments.ingest, arguments.log)
-    countdown = Countdown(arguments.log.stat().st_size if arguments.log.is_file() else 0)
+    profile = _profile(arguments.calibration, arguments.ingest, arguments.logs[0])
+    log, *joined = _files(arguments.logs, profile)
+    countdown = Countdown(log.stat().st_size if log.is_file() else 0)
     result = compensate_log(
-        compensation, arguments.log, arguments.output, profile,
-        topic=arguments.topic, smoothing=arguments.smoothing,
+        compensation, log, arguments.output, profile,
+        joined=joined, topic=arguments.topic, smoothing=arguments.smoothing,
         progress=lambda rows, read: countdown(read, f"{rows} samples"),
     )  # fmt: skip
     countdown.end()
@@ -70,7 +74,8 @@ def main(argv: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("apply", __doc__, EPILOG, ("--ingest",))
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help=f"the log: .mcap, {', '.join(MESSAGE_FORMATS)}, or text")
+    words = f"the log: .mcap, {', '.join(MESSAGE_FORMATS)}, or text; several files only where the profile joins them"
+    add("logs", type=Path, nargs="+", metavar="LOG", help=words)
     add(
         "--calibration",
         type=Path,
@@ -87,6 +92,24 @@ def _parser() -> argparse.ArgumentParser:
     words = "file of an effect in Python with which the calibration was made; the file is run; may be repeated"
     add("--python-effect", action="append", default=[], metavar="FILE", dest="python_effects", help=words)
     return parser
+
+
+def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:
+    """Return the log, or the files with readings of one recording, in the order of the profile that joins them."""
+    if logs[0].suffix.lower() not in (".mcap", *MESSAGE_FORMATS):
+        from pipeline.field_logs.text_output import sensor_parts  # noqa: PLC0415  (MCAP needs no parser of text)
+
+        parts = sensor_parts(profile.ingest)
+        if len(parts) > 1:
+            from pipeline.commands.readings import grouped  # noqa: PLC0415  (Hydra: 0.3 s that few logs need)
+
+            recordings = grouped(logs, dict(profile.ingest))
+            if len(recordings) > 1:
+                raise ConfigurationError(f"{len(recordings)} recordings are named; apply reads one", str(logs[1]))
+            return [recordings[0][part] for part in parts]
+    if len(logs) > 1:
+        raise ConfigurationError("apply reads one log, unless the profile joins several files", str(logs[1]))
+    return list(logs)
 
 
 def _profile(calibration: Path, ingest: str | None, log: Path) -> LogProfile:

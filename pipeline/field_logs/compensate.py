@@ -1,7 +1,8 @@
 """Compensation of a log as a stream: blocks are read, compensated and written one after the other.
 
 Each format of a log reads and writes its blocks (``pipeline.field_logs.text_output``, ``mcap_log``); all else is
-the same for all formats. Memory is bounded by the largest block; logs of other programs are held as a whole.
+the same for all formats. Memory is bounded by the largest block; logs of other programs, and files that the profile
+joins, are held as a whole.
 """
 
 from __future__ import annotations
@@ -97,6 +98,7 @@ def compensate_log(
     target: Path,
     profile: LogProfile | None = None,
     *,
+    joined: Sequence[Path] = (),
     topic: str | None = None,
     smoothing: float = SMOOTHING_S,
     block_bytes: int = BLOCK_BYTES,
@@ -104,13 +106,15 @@ def compensate_log(
 ) -> Result:
     """Compensate a log: MCAP by its suffix ``.mcap``, the formats of ``MESSAGE_FORMATS`` by theirs, else text.
 
-    ``profile``: by default the canonical CSV, or the only Imu topic. ``topic``: of the calibrated messages in an MCAP
+    ``profile``: by default the canonical CSV, or the only Imu topic. ``joined``: further files of a recording
+    whose profile joins several with readings, in its order. ``topic``: of the calibrated messages in an MCAP
     log; that of the readings and ``_calibrated`` by default. ``smoothing``: memory of the line through the
     temperature's past, s; 0 takes the temperature as it is. ``progress`` is called with the samples done and the bytes
     read. ``InputError``: the log is damaged, cannot be read as the profile says, or would be overwritten; no output is
     left.
     """
-    require_apart(source, target)
+    for file in (source, *joined):
+        require_apart(file, target)
     profile, suffix = profile or LogProfile(), source.suffix.lower()
     with replacing(target) as out:
         if suffix == ".mcap":
@@ -118,11 +122,14 @@ def compensate_log(
 
             stream = LogStream(compensation, 0.0, progress)  # ``Temperatures`` smooths
             return McapLog(source, out, profile, stream, topic, smoothing).compensate()
-        from pipeline.field_logs.text_output import CsvLog, compensate_messages  # noqa: PLC0415
+        from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
 
         stream = LogStream(compensation, smoothing, progress)
-        if suffix in MESSAGE_FORMATS:
-            return compensate_messages(source, out, profile, stream)
+        wanted = 1 if suffix in MESSAGE_FORMATS else len(sensor_parts(profile.ingest))
+        if 1 + len(joined) != wanted:
+            raise InputError(f"the profile reads a recording from {wanted} files; got {1 + len(joined)}", str(source))
+        if joined or suffix in MESSAGE_FORMATS:
+            return compensate_whole([source, *joined], out, profile, stream)
         return CsvLog(source, out, profile, stream).compensate(block_bytes)
 
 

@@ -3,9 +3,9 @@
 In a text log, the columns that the profile names as readings are replaced by calibrated ones in g and deg/s, under the
 canonical names ``accel_x_g`` .. ``gyro_z_dps``. Every other cell, and the lines before the data, are written unchanged.
 
-Logs of other programs (ROS bag, ULog, DataFlash, HDF5, MATLAB) are read as at ingest, with its checks, and are not
-written: the output has the columns of the canonical CSV, ``time_s, accel_x_g .. gyro_z_dps, temperature_degc``, in the
-body's axes.
+Logs of other programs (ROS bag, ULog, DataFlash, HDF5, MATLAB) and files that the profile joins are read as at ingest,
+with its checks, and are not written: the output has the columns of the canonical CSV, ``time_s, accel_x_g ..
+gyro_z_dps, temperature_degc``, in the body's axes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from pipeline.field_logs.log_checks import DECIMALS
 from pipeline.io.arrow import text_scalar, times_as_decimals, to_arrow, to_numpy
 from pipeline.io.channel_table import in_house_unit
 from pipeline.io.csv_layout import Layout, find_faults, other_separator
-from pipeline.io.ingest_settings import csv_formats, mcap_format
+from pipeline.io.files import MESSAGE_FORMATS
+from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_format
 from pipeline.io.text_log import TextLog
 from pipeline.io.units import (
     ACCELEROMETER,
@@ -37,6 +38,7 @@ from pipeline.io.units import (
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Readings, Result
@@ -51,14 +53,9 @@ class CsvLog:
     """A text log and the log that is made of it."""
 
     def __init__(self, source: Path, out: Output, profile: LogProfile, stream: LogStream) -> None:
-        formats = csv_formats(profile.ingest)
-        if len(formats) > 1:
-            raise InputError(
-                "the profile joins several files to one recording, which apply does not; write them into one file, "
-                "or choose another profile by --ingest",
-                str(source),
-            )
-        self.source, self.out, self.profile, self.stream, self.settings = source, out, profile, stream, formats[0]
+        (part,) = sensor_parts(profile.ingest)
+        self.source, self.out, self.profile, self.stream = source, out, profile, stream
+        self.settings = csv_formats(profile.ingest)[part]
         self.columns = {c.channel: c for c in self.settings.columns}
         self.places: dict[str, list[int]] = {}  # of the columns of each signal
         self.origin = 0.0
@@ -175,11 +172,24 @@ class CsvLog:
         return out
 
 
-def compensate_messages(source: Path, out: Output, profile: LogProfile, stream: LogStream) -> Result:
-    """Write the readings of a log of messages, calibrated, as text."""
-    from pipeline.io.mcap import read_log  # noqa: PLC0415  (the decoder costs what a text log need not pay)
+def sensor_parts(ingest: Mapping[str, Any]) -> list[int]:
+    """Return which files of a recording hold readings or the temperature: places in the profile's ``parts``."""
+    channels = {*ACCELEROMETER, *GYROSCOPE, "temperature"}
+    return [i for i, layout in enumerate(csv_formats(ingest)) if channels & {c.channel for c in layout.columns}]
 
-    table = read_log(source, mcap_format(profile.ingest))
+
+def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, stream: LogStream) -> Result:
+    """Write the readings of a log of messages, or of files that are joined on equal time, calibrated, as text."""
+    source, ingest = files[0], profile.ingest
+    if source.suffix.lower() in MESSAGE_FORMATS:
+        from pipeline.io.mcap import read_log  # noqa: PLC0415  (the decoder costs what a text log need not pay)
+
+        table = read_log(source, mcap_format(ingest))
+    else:
+        from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (one text log needs it not)
+
+        layouts = csv_formats(ingest)
+        table = read_csv(files, [layouts[part] for part in sensor_parts(ingest)], checks_of(ingest))
     origin = int(table.time_ns[0]) if table.time_ns[0] > SINCE_1970_NS else 0
     signals = {
         s: profile.to_body(s, np.column_stack([table.values[c] for c in triad]))

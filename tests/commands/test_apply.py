@@ -407,12 +407,34 @@ def test_the_axes_of_the_sensor_are_turned_to_the_bodys(calibration: Path, tmp_p
     np.testing.assert_allclose(found, np.column_stack(expected), atol=1e-12, rtol=1e-13)
 
 
-def test_a_profile_of_several_files_is_refused(calibration: Path, log: Path, tmp_path: Path) -> None:
-    part = counts_profile()["columns"]
-    accel = {c: v for c, v in part.items() if not c.startswith("gyro")}
-    gyro = {c: v for c, v in part.items() if not c.startswith("accel")}
-    parts = [{"file": "a.txt", "columns": accel}, {"file": "g.txt", "columns": gyro}]
-    with pytest.raises(InputError, match="joins several files"):
-        compensate_log(
-            load(calibration), log, tmp_path / "out.csv", LogProfile({"csv": {"parts": parts, "columns": {}}})
-        )
+@pytest.mark.parametrize("named", [("a.txt", "g.txt"), ("g.txt", "a.txt"), ("g.txt",)])
+def test_joined_files_give_what_one_file_gives(calibration: Path, tmp_path: Path, named: tuple[str, ...]) -> None:
+    columns_of = counts_profile()["columns"]
+    parts = [
+        {"file": file, "columns": {c: v for c, v in columns_of.items() if not c.startswith(other)}}
+        for file, other in (("a.txt", "gyro"), ("g.txt", "accel"))
+    ]
+    table = {"columns": {"time": columns_of["time"], "table_angle": {"column": "deg", "unit": "deg"}}}
+    parts.append({"file": "t.txt", "own_clock": True, **table})  # a table's log, which another log has not
+    with_profile(calibration, {"parts": parts, "columns": {}}, ("+y", "-x", "+z"))
+    counts = raw_counts()
+    for file, letter, rows in (("a.txt", "a", counts[:, :3]), ("g.txt", "g", counts[:, 3:])):
+        lines = [f"{5 * k},{','.join(map(str, row))}" for k, row in enumerate(rows.tolist())]
+        (tmp_path / file).write_text("\n".join([f"time_ms,{letter}x,{letter}y,{letter}z", *lines, ""]))
+    out = tmp_path / "out.csv"
+    files = [str(tmp_path / name) for name in named]
+    assert main(["--calibration", str(calibration), *files, "-o", str(out)]) == 0
+    scaled = [(part - 5) / scale for part, scale in ((counts[:, :3], 16384.0), (counts[:, 3:], 131.0))]
+    found = load(calibration).apply(*(np.column_stack([-v[:, 1], v[:, 0], v[:, 2]]) for v in scaled))
+    after = columns(out)
+    for sensor, expected in (("accelerometer", found.accelerometer), ("gyroscope", found.gyroscope)):
+        np.testing.assert_allclose(vectors(after, sensor), expected, atol=1e-12, rtol=1e-13)
+    np.testing.assert_allclose(np.array(after["time_s"], float), 0.005 * np.arange(len(counts)), atol=1e-12)
+    (tmp_path / "a.txt").unlink()
+    with pytest.raises(InputError, match="there is no such log"):
+        main(["--calibration", str(calibration), str(tmp_path / "g.txt"), "-o", str(out)])
+
+
+def test_several_logs_that_no_profile_joins_are_refused(calibration: Path, log: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="apply reads one log, unless the profile joins several files"):
+        main(["--calibration", str(calibration), str(log), str(log), "-o", str(tmp_path / "o.csv")])
