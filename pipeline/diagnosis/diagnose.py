@@ -22,7 +22,7 @@ from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.model.effects import catalogue, effect
 from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
-from pipeline.validation.heldout import last_error
+from pipeline.validation.heldout import last_error, static_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -138,6 +138,11 @@ def evidence_of(
             return None
         return None if error is None else HeldOut(error[0], *error[1])
 
+    static = (
+        None
+        if case.noise is None
+        else static_error(case.calibration, recordings, case.noise, settings, other=case.accelerometer)
+    )
     accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")
     implausible = [
         e["effect"] for e in document["ranking"] if e["effect"] in document["selected"] and not e["plausible"]
@@ -151,6 +156,7 @@ def evidence_of(
         document["residual_over_noise"],
         found.left_over_noise if found else None,
         published=published,
+        static=HeldOut(static[0], *static[1]) if static else None,
         agreement=(validation or {}).get("agreement"),
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,

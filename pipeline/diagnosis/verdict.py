@@ -27,7 +27,8 @@ LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms o
 DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null families was 0.006
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
-FREE = ("reference_least_squares", "nonlinear_least_squares", "cholesky_lu")  # methods that leave bias and matrix free
+FREE = ("reference_least_squares", "nonlinear_least_squares", "rests_and_moves", "cholesky_lu")  # bias and matrix free
+SAME_SESSION = "record static in the session of the other recordings, without switching the unit off in between"
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class Evidence:
     free: HeldOut | None = None  # of a free fit of the same recordings; filtered ones against the filtered reference
     full: HeldOut | None = None  # of the free fit with the selected effects
     agreement: Mapping[str, Any] | None = None  # of matrix and held-out motion (``pipeline.validation.agreement``)
+    static: HeldOut | None = None  # mean of the static recording, by the unit's calibration
     doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
     approximations: Sequence[str] = ()  # what the method's matrix and bias lack (``pipeline.diagnosis.method_errors``)
     unknown: Sequence[str] = ()  # covariates on which the residual depends, given what was selected
@@ -143,6 +145,12 @@ class Evidence:
         return unit_of(self.sensor)
 
     @property
+    def static_differs(self) -> bool:
+        """Whether the static recording contradicts a fit that no missing effect or method makes wrong."""
+        explained = self.found in {"nothing_missing", "not_enough_data"} and self.of_free_method
+        return explained and not self.approximations and self.static is not None and self.static.above
+
+    @property
     def of_method(self) -> bool:
         """Whether the method causes a held-out error above its interval: a free fit is within its own."""
         same = self.method == "reference_least_squares" and not self.filtered  # the calibration is the free fit
@@ -196,6 +204,7 @@ RULES: tuple[tuple[str, str, Callable[[Evidence], object]], ...] = (
     ("missing_effect", "beyond", lambda e: e.above and e.missing and not (e.full and e.full.above)),
     ("unexplained", "above_and_unexplained", lambda e: e.above and e.unexplained),
     ("left_by_method", "above_by_method", lambda e: e.above and e.of_method),
+    ("reference_in_doubt", "static", lambda e: e.static_differs),
     ("unexplained", "above_as_the_residual", lambda e: e.above and e.at_noise is False),
     ("reference_in_doubt", "contradiction", lambda e: e.above),
     ("unexplained", "unexplained", lambda e: e.unexplained),
@@ -269,7 +278,8 @@ def _next_step(verdict: str, document: Mapping[str, Any], e: Evidence) -> str:
         return of_unknown(document["unexplained"], on_table=e.on_table)
     if verdict == "reference_in_doubt":
         what = "the table's log and the mounting" if e.on_table else "the rests and turns"
-        return f"check {what} as said above, and record the recordings concerned again"
+        again = f"check {what} as said above, and record the recordings concerned again"
+        return SAME_SESSION if e.static_differs and not e.doubts else again
     if verdict == "floor_in_doubt":
         return "record static again: ten minutes or more at rest, on a base that does not shake"
     if verdict != "left_by_method":

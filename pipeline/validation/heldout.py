@@ -23,6 +23,7 @@ from pipeline.estimation.rest_means import held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.model.measurement import linear_truth
+from pipeline.signal.rests import Rest
 from pipeline.validation.agreement import agreement
 from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude, left_out
 from pipeline.validation.expected_error import expected_rms_error, linearized
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Noise, Recording, SensorCalibration, Values
-    from pipeline.signal.rests import Rest
 
 FALSE_REFUSALS = 1e-3  # probability that a calibration as good as the raw readings is refused
 STRETCHES = 20  # a stretch of a recording of minutes is longer than the correlation time of most wander
@@ -206,6 +206,29 @@ def last_error(
     if expected is None or not errors:
         return None
     return float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2))), expected
+
+
+def static_error(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise,
+    settings: Mapping[str, Any],
+    other: SensorCalibration | None = None,
+) -> tuple[float, list[float]] | None:
+    """Return the error of the mean of the static recording, and its interval as of a held-out rest; None without one.
+
+    The heading is not known, so Earth's rotation widens the interval of a gyroscope: once by what the bias holds of it,
+    once by what the recording shows.
+    """
+    static = [r for r in recordings if r.role == "static" and r.reading(calibration.sensor) is not None and r.samples]
+    found = [samples_of_rests(calibration.sensor, r, [Rest(0, r.samples)], noise, settings["table"]) for r in static]
+    samples = [s for s in found if s is not None and s.known.any()]
+    expected = _expected(calibration, recordings, samples, noise, settings, other=other)[0] if samples else None
+    if expected is None:
+        return None
+    errors = np.concatenate([last_error_of_magnitude(calibration, s, other) for s in samples])
+    turning = 2.0 * EARTH_RATE_DPS if calibration.sensor == "gyroscope" else 0.0
+    return float(np.sqrt(np.nanmean(errors**2))), [max(expected[0] - turning, 0.0), expected[1] + turning]
 
 
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:

@@ -189,3 +189,18 @@ def test_a_drift_that_a_short_recording_hides_is_given_the_time_that_shows_it() 
     (reason,) = [entry["reason"] for entry in found if entry["effect"] == "bias_drift"]
     (minutes,) = re.findall(r"within (\d+) min", reason)
     assert 4.0 < float(minutes) < 9.0
+
+
+@pytest.mark.parametrize(("sensor", "change"), [("gyroscope", 0.1), ("accelerometer", 0.01)])
+def test_a_static_recording_of_another_switching_on_is_in_doubt(sensor: str, change: float) -> None:
+    unit = hand_held("mpu6050", 3)
+    settings = {**unit.settings, "method": {"gyroscope": "rests_and_moves", "accelerometer": "nonlinear_least_squares"}}
+    unit = replace(unit, settings=settings)
+    moves, static = unit.recordings
+    shifted = replace(static, **{sensor: static.reading(sensor) + change})
+    other = replace(unit, recordings=[moves, shifted])
+    same, after = unit.diagnosed(sensor), other.diagnosed(sensor)
+    assert same["verdict"] == "nothing_missing"
+    assert after["verdict"] == "reference_in_doubt"
+    assert "times of switching on" in after["reason"]
+    assert "in the session of the other recordings" in after["next_experiment"]
