@@ -4,10 +4,10 @@
             most twice that of successive differences (no slow motion); its specific force is well above its scatter
     error : ||a| - 1 g| or |w| of a rest's mean reading, before and after compensation
 
-The right calibration brings rests nearer to 1 g and to zero rate. If it does not, the log was compensated already,
-belongs to another unit or sensor, or is read with other axes or units; or the sensor has changed. Between two rests
-gravity turns in the body by at most the integral of |w| (minus its value at rest): a gyroscope that integrates to less
-than half of the turn is not read in deg/s.
+The right calibration brings rests nearer to 1 g and to zero rate, and some of them near. If it does not, the log was
+compensated already, belongs to another unit or sensor, or is read with other axes or units; or the sensor has changed.
+Between two rests gravity turns in the body by at most the integral of |w| (minus its value at rest): a gyroscope that
+integrates to less than half of the turn is not read in deg/s.
 
 ``apply`` writes numbers rounded to 12 decimals without trailing zeros: 9 of 10 cells have 12 decimals. Sensors give
 fewer digits, programs that write doubles give more.
@@ -44,6 +44,9 @@ DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is
 # components each, P(F(3, 3) < 1/9) = 4 %. An accelerometer is judged in three directions or more, and where the
 # correction is at least half of the error after it.
 WORSE = {"accelerometer": 1.2, "gyroscope": 3.0}
+# g and deg/s: a larger change of the bias is unusual. The data sheet of the MPU-6050 allows the zero-g level 60 mg from
+# 25 to 70 degC, and the zero-rate output 20 deg/s from 25 to 85 degC: 0.05 g is a change by 38 degC, 5 deg/s by 15.
+CHANGED = {"accelerometer": 0.05, "gyroscope": 5.0}
 KNOWN = 5.0  # standard errors of a rest's mean that the error after is above
 APART_DEG = 30.0  # orientations that count as different; the least turn of gravity that is compared with the rate
 NEAR = 0.15  # a median |a| this near to a unit's factor is read in that unit
@@ -214,21 +217,30 @@ class LogChecks:
             still &= table["accelerometer scatter"] < DIRECTED * size
         if np.count_nonzero(still) < FEWEST_RESTS:
             return []
-        found, worse = [], []
+        found, worse, far = [], [], []
         for sensor in (s for s in present if s in calibrated):
             raw, done = table[sensor][still], table[f"{sensor} after"][still]
             before, after = _error(sensor, raw), _error(sensor, done)
             known = float(np.median(table[f"{sensor} scatter"][still])) / np.sqrt(WINDOW)
             change = np.linalg.norm(done, axis=1) - np.linalg.norm(raw, axis=1)
             enough = len(_directions(raw)) >= FEWEST_RESTS and np.sqrt(np.mean(change**2)) > after / 2.0
+            unit = "g from 1 g" if sensor == "accelerometer" else "deg/s from zero"
             if (sensor == "gyroscope" or enough) and after > max(WORSE[sensor] * before, KNOWN * known):
-                unit = "g from 1 g" if sensor == "accelerometer" else "deg/s from zero"
                 worse.append(f"the {sensor} is {before:.2g} {unit} before and {after:.2g} after")
+            least = float(np.min(_distances(sensor, done)))
+            if least > CHANGED[sensor]:
+                far.append(f"the {sensor} is at least {least:.2g} {unit}")
         if worse:
             found.append(
                 f"compensation takes the {np.count_nonzero(still)} quietest windows away from rest: "
                 f"{'; '.join(worse)}. The log is compensated already, or of another unit or sensor, or read with "
                 "other axes or units; or the sensor has changed since it was calibrated"
+            )
+        elif far:
+            found.append(
+                f"none of the {np.count_nonzero(still)} quietest windows is at rest after compensation: "
+                f"{'; '.join(far)}. The log is of another unit or sensor, or read with another profile, axes or units; "
+                "the sensor has changed since it was calibrated; or it moves throughout the log"
             )
         return found + self._turned(table, still)
 
@@ -252,10 +264,15 @@ class LogChecks:
         return [f"{told} deg: its readings look like {cause}; --ingest names a profile with the unit of each column"]
 
 
+def _distances(sensor: str, means: Values) -> Values:
+    """Return the distance of each rest from 1 g or from zero rate."""
+    size = np.linalg.norm(means, axis=1)
+    return np.asarray(np.abs(size - 1.0) if sensor == "accelerometer" else size)
+
+
 def _error(sensor: str, means: Values) -> float:
     """Return the rms distance of rests from 1 g or from zero rate."""
-    size = np.linalg.norm(means, axis=1)
-    return float(np.sqrt(np.mean((size - 1.0 if sensor == "accelerometer" else size) ** 2)))
+    return float(np.sqrt(np.mean(_distances(sensor, means) ** 2)))
 
 
 def _directions(means: Values) -> list[Values]:

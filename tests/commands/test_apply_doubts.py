@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 from pathlib import Path
 
@@ -94,6 +95,32 @@ def test_readings_in_another_unit_are_named(
     table = readings()
     table[:, columns] *= factor
     assert any(message in line for line in warnings(calibration, table, capsys))
+
+
+@pytest.mark.parametrize(
+    ("columns", "factor", "offset", "expected"),
+    [
+        (slice(4, 7), 5.0, 0.0, r"the gyroscope is at least 9\.\d deg/s from zero"),  # 4 |bias| are 9.2
+        (slice(4, 7), 1.0, 8.0, r"the gyroscope is at least 1[34] deg/s from zero"),  # sqrt(3) * 8
+        (slice(1, 4), 0.92, 0.0, r"the accelerometer is at least 0\.0[5-9]\d* g from 1 g"),
+        (slice(4, 7), 1.0, 1.0, None),  # a bias that has changed
+    ],
+)
+def test_rests_that_no_window_brings_to_rest_are_doubted(  # noqa: PLR0917  (a case of the table)
+    calibration: Path,
+    capsys: pytest.CaptureFixture[str],
+    columns: slice,
+    factor: float,
+    offset: float,
+    expected: str | None,
+) -> None:
+    table = readings()
+    table[:, columns] = factor * table[:, columns] + offset
+    said = warnings(calibration, table, capsys)
+    if expected is None:
+        assert said == []
+    else:
+        assert any("is at rest after compensation" in line and re.search(expected, line) for line in said), said
 
 
 def test_a_calibration_that_holds_the_factor_of_another_range_is_not_doubted(
