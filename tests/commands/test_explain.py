@@ -69,11 +69,14 @@ def test_an_error_far_above_the_noise_is_told_with_that_of_held_out_moves(
 ) -> None:
     (results / "bench" / "validations").mkdir()
     judged = {"steps": [{"rms_error": 0.1}], "noise_floor": 0.01, "unit": "deg/s", "held_out": True}
+    judged |= {"expected_rms_error": [0.0, 0.225]}
     moves = {"moves": 1, "rms_deg": {"before": 100.0, "after": 2.9}, "largest_expected_rms_deg": 8.8}
     document = {"accelerometer": None, "gyroscope": judged, "gravity_direction": moves}
     (results / "bench" / "validations" / "U1.json").write_text(json.dumps(document))
     main([str(results / "bench"), "U1"])
     said = capsys.readouterr().out
+    assert "0.1 deg/s, 10 times the noise floor." in said
+    assert "explain up to 0.225 deg/s: the uncertainty of the calibration" in said
     assert "explains an error so far above the noise; it does not show that the calibration is good" in said
     assert "direction of gravity by 2.9 deg (rms); noise and stated uncertainties explain at most 8.8 deg" in said
 

@@ -47,6 +47,17 @@ def test_probabilities_against_the_verdict_are_said(answer: list[str], *, disagr
     assert ("What is missing" in said) is not disagree
 
 
+def test_a_probability_is_said_of_effects_that_the_recordings_can_test() -> None:
+    hidden = [{"effect": "lever_arm", "reason": "there is no table"}, {"effect": "hysteresis", "reason": "at rest"}]
+    none = part("not_enough_data", [], [([], 0.97)]) | {"not_observable": hidden}
+    assert "95 % probability" not in " ".join(in_words(none, "accelerometer"))
+    few = part("missing_effect", ["warm_up"], [(["warm_up"], 0.97)]) | {"not_observable": hidden}
+    said = " ".join(in_words(few, "accelerometer"))
+    assert (
+        "probability: warm up (0.97). The recordings can test 1 of 3 effects: of the others this says nothing." in said
+    )
+
+
 def test_an_effect_of_the_bench_is_no_fault_of_the_sensor() -> None:
     found = part("missing_effect", ["lever_arm"], [])
     assert "It is a property of the mounting, not of the sensor." in in_words(found, "accelerometer")

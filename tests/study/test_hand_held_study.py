@@ -169,3 +169,10 @@ def test_held_out_errors_of_a_few_recordings_are_as_expected(case: str) -> None:
 def test_units_of_one_log_are_calibrated_by_their_own_columns(tmp_path: Path) -> None:
     for drawn in in_one_log(CASES["plain"][0], 3, tmp_path / "log"):
         assert all(one["chi"].mean() < 3.0 for one in judged(drawn).values())
+
+
+def test_the_cosine_is_zero_under_the_weights_of_the_fit() -> None:
+    drawn = draw(Hand(settle_deg=0.3, creep_dps=0.1), 1)
+    found = rests_and_moves.fit([drawn.recording], None, drawn.settings)
+    assert found.convergence is not None
+    assert found.convergence["cosine"] < 1e-5  # steps end at 3e-3 of an uncertainty; other weights give 1.5e-3

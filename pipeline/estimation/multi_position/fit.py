@@ -140,6 +140,7 @@ def fit(
         rounds += more
     uncertainty = np.sqrt(np.diag(solved.covariance))
     converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
+    cosine = solved.cosine  # under the weights of the fit, of which it is the minimum
     levels, likelihood = refined(equations, hypotheses, prior)
     every = [solve(equations, noise, *prior) for noise in levels]
     solved = max(every, key=lambda s: s.log_likelihood)
@@ -160,7 +161,7 @@ def fit(
         rounds,
         converged,
         solved.condition,
-        solved.cosine,
+        cosine,
         tuple((noise, float(w), s.scale) for noise, w, s in zip(levels, weight, every, strict=True)),
         prior[0],
     )
