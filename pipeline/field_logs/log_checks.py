@@ -44,8 +44,8 @@ DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is
 # components each, P(F(3, 3) < 1/9) = 4 %. An accelerometer is judged in three directions or more, and where the
 # correction is at least half of the error after it.
 WORSE = {"accelerometer": 1.2, "gyroscope": 3.0}
-# g and deg/s: a larger change of the bias is unusual. The data sheet of the MPU-6050 allows the zero-g level 60 mg from
-# 25 to 70 degC, and the zero-rate output 20 deg/s from 25 to 85 degC: 0.05 g is a change by 38 degC, 5 deg/s by 15.
+# g and deg/s: a larger change of the bias is unusual. By the temperature limits of the MPU-6050 (1.4 mg/degC and 0.32
+# deg/s/degC, configs/sensor/mpu6050.yaml) it takes 36 degC and 16 degC.
 CHANGED = {"accelerometer": 0.05, "gyroscope": 5.0}
 KNOWN = 5.0  # standard errors of a rest's mean that the error after is above
 APART_DEG = 30.0  # orientations that count as different; the least turn of gravity that is compared with the rate
