@@ -38,7 +38,8 @@ from pipeline.estimation.design import (
 from pipeline.estimation.engine import RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
-from pipeline.estimation.noise import wander_prior
+from pipeline.estimation.monte_carlo import with_matrix
+from pipeline.estimation.noise_prior import wander_prior
 from pipeline.estimation.observations import Observations, observe, weighted
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.uncertainty_budget import (
@@ -129,17 +130,11 @@ def _with_all_columns(start: Start, terms: Sequence[Term]) -> Start:
     return Start(start.bias, start.K, start.scale, tuple(full))
 
 
-def design_at(observations: Observations, at: Start) -> Design:
-    """Return the derivative of a model at some parameters, and its residual instead of the readings."""
+def design_at(observations: Observations, at: Start, beside: Sequence[Term] | None = None) -> Design:
+    """Return the derivative of a model at some parameters, or the columns of terms ``beside`` it; and its residual."""
     residual, base = _residual(observations, at)
-    scale = np.maximum(at.scale, 1e-300)
-    return Design(observations, at.terms, at.K, scale, target=residual, base=base)
-
-
-def design_beside(observations: Observations, fit: Fit, terms: Sequence[Term]) -> Design:
-    """Return columns of further terms at a fit, its residual instead of the readings, and the base taken out."""
-    residual, base = _residual(observations, fit)
-    return Design(observations, terms, fit.K, fit.scale, target=residual, base=base, project=True)
+    terms, project = (at.terms, False) if beside is None else (beside, True)
+    return Design(observations, terms, at.K, np.maximum(at.scale, 1e-300), target=residual, base=base, project=project)
 
 
 def _residual(observations: Observations, at: Start) -> tuple[Values, Values]:
@@ -402,10 +397,3 @@ def fit_in_mean_frame(fit: Fit) -> tuple[Fit, Values]:
     change = errors_in_mean_frame(K, theta, own, len(fit.covariance))
     terms = tuple(replace(term, values=theta) if term is mounting else term for term in fit.terms)
     return replace(fit, K=K, terms=terms, covariance=change @ fit.covariance @ change.T), change
-
-
-def with_matrix(values: Values) -> Values:
-    """Return (t, 12 + p) parameters with the matrix instead of K."""
-    K = values[:, 3:BASE].reshape(-1, 3, 3)
-    matrix = np.linalg.solve(K, np.broadcast_to(np.eye(3), K.shape)).reshape(-1, 9)
-    return np.concatenate([values[:, :3], matrix, values[:, BASE:]], axis=1)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.design import BASE
 from pipeline.estimation.engine import Posterior, draw_normal
 
 if TYPE_CHECKING:
@@ -189,3 +190,10 @@ def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Ca
         return np.asarray(d / size)
 
     return step
+
+
+def with_matrix(values: Values) -> Values:
+    """Return (t, 12 + p) parameters with the matrix instead of K."""
+    K = values[:, 3:BASE].reshape(-1, 3, 3)
+    matrix = np.linalg.solve(K, np.broadcast_to(np.eye(3), K.shape)).reshape(-1, 9)
+    return np.concatenate([values[:, :3], matrix, values[:, BASE:]], axis=1)

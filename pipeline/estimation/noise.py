@@ -47,18 +47,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError, InputError
+from pipeline.errors import ConfigurationError
 from pipeline.estimation.gauss_markov import (
     DEFAULT_TIME_S,
-    FARTHEST,
-    SHARPEST_WIDTH,
-    STATED_WIDTH,
     TIME_FACTORS,
     Blocks,
     GaussMarkov,
-    Prior,
     Setting,
-    fast,
     orthonormal,
     variance_of_average,
 )
@@ -104,57 +99,6 @@ def estimate_noise(sensor: str, recordings: list[Recording], sensor_file: dict[s
     white = _white_of_turns(fitted, sensor)
     return (
         _of_sensor_file(fitted, sensor_file) if white is None else _with_stated_wander(white, sensor_file, "residual")
-    )
-
-
-def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Noise | None:
-    """Return the noise that an earlier stage has estimated, else the estimate; None where it cannot be estimated.
-
-    ``settings``: ``noise`` by sensor, where an earlier stage has estimated it; ``sensor``, the sensor file.
-    """
-    if "noise" in settings:
-        noise: Noise | None = settings["noise"][sensor]
-        return noise
-    try:
-        return estimate_noise(sensor, list(recordings), dict(settings.get("sensor", {}).get(sensor) or {}))
-    except (ConfigurationError, InputError):
-        return None
-
-
-def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Prior:
-    """Return what the sensor file and a static recording say about the bias wander.
-
-    The prior is that of the sensor file times the likelihood of the static recording at each wander and correlation
-    time. A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative
-    uncertainty ``sqrt(tau / T)``. Where that is below ``SHARPEST_WIDTH``, the likelihood counts as that of a shorter
-    rest: no sensor is a Gauss-Markov process that well. Above the likeliest wander, the likelihood is at least
-    ``exp(-FARTHEST**2)`` of its maximum: the residuals of turns can show more wander than the rest (lack of fit).
-    Noise that is correlated over seconds (a filter in the sensor, values held between samples, chance in a short rest)
-    says nothing of a slow wander, and counts as white noise in the means of the blocks of a fit: then the prior is that
-    of the sensor file.
-
-    ``settings``: section ``sensor``.
-    """
-    sensor_file = settings.get("sensor", {}).get(sensor) or {}
-    static = any(r.role == "static" and r.reading(sensor) is not None and r.samples > 1 for r in recordings)
-    return wander_prior(noise_of(sensor, recordings, settings) if static and sensor_file else None, sensor_file)
-
-
-def wander_prior(noise: Noise | None, sensor_file: Mapping[str, Any]) -> Prior:
-    """Return the prior by the sensor file, and by the noise of a static recording (``prior_of``)."""
-    stated = Prior(float(sensor_file.get("bias_wander") or 0.0), _stated_time(sensor_file))
-    if noise is None or noise.source != "static" or noise.likelihood is None or fast(noise):
-        return stated
-    width = np.sqrt(noise.correlation_time / noise.length)
-    log_likelihood = noise.likelihood.log_likelihood * min(1.0, float(width / SHARPEST_WIDTH) ** 2)
-    largest = int(np.argmax(log_likelihood.max(axis=0)))  # turns may show more than a rest, never less
-    log_likelihood[:, largest:] = np.maximum(log_likelihood[:, largest:], log_likelihood.max() - FARTHEST**2)
-    return Prior(
-        float(np.sqrt(np.mean(noise.wander**2))),
-        noise.correlation_time,
-        float(np.clip(width, SHARPEST_WIDTH, STATED_WIDTH)),
-        stated,
-        (noise.likelihood.wander, log_likelihood),
     )
 
 
@@ -232,7 +176,7 @@ def _most_likely(
     blocks: _RestBlocks, design: Values, covariance: Values, sensor_file: dict[str, Any], source: str
 ) -> Noise:
     """Return the most likely noise; one ratio of wander to white noise for all axes unless they differ."""
-    times = TIMES * _stated_time(sensor_file)
+    times = TIMES * stated_time(sensor_file)
     log_likelihood, white = likelihood(blocks, design, covariance, times)
     gain = 2.0 * (log_likelihood - log_likelihood[:, :1])
     pooled = gain.sum(axis=2).max(axis=1)
@@ -274,13 +218,14 @@ def _without_detected_wander(gain: Values, white: Values, sensor_file: dict[str,
     return noise if loss < AGREEMENT_LOSS else replace(noise, wander=np.zeros(3), wander_source=source)
 
 
-def _stated_time(sensor_file: Mapping[str, Any]) -> float:
+def stated_time(sensor_file: Mapping[str, Any]) -> float:
+    """Return the correlation time of the bias wander by the sensor file, s."""
     return float(sensor_file.get("wander_time_s") or DEFAULT_TIME_S)
 
 
 def _with_stated_wander(white: Values, sensor_file: dict[str, Any], source: str) -> Noise:
     wander = np.full(3, float(sensor_file.get("bias_wander") or 0.0))
-    return Noise(np.maximum(white, SMALLEST_WHITE), wander, _stated_time(sensor_file), source)
+    return Noise(np.maximum(white, SMALLEST_WHITE), wander, stated_time(sensor_file), source)
 
 
 def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:

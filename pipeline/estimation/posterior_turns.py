@@ -16,7 +16,7 @@ from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
 from pipeline.estimation.design import BASE, Design, Term, placed
 from pipeline.estimation.evidence import Problem, linear_problem
 from pipeline.estimation.gauss_markov import WHITE, random_walks
-from pipeline.estimation.generalized_least_squares import Fit, design_beside, fit_terms
+from pipeline.estimation.generalized_least_squares import Fit, design_at, fit_terms
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import EXCITED, without
 from pipeline.estimation.selection import DELAYS, Selection
@@ -118,7 +118,7 @@ def _products(
     }
     keys = [(name, term.values.tobytes()) for name, term, _ in listed]
     if fit.terms or any(key not in places for key in keys):
-        design = design_beside(
+        design = design_at(
             selection.observations, fit, [*fit.terms[: len(selection.base.terms)], *(t for _, t, _ in listed)]
         )
         stacked, logarithms = design.products([WHITE, *selection.settings, *walks])

@@ -9,7 +9,7 @@ candidates' columns first, so that a candidate is a small linear problem of its 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,8 +18,9 @@ from pipeline.estimation.design import BASE, Design, Term
 from pipeline.estimation.gauss_markov import WHITE, Setting
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
+    from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.observations import Observations
     from pipeline.records import Index, Values
 
@@ -77,6 +78,31 @@ class Ranking:
         self.beside = products = without(stacked, np.arange(known))[:, known:, known:]
         self._reduce(products, design.sizes()[known:], [s.start - known for s in design.slices[len(configured) :]])
 
+    @classmethod
+    def at(
+        cls,
+        observations: Observations,
+        base: Fit,
+        fit: Fit,
+        candidates: Mapping[str, Term],
+        settings: Sequence[Setting],
+    ) -> Ranking:
+        """Return the linear problem at a fit: fitted effects at their values, others at each of their starts.
+
+        ``base``: the fit of base and configured effects. ``candidates``: by name.
+        """
+        fitted = {term.effect.name: replace(term, full=False) for term in fit.terms}
+        found: list[Term] = []
+        for name, term in candidates.items():
+            if name in fitted:
+                found.append(fitted[name])
+            elif term.effect.moves:
+                found.append(term)
+            else:
+                found += [Term(term.effect, values) for values in term.effect.starts(observations.sensor)]
+        configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
+        return cls(observations, configured, found, fit.K, fit.scale, settings)
+
     def _reduce(self, products: Values, sizes: Values, starts: Sequence[int]) -> None:
         """Keep of each candidate the directions that the motion excites, scaled to unit norm under white noise."""
         ends = [*starts[1:], len(sizes) - 1]
@@ -102,6 +128,10 @@ class Ranking:
     def indices(self, name: str) -> list[int]:
         """Return the candidates that are this effect and that the motion excites."""
         return [j for j, term in enumerate(self.candidates) if term.effect.name == name and len(self.places[j]) > 0]
+
+    def of_effects(self, names: Sequence[str]) -> list[int]:
+        """Return the index of the first candidate that is each effect."""
+        return [self.indices(name)[0] for name in names]
 
     def chosen(self, selected: Sequence[int]) -> Values:
         """Return the products without what base and selected candidates explain: (t, q + 1, q + 1) array."""

@@ -101,7 +101,7 @@ def _selection(  # noqa: PLR0917  (as ``select``)
     for this in candidates_for(observations, configured):
         prior = prior_of(this, observations, accelerometer, configured)
         candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
-    ranking = _ranking(observations, base, base, candidates, settings)
+    ranking = Ranking.at(observations, base, base, candidates, settings)
     limits = limits_of(observations.sensor, sensor_config)
     found = Selection(
         observations, noise, sensor_config, start, settings, limits, candidates, base, base, ranking, ranking
@@ -109,23 +109,6 @@ def _selection(  # noqa: PLR0917  (as ``select``)
     if search:
         found.run()
     return found
-
-
-def _ranking(
-    observations: Observations, base: Fit, fit: Fit, candidates: Mapping[str, Term], settings: Sequence[Setting]
-) -> Ranking:
-    """Return the linear problem at a fit: fitted effects at their values, others at each of their starts."""
-    fitted = {term.effect.name: replace(term, full=False) for term in fit.terms}
-    found: list[Term] = []
-    for name, term in candidates.items():
-        if name in fitted:
-            found.append(fitted[name])
-        elif term.effect.moves:
-            found.append(term)
-        else:
-            found += [Term(term.effect, values) for values in term.effect.starts(observations.sensor)]
-    configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
-    return Ranking(observations, configured, found, fit.K, fit.scale, settings)
 
 
 @dataclass
@@ -150,7 +133,7 @@ class Selection:
 
     def chosen(self) -> list[int]:
         """Return the indices of the selected effects among the ranking's candidates."""
-        return self._selected(self.names)
+        return self.ranking.of_effects(self.names)
 
     def run(self) -> None:
         """Search."""
@@ -184,12 +167,9 @@ class Selection:
             self._drop_refuted()
             self._merge()
 
-    def _selected(self, names: Sequence[str]) -> list[int]:
-        return [self.ranking.indices(name)[0] for name in names]
-
     def _beside(self, names: Sequence[str]) -> dict[str, Score]:
         """Return what each candidate brings beside some of the selected effects, best first."""
-        return {s.name: s for s in self.ranking.scores(self._selected(names), self.limits)}
+        return {s.name: s for s in self.ranking.scores(self.ranking.of_effects(names), self.limits)}
 
     def _scores(self) -> list[Score]:
         """Score all candidates; those of timing or with a time constant that compete are fitted to their optimum."""
@@ -212,7 +192,7 @@ class Selection:
         terms = [*self.base.terms, *self._terms(), Term(this, values)]
         fit = fit_terms(self.observations, terms, self.start, self.settings)
         self.fits[*self.names, score.name] = fit
-        before, _ = self.ranking.of_model(self._selected(self.names))
+        before, _ = self.ranking.of_model(self.ranking.of_effects(self.names))
         from scipy.special import chdtrc  # noqa: PLC0415  (as in Ranking)
 
         gain = max(2.0 * (fit.log_likelihood - before), 0.0)
@@ -267,7 +247,7 @@ class Selection:
         """Return whether an effect explains a part worth naming of an excess that is far above the noise."""
         if self.noise is None:
             return True
-        selected = [*self._selected(self.names), *beside]
+        selected = [*self.ranking.of_effects(self.names), *beside]
         floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
         residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
         drop = score.drop / self.ranking.samples
@@ -276,7 +256,7 @@ class Selection:
     def _refit(self) -> None:
         """Fit configured and selected effects together and rebuild the candidates there."""
         self._fit_selected()
-        self.ranking = _ranking(self.observations, self.base, self.fit, self.candidates, self.settings)
+        self.ranking = Ranking.at(self.observations, self.base, self.fit, self.candidates, self.settings)
 
     def _fit_selected(self) -> None:
         key = tuple(self.names)
@@ -336,7 +316,7 @@ class Selection:
 
     def _criterion(self, names: Sequence[str]) -> float:
         """Return ``2 log L - k log N`` of base and some candidates, at the values of the ranking."""
-        found, _ = self.ranking.of_model(self._selected(names))
+        found, _ = self.ranking.of_model(self.ranking.of_effects(names))
         count = sum(len(self.candidates[n].values) for n in names)
         return 2.0 * found - count * float(np.log(self.ranking.samples))
 
