@@ -201,11 +201,7 @@ def last_error(
     samples, reason = _choose(calibration.sensor, recordings, noise, settings, smoothed=smoothed)
     if reason is not None:
         return None
-    expected, _ = _expected(calibration, recordings, samples, noise, settings, other=other)
-    errors = [error for s in samples if (error := last_error_of_magnitude(calibration, s, other)) is not None]
-    if expected is None or not errors:
-        return None
-    return float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2))), expected
+    return _error_and_interval(calibration, recordings, samples, noise, settings, other=other)
 
 
 def static_error(
@@ -223,12 +219,29 @@ def static_error(
     static = [r for r in recordings if r.role == "static" and r.reading(calibration.sensor) is not None and r.samples]
     found = [samples_of_rests(calibration.sensor, r, [Rest(0, r.samples)], noise, settings["table"]) for r in static]
     samples = [s for s in found if s is not None and s.known.any()]
-    expected = _expected(calibration, recordings, samples, noise, settings, other=other)[0] if samples else None
-    if expected is None:
+    judged = _error_and_interval(calibration, recordings, samples, noise, settings, other=other) if samples else None
+    if judged is None:
         return None
-    errors = np.concatenate([last_error_of_magnitude(calibration, s, other) for s in samples])
+    error, (low, high) = judged
     turning = 2.0 * EARTH_RATE_DPS if calibration.sensor == "gyroscope" else 0.0
-    return float(np.sqrt(np.nanmean(errors**2))), [max(expected[0] - turning, 0.0), expected[1] + turning]
+    return error, [max(low - turning, 0.0), high + turning]
+
+
+def _error_and_interval(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    samples: Sequence[Samples],
+    noise: Noise,
+    settings: Mapping[str, Any],
+    *,
+    other: SensorCalibration | None,
+) -> tuple[float, list[float]] | None:
+    """Return the rms error of samples after the last step and its interval; None where either is not known."""
+    expected, _ = _expected(calibration, recordings, samples, noise, settings, other=other)
+    errors = [error for s in samples if (error := last_error_of_magnitude(calibration, s, other)) is not None]
+    if expected is None or not errors:
+        return None
+    return float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2))), expected
 
 
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
