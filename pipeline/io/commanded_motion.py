@@ -58,7 +58,7 @@ def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) ->
     )
     note = Note("N-PROGRAM", len(shifts), 0, 0, detail, float(table.time_ns[0]) / 1e9, float(table.time_ns[-1]) / 1e9)
     values = {**table.values, "table_angle": angle, "table_rate": rate}
-    return replace(table, values=values, notes=(*table.notes, note))
+    return replace(table, values=values, notes=(*table.notes, note), source={**table.source, "program": list(program)})
 
 
 class Program:

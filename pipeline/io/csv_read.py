@@ -94,7 +94,9 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
             values[column.channel] = in_house_unit(column, numbers)
             if column.unit == COUNTS and bool(np.all(numbers == np.rint(numbers))):
                 count_sizes[column.channel] = 1.0 / abs(column.counts_per_unit)
-    source = {"file": log.path, "sha256": log.sha256}
+    source: dict[str, Any] = {"file": log.path, "sha256": log.sha256}
+    if not any(channel in values for triad in TRIADS.values() for channel in triad):
+        source["table_only"] = True
     try:
         table = ChannelTable(log.path, times_of(rows), values, source, rows.lines, count_sizes, tuple(rows.notes))
         table = in_order(table, rows, checks)

@@ -23,7 +23,7 @@ from pipeline.io.files import MESSAGE_FORMATS, candidate_files
 from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_format
 from pipeline.io.quality_flags import examine
 from pipeline.io.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TRIADS
-from pipeline.records import Note, Recording, rate_of_attitude
+from pipeline.records import Note, Recording, files_of_readings, rate_of_attitude
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -197,17 +197,19 @@ def _stack(values: dict[str, Values], channels: Sequence[str]) -> Values | None:
 def _check_different(recordings: Sequence[Recording]) -> None:
     """Refuse one file under two names: held-out data would not be held out, or one axis would stand for another.
 
-    The parts of a log that was restarted differ in their ``session``.
+    The parts of a log that was restarted differ in their ``session``. Recordings may share the log of a table.
     """
-    seen: dict[tuple[str, int | None], Recording] = {}
+    seen: dict[tuple[str, int | None], tuple[str, str]] = {}
     for recording in recordings:
-        twin = seen.setdefault((recording.source["sha256"], recording.source.get("session")), recording)
-        if twin is not recording:
-            message = (
-                f"recordings {twin.name} and {recording.name} are the same file, byte for byte "
-                f"({twin.source['file']}); each needs its own"
-            )
-            raise IngestError(message, recording.source["file"], code="same_file")
+        for file in files_of_readings(recording.source):
+            key = file["sha256"], recording.source.get("session")
+            twin, first = seen.setdefault(key, (recording.name, file["file"]))
+            if twin != recording.name:
+                message = (
+                    f"recordings {twin} and {recording.name} are the same file, byte for byte ({first}); each needs "
+                    "its own"
+                )
+                raise IngestError(message, file["file"], code="same_file")
 
 
 def _compare_clocks(recordings: list[Recording]) -> list[Recording]:

@@ -144,6 +144,11 @@ class Recording:
         return replace(self, **{n: v[index] for n in OF_SAMPLES if (v := getattr(self, n)) is not None})
 
 
+def files_of_readings(source: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the files that hold a recording's readings: ``source`` and those joined, without logs of a table."""
+    return [file for file in (source, *source.get("joined", [])) if not file.get("table_only")]
+
+
 @dataclass(frozen=True)
 class WanderLikelihood:
     """Log likelihood of a static recording at each wander tried, relative to that without wander."""

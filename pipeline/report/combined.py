@@ -29,7 +29,16 @@ from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.uncertainty_budget import NOISE, own_and_bench
 from pipeline.estimation.uncertainty_budget import combined as budget_of
 from pipeline.io.files import wrong_name
-from pipeline.records import NORMAL, SENSORS, Contribution, Index, SensorCalibration, StageResult, Values
+from pipeline.records import (
+    NORMAL,
+    SENSORS,
+    Contribution,
+    Index,
+    SensorCalibration,
+    StageResult,
+    Values,
+    files_of_readings,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -67,10 +76,10 @@ def _refused(documents: Sequence[JSON]) -> str | None:
     """Return why calibrations have no joint estimate."""
     files: dict[str, str] = {}
     for document in documents:
-        for entry in document["inputs"]:
-            other = files.setdefault(entry["sha256"], document["unit"])
+        for file in (file for entry in document["inputs"] for file in files_of_readings(entry)):
+            other = files.setdefault(file["sha256"], document["unit"])
             if other != document["unit"]:
-                return f"{other} and {document['unit']} use the same recording, {entry['file']}"
+                return f"{other} and {document['unit']} use the same recording, {file['file']}"
     for key in SAME:
         if len({str(document[key]) for document in documents}) > 1:
             return f"the calibrations differ in {key}: {', '.join(str(d[key]) for d in documents)}"

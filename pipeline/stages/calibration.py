@@ -149,7 +149,10 @@ def _missing_s(recording: Recording) -> float:
 
 
 def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
-    """Return file, hash, rows and notes of each recording of a unit; ``joined``: the files that were joined with it."""
+    """Return file, hash, rows and notes of each recording of a unit.
+
+    ``joined``: the files that were joined with it. ``program``: the table's program, where that is the reference.
+    """
     return [
         {
             "recording": r.name,
@@ -161,7 +164,7 @@ def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
             "duration_s": round(float(r.time[-1] - r.time[0]), 6) if r.samples else 0.0,
             "missing_s": _missing_s(r),
             "notes": [vars(n) for n in r.notes],
-            **({"joined": r.source["joined"]} if "joined" in r.source else {}),
+            **{key: r.source[key] for key in ("joined", "program") if key in r.source},
         }
         for r in recordings
     ]

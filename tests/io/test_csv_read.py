@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, profile
 
+from pipeline.errors import IngestError
 from pipeline.io.arrow import write_canonical_csv
 from pipeline.io.csv_read import read_csv
 from pipeline.io.ingest_settings import csv_formats
@@ -284,6 +285,39 @@ def test_xsens_log_is_joined_from_its_two_files(reference: Path) -> None:
     means = read.gyroscope[read.time_ns < 50 * 10**9].mean(axis=0) * 83.2 + 32768
     np.testing.assert_allclose(means, [32777.150460, 32459.816527, 32511.848940], rtol=0, atol=1e-6)
     assert [other["file"].rpartition("/")[2] for other in read.source["joined"]] == ["gyroscope.txt"]
+
+
+def test_two_recordings_may_share_the_log_of_a_table_but_no_readings(tmp_path: Path, canonical: dict[str, Any]) -> None:
+    columns = {"time": {"column": "t", "unit": "s"}}
+    for of in "xyz":
+        columns |= {
+            f"accel_{of}": {"column": f"a{of}", "unit": "g"},
+            f"gyro_{of}": {"column": f"g{of}", "unit": "deg/s"},
+        }
+    columns["table_angle"] = {"column": "angle", "unit": "deg"}
+    parts = {"acc": ("accel_",), "gyr": ("gyro_",), "table": ("table",)}
+    canonical["csv"] |= {
+        "columns": {},
+        "parts": [
+            {
+                "file": f"{{file}}_{name}.csv",
+                "columns": {c: v for c, v in columns.items() if c.startswith(("time", *of))},
+            }
+            for name, of in parts.items()
+        ],
+    }
+    for name in ("a", "b"):
+        force, rate = make_recording(seed=ord(name)).accelerometer, make_recording(seed=ord(name)).gyroscope
+        for file, values, names in (("acc", force, "ax,ay,az"), ("gyr", rate, "gx,gy,gz"), ("table", None, "angle")):
+            rows = np.zeros((200, 1)) if values is None else values
+            table = np.column_stack([0.01 * np.arange(200), rows])
+            np.savetxt(tmp_path / f"{name}_{file}.csv", table, delimiter=",", header=f"t,{names}", comments="")
+    read = read_recordings(procedure("a", "b"), canonical, SENSOR, tmp_path)
+    assert [len({f["sha256"] for r in read for f in r.source["joined"][k:][:1]}) for k in (0, 1)] == [2, 1]
+    (tmp_path / "b_gyr.csv").write_bytes((tmp_path / "a_gyr.csv").read_bytes())
+    with pytest.raises(IngestError, match="recordings a and b are the same file") as refused:
+        read_recordings(procedure("a", "b"), canonical, SENSOR, tmp_path)
+    assert refused.value.file == str(tmp_path / "b_gyr.csv")
 
 
 def test_mpu6050_log_has_its_preamble_skipped_and_its_time_counted(reference: Path, tmp_path: Path) -> None:

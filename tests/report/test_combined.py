@@ -100,6 +100,16 @@ def test_a_recording_is_never_used_twice() -> None:
     assert told[0]["refused"] == "U1 and U2 use the same recording, U1.csv"
 
 
+def test_a_joined_file_is_never_used_twice_but_for_the_log_of_a_table() -> None:
+    one, other = document("U1", TRUTH), document("U2", TRUTH)
+    for found in (one, other):
+        found["inputs"][0]["joined"] = [{"file": "table.csv", "sha256": "t", "table_only": True}]
+    assert joint([one, other])[0]
+    for found in (one, other):
+        found["inputs"][0]["joined"].append({"file": "gyroscope.csv", "sha256": "g"})
+    assert joint([one, other])[1][0]["refused"] == "U1 and U2 use the same recording, gyroscope.csv"
+
+
 def test_calibrations_of_different_methods_have_no_joint_estimate() -> None:
     found, told = joint([document("U1", TRUTH), document("U2", TRUTH, method="staged")])
     assert not found

@@ -98,6 +98,13 @@ def test_every_file_that_was_read_is_listed_with_its_hash(done: Bench) -> None:
         assert digest in page
 
 
+def test_the_inputs_hold_the_program_that_is_the_reference(done: Bench) -> None:
+    inputs = {entry["recording"]: entry for entry in result(done, "calibrations", "program")["inputs"]}
+    turned = [step["turn_deg"] for step in inputs["gyro_x"]["program"] if "turn_deg" in step]
+    assert abs(turned[0]) >= 360.0
+    assert all("program" not in entry for entry in result(done, "calibrations", "file")["inputs"])
+
+
 def test_windows_in_the_configuration_take_the_place_of_what_is_found(done: Bench) -> None:
     packs = map(Pack, done.results.glob("batches/*/ingest.zip"))
     ingested = next(pack for pack in packs if "windows.parquet" in pack)
