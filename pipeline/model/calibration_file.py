@@ -1,9 +1,9 @@
-"""``calibrations/<unit>.json``: read and checked before it is applied, and its implausible parameters.
+"""Read and check ``calibrations/<unit>.json``; find implausible parameters in it.
 
-The file may have been edited, cut, or written by another version. Every fault is an ``InputError`` that names the file,
-the key, its value and what was expected.
+The file may have been edited, truncated, or written by another version. Every fault is an ``InputError`` that names
+the file, the key, its value and what was expected.
 
-Parameters that no sensor of the configured model has nearly always mean another range, unit or column. With
+A parameter far outside the limits of the sensor model nearly always means another range, unit or column. With
 
     reading = bias + K truth + ...,    K = matrix^-1 = P R
 
@@ -51,7 +51,7 @@ LARGEST_FACTOR = 1000.0
 # Two axes 1 deg apart have a condition of 2 / sin(1 deg) = 115; a sensor's axes are 90 deg apart within some degrees.
 LARGEST_CONDITION = 100.0
 
-FAST_S = 0.1  # shorter than estimators average over between two images or scans: there a process counts as white
+FAST_S = 0.1  # estimators average over longer times, between two images or scans: a faster process counts as white
 WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
 LEFT_OUT = {
     "N-STUCK": "stuck",
@@ -133,8 +133,8 @@ def read_calibration(file: Path) -> dict[str, Any]:
         shown = "missing" if version is None else repr(version)
         _refuse(file, f"schema_version is {shown}; this version reads {SCHEMA_VERSION}: calibrate the unit anew")
     if document["status"] == "failed":
-        told = document.get("error")
-        cause = told.get("message", "unknown") if isinstance(told, dict) else "unknown"
+        error_entry = document.get("error")
+        cause = error_entry.get("message", "unknown") if isinstance(error_entry, dict) else "unknown"
         _refuse(file, f"unit {document.get('unit')} failed and has no calibration; cause: {cause}")
     try:
         _DOCUMENT(document)
@@ -142,16 +142,15 @@ def read_calibration(file: Path) -> dict[str, Any]:
         _refuse(file, f"{wrong}; {WHAT_TO_DO}")
     if all(document[sensor] is None for sensor in SENSORS):
         reasons = document.get("not_calibrated")
-        told = "; ".join(map(str, reasons.values())) if isinstance(reasons, dict) and reasons else "not stated"
-        _refuse(file, f"accelerometer and gyroscope are null: there is nothing to apply; reason: {told}")
+        cause = "; ".join(map(str, reasons.values())) if isinstance(reasons, dict) and reasons else "not stated"
+        _refuse(file, f"accelerometer and gyroscope are null: there is nothing to apply; reason: {cause}")
     return document
 
 
 def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibration | None:
     """Return the calibration of one sensor of ``read_calibration``; None where it is not calibrated.
 
-    Raises ``InputError`` if matrix, covariance or an effect is not what it should be, ``ConfigurationError`` if an
-    effect is not known.
+    Raises ``InputError`` if matrix, covariance or an effect is invalid, ``ConfigurationError`` if an effect is unknown.
     """
     part = document[sensor]
     if part is None:
@@ -174,9 +173,8 @@ def sample_covariance(document: Mapping[str, Any], sensor: str) -> Values | None
         cov = M diag(N^2 / dt + 2 Q^2 / dt^2 + sum_i G_i^2) M^T
 
     with the white and quantisation noise N and Q of an axis at rest, identified at the sampling interval dt, and the
-    standard deviation G_i of its Gauss-Markov processes with a correlation time of less than ``FAST_S``: a bias that
-    wanders more slowly is no part of the noise of a sample. None where the sensor is not calibrated, or the noise of an
-    axis is not known.
+    standard deviation G_i of its Gauss-Markov processes with a correlation time of less than ``FAST_S``. A slower bias
+    wander is not noise of a single sample. None where the sensor is not calibrated, or the noise of an axis is unknown.
     """
     noise, part = (document.get("noise") or {}).get(sensor) or {}, document.get(sensor)
     axes = noise.get("axes") or {}
@@ -307,7 +305,7 @@ def _of_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, float
         try:
             effect = effect_of(FittedEffect(entry["name"], entry["parameters"], entry.get("definition")))
         except ConfigurationError:
-            continue  # in Python, and not loaded here: its limits are not known
+            continue  # an effect in Python that is not loaded here: its limits are unknown
         sizes = parameter_limits(effect, sensor, limits)
         for (symbol, p), limit in zip(entry["parameters"].items(), sizes, strict=True):
             spread = p.get("expanded_uncertainty")
@@ -317,7 +315,7 @@ def _of_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, float
 
 
 def _scale_cause(sensor: str, factors: np.ndarray) -> str:
-    """Return what scale factors far from 1 nearly always come from."""
+    """Return the likely cause of scale factors far from 1."""
     mean = float(np.mean(factors))
     if np.ptp(factors) > EQUAL_SPREAD * mean:
         return "another column, counts per unit or axis map of this axis, or a damaged axis"
@@ -331,7 +329,7 @@ def _scale_cause(sensor: str, factors: np.ndarray) -> str:
 
 
 def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
-    """Return what is implausible in a sensor's part of ``calibrations/<unit>.json``, a sentence for each cause."""
+    """Return a sentence for each cause of implausible parameters; ``part``: of ``calibrations/<unit>.json``."""
     by_cause: dict[str, list[Entry]] = {}
     for entry in (part or {}).get("implausible") or []:
         by_cause.setdefault(entry["likely_cause"], []).append(entry)
@@ -349,11 +347,10 @@ def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
 
 
 def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """Return the sources that U of a sensor does not include and that can exceed it: source and size, and the reason.
+    """Return the error sources that are not in the expanded uncertainty U of a sensor and can exceed U.
 
-    An error of the matrix is relative; it changes the scale factors most, and is compared with their U.
-
-    ``part``: of ``calibrations/<unit>.json``.
+    Each entry is the source with its size, and the reason why U does not include it. A relative error of the matrix
+    changes the scale factors most, so that it is compared with their U. ``part``: of ``calibrations/<unit>.json``.
     """
     found = []
     part = part or {}
@@ -367,7 +364,7 @@ def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def not_determined(part: Mapping[str, Any]) -> str:
-    """Return which misalignments of a calibrated sensor the rests do not determine, and what would; else nothing."""
+    """Return which misalignments the rests do not determine, and which rests would; empty if all are determined."""
     lines = (part.get("uncertainty_budget") or {}).get("contributions") or []
     names = next((str(line["remark"]) for line in lines if line["source"] == LIMIT), "")
     return names and (
@@ -377,9 +374,9 @@ def not_determined(part: Mapping[str, Any]) -> str:
 
 
 def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:
-    """Return the rows of each recording that no fit uses, by its notes: ``404 of 18,247 rows of gyro_z (3.2 s stuck)``.
+    """Describe the rows of each recording that no fit uses: ``404 of 18,247 rows of gyro_z (3.2 s stuck)``.
 
-    ``inputs``: as in ``calibrations/<unit>.json``. Of lost time, the share is stated.
+    ``inputs``: as in ``calibrations/<unit>.json``. Missing time is stated as a share of the duration.
     """
     found = []
     for entry in inputs or []:

@@ -1,4 +1,4 @@
-"""Checks of files that users write or edit: a check returns the value, or states what is wrong and where.
+"""Check values from files that users write or edit: a check returns the value, or raises what is wrong and where.
 
 ``fields``, ``each`` and ``items`` build the check of a document from those of its values. Only the standard library is
 imported: every job reads the effects that ship, and pydantic would add 0.1 s to its start.
@@ -19,7 +19,7 @@ Check = Callable[[Any], Any]
 
 
 class WrongValueError(Exception):
-    """What is wrong with a value, and the keys and indices that lead to it."""
+    """A value is invalid: the reason, and the keys and indices that lead to the value."""
 
     def __init__(self, reason: str, *path: str | int) -> None:
         super().__init__(reason)
@@ -31,13 +31,13 @@ class WrongValueError(Exception):
 
 
 def expected(what: str, given: object) -> WrongValueError:
-    """Return the error of a value that is not what is expected."""
+    """Return the error that states the expected value and the given one."""
     shown = json.dumps(given, default=str, ensure_ascii=False)
     return WrongValueError(f"{what} is expected, not {shown if len(shown) <= 60 else f'{shown[:57]}...'}")
 
 
 def fields(checks: Mapping[str, Check], required: Iterable[str] = (), *, others: bool = False) -> Check:
-    """Return the check of a mapping with these keys; ``others``: any other key is left alone."""
+    """Return the check of a mapping with these keys; ``others``: allow any other key, and drop it."""
 
     def check(given: object) -> dict[str, Any]:
         values = mapping(given)
@@ -60,7 +60,7 @@ def each(check: Check) -> Check:
 
 
 def items(check: Check, count: int | None = None) -> Check:
-    """Return the check of a list, of ``count`` values."""
+    """Return the check of a list; with ``count``, of exactly so many values."""
     what = "a list" if count is None else f"a list of {count} values"
 
     def checked(given: object) -> list[Any]:
@@ -77,7 +77,7 @@ def or_none(check: Check) -> Check:
 
 
 def one_of(*known: str) -> Check:
-    """Return the check of one of some texts."""
+    """Return the check that a value is one of the given texts."""
     *first, last = (repr(str(k)) for k in known)
     what = f"one of {', '.join(first)} or {last}" if first else last
 
@@ -90,28 +90,28 @@ def one_of(*known: str) -> Check:
 
 
 def mapping(given: object) -> dict[Any, Any]:
-    """Return a mapping."""
+    """Return the value if it is a mapping."""
     if not isinstance(given, dict):
         raise expected("a mapping of names", given)
     return given
 
 
 def text(given: object) -> str:
-    """Return a text."""
+    """Return the value if it is a text."""
     if not isinstance(given, str):
         raise expected("a text", given)
     return given
 
 
 def flag(given: object) -> bool:
-    """Return a truth value."""
+    """Return the value if it is true or false."""
     if not isinstance(given, bool):
         raise expected("true or false", given)
     return given
 
 
 def number(given: object) -> float:
-    """Return a finite number."""
+    """Return the value if it is a finite number."""
     if isinstance(given, bool) or not isinstance(given, (int, float)) or not isfinite(given):
         raise expected("a finite number", given)
     return given

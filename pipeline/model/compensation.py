@@ -1,12 +1,15 @@
-"""A unit's calibration as an object that compensates arrays, logs and streams.
+"""Compensate arrays, logs and streams by the calibration of a unit.
 
     truth = matrix @ (reading - bias - sum of effects(truth))
 
-Everything is causal and each sample is computed by itself, so that a log in one piece, in blocks, or sample by sample
-gives the same numbers to the last bit. Effects of the time and the temperature alone are subtracted once, first.
-Sensors whose effects depend on what they change are solved by fixed point (``pipeline.model.measurement``). What a
-sample needs of the one before it, such as the rate for an angular acceleration, is that one's value of the same
-iteration. The effects of a sensor that depend on the other sensor's truth alone are subtracted once, last.
+The computation is causal: a log in one piece, in blocks, or sample by sample gives the same numbers to the last bit.
+The effects are subtracted in three steps:
+
+1. Effects that depend on time and temperature only are subtracted once.
+2. Sensors whose effects depend on the truth that they change are solved by fixed point
+   (``pipeline.model.measurement``). Where a sample needs the sample before it, as for an angular acceleration, it takes
+   that sample's value of the same iteration.
+3. Effects that depend on the truth of the other sensor only are subtracted once.
 """
 
 from __future__ import annotations
@@ -46,10 +49,10 @@ class Compensated(NamedTuple):
 
 @dataclass(frozen=True)
 class Steps:
-    """The effects of one sensor by what they depend on, for Python and for ``calibration.h``.
+    """The effects of one sensor, divided by the signals that they depend on, for Python and for ``calibration.h``.
 
-    ``steady`` depend on the time and the temperature alone, ``moving`` on the truth; ``fields`` are those of a motion
-    that each of them reads.
+    ``steady`` effects depend on time and temperature only, ``moving`` effects on the truth. ``fields``: effect to the
+    fields of ``Motion`` that it reads.
     """
 
     steady: list[FittedEffect]
@@ -58,7 +61,7 @@ class Steps:
 
     @classmethod
     def of(cls, sensor: str, effects: Sequence[FittedEffect]) -> Self:
-        """Return the steps of some effects of a sensor."""
+        """Divide the given effects of a sensor."""
         fields = {e.name: fields_used(sensor, [e]) for e in effects}
         moving = [e for e in effects if fields[e.name] - OF_THE_ROOM]
         return cls([e for e in effects if e not in moving], moving, fields)
@@ -74,7 +77,7 @@ class Steps:
 
 
 def circular(steps: Mapping[str, Steps]) -> set[str]:
-    """Return the sensors whose effects depend on what they change, directly or through the other sensor."""
+    """Return the sensors whose effects depend on their own truth, directly or through the other sensor."""
     moving = {s for s, step in steps.items() if step.moving}
     looks_at = {s: set().union(*(steps[s].needs(e.name) for e in steps[s].moving)) & moving for s in moving}
     return {s for s, seen in looks_at.items() if any(other == s or s in looks_at[other] for other in seen)}
@@ -116,7 +119,7 @@ class CompensationStream:
         found = {s: np.empty((n, 3)) if s in self.steps else arrays[s] for s in sensors}
         for start in range(0, n, BLOCK):
             block = slice(start, start + BLOCK)
-            # as doubles, axis by axis in memory: so they are processed
+            # doubles, contiguous axis by axis, the order in which they are processed
             cut = {name: np.asarray(a[block], np.float64, order="F") for name, a in arrays.items()}
             for s, truth in self._block(cut).items():
                 if s in self.steps:
@@ -125,23 +128,23 @@ class CompensationStream:
         return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
 
     def _block(self, arrays: Mapping[str, Values]) -> Truths:
-        """Return the truths of some samples."""
+        """Return the truth of each sensor in a block of samples."""
         readings = {s: arrays[s] for s in SENSORS if s in arrays}
         steps = {s: self.steps[s] for s in readings if s in self.steps}
         used = set().union(*(step.used for step in steps.values()))
-        nothing = np.zeros_like(next(iter(readings.values()))) if used else np.zeros((0, 3))
-        clock, warmth = arrays.get("time", nothing[:, 0]), arrays.get("temperature")
-        if warmth is not None and "time" in arrays and "temperature" in used and self.smoothing > 0:
-            warmth = self._line.apply(clock, warmth)
+        zeros = np.zeros_like(next(iter(readings.values()))) if used else np.zeros((0, 3))
+        clock, warm = arrays.get("time", zeros[:, 0]), arrays.get("temperature")
+        if warm is not None and "time" in arrays and "temperature" in used and self.smoothing > 0:
+            warm = self._line.apply(clock, warm)
 
         def true_motion(truths: Truths, number: int) -> Motion:
-            force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
+            force, rate = truths.get("accelerometer", zeros), truths.get("gyroscope", zeros)
             end = self._ends[min(number, len(self._ends) - 1)]
-            return log_motion(clock, specific_force=force, angular_rate=rate, temperature=warmth, used=used, end=end)
+            return log_motion(clock, specific_force=force, angular_rate=rate, temperature=warm, used=used, end=end)
 
         if any(step.steady for step in steps.values()):
             room = log_motion(
-                clock, specific_force=nothing, angular_rate=nothing, temperature=warmth, used=set(), end=LogEnd()
+                clock, specific_force=zeros, angular_rate=zeros, temperature=warm, used=set(), end=LogEnd()
             )
             readings |= {s: self._steady[s].take_off(readings[s], room) for s in steps}
         return self._solved(steps, readings, true_motion, used & OF_THE_PAST)
@@ -149,23 +152,23 @@ class CompensationStream:
     def _solved(
         self, steps: dict[str, Steps], readings: Truths, true_motion: Callable[[Truths, int], Motion], past: set[str]
     ) -> Truths:
-        """Subtract the effects that depend on the truth, and keep the end of the block in each iteration."""
+        """Subtract the effects that depend on the truth; store the end of the block for each iteration."""
         turns = circular(steps)
         once = {s: self._moving[s] for s, step in steps.items() if step.moving and s not in turns}
         ends: list[LogEnd] = []
 
-        def noted(truths: Truths, number: int) -> Motion:
+        def motion_of(truths: Truths, number: int) -> Motion:
             motion = true_motion(truths, number)
             if past:
                 ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))
             return motion
 
-        truths = solve({s: self._moving[s] if s in turns else self._linear[s] for s in steps}, readings, noted)
+        truths = solve({s: self._moving[s] if s in turns else self._linear[s] for s in steps}, readings, motion_of)
         settled = len(ends)
         for number in range(settled, max(settled + 1, len(self._ends)) if turns and past else settled):
-            noted(truths, number)
+            motion_of(truths, number)
         if once:
-            motion = true_motion(truths, len(self._ends)) if turns else noted(truths, 0)
+            motion = true_motion(truths, len(self._ends)) if turns else motion_of(truths, 0)
             truths |= without_effects(once, readings, motion)
         self._ends = ends or self._ends
         return truths

@@ -1,16 +1,16 @@
-"""The trajectory of a turn between the samples of the table's log.
+"""Interpolate the angle, rate and acceleration of a turn between the samples of the table's log.
 
-A table's program consists of stretches of constant angular acceleration; its log samples angle A and rate r at other
-times than where the stretches end. Between two samples, dt apart,
+A table's program consists of stretches of constant angular acceleration. They end at times between the samples of the
+logged angle A and rate r. Between two samples, dt apart,
 
     no bend inside:   dA = (r_0 + r_1) dt / 2
     a bend at s:      dr = a s + b (dt - s),   dA = r_0 dt + a s (dt - s / 2) + b (dt - s)^2 / 2
 
 where a and b are the accelerations before and after it. An interval without a bend has ``a = dr / dt``; one with a bend
-takes a, b or both from its neighbours, which gives s; where both are known the second equation is a check, else the
-next interval must go on as this one ends. So ramps of a few samples are followed exactly. Elsewhere, in smooth motion,
-the angle is the quintic through angle, rate and acceleration at both ends, with the acceleration from the five nearest
-rates; one curve gives all three.
+takes a, b or both from its neighbours, which gives s. Where both are known, the second equation is a check; else the
+next interval must begin with the acceleration with which this one ends. So ramps of a few samples are followed exactly.
+Elsewhere, in smooth motion, angle, rate and acceleration come from the quintic that has the logged angle and rate at
+both ends, and the acceleration from the five nearest rates.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pipeline.records import Index, Mask, Values, median
 
 TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3  # a good encoder's resolution; 17 ug of specific force
 GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for; and an interval without any
-MOVING_DPS = 0.02  # above the rate noise of a resting table
+MOVING_DPS = 0.02  # exceeds the rate noise of a resting table
 SAME_SHARE, SAME_DPS2 = 0.01, 0.1  # how nearly two neighbouring intervals must agree on an acceleration
 LAG_ROUNDING_DPS = 1e-11  # some hundred roundings of a rate of 400 deg/s
 MEMORY_S = 0.3  # fifteen time constants of the slowest filter of 20 ms
@@ -29,7 +29,7 @@ CORNER_DPS2 = 3.0  # over a filter of 20 ms: 0.06 deg/s
 
 
 class EncoderTrajectory:
-    """Angle, rate and acceleration at any time, by a log.
+    """Angle, rate and acceleration at any time, interpolated from a log.
 
     Parameters
     ----------
@@ -41,11 +41,11 @@ class EncoderTrajectory:
     explained : (n - 1,) array of bool
         Intervals that one or two stretches of constant acceleration reproduce.
     valid : (n - 1,) array of bool
-        Those, and intervals of smooth motion: ``dA = (r_0 + r_1) dt / 2 - (r'_1 - r'_0) dt^2 / 12`` to 1e-3 deg, or to
-        what the log's own noise allows. In the others the trajectory is a guess.
+        Explained intervals, and intervals of smooth motion: ``dA = (r_0 + r_1) dt / 2 - (r'_1 - r'_0) dt^2 / 12`` to
+        1e-3 deg, or to the noise of the log. In other intervals the trajectory is not reliable.
     valid_samples : (n,) array of bool
-        Samples with a valid interval after them and valid intervals only in the 0.3 s before them, in which a filter
-        inside the sensor settles. Samples at which one stretch ends are left out.
+        Samples followed by a valid interval, with only valid intervals in the 0.3 s before them, in which a filter
+        inside the sensor settles. Samples at which a stretch ends are not valid.
     acceleration : (n,) array, deg/s^2
         At the samples.
     """
@@ -68,7 +68,7 @@ class EncoderTrajectory:
         self.valid_samples = self._filter_settled()
 
     def _filter_settled(self) -> Mask:
-        """Return the samples with valid intervals after them and while a filter of the sensor settles before them."""
+        """Return ``valid_samples``."""
         lost = np.concatenate([[0], np.cumsum(~self.valid)])  # invalid intervals before each sample
         first = np.searchsorted(self.time, self.time - MEMORY_S, side="right") - 1
         past = lost - lost[np.maximum(first, 0)] == 0
@@ -77,13 +77,13 @@ class EncoderTrajectory:
         return known
 
     def _corners(self) -> Mask:
-        """Return which inner samples a stretch ends at: there the acceleration is that before or that after."""
+        """Return at which inner samples a stretch ends: the acceleration jumps there."""
         jump = np.abs(self._before[1:] - self._after[:-1])
         both = self.explained[1:] & self.explained[:-1]
         return np.asarray(both & (jump > CORNER_DPS2))
 
     def _bends(self, even: Mask) -> tuple[Values, Values, Values, Mask]:
-        """Return for each interval where it bends, the acceleration before and after, and whether that holds."""
+        """Return for each interval the time of its bend, the acceleration before and after it, and whether it bends."""
         step, mean = self._step, self._mean
         left, right = np.concatenate([[False], even[:-1]]), np.concatenate([even[1:], [False]])
         a, b = np.concatenate([mean[:1], mean[:-1]]), np.concatenate([mean[1:], mean[-1:]])
@@ -98,7 +98,8 @@ class EncoderTrajectory:
             a = np.where(right & ~left, (dr - b * (step - s)) / s, a)
             miss = np.abs(dA - r0 * step - a * s * (step - 0.5 * s) - 0.5 * b * (step - s) ** 2)
             bent = ~even & (left | right) & (s >= 0) & (s <= step) & (miss <= 3.0 * self._tolerance)
-            # With one neighbour known there is nothing left to check by, but the next interval must go on as this ends.
+            # With one neighbour known, the second equation gives s and is no check: the next interval must continue
+            # with the acceleration with which this one ends.
             same = np.abs(b[:-1] - a[1:]) <= SAME_SHARE * np.abs(b[:-1]) + SAME_DPS2
             checked = (left & right) | np.append(same & bent[1:], False) | np.append(False, same & bent[:-1])
             bent &= checked
@@ -106,7 +107,7 @@ class EncoderTrajectory:
         return np.where(whole, step, s), np.where(whole, mean, a), np.where(whole, mean, b), bent
 
     def _at_samples(self, slope: Values) -> Values:
-        """Return the acceleration at the samples: of an adjacent explained interval, else by the nearest rates."""
+        """Return the acceleration at the samples: from an adjacent explained interval, else from the nearest rates."""
         known = np.zeros((2, len(self.time)))
         weight = np.zeros((2, len(self.time)))
         known[0, :-1], weight[0, :-1] = self._before, self.explained
@@ -132,10 +133,10 @@ class EncoderTrajectory:
         return angle, rate, acceleration
 
     def known_at(self, time: Values) -> Mask:
-        """Return which times are known from the log: (n,) array.
+        """Return at which of n times, near the samples, the trajectory is valid: (n,) array.
 
-        Those from ``MEMORY_S`` before a sample of ``valid_samples`` to the next sample belong to it; others must lie
-        between two such samples.
+        A time from ``MEMORY_S`` before its sample to the next sample is valid if the sample is in ``valid_samples``.
+        Any other time must lie between two valid samples.
         """
         step = np.append(self._step, 0.0)
         k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self._step) - 1)
@@ -143,10 +144,10 @@ class EncoderTrajectory:
         return np.where(near, self.valid_samples, self.valid_samples[k] & self.valid_samples[k + 1])
 
     def lagged(self, time: Values, lag: float) -> tuple[Values, Values]:
-        """Return the rate (deg/s) that a first-order lag shows, and its derivative (deg/s^2), at any times.
+        """Return the rate (deg/s) behind a first-order lag, and its derivative (deg/s^2), at any times.
 
-        A stretch ``r + a x`` leaves ``r + a (x - lag) + (L - r + a lag) exp(-x / lag)`` of what was shown before, L.
-        The time constant ``lag``, s, is above 0.
+        In a stretch with the rate ``r + a x``, the output is ``r + a (x - lag) + (L - r + a lag) exp(-x / lag)``, where
+        L is the output at x = 0. The time constant ``lag``, s, is above 0.
         """
         through = np.zeros(len(self.time))
         gain = np.zeros(len(self.time))
@@ -154,7 +155,7 @@ class EncoderTrajectory:
         everything = np.arange(len(self._step))
         through[1:], gain[1:] = self._lag_step(everything, self._step, lag)
         shown = through.copy()
-        for _ in range(len(shown)):  # each pass hands on what was shown one sample further; its weight dies out
+        for _ in range(len(shown)):  # each pass carries the output one sample further, with a weight that decays
             following = through + gain * np.concatenate([[0.0], shown[:-1]])
             settled = float(np.abs(following - shown).max()) <= LAG_ROUNDING_DPS
             shown = following
@@ -167,7 +168,7 @@ class EncoderTrajectory:
         return value, (self._piecewise(k, x)[1] - value) / lag
 
     def _lag_step(self, k: Index, x: Values, lag: float) -> tuple[Values, Values]:
-        """Return what a lag shows at x into intervals: a part of its own, and the factor on what it showed before."""
+        """Return the output of a lag at x into intervals: a value, and a factor on the output at x = 0."""
         a, b, s = self._before[k], self._after[k], self._bend[k]
         first, second = np.minimum(x, s), np.maximum(x - s, 0.0)
         fade, fade_after = np.exp(-first / lag), np.exp(-second / lag)
@@ -204,6 +205,6 @@ def nearest_slope(time: Values, values: Values) -> Values:
     for j in range(5):
         a, b, c, d = (t[m] for m in range(5) if m != j)
         spread = (t[j] - a) * (t[j] - b) * (t[j] - c) * (t[j] - d)
-        # derivative at 0 of (x - a) (x - b) (x - c) (x - d): the sum of its products that leave one factor out
+        # derivative at 0 of (x - a) (x - b) (x - c) (x - d): the sum of the products of three factors
         slope -= v[j] * (a * b * (c + d) + c * d * (a + b)) / spread
     return slope

@@ -1,11 +1,11 @@
-"""Formulas in named signals: parsed against a white list, compiled to numpy and to C, never run as Python.
+"""Parse formulas in named signals against a white list, and compile them to numpy and to C; never run them as Python.
 
     formula  := sum of products and powers of numbers, pi, signals and functions of formulas
     a ** b   :  b is a number, at most 20 in size; ** 2 and ** 3 are products, so that numpy and C agree to the last bit
 
-where a signal is one of ``SIGNALS`` and a function one of ``FUNCTIONS``. Python's own parser reads the text. The tree
-is translated node by node; an unknown name, an attribute, an index, a text, a keyword or a comparison is refused with
-its place.
+where a signal is one of ``SIGNALS`` and a function one of ``FUNCTIONS``. Python's parser reads the text. The tree is
+translated node by node. An unknown name, an attribute, an index, a text, a keyword or a comparison is refused with its
+position.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ if TYPE_CHECKING:
     Signals = Mapping[str, Values]
     Evaluate = Callable[[Signals], Any]
 
-LONGEST, DEEPEST, MOST_NODES, LARGEST_POWER = 500, 40, 200, 20.0  # far above any formula of physics; bound the cost
+LONGEST, DEEPEST, MOST_NODES, LARGEST_POWER = 500, 40, 200, 20.0  # above every shipped formula; they bound the cost
 
 
 class Signal(NamedTuple):
-    """A signal: its meaning, the field of ``Motion`` that holds it, where in it, and its name in ``calibration.h``.
+    """A signal: its meaning, the field of ``Motion`` that holds it, the index in that field, and its name in C.
 
-    No field: it is the sensor's own truth. No name in C: the log of a sensor does not hold it.
+    An empty ``field`` is the truth of the sensor. With an empty ``c`` (the name in ``calibration.h``), the log of a
+    sensor does not hold the signal.
     """
 
     meaning: str
@@ -73,7 +74,7 @@ OF_THE_MOTION = {name for name, signal in SIGNALS.items() if signal.field in MOV
 
 
 class Function(NamedTuple):
-    """A function: how many values it takes, what numpy and what C call."""
+    """A function: its number of arguments, its numpy function and its C expression."""
 
     takes: int
     numpy: Callable[..., Any]
@@ -92,9 +93,9 @@ def _band(x: Values, low: Values, high: Values) -> Values:
     return np.where(np.isnan(x), x, np.logical_and(x >= low, x <= high))
 
 
-_OF_THE_LIBRARY = (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt)
+_LIBRARY_FUNCTIONS = (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt)
 FUNCTIONS: dict[str, Function] = {
-    **{f.__name__: Function(1, f, f"(imu_real){f.__name__}({{}})") for f in _OF_THE_LIBRARY},
+    **{f.__name__: Function(1, f, f"(imu_real){f.__name__}({{}})") for f in _LIBRARY_FUNCTIONS},
     "sign": Function(1, np.sign, "(imu_real)imu_sign({})"),
     "radians": Function(1, np.radians, f"({{}} * (imu_real){np.pi / 180.0!r})"),
     "abs": Function(1, np.abs, "(imu_real)fabs({})"),
@@ -114,7 +115,7 @@ POWERS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of a name, 
     3.0: (_cube, "({0} * {0} * {0})", "imu_cube({0})"),
 }
 IN_C_ONCE = {f"(m->temperature - (imu_real){25.0!r})": "dt"}  # calibration.h has a name for it
-SIMPLE_IN_C = re.compile(r"[\w\[\]{}>-]+")  # a name: written out twice it costs nothing
+SIMPLE_IN_C = re.compile(r"[\w\[\]{}>-]+")  # a name: to evaluate it twice costs nothing
 STRANGE = re.compile(r"[^A-Za-z0-9_ .+\-*/(),]")
 HINTS = {
     "^": "; write ** for a power",
@@ -126,7 +127,7 @@ HINTS = {
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula as it was written, and the signals in it, ready to be evaluated."""
+    """A parsed formula: its text, the signals in it, and its compiled forms."""
 
     text: str
     signals: frozenset[str]
@@ -134,9 +135,9 @@ class Formula:
     _c: str
 
     def __call__(self, signals: Signals) -> Values:
-        """Return the value: an array of the shape that the signals broadcast to, 0-d where it names none.
+        """Return the value, in the shape to which the signals broadcast; 0-d where the formula names no signal.
 
-        What is not a number (``log(-1)``) comes out as NaN or infinite, without a warning.
+        Undefined values (``log(-1)``) are NaN or infinite, without a warning.
         """
         with np.errstate(all="ignore"):
             return np.asarray(self._evaluate(signals), np.float64)
@@ -147,10 +148,10 @@ class Formula:
 
 
 def parse(text: str, where: str | None = None) -> Formula:
-    """Read a formula; messages name ``where``, its file and line.
+    """Parse a formula; ``where``: its file and line, for messages.
 
-    Raises ``ConfigurationError`` if it is anything but numbers, signals and functions, too long or too deep; with the
-    position in the text.
+    Raises ``ConfigurationError`` with the position in the text if it contains anything but numbers, signals, functions
+    and operators, or is too long or too deeply nested.
     """
     line = " ".join(text.split())
     if not line:
@@ -178,7 +179,7 @@ def parse(text: str, where: str | None = None) -> Formula:
 
 
 class _Reader:
-    """Translates the tree of one formula into a function of numpy arrays and a C expression; notes its signals."""
+    """Translates the tree of one formula into a numpy function and a C expression; collects its signals."""
 
     def __init__(self, text: str, where: str | None) -> None:
         self.text, self.where = text, where

@@ -1,4 +1,4 @@
-"""The motion of the body that a table's log implies.
+"""Compute the motion of the body from the log of a table.
 
 A turn about body axis ``a`` by the angle ``A(t)``:
 
@@ -66,13 +66,13 @@ def normal_gravity_g(latitude_deg: float) -> float:
 
 
 def earth_of(table: Mapping[str, Any]) -> Values | None:
-    """Return Earth's rotation in the level frame, None where the table's latitude or azimuth is not set."""
+    """Return Earth's rotation in the level frame; None where the table's latitude or azimuth is not set."""
     latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
     return None if latitude is None or azimuth is None else earth_rate(float(latitude), float(azimuth))
 
 
 def table_motion(recording: Recording, table: Mapping[str, Any]) -> Motion | None:
-    """Return the motion by the table's log at its gravity, with Earth's rotation where that is known."""
+    """Return ``reference_motion`` with gravity, latitude and azimuth of a table's configuration."""
     one_shaft = table.get("azimuth_of") == "turn_axis"
     return reference_motion(recording, float(table.get("gravity_g") or 1.0), earth_of(table), one_shaft=one_shaft)
 
@@ -84,12 +84,12 @@ def reference_motion(
     *,
     one_shaft: bool = False,
 ) -> Motion | None:
-    """Return the motion that the table's log gives for a recording, or None where it gives none.
+    """Return the motion of a recording by the log of the table; None where the recording has no such log.
 
-    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``; it keeps the motion, whose arrays are
-    shared. ``earth_rate_level``: Earth's rotation in the level frame, (3,), deg/s; None leaves it out. ``one_shaft``:
-    whether level x is the axis about which the encoder counts right-handed, the same in all turns
-    (``table.azimuth_of``), and not the body's axis at angle 0. Raises ``InputError`` if there are too few samples to
+    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``. The motion is cached in the recording;
+    its arrays are shared. ``earth_rate_level``: Earth's rotation in the level frame, (3,), deg/s, or None.
+    ``one_shaft``: level x is the axis about which the encoder counts right-handed, the same in all turns
+    (``table.azimuth_of``), not the body axis at angle 0. Raises ``InputError`` if there are too few samples to
     differentiate the log.
     """
     if recording.axis is not None and recording.table_angle is not None:
@@ -157,7 +157,7 @@ def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
     log: EncoderTrajectory, axis: int, home: Values, gravity_g: float,
     offset: float | Values, lag: float,
 ) -> Motion:  # fmt: skip
-    """Return the motion of a turn at ``time + offset``, behind a lag."""
+    """Return the motion of a turn at ``time + offset``, filtered by a first-order lag in s."""
     angle, rate, acceleration = log.angle, log.rate, log.acceleration
     if np.any(offset):
         angle, rate, acceleration = log.at(log.time + offset)
@@ -188,9 +188,9 @@ def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
 def level_at_zero(axis: int, up: str = "", shaft: int = 0) -> Values:
     """Return the level axes in the body frame at table angle 0, as rows: (3, 3) array.
 
-    Where the turn axis stands vertical, ``up`` is the body axis, with its sign, that points up all the time; level x is
-    then the body axis after it in cyclic order. Where one level shaft turns the unit about each axis, level x is the
-    body axis times ``shaft``, 1 or -1, about which its encoder counts right-handed: the level frame stays in the room.
+    Where the turn axis is vertical, ``up`` is the body axis, with its sign, that always points up; level x is then the
+    next body axis in cyclic order. Where one level shaft turns the unit about each axis, level x is the body axis times
+    ``shaft``, 1 or -1, about which its encoder counts right-handed: the level frame is then fixed in the room.
     """
     if not up and not shaft:
         return np.asarray(LEVEL_AT_ZERO[axis])

@@ -1,4 +1,4 @@
-"""The motion and the temperature of a log by its own signals, causally: no sample depends on later ones.
+"""Compute the motion and the smoothed temperature of a log from its own signals; no sample depends on later ones.
 
     domega/dt[n] = (omega[n] - omega[n-1]) / (t[n] - t[n-1]),    df/dt likewise; 0 at the first sample
 
@@ -8,12 +8,12 @@ The temperature is smoothed by a line with exponentially decaying weights (expon
 
     T(t) = a,  (a, b) = argmin sum_i exp((t_i - t) / h) (T_i - a - b (t_i - t))^2,    t_i <= t
 
-where h is the memory, s. A ramp passes without lag; the thermometer's noise is averaged. The line follows from five
-sums, taken about the start ``o`` of the stretch of time in which the sample lies, a multiple of 4 h:
+where h is the memory, s. A ramp passes without lag, and the noise of the thermometer is averaged. Time is divided into
+stretches of 4 h. The line follows from five sums, taken about the start ``o`` of the stretch of the sample:
 
     S_k = sum_i exp((t_i - o) / h) (t_i - o)^k,   k = 0, 1, 2;    R_k likewise with T_i - 25 degC,   k = 0, 1
 
-Each sample adds its terms in its turn; where a stretch begins, the sums are moved to its start.
+The samples add their terms one by one; where a stretch begins, the sums are moved to its start.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 STRETCH = 4.0  # memories: exp(4) costs two digits of the sums; shorter stretches cost time
 FARTHEST = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
-DEGENERATE = 1e-15  # determinant over its scale, below which a double holds no slope
+DEGENERATE = 1e-15  # determinant over its scale, below which doubles do not resolve a slope
 SIGNALS = {
     "time": {"time"},
     "temperature": {"temperature"},
@@ -57,7 +57,7 @@ class LogEnd:
     direction: Values = field(default_factory=lambda: np.zeros(3))
 
     def after(self, motion: Motion, used: set[str]) -> LogEnd:
-        """Return the end of the next block; only what is used is kept."""
+        """Return the state at the end of the next block; only the ``used`` fields are stored."""
         force = _last_known(motion.time, motion.specific_force) if "specific_force_rate" in used else None
         rate = _last_known(motion.time, motion.angular_rate) if "angular_acceleration" in used else None
         direction = self.direction if motion.direction is None else motion.direction[-1]
@@ -78,9 +78,9 @@ def log_motion(
     used: set[str],
     end: LogEnd,
 ) -> Motion:
-    """Return the motion of a block; ``temperature`` is smoothed, ``end`` is of the block before.
+    """Return the motion of a block; ``temperature`` is smoothed already, ``end`` is the end of the block before.
 
-    Of the fields that are not ``used``, only those that cost nothing are filled.
+    Derivatives and direction are computed only where they are ``used``.
     """
     zeros = np.zeros_like(specific_force)
     rate = _difference(time, specific_force, end.force) if "specific_force_rate" in used else zeros
@@ -106,9 +106,9 @@ def log_motion(
 
 
 def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
-    """Return the fields of a motion that effects look at.
+    """Return the fields of a motion that effects depend on.
 
-    Raises ``ConfigurationError`` if one needs what no log of a sensor holds, such as a table's angle.
+    Raises ``ConfigurationError`` if one depends on a field that no log of a sensor holds, such as a table's angle.
     """
     seen: set[str] = set()
     for fitted in effects:
@@ -145,7 +145,7 @@ def _difference(time: Values, values: Values, before: Known | None) -> Values:
 
 
 class ExponentialRegression:
-    """Exponential regression of a temperature log with a memory in s."""
+    """Exponential regression of a temperature log; ``memory`` in s."""
 
     def __init__(self, memory: float) -> None:
         self.memory = memory
@@ -153,9 +153,9 @@ class ExponentialRegression:
         self._sums = np.zeros(5)
 
     def apply(self, time: Values, temperature: Values) -> Values:
-        """Return the line at each sample: (n,) array, degC; a row without a temperature (NaN) is given the line's.
+        """Return the line at each sample: (n,) array, degC; also where the temperature is missing (NaN).
 
-        Raises ``InputError`` if time goes back by more than the line can bear.
+        Raises ``InputError`` if time goes back by more than ``FARTHEST`` memories.
         """
         stretch = np.floor(time / (STRETCH * self.memory))
         cuts = np.flatnonzero(stretch[1:] != stretch[:-1]) + 1
@@ -166,10 +166,10 @@ class ExponentialRegression:
         return out
 
     def _move(self, stretch: float, time: float) -> None:
-        """Carry the sums over to the start of another stretch."""
+        """Move the sums to the start of another stretch."""
         step = (stretch - self._stretch) * (STRETCH * self.memory)
         self._stretch = stretch
-        if not abs(step) > 0.0 or not self._sums[0]:  # NaN: nothing is known yet
+        if not abs(step) > 0.0 or not self._sums[0]:  # NaN: no stretch yet
             return
         if step < -FARTHEST * self.memory:
             raise InputError(f"time goes back by {-step:.6g} s or so to {time:.6f} s; sort the log, or cut it there")
@@ -178,13 +178,13 @@ class ExponentialRegression:
         self._sums = np.exp(-step / self.memory) * np.array(moved)
 
     def _along(self, time: Values, temperature: Values) -> Values:
-        """Return the line within a stretch; of one known sample, its temperature."""
+        """Return the line within a stretch; from one known sample, its temperature."""
         at = time - self._stretch * (STRETCH * self.memory)
         missing = np.isnan(temperature)
-        above = np.where(missing, 0.0, temperature - REFERENCE_TEMPERATURE)
+        excess = np.where(missing, 0.0, temperature - REFERENCE_TEMPERATURE)
         weight = np.where(missing, 0.0, np.exp(at / self.memory))
-        leaned = weight * at
-        terms = np.array([weight, leaned, leaned * at, weight * above, leaned * above])
+        weighted_time = weight * at
+        terms = np.array([weight, weighted_time, weighted_time * at, weight * excess, weighted_time * excess])
         sums = np.add.accumulate(np.column_stack([self._sums, terms]), axis=1)[:, 1:]
         self._sums = sums[:, -1]
         s0, s1, s2, r0, r1 = sums

@@ -1,13 +1,13 @@
-"""The measurement equation of a sensor, forward and inverse.
+"""Evaluate and invert the measurement equation of a sensor.
 
     reading = bias + K @ truth + sum of effects,             K = matrix^-1
     truth = matrix @ (reading - bias - sum of effects(truth))
 
-The inverse is solved by fixed point, starting without the effects; each round gains about two digits, as effects are
-small. A sample that has settled is left alone, so that its result does not depend on the other samples. Only effects
-that belong to the sensor are subtracted; those of a mounting, a table or one recording do not exist in another log. The
-two sensors are solved together: a gyroscope's g-sensitivity needs the specific force, an accelerometer's inner lever
-arms the angular rate.
+The inverse is solved by fixed point, starting without the effects. Effects are small, so that each round gains about
+two digits. A converged sample is not changed any more: its result does not depend on the other samples. Only effects of
+the sensor are subtracted; effects of a mounting, a table or one recording do not occur in another log. The two sensors
+are solved together: a gyroscope's g-sensitivity needs the specific force, an accelerometer's inner lever arms need the
+angular rate.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 ROUNDS = 60  # two digits a round: far more than 1e-13 needs
 TOLERANCE = 1e-13  # relative: some hundred roundings of a double
-OUT_OF_REACH = 1e12  # g or deg/s: far beyond any reading, the fixed point runs away
+OUT_OF_REACH = 1e12  # g or deg/s: far beyond any reading, the fixed point diverges
 
 
 @dataclass(frozen=True)
 class Part:
-    """Effects with their values that are subtracted from the readings of a sensor, and K, the inverse of its matrix."""
+    """The effects, with their values, to subtract from the readings of a sensor; K is the inverse of its matrix."""
 
     calibration: SensorCalibration
     effects: tuple[tuple[Effect, Values], ...]
@@ -47,7 +47,7 @@ class Part:
         return cls(calibration, tuple((effect_of(e), e.values) for e in effects), inverse_of(calibration))
 
     def take_off(self, reading: Values, motion: Motion) -> Values:
-        """Return readings without what the effects add at a motion: (n, 3) array, g or deg/s."""
+        """Subtract the effects at a motion from readings: (n, 3) array, g or deg/s."""
         for effect, values in self.effects:
             reading = reading - effect.reading(self.calibration.sensor, motion, self.K, values)
         return reading
@@ -71,9 +71,9 @@ def compensate(
     motion: Motion,
     effects: Sequence[FittedEffect] | None = None,
 ) -> Values:
-    """Return the truth by (n, 3) readings; the rest of the motion is known.
+    """Return the truth of (n, 3) readings of one sensor; the other fields of the motion are known.
 
-    ``effects`` are subtracted, by default all of the calibration that belong to the sensor. Errors as of ``solve``.
+    ``effects``: those to subtract, by default all effects of the sensor. Errors as of ``solve``.
     """
     sensor = calibration.sensor
     own = "specific_force" if sensor == "accelerometer" else "angular_rate"
@@ -93,8 +93,8 @@ def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
 def solve(parts: Mapping[str, Part], readings: Truths, motion_at: Callable[[Truths, int], Motion]) -> Truths:
     """Solve the measurement equation of one or both sensors.
 
-    ``parts``: by sensor, the readings of one without are the truth; ``readings``: by sensor, (n, 3), g or deg/s, as the
-    result; ``motion_at``: returns the motion that given truths make, in a round counted from 0. Raises
+    ``parts``: by sensor; the readings of a sensor without a part are its truth. ``readings`` and result: by sensor,
+    (n, 3), g or deg/s. ``motion_at(truths, round)``: returns the motion for given truths; rounds count from 0. Raises
     ``ConvergenceError`` if a reading is so far out of range that the equation has no solution.
     """
     busy = {s: part for s, part in parts.items() if part.effects}
@@ -112,19 +112,19 @@ def solve(parts: Mapping[str, Part], readings: Truths, motion_at: Callable[[Trut
         truths |= moved
         if settled.all():
             return truths
-    _complain(truths, readings)
+    _raise_divergence(truths, readings)
     return truths
 
 
 def without_effects(parts: Mapping[str, Part], readings: Truths, motion: Motion) -> Truths:
-    """Return ``matrix @ (reading - bias - effects(motion))`` of each of the sensors in ``parts``."""
+    """Return ``matrix @ (reading - bias - effects(motion))`` for each sensor in ``parts``."""
     return {s: linear_truth(part.calibration, part.take_off(readings[s], motion)) for s, part in parts.items()}
 
 
 def linear_truth(calibration: SensorCalibration, reading: Values) -> Values:
     """Return ``matrix @ (reading - bias)``: (n, 3) array.
 
-    Each row's terms are added in their order, so that no rounding depends on how many samples there are.
+    The three products of a row are added in a fixed order, so that no rounding depends on the number of samples.
     """
     rest = reading - calibration.bias
     x, y, z = rest.T
@@ -140,13 +140,13 @@ def inverse_of(calibration: SensorCalibration) -> Values:
 
 
 def _near(new: Values, old: Values) -> Mask:
-    """Return which samples have not moved, relative to their size; a missing one stays missing: (n,) array."""
+    """Return which samples have converged, relative to their size; missing ones (NaN) count as such: (n,) array."""
     far = np.abs(new - old) > TOLERANCE * np.maximum(np.abs(new), 1.0)
     return np.logical_not(far[:, 0] | far[:, 1] | far[:, 2])
 
 
-def _complain(truths: Truths, readings: Truths) -> None:
-    """Name the reading for which the equation has no solution: the farthest out of range."""
+def _raise_divergence(truths: Truths, readings: Truths) -> None:
+    """Raise ``ConvergenceError`` with the largest reading of the sensor that diverged."""
     sensor = max(truths, key=lambda s: float(np.max(np.nan_to_num(np.abs(truths[s]), posinf=1e300))))
     size = np.nan_to_num(np.abs(readings[sensor]).max(axis=1))
     row = int(np.argmax(size))

@@ -1,8 +1,9 @@
-"""The figures of a sensor's file (``configs/sensor``): those of a range, and those that its data sheet does not state.
+"""Complete a sensor's file (``configs/sensor``): figures of a chosen range, and figures that its data sheet omits.
 
-``ranges`` maps a full scale to counts per unit; the override ``sensor.accelerometer.range=6`` stands for ``full_scale``
-and ``counts_per_unit`` of one of them. A figure that is null, or left out, is that of ``generic``, and its name stands
-in ``assumed``; so is the whole part of a sensor that the chip does not have. Full scale and counts are never assumed.
+``ranges`` maps a full scale to counts per unit; the override ``sensor.accelerometer.range=6`` sets ``full_scale`` and
+``counts_per_unit`` of that range. A figure that is null or absent is taken from ``generic``, and its name is listed in
+``assumed``. The same applies to all figures of a sensor that the chip does not have. Full scale and counts are never
+taken from ``generic`` for a sensor that the chip has.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ NEEDED = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor
 
 
 def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a sensor in which the figures of ``generic`` stand for those that are not stated."""
+    """Return a sensor's file in which figures that are not stated are taken from ``generic``."""
     out = dict(sensor)
     for part in SENSORS:
         sensor_config = dict(sensor.get(part) or {k: generic[part][k] for k in ("full_scale", "counts_per_unit")})
@@ -30,7 +31,7 @@ def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str
 
 
 def range_settings(key: str, value: Any, sensor: Mapping[str, Any]) -> list[tuple[str, Any]]:  # noqa: ANN401  (the user's)
-    """Return what an override stands for: itself, or the figures of the range that it chooses.
+    """Return the settings that an override makes: itself, or the figures of the range that it chooses.
 
     Raises ``ConfigurationError`` if the sensor's file does not list the range.
     """
@@ -47,9 +48,9 @@ def range_settings(key: str, value: Any, sensor: Mapping[str, Any]) -> list[tupl
 
 
 def settings_of_ranges(sensor: Mapping[str, Any], wanted: Sequence[float | None]) -> list[str]:
-    """Return the overrides that set the range of the accelerometer, g, then of the gyroscope, deg/s; None: as it is.
+    """Return the overrides that set the range of the accelerometer, g, then of the gyroscope, deg/s; None: unchanged.
 
-    They are ``range`` of a sensor whose file lists its ranges, else full scale and counts per unit. Raises
+    An override sets ``range`` where the sensor's file lists ranges, else full scale and counts per unit. Raises
     ``ConfigurationError`` if there are more ranges than sensors, one is not positive, or the file does not list it.
     """
     parts = [part for part in SENSORS if sensor.get(part)]
@@ -68,18 +69,18 @@ def settings_of_ranges(sensor: Mapping[str, Any], wanted: Sequence[float | None]
 
 
 def assumed_figures(name: str, sensor: Mapping[str, Any]) -> str:
-    """Return which figures of a ``completed`` sensor are those of ``generic``; empty for none."""
+    """Return the sentence that lists the figures of a ``completed`` sensor from ``generic``; empty for none."""
     parts = [f"{', '.join(found)} of the {part}" for part in SENSORS if (found := sensor[part].get("assumed"))]
     return f"the file of the sensor {name} does not state {', and '.join(parts)}: generic's are used" if parts else ""
 
 
 def as_stated(sensor_config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures that the sensor's file states; None for those of ``generic``."""
+    """Return the figures that the sensor's file states, and None for figures from ``generic``."""
     return {**sensor_config, **dict.fromkeys(sensor_config.get("assumed") or ())}
 
 
 def without_overridden(sensor: dict[str, Any], keys: set[str]) -> dict[str, Any]:
-    """Return a sensor in which what an override states (``sensor.gyroscope.bias``) is not assumed."""
+    """Remove figures that an override states (``sensor.gyroscope.bias``) from the ``assumed`` list of a sensor."""
     for part in SENSORS:
         sensor_config = sensor.get(part) if isinstance(sensor, dict) else None
         sensor_config = sensor_config if isinstance(sensor_config, dict) else {}

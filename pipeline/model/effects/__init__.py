@@ -1,8 +1,7 @@
-"""The catalogue of physical effects: every file of ``configs/effect/`` that ships is one.
+"""The catalogue of physical effects: one effect for each file of ``configs/effect/`` that is part of the package.
 
-``catalogue()`` finds the files. Effects of users have the same schema and are registered in the process that uses them.
-A YAML file is data: it is read within limits, and its formulas are parsed. A Python file is code and is run; only the
-command line can name one.
+Effects of users have the same schema and are registered in the process that uses them. A YAML file is data: it is read
+within size limits, and its formulas are parsed. A Python file is code and is run; only the command line can name one.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 
 FOLDER = CONFIGS / "effect"
 BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
-LARGEST_BYTES, LARGEST_SIZE = 16384, 1000  # of one file; the largest that ships has 2 kB and 70 values
+LARGEST_BYTES, LARGEST_SIZE = 16384, 1000  # of one file; the largest built-in one has 2 kB and 70 values
 OF_PYTHON = ("name", "owner", "layout", "meaning", "excitation", "experiment", "source")
 _registered: dict[str, Effect] = {}
 _left_out: set[str] = set()
@@ -53,23 +52,23 @@ def built_in() -> dict[str, Effect]:
 def catalogue() -> dict[str, Effect]:
     """Return every effect by name: the built-in ones in alphabetical order, then the registered ones."""
     every = {**built_in(), **_registered}
-    return {name: this for name, this in every.items() if name not in _left_out}
+    return {name: kind for name, kind in every.items() if name not in _left_out}
 
 
 @cache
 def bench_priors() -> dict[str, str]:
-    """Return the effects of the bench, each with the table's setting that states its standard deviation."""
-    return {name: this.prior for name, this in built_in().items() if this.prior}
+    """Return, by effect of the bench, the setting of the table that states its standard deviation."""
+    return {name: kind.prior for name, kind in built_in().items() if kind.prior}
 
 
 def stated_priors(table: Mapping[str, Any]) -> dict[str, float]:
-    """Return the effects of the bench whose standard deviation a table's config states, with that."""
+    """Return the standard deviation of each effect of the bench for which a table's config states one."""
     return {name: float(table[key]) for name, key in bench_priors().items() if table.get(key)}
 
 
 @contextmanager
 def leaving_out(names: Iterable[str]) -> Iterator[None]:
-    """Take effects out of the catalogue within a ``with`` block, as unknown effects in studies of the diagnosis."""
+    """Remove effects from the catalogue within a ``with`` block, to study the diagnosis of unknown effects."""
     fresh = set(names) - _left_out
     _left_out.update(fresh)
     try:
@@ -89,9 +88,9 @@ def register(effect: Effect) -> None:
 
 
 def register_user_effects(section: Mapping[str, Any]) -> None:
-    """Register the effects that a job's configuration carries: ``formulas`` and ``python`` (paths and hashes).
+    """Register the effects of a job's configuration: ``formulas`` and ``python`` (paths and hashes).
 
-    Raises ``ConfigurationError`` if one is not as it should be.
+    Raises ``ConfigurationError`` if one is faulty.
     """
     for definition in section.get("formulas", ()):
         register(effect_from(definition, f"effect {definition.get('name')} of the campaign"))
@@ -100,13 +99,13 @@ def register_user_effects(section: Mapping[str, Any]) -> None:
 
 
 def forget(*names: str) -> None:
-    """Take registered effects out of the catalogue again; all of them where none is named."""
+    """Remove registered effects from the catalogue; all of them where none is named."""
     for name in names or tuple(_registered):
         _registered.pop(name, None)
 
 
 def effect(name: str) -> Effect:
-    """Return one effect by name; ``<effect>@<setup>`` is that of one session (``pipeline.model.effects.mounting``).
+    """Return one effect by name; ``<effect>@<setup>`` acts in one session (``pipeline.model.effects.mounting``).
 
     Raises ``ConfigurationError`` if there is none of that name.
     """
@@ -120,9 +119,9 @@ def effect(name: str) -> Effect:
 
 
 def effect_of(fitted: FittedEffect) -> Effect:
-    """Return the effect that was fitted: from its own definition where it carries one, else from the catalogue.
+    """Return the effect that was fitted: from its stored definition where there is one, else from the catalogue.
 
-    Raises ``ConfigurationError`` if it was defined in Python and the file has not been named, or has changed.
+    Raises ``ConfigurationError`` if it is defined in a Python file that was not named, or has changed.
     """
     if fitted.definition is None:
         return effect(fitted.name)
@@ -142,7 +141,7 @@ def effect_of(fitted: FittedEffect) -> Effect:
 
 
 def owner_of(fitted: FittedEffect) -> str:
-    """Return whose a fitted effect is; a Python file need not be loaded for that."""
+    """Return the owner of a fitted effect, without loading its Python file."""
     if fitted.definition and "owner" in fitted.definition:
         return str(fitted.definition["owner"])
     return effect_of(fitted).owner
@@ -166,13 +165,13 @@ def _in_session(name: str) -> Effect:
 
 @cache
 def built_in_files() -> dict[str, Path]:
-    """Return the file of each effect that ships, by name; a user's file in the same folder is not one."""
+    """Return the file of each built-in effect, by name; a user's file in the same folder is none."""
     files = sorted(FOLDER.glob("*.yaml"))
     return {f.stem: f for f in files if BUILT_IN.search(f.read_text(encoding="utf-8", errors="replace"))}
 
 
 def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
-    """Return the effects of YAML files, by name.
+    """Read the effects of YAML files, by name.
 
     Raises ``ConfigurationError`` with a line for each faulty file.
     """
@@ -189,9 +188,9 @@ def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
 
 
 def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
-    """Return the effect of one YAML file.
+    """Read the effect of one YAML file.
 
-    Raises ``ConfigurationError`` if it is faulty, with the line.
+    Raises ``ConfigurationError`` with the faulty line.
     """
     text = read_text(file, LARGEST_BYTES, "an effect")
     given = load_yaml(text, str(file), LARGEST_SIZE)
@@ -231,8 +230,8 @@ def effect_from(
 def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
     """Run a Python file that the user has named, and return its ``EFFECT``.
 
-    ``sha256``: of the content that is expected. Raises ``MissingInputError`` if there is no such file,
-    ``ConfigurationError`` if its content differs, fails, or holds no effect of the file's name.
+    ``sha256``: of the expected content. Raises ``MissingInputError`` if there is no such file, ``ConfigurationError``
+    if its content differs, it fails, or it defines no effect of the file's name.
     """
     file = Path(path)
     if file.suffix != ".py" or not file.is_file():
@@ -258,7 +257,7 @@ def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
 
 
 class _ThisContent(InspectLoader):
-    """Loads the very bytes that were hashed; reads and writes no cache of compiled code."""
+    """Loads exactly the bytes that were hashed; reads and writes no cache of compiled code."""
 
     def __init__(self, content: bytes) -> None:
         self.content = content
@@ -269,7 +268,7 @@ class _ThisContent(InspectLoader):
 
 
 def _problem_of(found: object, name: str) -> str:
-    """Return why the ``EFFECT`` of a Python file cannot be used; empty where it can."""
+    """Return why the ``EFFECT`` of a Python file is unusable; empty if it is usable."""
     if not isinstance(found, Effect):
         return (
             "holds no effect: EFFECT = MyEffect() is expected, of a class derived from "
@@ -286,7 +285,7 @@ def _problem_of(found: object, name: str) -> str:
 
 
 def _lines(text: str) -> dict[tuple[str, ...], int]:
-    """Return the line of each key of a YAML text, by the keys from the top."""
+    """Return the line of each key of a YAML text, by the path of keys to it."""
     found: dict[tuple[str, ...], int] = {}
     todo: list[tuple[tuple[str, ...], yaml.Node | None]] = [((), yaml.compose(text, yaml.SafeLoader))]
     for path, node in todo:  # the list grows while it is walked

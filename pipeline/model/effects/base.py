@@ -1,9 +1,9 @@
-"""The interface of an effect: what every physical effect on the readings of a sensor provides.
+"""The interface of a physical effect on the readings of a sensor.
 
     reading = bias + K @ truth + z(motion, K; p),    K = matrix^-1
 
-where ``p`` are the parameters of the effect and ``z`` vanishes at ``p = 0``. An effect provides z and dz/dp for a
-motion without noise, so that its fit is linear wherever the physics is.
+where ``p`` are the parameters of the effect and ``z`` is 0 at ``p = 0``. An effect provides z and dz/dp for a motion
+without noise.
 
 Effects of timing change the motion instead: ``reading(t) = bias + K @ truth' + z(motion')``, where the primed motion
 acts on the sensor at the sample's time stamp (``Effect.moved``).
@@ -34,7 +34,7 @@ TURNING_DPS = 0.25  # above a gyroscope's noise and residual bias, below a slow 
 
 
 class Owner(StrEnum):
-    """Whose an effect is; only the sensor's are compensated in field logs."""
+    """Where an effect originates; only effects of the sensor are compensated in field logs."""
 
     SENSOR = "sensor"
     RECORDING = "recording"
@@ -45,8 +45,8 @@ class Owner(StrEnum):
 class Layout(StrEnum):
     """How regressors act on the three axes."""
 
-    PER_AXIS = "per_axis"  # (n, 3, q): each axis has q regressors and q coefficients of its own
-    EVERY_AXIS = "every_axis"  # (n, q): the same q regressors for each axis, with coefficients of its own
+    PER_AXIS = "per_axis"  # (n, 3, q): each axis has separate q regressors and q coefficients
+    EVERY_AXIS = "every_axis"  # (n, q): the same q regressors for each axis, with separate coefficients
     SHARED = "shared"  # (n, 3, p): p coefficients that the axes share
 
 
@@ -70,19 +70,19 @@ class Effect(abc.ABC):
     needs_clock: bool = False  # the time between the recordings must be known
     needs_motion: bool = False  # it adds nothing while the body rests
     needs_both_directions: bool = False  # turns in one direction show it as a part of bias and matrix
-    of_turns: bool = False  # it has parameters of its own for each recording of a turn
+    of_turns: bool = False  # it has separate parameters for each recording of a turn
     nonlinear: tuple[str, ...] = ()  # parameters in which the reading is not linear
-    prior: str = ""  # setting of the table that puts it into the model: standard deviation of its parameters
+    prior: str = ""  # setting of the table that adds it to the model: standard deviation of its parameters
     contains: tuple[str, ...] = ()  # effects of which this is a generalisation; the two are never fitted together
-    unseen: Mapping[str, str] = MappingProxyType({})  # sensor to the reason why its readings never change
+    unseen: Mapping[str, str] = MappingProxyType({})  # sensor to the reason why the effect never changes its readings
     meaning: str  # one sentence for the reader of a report
-    excitation: str  # advice: what a recording must do for this effect to show
-    experiment: str  # advice: what separates it from its look-alikes
+    excitation: str  # advice: the motion or temperature that makes this effect observable
+    experiment: str  # advice: the experiment that distinguishes it from effects with similar signals
     experiment_by_hand: str = ""  # the same without a table, where that is another experiment
     source: str  # of the equation
-    typical_share: float = 0.5  # size of a simulated effect as a share of its limits, where none is given
-    proposed: bool = False  # recording what shows it is the first advice where it is not observable
-    definition: dict[str, Any] | None = None  # of a user's effect, its file; every calibration with the effect holds it
+    typical_share: float = 0.5  # default size of a simulated effect, as a share of its limits
+    proposed: bool = False  # where it is not observable, the first advice is to record what shows it
+    definition: dict[str, Any] | None = None  # content of a user's file; stored in every calibration with the effect
 
     @abc.abstractmethod
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
@@ -102,8 +102,8 @@ class Effect(abc.ABC):
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return what the effect adds to the reading: (n, 3) array, g or deg/s.
 
-        Linear effects have ``columns @ values``; the others override this with the exact value. The terms are added
-        in their order, sample by sample, so that no rounding depends on how many samples there are.
+        Linear effects return ``columns @ values``; the others override this with the exact value. The terms are added
+        in a fixed order, sample by sample, so that no rounding depends on the number of samples.
         """
         regressors = self.regressors(sensor, motion, K, values)
         if self.layout == Layout.EVERY_AXIS:
@@ -115,7 +115,7 @@ class Effect(abc.ABC):
         return added
 
     def of_recordings(self, setups: Mapping[str, str]) -> Effect:
-        """Return the effect with its parameters in these recordings, name to setup; most have the same in all."""
+        """Return the effect with its parameters for these recordings (name to setup); most have one set for all."""
         del setups
         return self
 
@@ -125,7 +125,7 @@ class Effect(abc.ABC):
         return motion
 
     def slope(self, sensor: str, moved: Motion) -> Values | None:
-        """Return du/dp of an effect of timing with one parameter p, from the moved motion alone; None: not so."""
+        """Return du/dp of an effect of timing with one parameter p, from the moved motion; None for other effects."""
         del sensor, moved
         return None
 
@@ -140,40 +140,40 @@ class Effect(abc.ABC):
         return (self.needs_clock or "temperature" in self.needs) and not self.moves
 
     def of_the_room(self, sensor: str) -> bool:
-        """Whether the effect follows the time and the temperature alone: it adds to the bias."""
+        """Whether the effect depends on time and temperature only: it adds to the bias."""
         return self.uses_time_or_temperature and self.fields(sensor, self.starts(sensor)[0]) <= OF_THE_ROOM
 
     def starts(self, sensor: str) -> list[Values]:
-        """Return the values from which a fit starts, several where the reading is not linear in them."""
+        """Return the values from which a fit starts; several where the reading is not linear in the parameters."""
         return [np.zeros(len(self.parameters(sensor)))]
 
     def stepped(self, values: Values, step: Values) -> Values:
-        """Return ``values + step``, as far as the parameters may go in one round of a nonlinear fit."""
+        """Return ``values + step``, limited to the change allowed in one round of a nonlinear fit."""
         return values + step
 
     def fields(self, sensor: str, values: Values) -> set[str]:
-        """Return the fields of ``Motion`` that the reading depends on: those that are read while it is computed."""
+        """Return the fields of ``Motion`` that the reading depends on, by recording which are read."""
         seen: set[str] = set()
         self.reading(sensor, _watched(seen), np.eye(3), values)
         return seen | set(self.needs)
 
     def in_c(self, values: Values) -> list[str] | None:
-        """Return what is added to each axis as C expressions in the names of ``calibration.h``; None: not in C."""
+        """Return a C expression for each axis, in the names of ``calibration.h``; None if there is none."""
         del values
         return None
 
     def limits(self, sensor: str) -> dict[str, float]:
-        """Return the largest plausible sizes that the effect brings itself, keyed as those of the sensor file."""
+        """Return the largest plausible sizes by the effect's file, with the keys of the sensor file."""
         del sensor
         return {}
 
     def available(self, motion: Motion) -> bool:
-        """Return whether the motion holds what the effect needs."""
+        """Return whether the motion has all fields that the effect needs."""
         return all(getattr(motion, need) is not None for need in self.needs)
 
 
 def _watched(seen: set[str]) -> Motion:
-    """Return a motion of two samples that notes which of its fields are read."""
+    """Return a motion of two samples that adds each field that is read to ``seen``."""
     names = {f.name for f in fields(Motion)}
 
     class Watched(Motion):
@@ -198,16 +198,16 @@ def truth_rate(sensor: str, motion: Motion) -> Values:
 
 
 def length(vectors: Values) -> Values:
-    """Return the length of each vector, its squares added in the order x, y, z: (n,) array."""
+    """Return the length of each vector, with the squares added in the order x, y, z: (n,) array."""
     x, y, z = vectors[:, 0], vectors[:, 1], vectors[:, 2]
     return np.asarray(np.sqrt(x * x + y * y + z * z), np.float64)
 
 
 def turning_direction(motion: Motion) -> Values:
-    """Return the unit vector of the turn that goes on or, at rest, of the last one: (n, 3) array, body frame.
+    """Return the unit vector of the present turn or, at rest, of the last turn: (n, 3) array, body frame.
 
-    A table turns where its rate or its angle changes (a step may lie between two samples), any other body where it
-    turns faster than 0.25 deg/s.
+    A table turns where its rate exceeds that of a rest or its angle changes (a step may lie between two samples). Any
+    other body turns where its rate exceeds 0.25 deg/s.
     """
     if motion.direction is not None:
         return motion.direction
@@ -253,7 +253,7 @@ def unit_of(sensor: str) -> str:
 
 
 def largest_by_unit(limits: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Return the largest of some limits ``{parameter: {value, unit}}`` of each unit."""
+    """Return the largest limit for each unit, from ``{parameter: {value, unit}}``."""
     found: dict[str, float] = {}
     for limit in limits.values():
         found[limit["unit"]] = max(limit["value"], found.get(limit["unit"], 0.0))
@@ -263,15 +263,15 @@ def largest_by_unit(limits: Mapping[str, Mapping[str, Any]]) -> dict[str, float]
 def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -> Values:
     """Return the limit of each parameter's absolute value: (p,) array, infinite where there is none.
 
-    ``limits`` are the ``effects`` of the sensor's configuration; where they do not name the effect, those of its file
-    count. A limit of ``<effect>_<parameter>`` or of ``<effect>_<parameter without its axis>`` precedes that of the
-    effect. An effect in one session has the limits of the effect.
+    ``limits`` are the ``effects`` of the sensor's configuration; where they do not name the effect, the limits of its
+    file apply. A limit of ``<effect>_<parameter>`` or ``<effect>_<parameter without its axis>`` takes precedence over
+    the limit of ``<effect>``. An effect in one session (``<effect>@<setup>``) has the limits of the effect.
     """
-    found, own = [], effect.name.partition("@")[0]
-    if own not in limits:
+    found, base_name = [], effect.name.partition("@")[0]
+    if base_name not in limits:
         limits = {**effect.limits(sensor), **limits}
     for parameter in effect.parameters(sensor):
         symbol = parameter.name.rpartition("_")[0]
-        names = (f"{own}_{parameter.name}", f"{own}_{symbol}", own)
+        names = (f"{base_name}_{parameter.name}", f"{base_name}_{symbol}", base_name)
         found.append(next((float(limits[name]) for name in names if name in limits), np.inf))
     return np.array(found)

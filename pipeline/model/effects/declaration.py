@@ -1,4 +1,4 @@
-"""The file of an effect, read and checked. Built-in effects and those of users have one schema.
+"""Read and check the file of an effect. Built-in effects and effects of users have the same schema.
 
     name: gear_mesh                 # the file's stem
     owner: table                    # sensor (compensated in field logs), recording, mounting or table
@@ -7,10 +7,10 @@
     terms:                          # the effect is the sum of coefficient times formula
       A: {formula: "cos(5 * radians(angle))", unit: deg/s}
 
-A ``formula`` is a text (for each axis, with a coefficient for each: A_x, A_y, A_z), a mapping of x, y and z (likewise,
-with a formula for each axis), or a list of three (a vector with one coefficient). A star in the name of a term stands
-for the axis (``G_*x``: G_xx, G_yx, G_zx). ``docs/effects_of_your_own.md`` lists all keys. A built-in effect that no
-formula can state names its class (``python: timing.TimeOffset``) and ``parameters``.
+A ``formula`` is one of three forms: a text (the same formula for each axis, with coefficients A_x, A_y, A_z), a mapping
+of x, y and z (a formula and a coefficient for each axis), or a list of three (a vector with one coefficient). A star in
+the name of a term stands for the axis (``G_*x``: G_xx, G_yx, G_zx). ``docs/effects_of_your_own.md`` lists all keys. A
+built-in effect that no formula can express states its class (``python: timing.TimeOffset``) and its ``parameters``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
 TERM = re.compile(r"[A-Za-z](?=.{0,19}$)[A-Za-z0-9_]*\*?[A-Za-z0-9_]*")
 RESERVED = ("auto", "all", "none")
-MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30  # above every shipped effect; they bound pages and fits
+MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30  # above every built-in effect; they limit pages and fits
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Term:
 
     unit: str | dict[str, str]  # of the coefficient, for both sensors or by sensor
     meaning: str = ""
-    formulas: dict[str, Formula] = field(default_factory=dict)  # by axis, "" every axis; none: of an effect in Python
+    formulas: dict[str, Formula] = field(default_factory=dict)  # by axis, "": every axis; none for an effect in Python
     shared: bool = False  # the formulas are a vector with one coefficient
 
     @property
@@ -52,18 +52,18 @@ class Term:
 
     @property
     def by_axis(self) -> bool:
-        """Whether its value differs between the axes."""
+        """Whether the value differs between the axes."""
         return len(self.formulas) > 1 or "u" in self.signals
 
     @property
     def text(self) -> str:
-        """The formulas as they were written."""
+        """The text of the formulas."""
         return ", ".join(formula.text for formula in self.formulas.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Declaration:
-    """What the file of an effect says."""
+    """The checked content of the file of an effect."""
 
     name: str
     owner: Owner
@@ -87,7 +87,7 @@ class Declaration:
     parameters: dict[str, Term] = field(default_factory=dict)
 
     def coefficients(self, term: str) -> list[tuple[str, str]]:
-        """Return axis and name of a term's coefficients; no axis where the axes share one."""
+        """Return axis and name of each coefficient of a term; the axis is empty where the axes share a coefficient."""
         if "*" in term:
             return [(a, term.replace("*", a)) for a in self.axes]
         if term in self.terms and not self.terms[term].shared:
@@ -95,7 +95,7 @@ class Declaration:
         return [("", term)]
 
     def parameters_of(self, sensor: str) -> tuple[Parameter, ...]:
-        """Return the coefficients: axis by axis those that each axis has of its own, then those that the axes share."""
+        """Return the coefficients: those of x, of y, of z, then the shared ones."""
         found: dict[str, list[Parameter]] = {axis: [] for axis in (*self.axes, "")}
         for name, term in {**self.terms, **self.parameters}.items():
             unit = term.unit if isinstance(term.unit, str) else term.unit[sensor]
@@ -109,11 +109,11 @@ def read_declaration(
     given: Mapping[str, Any], where: str, lines: Callable[[], Mapping[tuple[str, ...], int]] = dict, *,
     built_in: bool = False,
 ) -> Declaration:  # fmt: skip
-    """Check what a file says of an effect.
+    """Check the content of an effect's file.
 
-    ``where``: the file, for messages; ``lines``: returns the line of each key, by the keys from the top, for a message
-    alone; ``built_in``: whether the file may name a class and its ``parameters``. Raises ``ConfigurationError`` at the
-    first thing that is wrong, with file, line, and what is expected.
+    ``where``: the file, for messages; ``lines``: returns the line of each key, called for a message only; ``built_in``:
+    whether the file may name a class and its ``parameters``. Raises ``ConfigurationError`` at the first fault, with
+    file, line, and what is expected.
     """
     checks = {**CHECKS, **BUILT_IN_CHECKS} if built_in else CHECKS
     try:
@@ -168,7 +168,7 @@ def _size(given: object) -> float:
 
 
 def _formulas(given: Any) -> dict[str, Formula]:  # noqa: ANN401
-    """Return the formula of each axis, or of all of them."""
+    """Return the formula of each axis, or one under the key "" for all axes."""
     if not isinstance(given, (dict, list)):
         return {"": _formula(given)}
     texts = dict(zip(AXES, given, strict=False)) if isinstance(given, list) else given
@@ -221,7 +221,7 @@ BUILT_IN_CHECKS: dict[str, Check] = {
 
 
 def _check_consistency(declared: Declaration) -> None:
-    """Refuse the first part that contradicts another."""
+    """Raise ``WrongValueError`` for the first part that contradicts another."""
     terms = declared.terms
     if not (declared.python or 1 <= len(terms) <= MOST_TERMS):
         raise WrongValueError(f"{len(terms)} terms; from 1 to {MOST_TERMS} are expected", "terms")
@@ -243,13 +243,13 @@ def _check_consistency(declared: Declaration) -> None:
 
 
 def _check_sensors(declared: Declaration, given: object, what: str, *path: str) -> None:
-    """Refuse a mapping that does not hold a value for each sensor of the effect."""
+    """Raise ``WrongValueError`` if a mapping does not have one value for each sensor of the effect."""
     if isinstance(given, dict) and set(given) != set(declared.sensors):
         raise WrongValueError(f"a {what} for each of {', '.join(declared.sensors)} is expected", *path)
 
 
 def _wrong_term(declared: Declaration, name: str, term: Term) -> str:
-    """Return how one term contradicts the rest of the file."""
+    """Return how a term contradicts the rest of the file; empty if it does not."""
     if not term.signals:
         return "the formula names no signal: a constant is the bias, which is fitted anyway"
     not_in_a_log = sorted(s for s in term.signals if not SIGNALS[s].c)

@@ -1,11 +1,11 @@
-"""Effects whose terms are formulas: compiled to numpy for the fit, to C for ``calibration.h``.
+"""Evaluate effects whose terms are formulas: by numpy in the fit, as C in ``calibration.h``.
 
     z_c = sum over terms of p_tc h_t(signals)          (a coefficient for each axis c in ``axes``)
         + sum over vector terms of p_t h_tc(signals)   (one coefficient for all axes)
 
-where p are the coefficients, which are fitted, and h formulas in the signals of ``pipeline.model.formula``; those of
-the table's angle and rate count 0 in a recording without a turn axis. With ``adds_to: truth`` the terms change the
-specific force or the rate itself; the reading changes by K times that, K the inverse of the calibration matrix.
+where p are the coefficients, which are fitted, and h are formulas in the signals of ``pipeline.model.formula``. A
+formula with the table's angle or rate is 0 in a recording without a turn axis. With ``adds_to: truth`` the terms change
+the specific force or the rate; the reading changes by K times the terms, with K the inverse of the calibration matrix.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ TRUTHS = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
 
 
 class DeclaredEffect(Effect):
-    """An effect whose name, owner, parameters and texts are those of a file; its equation is a subclass.
+    """An effect with name, owner, parameters and texts from a file; a subclass has its equation.
 
-    ``definition``: of a user's effect, the content of the file.
+    ``definition``: the content of the file of a user's effect.
     """
 
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
@@ -49,7 +49,7 @@ class DeclaredEffect(Effect):
         return self._parameters[sensor]
 
     def limits(self, sensor: str) -> dict[str, float]:
-        """Return the limits that the file declares, keyed as those of a data sheet; its own name: the largest."""
+        """Return the declared limits as ``<effect>_<parameter>``, and under ``<effect>`` the largest of them."""
         sizes: dict[str, float] = {}
         for term, size in self.declared.limits.items():
             names = [name for _, name in self.declared.coefficients(term)] if "*" in term else [term]
@@ -63,7 +63,7 @@ class FormulaEffect(DeclaredEffect):
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
         super().__init__(declared, definition)
         terms = list(declared.terms.values())
-        self._own, self._shared = [t for t in terms if not t.shared], [t for t in terms if t.shared]
+        self._by_axis, self._shared = [t for t in terms if not t.shared], [t for t in terms if t.shared]
         self._names = sorted({signal for term in terms for signal in term.signals})
         fields = {SIGNALS[name].field for name in self._names}
         self.needs = tuple(field for field in NEEDED if field in fields)
@@ -85,11 +85,11 @@ class FormulaEffect(DeclaredEffect):
         return {SIGNALS[signal].field or TRUTHS[sensor] for signal in self._names}
 
     def in_c(self, values: Values) -> list[str]:
-        """Return the sum on each axis as a C expression, its terms in the order of ``reading``."""
+        """Return the sum for each axis as a C expression, with the terms in the order of ``reading``."""
         rows: dict[str, list[str]] = {axis: [] for axis in AXES}
         coefficients = iter(values.tolist())
         for axis in (*self.declared.axes, ""):
-            for term in self._own if axis else self._shared:
+            for term in self._by_axis if axis else self._shared:
                 factor = c_number(next(coefficients))
                 for a in axis or AXES:
                     formula = term.formulas.get(a) or term.formulas[""]
@@ -97,14 +97,14 @@ class FormulaEffect(DeclaredEffect):
         return [" + ".join(products) or "0" for products in rows.values()]
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the formulas' values in the shape of the layout.
+        """Return the values of the formulas in the shape of the layout.
 
-        Raises ``InputError`` if a value is not finite where its signals are, or the recording does not hold a signal.
+        Raises ``InputError`` if a value is not finite where its signals are finite, or the recording lacks a signal.
         """
         del values
         signals = {name: self._signal(name, sensor, motion) for name in self._names}
         own, shared = (
-            [_value(term, signals, len(motion.time)) for term in terms] for terms in (self._own, self._shared)
+            [_value(term, signals, len(motion.time)) for term in terms] for terms in (self._by_axis, self._shared)
         )
         out = np.concatenate(own, axis=1) if self.layout == Layout.EVERY_AXIS else _stacked(own, len(motion.time))
         if self.layout == Layout.SHARED:
@@ -119,23 +119,23 @@ class FormulaEffect(DeclaredEffect):
         if self.layout == Layout.SHARED:
             return super().reading(sensor, motion, K, values)
         signals = {name: self._signal(name, sensor, motion) for name in self._names}
-        added, product = np.zeros((2, 3, len(motion.time))).transpose(0, 2, 1)  # axis by axis in memory: fast in logs
-        for term, coefficients in zip(self._own, values.reshape(3, -1).T, strict=True):
+        added, product = np.zeros((2, 3, len(motion.time))).transpose(0, 2, 1)  # contiguous axis by axis: faster
+        for term, coefficients in zip(self._by_axis, values.reshape(3, -1).T, strict=True):
             added += np.multiply(_value(term, signals, len(motion.time)), coefficients, out=product)
         if not np.isfinite(added).all():
             self._check_finite(signals, motion)
         return added
 
     def _signal(self, name: str, sensor: str, motion: Motion) -> Values | None:
-        """Return a signal: (n, 1) array, u of all axes: (n, 3); None: the angle or rate where there is no turn axis."""
+        """Return a signal, (n, 1) array; (n, 3) for u; None for the angle or rate where there is no turn axis."""
         if name == "u":
             return truth(sensor, motion)
         if name == "speed":
             return length(motion.angular_rate)[:, None]
         field, place = SIGNALS[name].field, SIGNALS[name].place
-        found: Values | None = turning_direction(motion) if field == "direction" else getattr(motion, field)
-        if found is not None:
-            return found[(slice(None), *place, None)]
+        values: Values | None = turning_direction(motion) if field == "direction" else getattr(motion, field)
+        if values is not None:
+            return values[(slice(None), *place, None)]
         if name in OF_THE_TURN:
             return None
         raise InputError(
@@ -144,8 +144,8 @@ class FormulaEffect(DeclaredEffect):
         )
 
     def _check_finite(self, signals: dict[str, Any], motion: Motion) -> None:
-        """Refuse a formula that is not finite where its signals are."""
-        for axis, formula in (each for term in (*self._own, *self._shared) for each in term.formulas.items()):
+        """Raise ``InputError`` for a formula that is not finite where its signals are finite."""
+        for axis, formula in (each for term in (*self._by_axis, *self._shared) for each in term.formulas.items()):
             own = {name: signal for name, signal in _of_axis(signals, axis).items() if name in formula.signals}
             if any(signal is None for signal in own.values()):
                 continue
@@ -161,13 +161,13 @@ class FormulaEffect(DeclaredEffect):
 
 
 def _of_axis(signals: dict[str, Any], axis: str) -> dict[str, Any]:
-    """Return the signals of one axis, of all where none is named."""
+    """Return the signals with u of one axis; of all axes if ``axis`` is empty."""
     c = AXES.index(axis) if axis else 0
     return {**signals, "u": signals["u"][:, c : c + 1]} if axis and "u" in signals else signals
 
 
 def _value(term: Term, signals: dict[str, Any], n: int) -> Values:
-    """Return a term's value, (n, 1) or (n, 3) array; zeros where the motion lacks a signal of the turn."""
+    """Return a term's value, (n, 1) or (n, 3) array; zeros where the motion has no turn axis for its signals."""
     parts = []
     for axis, formula in term.formulas.items():
         lacking = any(signals[name] is None for name in formula.signals)
@@ -177,7 +177,7 @@ def _value(term: Term, signals: dict[str, Any], n: int) -> Values:
 
 
 def _stacked(values: list[Values], n: int) -> Values:
-    """Return q values of (n, 1) or (n, 3) as an (n, 3, q) array."""
+    """Stack q arrays, (n, 1) or (n, 3), to an (n, 3, q) array."""
     out = np.empty((n, 3, len(values)))
     for j, value in enumerate(values):
         out[:, :, j] = value

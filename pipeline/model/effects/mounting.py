@@ -1,28 +1,29 @@
-"""Effects of a recording or a session: rotations of its mounting, and zeros of the table's angle.
+"""Effects in a recording or a session: rotations of its mounting, and zeros of the table's angle.
 
     mounting:      u' = exp([theta_k]x)^T u,   theta_k the rotation of the unit in recording or setup k, body frame
     encoder_zero:  u' = exp([zero_k e_a]x) u,  e_a the axis of turn k: the unit is at A - zero_k where the log says A
 
 and ``reading = b + K u' + ...`` with u the truth by the log. Both have parameters for each recording, so that they are
-bound to the recordings of a unit before they are fitted (``Effect.of_recordings``). They change the whole motion, so
-that the other effects act on what the rotated sensor senses.
+bound to the recordings of a unit before they are fitted (``Effect.of_recordings``). They change the whole motion: the
+other effects act on the motion in the frame of the rotated sensor.
 
-A rotation that all recordings share is a part of K. A prior chooses it: ``theta_k ~ N(0, s^2)``, so that the frame of
-the calibration is the mean of the mountings. Gravity determines the others: in turns about three axes, the constant and
-the two first harmonics of the accelerometer are 27 numbers against 9 of K, 3 of b and 6 of the mountings.
+A rotation that all recordings share cannot be distinguished from K. The prior ``theta_k ~ N(0, s^2)`` determines it:
+the frame of the calibration is then the mean of the mountings. Gravity determines the other rotations: in turns about
+three axes, the constant and the two first harmonics of the accelerometer are 27 numbers for 9 parameters of K, 3 of b
+and 6 of the mountings.
 
-An effect of one session is that of one table, mounting or switching-on, where the recordings come from several:
+Where the recordings come from several tables, mountings or switchings-on (sessions), an effect can act in one session:
 
     z = z_effect in the recordings of that session, 0 in the others
 
-A procedure names the session of each recording (``setup``); ``<effect>@<setup>`` is the effect there. Recordings of
-several sessions then give one estimate of a sensor and the errors of each table. Two effects exist in a session only;
-in a single session they are part of the matrix and of the bias:
+A procedure names the session of each recording (``setup``); ``<effect>@<setup>`` is the effect in that session.
+Recordings of several sessions then give one estimate of a sensor, and the errors of each table. Two effects exist only
+as effects of a session, because in a single session they are part of the matrix and of the bias:
 
     mounting : z = K (exp([theta]x)^T - 1) u: the unit is rotated by the vector theta, deg, against the other sessions
     bias     : z = db: the bias has changed, as after switching off and on
 
-One session is without them: the reference of the others. The leans of a table's axes contain the mounting.
+One session, the reference, has neither of them. The leans of a table's axes contain the mounting.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "specific_f
 
 
 def rotated(motion: Motion, rotation: Values) -> Motion:
-    """Return a motion whose vectors in the body frame are rotated, by (3, 3), now and at any offset in time."""
+    """Rotate the vectors of a motion in the body frame by a (3, 3) matrix, also at offsets in time."""
     found: dict[str, Any] = {n: v @ rotation.T for n in VECTORS if (v := getattr(motion, n)) is not None}
     for name in ("at_offset", "at_lag"):
         trajectory = getattr(motion, name)
@@ -99,12 +100,12 @@ class _OfRecordings(DeclaredEffect):
         return bound
 
     def owner_of(self, recording: str, setup: str) -> str:
-        """Return what has the parameters of a recording: the recording itself."""
+        """Return the name under which a recording has parameters: its own."""
         del setup
         return recording
 
     def covers(self, motion: Motion) -> bool:
-        """Return whether there are parameters for a recording."""
+        """Return whether there are parameters for the recording of a motion."""
         return self.owner_of(motion.recording, motion.setup) in self.recordings
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
@@ -122,13 +123,13 @@ class _OfRecordings(DeclaredEffect):
 
     def moved(self, motion: Motion, values: Values) -> Motion:
         """Return the motion in the frame of the rotated unit."""
-        own = self._own(motion)
+        own = self._place(motion)
         return rotated(motion, self.rotation(motion, values[own])) if own.stop and np.any(values[own]) else motion
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the derivative of ``K u'`` with respect to each parameter, zeros for the other recordings."""
         columns = np.zeros((len(motion.time), 3, len(values)))
-        own = self._own(motion)
+        own = self._place(motion)
         if own.stop:
             columns[:, :, own] = rotation_columns(sensor, motion, K, partial(self.rotation, motion), values[own])
         return columns
@@ -137,8 +138,8 @@ class _OfRecordings(DeclaredEffect):
         """Return ``K (u' - u)``."""
         return np.asarray((truth(sensor, self.moved(motion, values)) - truth(sensor, motion)) @ K.T)
 
-    def _own(self, motion: Motion) -> slice:
-        """Return the place of a recording's parameters; empty where it has none."""
+    def _place(self, motion: Motion) -> slice:
+        """Return the slice of the parameters of a motion's recording; empty where it has none."""
         if not self.covers(motion):
             return slice(0, 0)
         size = len(self.suffixes)
@@ -147,13 +148,13 @@ class _OfRecordings(DeclaredEffect):
 
 
 class Mounting(_OfRecordings):
-    """The rotation of the unit in each recording, one for all recordings of a setup: three parameters each."""
+    """The rotation of the unit in each recording, or in all recordings of a setup: three parameters each."""
 
     suffixes = ("_x", "_y", "_z")
     what = "rotation of the unit"
 
     def owner_of(self, recording: str, setup: str) -> str:
-        """Return the setup, or the recording where none is named."""
+        """Return the setup, or the recording where no setup is named."""
         return setup or recording
 
     def rotation(self, motion: Motion, values: Values) -> Values:
@@ -173,13 +174,13 @@ def in_mean_frame(K: Values, values: Values) -> tuple[Values, Values]:
 
 
 def errors_in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Values:
-    """Return the map of small errors of a fit to those in the frame of the mean of the mountings: (count, count) array.
+    """Return the matrix that maps small errors of a fit to the frame of the mean mounting: (count, count) array.
 
-    Readings do not change with a rotation phi of the frame, ``K' = K exp([phi]x)``, ``exp([theta_k']x) =
-    exp([theta_k]x) exp([phi]x)``. With G the derivative of all parameters with respect to phi and A their mean
-    rotation, the map is ``1 - G (A G)^-1 A`` (S-transformation; Baarda, Publ. Geodesy 5, 1973).
+    A rotation phi of the frame does not change the readings: ``K' = K exp([phi]x)``, ``exp([theta_k']x) =
+    exp([theta_k]x) exp([phi]x)``. With G the derivative of all parameters with respect to phi and A the matrix that
+    takes the mean of the rotations, the map is ``1 - G (A G)^-1 A`` (S-transformation; Baarda, Publ. Geodesy 5, 1973).
 
-    ``values``: (3 m,) rotations of the unit, deg, which are the parameters ``at``; K is row by row from 3 to 12.
+    ``values``: (3 m,) rotations of the unit, deg, the parameters ``at``; parameters 3 to 12 are K, row by row.
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s that only fits of mountings pay)
 
@@ -194,7 +195,7 @@ def errors_in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Va
 
 
 class EncoderZero(_OfRecordings):
-    """The zero of the table's angle in each turn: one parameter a recording."""
+    """The zero of the table's angle in each turn: one parameter for each recording."""
 
     suffixes = ("",)
     what = "zero of the table's angle"
@@ -215,7 +216,7 @@ AS_THE_BASE = (
 
 
 class _Mounting(Effect):
-    """The mounting of a session against that of the others."""
+    """The rotation of the mounting in one session against the other sessions."""
 
     name = "mounting"
     owner = Owner.MOUNTING
@@ -231,16 +232,16 @@ class _Mounting(Effect):
         return tuple(Parameter(f"theta_{a}", "deg", f"turn of the unit, its part about body {a}") for a in "xyz")
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the derivative by differences that are exact to 1e-8."""
+        """Return the derivative by central differences."""
         return rotation_columns(sensor, motion, K, turned_back, values)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return what the turn adds, however large it is."""
+        """Return ``K (exp([theta]x)^T - 1) u``."""
         return np.asarray(truth(sensor, motion) @ (K @ (turned_back(values) - np.eye(3))).T)
 
 
 class _Bias(Effect):
-    """The difference of the bias of a session to that of the others."""
+    """The difference between the bias in one session and in the other sessions."""
 
     name = "bias"
     owner = Owner.MOUNTING
@@ -264,7 +265,7 @@ OWN: dict[str, Effect] = {effect.name: effect for effect in (_Mounting(), _Bias(
 
 
 class _InSession(Effect):
-    """An effect in one session, linear in its parameters; ``name`` is ``<base>@<session>``."""
+    """An effect that acts in one session only; ``name`` is ``<base>@<session>``."""
 
     def __init__(self, name: str, base: Effect) -> None:
         self.base, self.session = base, name.partition(SEPARATOR)[2]
@@ -273,16 +274,16 @@ class _InSession(Effect):
         self.name = name
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
-        """Return those of the effect."""
+        """Return the parameters of the effect."""
         return self.base.parameters(sensor)
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return those of the effect in its session, zeros elsewhere."""
+        """Return the regressors of the effect in its session, zeros elsewhere."""
         found = self.base.regressors(sensor, motion, K, values)
         return found if motion.setup == self.session else np.zeros_like(found)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return what the effect adds in its session, zeros elsewhere."""
+        """Return the reading of the effect in its session, zeros elsewhere."""
         if motion.setup == self.session:
             return self.base.reading(sensor, motion, K, values)
         return np.zeros((len(motion.time), 3))

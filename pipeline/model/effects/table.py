@@ -1,4 +1,4 @@
-"""Errors of the table: in turns about its axes, and its level.
+"""Effects of errors of the table: in its turns and in its level.
 
 With K the inverse of the calibration matrix, f the specific force, g, A the table angle, e_a the unit vector of axis a,
 and the parameters of ``configs/effect/`` (angles in deg):
@@ -6,15 +6,15 @@ and the parameters of ``configs/effect/`` (angles in deg):
     table_tilt:            accelerometer: z = K R^T |f| (pi/180) (-d_y, d_x, 0), R the rotation from body to level
 
     turns about axis a:
-    table_axis_nonorthogonality, d_a how far the axis leans along the other two body axes at angle 0, R_a a turn
+    table_axis_nonorthogonality, d_a: lean of the axis along the other two body axes at angle 0; R_a: a turn
                            accelerometer: z = K [theta x f - R_a(-A) (theta x f_0)] (pi/180),  theta = e_a x d_a
                            gyroscope:     z = K (pi/180) d_a dA/dt
-    table_backlash, the angle is behind by B_a in the direction s = +1 or -1 of this or the last turn
+    table_backlash, the angle lags by B_a in the direction s = +1 or -1 of the present or last turn
                            accelerometer: z = K (e_a x f) (pi/180) B_a s
-    table_encoder_error, an encoder off centre
+    table_encoder_error, an eccentric encoder
                            accelerometer: z = -K (e_a x f) (pi/180) (A_a cos A + B_a sin A)
                            gyroscope:     z = K e_a dA/dt (pi/180) (B_a cos A - A_a sin A)
-    table_rate_ripple, the accelerometer sees the angle that it sums up to, where the log shows the commanded one
+    table_rate_ripple; the accelerometer shows the integral of the ripple, the log shows the commanded angle
                            accelerometer: z = -K (e_a x f) [A_a sin A + B_a (1 - cos A)]
                            gyroscope:     z = K e_a dA/dt (A_a cos A + B_a sin A)
 """
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pipeline.records import Motion, Values
 
 
-UPRIGHT = 0.5  # sine of the turn axis's elevation, which is 0 or 1: gravity turns with the angle, or not at all
+UPRIGHT = 0.5  # sine of the elevation of the turn axis, which is 0 (level axis) or 1 (vertical axis)
 SIGNS = np.array([[1.0], [-1.0]])  # of d_x and d_y in the equation above
 
 
@@ -57,14 +57,14 @@ class TableTilt(DeclaredEffect):
 
 
 class _OfTurns(DeclaredEffect):
-    """An error in turns about one axis of the table: the same number of parameters for each axis."""
+    """An error in turns of the table, with the same number of parameters for each axis."""
 
     layout = Layout.SHARED
     needs: tuple[str, ...] = ("angle",)
     each = 2
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the columns of the axis turned about, zeros for the others."""
+        """Return the columns of the turn axis, zeros for the others."""
         del values
         out = np.zeros((len(motion.time), 3, 3 * self.each))
         if motion.axis is not None and motion.angle is not None and motion.rate is not None:
@@ -103,14 +103,14 @@ class TableAxisNonorthogonality(_OfTurns):
 
 
 class TableBacklash(_OfTurns):
-    """Play of the table: one coefficient a turn axis."""
+    """Backlash of the table: one coefficient for each turn axis."""
 
     each = 1
     needs_both_directions = True
     unseen = MappingProxyType({"gyroscope": "an angle that is behind by a constant does not change the rate"})
 
     def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
-        """Return the change with the angle times the direction; zeros for the gyroscope."""
+        """Return the derivative with respect to the angle times the direction; zeros for the gyroscope."""
         if sensor == "gyroscope":
             return (np.zeros((len(motion.time), 3)),)
         slope = motion.specific_force @ (np.radians(1.0) * K @ ABOUT[axis]).T
@@ -118,7 +118,7 @@ class TableBacklash(_OfTurns):
 
 
 class TableEncoderError(_OfTurns):
-    """Angle error once a turn: two coefficients a turn axis."""
+    """Angle error with a period of one turn: two coefficients for each turn axis."""
 
     def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
         """Return the columns of A and B."""
@@ -131,7 +131,7 @@ class TableEncoderError(_OfTurns):
 
 
 class TableRateRipple(_OfTurns):
-    """Rate error once a turn: two coefficients a turn axis."""
+    """Rate error with a period of one turn: two coefficients for each turn axis."""
 
     needs_motion = True
 

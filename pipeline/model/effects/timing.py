@@ -1,13 +1,14 @@
-"""Effects of time: a bias that settles, and readings that are those of another time or of a filtered motion.
+"""Effects of time: warm-up of the bias, errors of the time stamps, and a lag of the readings.
 
     warm_up:       z = A exp(-t / tau),  t the time since power-on, s; 0 at tau = 0
     time_offset:   reading(t) = model(t + tau)
     clock_rate:    reading(t) = model(t + 1e-6 e t)
     low_pass_lag:  reading(t) = model(u'),  u'(t) = integral_0^inf exp(-s / tau) / tau u(t - s) ds
 
-In the last three z = K (u' - u), with tau in s (an offset is negative where the reading comes late, a time constant is
-0 or more), e in ppm, u the truth, g or deg/s, u' the truth there, and K the inverse of the calibration matrix. The lag
-of a turn's rate is exact; that of other signals is a Gauss-Laguerre sum, exact for polynomials of degree 7 in time.
+In the last three z = K (u' - u), with u the truth, g or deg/s, u' the truth at the changed time or behind the lag, and
+K the inverse of the calibration matrix. tau is in s: an offset is negative where the reading is late, a time constant
+is 0 or more. e is in ppm. The lag of a turn's rate is exact; the lag of other signals is a Gauss-Laguerre sum, exact
+for polynomials of degree 7 in time.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
     from pipeline.records import Motion, Values
 
 
-STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # of a part of some grams to a box of some kilograms, in steps of three
-SHORTEST_S, LONGEST_S = 1.0, 1e5  # beyond these it is a step at the start, or a drift
-START_LAG_S = 0.005  # above 0, where a lag and a time offset have the same column; below the lag of a 30 Hz filter
+STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # from a part of some grams to a box of some kilograms, in factors of three
+SHORTEST_S, LONGEST_S = 1.0, 1e5  # a shorter warm-up is a step at the start, a longer one a drift
+START_LAG_S = 0.005  # not 0, where a lag and a time offset have the same column; below the lag of a 30 Hz filter
 PPM = 1e-6  # one part in a million
 STEP_S = 1e-5  # of the central difference: its rounding is 1e-11 of u per second
 
@@ -60,7 +61,7 @@ class WarmUp(DeclaredEffect):
         return np.asarray(decay[:, None])
 
     def columns(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the columns of A and ``A t / tau^2 exp(-t / tau)``, that of tau."""
+        """Return the columns of A, and the column of tau, ``A t / tau^2 exp(-t / tau)``."""
         decay = self.regressors(sensor, motion, K, values)
         tau = values[3]
         slope = decay[:, 0] * motion.time / tau**2 if tau > 0 else np.zeros_like(motion.time)
@@ -79,7 +80,7 @@ class WarmUp(DeclaredEffect):
 def shifted(motion: Motion, offset: float | Values) -> Motion:
     """Return the motion at ``time + offset``, s: a float or (n,) array.
 
-    Without a trajectory between the samples the truth is extended along its rate.
+    Without a trajectory between the samples the truth is extrapolated linearly.
     """
     if not np.any(offset):
         return motion
@@ -94,13 +95,13 @@ def shifted(motion: Motion, offset: float | Values) -> Motion:
 
 
 def _seen_from(motion: Motion, moved: Motion | None) -> Motion:
-    """Return a moved motion whose rests and directions are those of the motion as logged."""
+    """Return a moved motion with the rests and directions of the logged motion."""
     assert moved is not None  # noqa: S101
     return replace(moved, still=motion.still, direction=motion.direction)
 
 
 class _Timing(DeclaredEffect):
-    """An effect that moves the motion in time: its value is K times the change of the truth."""
+    """An effect that moves the motion in time: it adds K times the change of the truth."""
 
     layout = Layout.SHARED
     needs_motion = True
@@ -132,7 +133,7 @@ class TimeOffset(_Timing):
 
 
 class ClockRate(_Timing):
-    """A clock that runs at a wrong rate: one coefficient."""
+    """A rate error of the clock: one coefficient."""
 
     needs_clock = True
     nonlinear = ("e",)
@@ -152,7 +153,7 @@ class LowPassLag(_Timing):
     nonlinear = ("tau",)
 
     def starts(self, sensor: str) -> list[Values]:
-        """Return a short lag: at none, it looks exactly like a time offset."""
+        """Return a short lag: at 0 its column equals that of a time offset."""
         del sensor
         return [np.array([START_LAG_S])]
 
@@ -161,7 +162,7 @@ class LowPassLag(_Timing):
         return np.maximum(values + step, 0.0)
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return ``K du'/dtau``: minus the rate of u where there is no lag yet, else a central difference."""
+        """Return ``K du'/dtau``: ``-K du/dt`` at a lag of 0, else a central difference."""
         if values[0] <= STEP_S:
             slope = -truth_rate(sensor, motion)
         else:
