@@ -21,9 +21,9 @@ The measurement equation
     ``reading = bias + K @ truth + sum of effects + noise``, with ``K = matrix^-1``, so
     ``truth = matrix @ (reading - bias - effects)``, where
 
-    reading : (3,) what the sensor says, g or deg/s
+    reading : (3,) output of the sensor, g or deg/s
     bias    : (3,) same unit
-    matrix  : (3, 3) the calibration matrix, scale factor, misalignment and non-orthogonality in one
+    matrix  : (3, 3) the calibration matrix: scale factor, misalignment and non-orthogonality together
     effects : functions of the motion, the temperature and the time; see ``pipeline.model.effects``
     noise   : white noise plus a Gauss-Markov bias wander; see ``pipeline.records.Noise``
 """
@@ -50,14 +50,14 @@ def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()
     ----------
     path : str or Path
     python_effects : sequence of str or Path
-        Files of the effects in Python with which it was made; those from formulas come with the calibration.
+        Files of the Python effects that the calibration uses. The calibration itself contains effects by formula.
 
     Raises
     ------
     InputError
-        If the file does not exist, is no calibration, or is the record of a failed unit.
+        If the file does not exist, is not a calibration, or is the record of a failed unit.
     ConfigurationError
-        If an effect is not known, or is one in Python whose file is not given.
+        If an effect is unknown, or is a Python effect whose file is not in ``python_effects``.
     """
     from pipeline.model.compensation import load  # noqa: PLC0415  (numpy is imported only where it is needed)
 
@@ -65,7 +65,7 @@ def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()
 
 
 def load_campaign(folder: str | Path) -> CampaignResults:
-    """Load ``results/<campaign>`` as pandas DataFrames; ``InputError`` where the folder holds no such results.
+    """Load ``results/<campaign>`` as pandas DataFrames; ``InputError`` if the folder has no results of a campaign.
 
     The tables are ``.summary``, ``.parameters``, ``.errors``, ``.diagnosis``, ``.effects``, ``.noise`` and ``.chips``;
     ``.unit(name)`` is one unit.

@@ -24,7 +24,7 @@ PROGRAM = "imu-calibration" if Path(sys.argv[0]).name == "imu-calibration" else 
 
 
 def _summary(module: str, function: str) -> str:
-    """Return the first line of the docstring of a function, of ``main`` that of its module, without importing it."""
+    """Read the summary line of a command from its source: of the module for ``main``, else of the function."""
     text = HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
     start = 0 if function == "main" else text.index(f"\ndef {function}")
     return text[start:].split('"""', 2)[1].splitlines()[0]
@@ -41,14 +41,14 @@ def _help() -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; a user error is one line and exit code 2."""
+    """Run a command or stage and return its exit code; report a user error in one line, with exit code 2."""
     command, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if command in ("-h", "--help", "--version"):
         from pipeline import __version__  # noqa: PLC0415  (nothing of the package is needed before)
 
         print(f"imu-calibration {__version__}" if command == "--version" else _help())
         return 0
-    if command == "job-server":  # of a run
+    if command == "job-server":  # started by workflow/rules/common.smk
         import socket  # noqa: PLC0415
 
         from pipeline.stages.job_server import serve  # noqa: PLC0415

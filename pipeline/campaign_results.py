@@ -3,8 +3,8 @@
     results = pipeline.load_campaign("results/demo")
     results.errors.query("step == 'calibrated'").pivot(index="unit", columns="sensor", values="rms_error")
 
-Tables are read from the published files when they are first asked for. Accelerometer figures are in g (9.80665 m/s^2),
-gyroscope figures in deg/s; parameters have a column with their unit.
+A table is read from the published files at its first use. Accelerometer figures are in g (9.80665 m/s^2), gyroscope
+figures in deg/s; parameters have a column with their unit.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FIGURES = ("_before", "_after", "_floor", "_answers")  # endings of the columns 
 
 @dataclass(frozen=True)
 class UnitResults:
-    """The documents of one unit, as in their files; of a failed unit ``calibration["error"]`` names the cause."""
+    """The published documents of one unit; if the unit failed, ``calibration["error"]`` states the cause."""
 
     name: str
     calibration: JSON
@@ -58,8 +58,9 @@ class UnitResults:
         if self.calibration["status"] != "ok":
             error = self.calibration.get("error") or {}
             return f"<unit {self.name}: failed, {error.get('code')}: {error.get('message')}>"
-        told = [f"{s} {((self.diagnosis or {}).get(s) or {}).get('verdict')}" for s in SENSORS if self.calibration[s]]
-        return f"<unit {self.name}: {', '.join(told)}>"
+        calibrated = [s for s in SENSORS if self.calibration[s]]
+        verdicts = [f"{s} {((self.diagnosis or {}).get(s) or {}).get('verdict')}" for s in calibrated]
+        return f"<unit {self.name}: {', '.join(verdicts)}>"
 
 
 class CampaignResults:
@@ -70,8 +71,8 @@ class CampaignResults:
         if not (self.folder / "summary.csv").is_file():
             parent = self.folder if self.folder.is_dir() else self.folder.parent
             known = sorted(str(file.parent) for file in parent.glob("*/summary.csv"))
-            there = f"there are {', '.join(known)}" if known else f"{parent} holds no results of a campaign"
-            raise MissingInputError(f"holds no summary.csv of a campaign; {there}", str(folder))
+            hint = f"there are {', '.join(known)}" if known else f"{parent} holds no results of a campaign"
+            raise MissingInputError(f"holds no summary.csv of a campaign; {hint}", str(folder))
         self._documents: dict[str, UnitResults] = {}
 
     def __repr__(self) -> str:
@@ -90,9 +91,9 @@ class CampaignResults:
 
         Columns: ``unit, serial, lot, date, status`` ("ok", "failed"), ``error, sensor, method``; for each sensor
         ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
-        (g or deg/s), ``_verdict``, ``_selected`` (missing, joined by ";"), ``_reason``, ``_answers`` (how many are in
-        the answer set), ``_implausible``, ``_not_in_uncertainty``; ``pass``; ``left_out`` (rows that no fit
-        uses); and the user's own columns of ``units.csv``.
+        (g or deg/s), ``_verdict``, ``_selected`` (missing effects, joined by ";"), ``_reason``, ``_answers`` (number of
+        answers in the answer set), ``_implausible``, ``_not_in_uncertainty``; ``pass``; ``left_out`` (rows that no fit
+        uses); and other columns of ``units.csv``.
         """
         kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}
         return pd.read_csv(self.folder / "summary.csv", dtype=kinds, keep_default_na=False, na_values=[""])
@@ -121,8 +122,8 @@ class CampaignResults:
 
         Columns: ``unit, sensor, step`` ("raw", "stage:<name>", "calibrated", "+ <effect>"), ``rms_error,
         mean_abs_error, max_error, min_error, sum_abs_error`` (g or deg/s, of the magnitude minus its reference),
-        ``change_percent`` (of mean_abs_error, against raw), ``vector_rms_error`` (empty without an attitude reference),
-        ``noise_floor`` and ``vector_noise_floor`` (rms that noise alone gives).
+        ``change_percent`` (of mean_abs_error, relative to raw), ``vector_rms_error`` (empty without an attitude
+        reference), ``noise_floor`` and ``vector_noise_floor`` (rms error that noise alone causes).
         """
         rows = (
             {**part, **step, **about, "step": step["name"]}
@@ -133,10 +134,10 @@ class CampaignResults:
 
     @cached_property
     def diagnosis(self) -> pd.DataFrame:
-        """One row for each unit and sensor.
+        """The verdicts, one row for each unit and sensor.
 
-        Columns: ``unit, sensor, verdict, residual_over_noise`` (rms residual of the diagnosis's own fit over the
-        noise), ``selected`` (missing effects, joined by ";"), ``reason, next_experiment, override`` (text).
+        Columns: ``unit, sensor, verdict, residual_over_noise`` (rms residual of the fit of the diagnosis, divided by
+        the noise), ``selected`` (missing effects, joined by ";"), ``reason, next_experiment, override`` (text).
         """
         rows = (
             {**part, **about, "selected": ";".join(part.get("selected") or [])}
@@ -146,12 +147,12 @@ class CampaignResults:
 
     @cached_property
     def effects(self) -> pd.DataFrame:
-        """Every candidate effect that was ranked: one row for each unit, sensor and effect, best evidence first.
+        """The ranking of candidate effects, one row for each unit, sensor and effect, strongest evidence first.
 
         Columns: ``unit, sensor, effect, delta_bic`` (above 10: strong evidence), ``p_value, explained_share`` (of the
         residual above the noise), ``held_out_error_before, held_out_error_after`` (rms of the vector, g or deg/s),
-        ``plausible`` (within the sensor file's limits), ``selected`` (bool), ``look_alikes`` (effects with much the
-        same signal, joined by ";").
+        ``plausible`` (within the sensor file's limits), ``selected`` (bool), ``look_alikes`` (effects with a similar
+        signal, joined by ";").
         """
         rows = (
             about
@@ -168,7 +169,7 @@ class CampaignResults:
         """The noise at rest, one row for each unit, sensor, axis and term (docs/noise.md).
 
         Columns: ``unit, sensor, axis, term`` ("white", "random_walk" ...), ``value, value_unit, low, high`` (95 %),
-        ``upper_limit`` and ``reason`` of a term that was not seen, ``correlation_time_s, frequency_hz``.
+        ``upper_limit`` and ``reason`` (of a term that was not detected), ``correlation_time_s, frequency_hz``.
         """
         rows = (
             {"unit": unit.name, "sensor": sensor, "axis": axis, "term": name, "value_unit": part["unit"]}
@@ -177,49 +178,50 @@ class CampaignResults:
             | dict(zip(("low", "high"), part["interval"] or (None, None), strict=True))
             for unit in map(self.unit, self.units)
             for sensor, noise in (unit.calibration.get("noise") or {}).items()
-            for axis, found in (noise["axes"] or {}).items()
-            for name, parts in (found["terms"] or {}).items()
+            for axis, identified in (noise["axes"] or {}).items()
+            for name, parts in (identified["terms"] or {}).items()
             for part in (parts if isinstance(parts, list) else [parts])
         )
         return pd.DataFrame(rows, columns=["unit", "sensor", *NOISE])
 
     @cached_property
     def chips(self) -> pd.DataFrame:
-        """How the chips of boards sit to the reference chip, one row for each chip and parameter (docs/boards.md).
+        """Position of each chip of a board relative to its reference chip, one row for each parameter (docs/boards.md).
 
         Columns: ``board, reference, unit, parameter`` ("rotation_x", "lever_arm_y", "time_offset_gyroscope" ...),
         ``value, value_unit, expanded_uncertainty`` (95 %), ``observable`` (bool).
         """
         rows = (
             {"board": board["name"], "reference": board["reference"], "unit": chip, "parameter": name}
-            | found
-            | {"value_unit": found["unit"], "unit": chip}
+            | parameter
+            | {"value_unit": parameter["unit"], "unit": chip}
             for unit in map(self.unit, self.units)
             for board in [unit.calibration.get("board") or {"chips": {}}]
             for chip, part in board["chips"].items()
-            for name, found in part.get("parameters", {}).items()
+            for name, parameter in part.get("parameters", {}).items()
         )
         return pd.DataFrame(rows, columns=CHIPS)
 
     def unit(self, name: str) -> UnitResults:
-        """Return the documents of one unit; ``InputError`` where the campaign has no such unit."""
+        """Return the documents of one unit; ``InputError`` if the campaign has no such unit."""
         if name not in self._documents:
             if name not in self.units:
                 near = get_close_matches(name, self.units, n=5) or self.units[:5]
                 raise InputError(f"has no unit {name!r}; there are {', '.join(near)}", str(self.folder))
-            calibration, *others = DOCUMENTS
-            found = self._document(calibration, name)
-            ok = found["status"] == "ok"
-            read = (self._document(folder, name) if ok else None for folder in others)
-            self._documents[name] = UnitResults(name, found, *read)
+            folder, *others = DOCUMENTS
+            calibration = self._document(folder, name)
+            ok = calibration["status"] == "ok"
+            self._documents[name] = UnitResults(
+                name, calibration, *(self._document(folder, name) if ok else None for folder in others)
+            )
         return self._documents[name]
 
     def _document(self, folder: str, name: str) -> JSON:
-        found: JSON = read_json(self.folder / folder / f"{name}.json", read_published)
-        return found
+        document: JSON = read_json(self.folder / folder / f"{name}.json", read_published)
+        return document
 
     def _parts(self, document: str) -> Iterator[tuple[JSON, JSON]]:
-        """Yield ``{unit, sensor}`` and the sensor's part of a document, where there is one."""
+        """Yield ``{unit, sensor}`` and the part of a document about this sensor, if it has one."""
         for unit in map(self.unit, self.units):
             for sensor in SENSORS:
                 part = (getattr(unit, document) or {}).get(sensor)

@@ -1,8 +1,8 @@
-"""The tree of user errors.
+"""The classes of errors that users see.
 
-Each says what is wrong, where, what was expected and what to do. A user error is one line and exit code 2 on the
-command line (of an unknown log a second line names the command that proposes a profile), and a failure record of one
-unit in a batch; all else that is raised is a bug and keeps its traceback.
+The message states what is wrong, where, what was expected and what to do. A command prints a user error in one line
+and exits with code 2. (After the error of an unknown log, a second line names the command that proposes a profile.) In
+a batch a user error becomes the failure record of one unit. Any other exception is a bug and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -17,11 +17,7 @@ UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")  # codes of lo
 
 
 class PipelineError(Exception):
-    """A user error.
-
-    ``message``: what is wrong, where (line, time, axis), what was expected and what to do; ``file``: the file
-    concerned, with its line as ``path:line`` where there is one.
-    """
+    """A user error: ``message``, and ``file`` as ``path`` or ``path:line``."""
 
     code: str = "error"
 
@@ -35,31 +31,31 @@ class PipelineError(Exception):
 
 
 class InputError(PipelineError):
-    """A recording or another input file cannot be used as it is."""
+    """A recording or another input file cannot be used."""
 
     code = "bad_input"
 
 
 class IngestError(InputError):
-    """A recording cannot be used as it is.
+    """A recording cannot be used.
 
     Parameters
     ----------
     message : str
         What is wrong and where, with the facts.
     code : str
-        That of ``docs/bad_inputs.md``: ``not_a_number``, ``wrong_sense`` ...
+        A code of ``docs/bad_inputs.md``: ``not_a_number``, ``wrong_sense`` ...
     offset : int, optional
         Byte of the file at which the error was found.
     hint : str
-        What to do about it.
+        What the user can do.
 
     Attributes
     ----------
     fact : str
         The message without byte and hint.
     sessions : int
-        Of a log that was restarted: how many parts it has.
+        Number of parts of a log whose logger was restarted.
     """
 
     sessions: int = 0
@@ -79,7 +75,7 @@ class MissingInputError(InputError):
 
 
 class DamagedFileError(InputError):
-    """A file that an earlier stage of a run wrote is damaged or missing; the same command writes it anew."""
+    """A file that an earlier stage wrote is damaged or missing; the same command run again writes it."""
 
     code = "damaged_file"
 
@@ -91,7 +87,7 @@ class ConfigurationError(PipelineError):
 
 
 class NotObservableError(PipelineError):
-    """The recording does not determine what was asked of it."""
+    """The recording does not determine a quantity that the method estimates."""
 
     code = "not_observable"
 
@@ -103,11 +99,11 @@ class ConvergenceError(PipelineError):
 
 
 class CannotCalibrateError(PipelineError):
-    """The procedure or method cannot calibrate this sensor at all: it becomes ``null`` with a reason, no failure."""
+    """The procedure or method cannot calibrate this sensor: its result is ``null`` with a reason, not a failure."""
 
     code = "cannot_calibrate"
 
 
 def first(names: Sequence[str], most: int, of: str = "") -> list[str]:
-    """Return the first ``most`` names or lines of a message, and instead of the others how many they are."""
+    """Return the first ``most`` names or lines; one last entry states the number of the others."""
     return [*names[:most], *([f"and {len(names) - most} more {of}".rstrip()] if len(names) > most else [])]

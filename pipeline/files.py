@@ -1,7 +1,7 @@
-"""Files that are complete or absent, however a run ends; JSON documents; and where the shipped files are.
+"""Atomic writing of files, JSON documents, and the paths of the shipped files.
 
-A file is written under a temporary name and then renamed. ``fsync`` makes it survive a power failure; it takes some
-milliseconds, so a job that writes many files flushes them together at its end.
+A file is written under a temporary name and then renamed, so it is complete or absent even after a crash. ``fsync``
+makes it survive a power failure. It takes some milliseconds, so a job that writes many files flushes them together.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"
 WRITE_AGAIN = "run the same command again: snakemake writes the file anew"
-_encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=lambda array: array.tolist())  # of numpy
+_encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=lambda array: array.tolist())  # numpy arrays
 _flushed_at_end: list[Path] = []  # folders whose files are flushed together
 
 
@@ -72,7 +72,7 @@ def _encoded(value: Any) -> str:  # noqa: ANN401
 
 
 def _not_finite(value: Any, place: str = "value") -> Iterator[str]:  # noqa: ANN401
-    """Yield the places of numbers that are not finite, with the texts beside them, which say of what they are."""
+    """Yield the place of each number that is not finite, with the texts in the same objects, which identify it."""
     if isinstance(value, float) and not math.isfinite(value):
         yield f"{place} is {value}"
     elif isinstance(value, dict):
@@ -85,10 +85,9 @@ def _not_finite(value: Any, place: str = "value") -> Iterator[str]:  # noqa: ANN
 
 
 def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: ANN401
-    """Return a value as JSON; raises ``ValueError``, with its place, for a number that is not finite.
+    """Return a value as JSON; ``ValueError`` names the place of a number that is not finite.
 
-    Down to some levels, containers of containers are indented. The others stand on one line each: that is read well,
-    and written by C.
+    Down to ``levels``, containers of containers are indented. Each other container is on one line, which C code writes.
     """
     if levels and isinstance(value, dict | list) and value:
         members = list(value.values() if isinstance(value, dict) else value)
@@ -102,14 +101,14 @@ def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: 
 
 
 def write_json(path: Path, value: Any) -> None:  # noqa: ANN401
-    """Write a JSON file atomically, as ``json_text`` formats it."""
+    """Write a value as a JSON file, atomically."""
     write_atomically(path, json_text(value) + "\n")
 
 
 def exchange(one: Path, other: Path) -> None:
-    """Exchange two files or folders of one file system in one step, so that both names always exist.
+    """Exchange two files or folders of one file system atomically, so that both names always exist.
 
-    Where the system has no such step (``renameat2`` is Linux's), three renames do it.
+    Only Linux has the system call (``renameat2``). On other systems three renames exchange them.
     """
     at_cwd, rename_exchange = -100, 2  # AT_FDCWD of fcntl.h, RENAME_EXCHANGE of linux/fs.h
     system = ctypes.CDLL(None, use_errno=True)
@@ -123,7 +122,7 @@ def exchange(one: Path, other: Path) -> None:
 
 @contextmanager
 def flushed_together(folder: Path) -> Iterator[None]:
-    """Flush the files written within the block together at its end; they lie on the file system of the folder."""
+    """Flush all files that the block writes to the file system of a folder once, at the end of the block."""
     _flushed_at_end.append(folder)
     try:
         yield
@@ -133,7 +132,7 @@ def flushed_together(folder: Path) -> Iterator[None]:
 
 
 def flush_file_system(folder: Path) -> None:
-    """Write to the disk what the system buffers for the file system of a folder; raises ``OSError`` on failure."""
+    """Flush the buffers of the file system that contains a folder; raises ``OSError`` on failure."""
     system = ctypes.CDLL(None, use_errno=True)
     if not hasattr(system, "syncfs"):  # not Linux
         os.sync()

@@ -1,17 +1,17 @@
-"""What each run of a campaign changed: ``results/<campaign>/history/<number>.json``.
+"""Record the changes of each run of a campaign in ``results/<campaign>/history/<number>.json``.
 
-The first file holds every unit, each later file the units whose configuration, recordings or results differ from those
-before, so that a fleet's history grows with what changes. A run that changes nothing writes no file.
+The first file holds every unit. Each later file holds the units whose configuration, recordings or results differ from
+the previous ones. A run that changes nothing writes no file.
 
-A unit's state is::
+The state of a unit is::
 
     {"status", "error", "config_sha256", "config": {section: digest}, "recordings": {file: digest},
      "overrides": {key: value}, "accelerometer": {"effects", "error", "floor", "verdict", "selected", "uncertainty"} or
      null, "gyroscope": likewise}
 
-where ``error`` is the held-out rms error of the last step and ``floor`` its noise floor, in g or deg/s, and
-``uncertainty`` the largest expanded uncertainty of ``bias`` and ``matrix``. The values of a
-section stand once, under its digest, in ``sections`` of the first entry that has it.
+where ``error`` is the held-out rms error of the last step, ``floor`` its noise floor, in g or deg/s, and
+``uncertainty`` the largest expanded uncertainty of ``bias`` and ``matrix``. ``sections`` of an entry holds the values
+of each configuration section that no earlier entry contains, by digest.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 FOLDER = "history"
-VALUES = "values"  # of the sections of a state that was read, by key
+VALUES = "values"  # key of a state: the values of each configuration section
 DIGITS = 16  # of a digest
-LONGEST = 60  # letters of a value; a longer one ends in a digest
-NAMED = 4  # changed values and recordings
+LONGEST = 60  # characters of a value; a longer one is cut and ends in its digest
+NAMED = 4  # changed values and recordings that a text names
 SENSORS = ("accelerometer", "gyroscope")
 
 
 @dataclass(frozen=True)
 class Change:
-    """What differs between two states of a unit.
+    """The differences between two states of a unit.
 
-    ``added``, ``removed``: effects of each sensor; ``settings``: others, each as ``key: before -> after``; ``other``:
-    recordings, configuration, whether the unit was calibrated.
+    ``added``, ``removed``: effects of each sensor; ``settings``: other overrides, each as ``key: before -> after``;
+    ``other``: texts about recordings, values of the configuration and status.
     """
 
     added: dict[str, list[str]]
@@ -54,13 +54,13 @@ class Change:
     other: list[str]
 
     def words(self, sensor: str | None = None) -> list[str]:
-        """Return the change as a list of texts, of the effects of one sensor or of both."""
-        told = []
+        """Return the change as a list of texts, with the effects of one sensor or of both."""
+        effects = []
         for s in SENSORS if sensor is None else (sensor,):
             name = f"{s}." if sensor is None else ""
-            told += [f"+ {name}{effect}" for effect in self.added[s]]
-            told += [f"\N{MINUS SIGN} {name}{effect}" for effect in self.removed[s]]
-        return [*told, *self.settings, *self.other]
+            effects += [f"+ {name}{effect}" for effect in self.added[s]]
+            effects += [f"\N{MINUS SIGN} {name}{effect}" for effect in self.removed[s]]
+        return [*effects, *self.settings, *self.other]
 
 
 def digest(value: Any) -> str:  # noqa: ANN401  (any JSON value)
@@ -69,7 +69,7 @@ def digest(value: Any) -> str:  # noqa: ANN401  (any JSON value)
 
 
 def flat(value: Any, above: str = "") -> dict[str, str]:  # noqa: ANN401  (any JSON value)
-    """Return the values of a section by dotted key, as texts."""
+    """Flatten a section: return its values as texts, by dotted key."""
     if isinstance(value, dict) and (value or not above):
         return {
             k: v for key, below in value.items() for k, v in flat(below, f"{above}.{key}" if above else key).items()
@@ -85,10 +85,9 @@ def unit_state(
     overrides: Mapping[str, str],
     config: Mapping[str, str] | None = None,
 ) -> JSON:
-    """Return the state of a unit.
+    """Return the state of a unit from its published documents.
 
-    It follows from its published documents, the overrides of its settings (key to value) and the digest of each section
-    of its configuration.
+    ``overrides``: key to value; ``config``: section of the configuration to digest.
     """
     state = {
         "status": calibration.get("status"),
@@ -100,42 +99,42 @@ def unit_state(
     }
     for sensor in SENSORS:
         fitted = calibration.get(sensor)
-        held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
+        held_out, diagnosed = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
         last = (held_out.get("steps") or [{}])[-1]
         state[sensor] = fitted and {
             "effects": [effect["name"] for effect in fitted.get("effects") or []],
             "error": last.get("rms_error"),
             "floor": held_out.get("noise_floor"),
-            "verdict": found.get("verdict"),
-            "selected": found.get("selected") or [],
+            "verdict": diagnosed.get("verdict"),
+            "selected": diagnosed.get("selected") or [],
             "uncertainty": _largest(fitted.get("expanded_uncertainty") or {}),
         }
     return state
 
 
 def _digest(entry: JSON) -> str:
-    """Return the digest of a recording: of its file, or of all files that are joined to it."""
+    """Return the digest of a recording: of its file and the files that are joined to it."""
     digests = [str(file.get("sha256")) for file in (entry, *entry.get("joined", []))]
-    found = digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
-    return found[:DIGITS]
+    whole = digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
+    return whole[:DIGITS]
 
 
 def _largest(uncertainty: Mapping[str, Any]) -> dict[str, float]:
-    """Return the largest expanded uncertainty of bias and matrix, where they have one."""
-    found = {key: np.asarray(uncertainty.get(key) or np.nan, float) for key in ("bias", "matrix")}
-    return {key: float(np.nanmax(values)) for key, values in found.items() if np.isfinite(values).any()}
+    """Return the largest expanded uncertainty of bias and matrix, if they have one."""
+    uncertainties = {key: np.asarray(uncertainty.get(key) or np.nan, float) for key in ("bias", "matrix")}
+    return {key: float(np.nanmax(values)) for key, values in uncertainties.items() if np.isfinite(values).any()}
 
 
 def read_history(results: Path) -> list[JSON]:
-    """Return the entries of a campaign's results, the oldest first; ``InputError`` where a file is no such entry."""
+    """Return the history of a campaign, oldest entry first; ``InputError`` if a file is not an entry."""
     entries = []
     for file in sorted((results / FOLDER).glob("[0-9]*.json")):
         try:
             entry = json.loads(file.read_text(encoding="utf-8"))
-            known = isinstance(entry["run"], int) and isinstance(entry["units"], dict)
+            valid = isinstance(entry["run"], int) and isinstance(entry["units"], dict)
         except (OSError, ValueError, KeyError, TypeError):
-            known = False
-        if not known:
+            valid = False
+        if not valid:
             raise InputError("is no history of runs: remove it, or the whole folder", str(file))
         entries.append(entry)
     return sorted(entries, key=lambda e: int(e["run"]))
@@ -147,10 +146,10 @@ def record(
     settings: Mapping[str, Any],
     sections: Mapping[str, Any] | None = None,
 ) -> list[JSON]:
-    """Append the states of the units (name to state) that differ from the last ones; return all entries.
+    """Append the states of the units (name to state) that differ from their last ones; return all entries.
 
-    ``results`` are those of the campaign, ``settings`` those of the run, ``sections`` of the configurations by digest.
-    Raises ``InputError`` as ``read_history``.
+    ``results``: folder of the campaign's results; ``settings``: of the run; ``sections``: of all configurations, by
+    digest. Raises ``InputError`` like ``read_history``.
     """
     entries = read_history(results)
     last = {unit: states[-1][1] for unit, states in of_units(entries).items()}
@@ -160,9 +159,9 @@ def record(
     if changed or gone:
         number = entries[-1]["run"] + 1 if entries else 1
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        told = {key for entry in entries for key in entry.get("sections") or {}}
-        used = {key for state in changed.values() for key in (state.get("config") or {}).values()} - told
-        new = {key: flat(section) for key, section in (sections or {}).items() if key in used}
+        recorded = {key for entry in entries for key in entry.get("sections") or {}}
+        needed = {key for state in changed.values() for key in (state.get("config") or {}).values()} - recorded
+        new = {key: flat(section) for key, section in (sections or {}).items() if key in needed}
         entry = {
             "run": number,
             "time": now,
@@ -177,21 +176,21 @@ def record(
 
 
 def of_units(entries: Sequence[JSON]) -> dict[str, list[tuple[int, JSON]]]:
-    """Return the states of each unit with the run that brought them; ``{}`` stands for a unit that has gone."""
-    found: dict[str, list[tuple[int, JSON]]] = {}
+    """Return the states of each unit, each with the number of its run; ``{}`` marks a unit that was removed."""
+    histories: dict[str, list[tuple[int, JSON]]] = {}
     sections: JSON = {}
     for entry in entries:
         sections |= entry.get("sections") or {}
         for unit, state in entry["units"].items():
             values = {name: sections.get(key, {}) for name, key in (state.get("config") or {}).items()}
-            found.setdefault(unit, []).append((entry["run"], state | {VALUES: values}))
+            histories.setdefault(unit, []).append((entry["run"], state | {VALUES: values}))
         for unit in entry.get("gone") or []:
-            found.setdefault(unit, []).append((entry["run"], {}))
-    return found
+            histories.setdefault(unit, []).append((entry["run"], {}))
+    return histories
 
 
 def difference(before: JSON, after: JSON) -> Change:
-    """Return what differs in the configuration and the recordings of a unit."""
+    """Return the differences between two states of a unit."""
     fitted = [{s: (state.get(s) or {}).get("effects") or [] for s in SENSORS} for state in (before, after)]
     calibrated = [state.get("status") == "ok" for state in (before, after)]
     added, removed = (
@@ -223,7 +222,7 @@ def _named(what: str, names: Sequence[str]) -> str:
 
 
 def _changed_recordings(before: JSON, after: JSON) -> list[str]:
-    """Return the files whose content differs; nothing where a state of an older version does not name them."""
+    """Return the files whose content differs; none if a state of an older version does not list its files."""
     old, new = before.get("recordings"), after.get("recordings")
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return []
@@ -231,25 +230,25 @@ def _changed_recordings(before: JSON, after: JSON) -> list[str]:
 
 
 def _changed_values(before: JSON, after: JSON) -> list[str]:
-    """Return the values of the configuration that differ, but for effects, each as ``key: before -> after``."""
+    """Return the values of the configuration that differ, except effects, each as ``key: before -> after``."""
     old, new = (
         {f"{s}.{k}": v for s, part in (state.get(VALUES) or {}).items() for k, v in part.items()}
         for state in (before, after)
     )
     keys = [k for k in dict.fromkeys([*old, *new]) if old.get(k) != new.get(k)] if old and new else []
     keys = [k for k in keys if not k.startswith("effects.")]
-    defined = [k for k in keys if k.startswith("user_effects.") and not (k in old and k in new)]  # named as effects
+    defined = [k for k in keys if k.startswith("user_effects.") and not (k in old and k in new)]  # effects, too
     arrow = "\N{RIGHTWARDS ARROW}"
     return [f"{k}: {old.get(k, 'absent')} {arrow} {new.get(k, 'absent')}" for k in keys if k not in defined]
 
 
 def dropped(entries: Sequence[JSON]) -> dict[tuple[str, int], list[str]]:
-    """Return the effects (``sensor.effect``) that the last run no longer has, by unit and the run that had them."""
-    found, states = {}, of_units(entries)
+    """Return the effects (``sensor.effect``) that the last run no longer has, by unit and run that had them."""
+    lost, states = {}, of_units(entries)
     for unit in entries[-1]["units"]:
         if len(states[unit]) > 1:
             (run, before), (_, after) = states[unit][-2:]
             removed = difference(before, after).removed
             if effects := [f"{sensor}.{effect}" for sensor in SENSORS for effect in removed[sensor]]:
-                found[unit, run] = effects
-    return found
+                lost[unit, run] = effects
+    return lost

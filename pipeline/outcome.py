@@ -1,6 +1,7 @@
-"""What a run found, in lines for the terminal, and the commands with which a user continues, quoted for a POSIX shell.
+"""Build the closing lines that a run prints to the terminal, and the commands that it proposes.
 
-A word that the shell would change stands in single quotes; within it, YAML with double quotes where needed.
+Commands are quoted for a POSIX shell: single quotes enclose a word that the shell would change, and YAML within it
+uses double quotes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pipeline.files import INSTALLED, read_json
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
 JSON = dict[str, Any]
@@ -30,10 +31,10 @@ VERDICTS = {
     "left_by_method": "warn",
     "not_enough_data": "",
     "nothing_missing": "good",
-}  # what can be added first, then what is in doubt, in the order in which verdicts apply; with the pages' CSS class
+}  # verdict: CSS class on the pages; in the order of the lines: effects that can be added, then what is in doubt
 NAMED = 5  # units that a line names, and lines of one kind
 SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
-PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that YAML reads as they stand, within brackets too
+PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
 EFFECTS = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
 RESULTS = "results"  # the default folder of results
@@ -55,7 +56,7 @@ def read_summary(results: Path) -> list[dict[str, str]]:
 
 
 def findings_of(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Return the verdicts in rows as of ``summary.csv``."""
+    """Return the verdict on each sensor in rows of ``summary.csv``."""
     return [
         Finding(row["unit"], sensor, verdict, list(filter(None, (row[f"{sensor}_selected"] or "").split(";"))))
         for row in rows
@@ -65,33 +66,34 @@ def findings_of(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
 
 
 def verdict_groups(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
-    """Return units by the effect that they miss, and by each other verdict but ``nothing_missing``."""
+    """Group the units by missing effect, or by verdict; units with ``nothing_missing`` are left out."""
     groups: dict[tuple[int, str], list[str]] = {}
     for unit, sensor, verdict, selected in findings:
         missing = [f"{effect} missing" for effect in selected]
-        told = missing if verdict == "missing_effect" else [verdict.replace("_", " ")]
-        for what in told if verdict != "nothing_missing" else []:
+        texts = missing if verdict == "missing_effect" else [verdict.replace("_", " ")]
+        for what in texts if verdict != "nothing_missing" else []:
             groups.setdefault((place(verdict), f"{sensor}, {what}"), []).append(unit)
     return [(what, units) for (_, what), units in sorted(groups.items())]
 
 
 def place(verdict: str | None) -> int:
-    """Return the place of a verdict in ``VERDICTS``; one that is not there comes last."""
+    """Return the index of a verdict in ``VERDICTS``; an unknown verdict comes last."""
     return [*VERDICTS, verdict].index(verdict)
 
 
 def lines_of(groups: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
-    """Return groups of units as lines, of a large one its first units."""
+    """Return a line for each group of units; it names the first units of a large group."""
     return [f"{what}: {', '.join(first(units, NAMED))}" for what, units in groups]
 
 
 def commands_of(
     part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any], results: str = RESULTS
 ) -> JSON:
-    """Return the commands that add what a diagnosis selected: ``add`` for every run, ``once`` for one; else nothing.
+    """Return the commands that add the effects which a diagnosis selected; ``{}`` if it selected none.
 
-    ``verb`` is what they are for: to add what is missing, or to try what does not explain all. ``part`` is the sensor's
-    part of ``diagnoses/<unit>.json``, ``settings`` are those of the run, ``results`` holds those of all campaigns.
+    ``add`` is for every run, ``once`` for one run. ``verb`` is "add", or "try" if the effects do not explain the whole
+    residual. ``part``: the sensor's part of ``diagnoses/<unit>.json``; ``settings``: of the run; ``results``: folder of
+    the results of all campaigns.
     """
     if not part.get("override"):
         return {}
@@ -107,7 +109,7 @@ def commands_of(
 def next_commands(
     findings: Sequence[Finding], settings: Mapping[str, Any], results: str = RESULTS
 ) -> list[tuple[str, str]]:
-    """Return the commands to continue with, each behind what it is for."""
+    """Return the purpose and the text of each command with which the user can continue."""
     missing: dict[str, list[str]] = {}
     for unit, sensor, verdict, selected in findings:
         if verdict == "missing_effect":
@@ -126,9 +128,10 @@ def next_commands(
 
 
 def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) -> str:
-    """Return the last lines of a run but those of failed units, from the results of its campaign and its settings.
+    """Return the closing lines of a run, except those about failed units.
 
-    ``of_this_run``: whether the last entry of the history is of this run.
+    ``results``: folder of the campaign's results; ``settings``: of the run; ``of_this_run``: whether this run wrote the
+    last entry of the history.
     """
     rows, folder = read_summary(results), str(results.parent)
     calibrated = sum(row["status"] == "ok" for row in rows)
@@ -139,10 +142,8 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         *lines_of(verdict_groups(findings)),
     ]
     units = [row["unit"] for row in rows]
-    lines += first(_told(results, "validations", units, lambda part: part.get("reason") or ""), NAMED, "reasons")
-    lines += first(
-        _told(results, "calibrations", units, lambda part: part.get("not_determined") or ""), NAMED, "reasons"
-    )
+    for documents, key in (("validations", "reason"), ("calibrations", "not_determined")):
+        lines += first(_reasons(results / documents, key, units), NAMED, "reasons")
     lines += lines_of(_not_in_uncertainty(rows).items())
     lines += first([f"{r['unit']}, left out: {what}" for r in rows if (what := r.get("left_out"))], NAMED, "units")
     entries = read_history(results) if of_this_run else []
@@ -158,20 +159,20 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     return "\n".join(lines) + "\n"
 
 
-def _told(results: Path, kind: str, units: Sequence[str], of_sensor: Callable[[JSON], str]) -> list[str]:
-    """Return what the published validations or calibrations tell of sensors, with the units; nothing of most."""
+def _reasons(documents: Path, key: str, units: Sequence[str]) -> list[str]:
+    """Return a line for each text that the published documents of units state for a sensor under ``key``."""
     groups: dict[str, list[str]] = {}
-    files = {unit: results / kind / f"{unit}.json" for unit in units}
-    for unit, file in files.items():
+    for unit in units:
+        file = documents / f"{unit}.json"
         document = read_json(file) if file.is_file() else {}
         for sensor in SENSORS:
-            if reason := of_sensor(document.get(sensor) or {}):
+            if reason := (document.get(sensor) or {}).get(key):
                 groups.setdefault(f"{sensor}, {reason}", []).append(unit)
     return lines_of(groups.items())
 
 
 def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
-    """Return the units by what U of a sensor does not include and can exceed it."""
+    """Group the units by source of error that can exceed the expanded uncertainty U and is not part of it."""
     groups: dict[str, list[str]] = {}
     for row in rows:
         for sensor in SENSORS:
@@ -181,9 +182,9 @@ def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str
 
 
 def _changes(entries: Sequence[JSON]) -> list[str]:
-    """Return a line for each sensor whose effects or error the last run has changed, the largest change first."""
+    """Return a line for each sensor whose effects or error the last run changed, largest change first."""
     states = of_units(entries)
-    found: list[tuple[float, str]] = []
+    lines: list[tuple[float, str]] = []
     for unit in entries[-1]["units"]:
         before, after = [{}, *(state for _, state in states[unit])][-2:]
         change = difference(before, after)
@@ -197,31 +198,31 @@ def _changes(entries: Sequence[JSON]) -> list[str]:
             words = ", ".join(change.words(sensor)).replace("\N{MINUS SIGN}", "-").replace("\N{RIGHTWARDS ARROW}", "->")
             floor = after[sensor].get("floor")
             ratio = f", {errors[1] / floor:.3g} times the noise floor" if floor else ""
-            told = f"held-out error {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}{ratio}"
+            line = f"held-out error {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}{ratio}"
             uncertainty = uncertainty_words(before[sensor], after[sensor], UNITS[sensor])
-            told += f"\n  {uncertainty}" if uncertainty else ""
-            found.append((factor, f"{unit}, {sensor}: {words}; {told}"))
-    return [line for _, line in sorted(found, key=lambda f: -f[0])]
+            line += f"\n  {uncertainty}" if uncertainty else ""
+            lines.append((factor, f"{unit}, {sensor}: {words}; {line}"))
+    return [line for _, line in sorted(lines, key=lambda entry: -entry[0])]
 
 
 def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:
-    """Return how the expanded uncertainties of bias and matrix changed, in words; empty where they did not.
+    """Return the change of the expanded uncertainties of bias and matrix in words; empty without a change.
 
     ``before``, ``after``: states of a sensor in the history.
     """
     was, now = (state.get("uncertainty") or {} for state in (before, after))
-    told = [
+    changes = [
         f"{key} {was[key] * scale:.2g} -> {now[key] * scale:.2g} {of}"
         for key, scale, of in (("bias", 1.0, unit), ("matrix", 100.0, "%"))
         if key in was and key in now and abs(now[key] - was[key]) > SMALLEST_CHANGE * was[key]
     ]
-    return f"largest expanded uncertainty (95 %): {', '.join(told)}" if told else ""
+    return f"largest expanded uncertainty (95 %): {', '.join(changes)}" if changes else ""
 
 
 def run_command(settings: Mapping[str, Any]) -> str:
-    """Return the command of a run: ``snakemake`` in a clone, ``imu-calibration run`` where the wheel is installed.
+    """Return the command of a run: ``snakemake`` in a clone, ``imu-calibration run`` if the wheel is installed.
 
-    ``settings``: as given by ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
+    ``settings``: those of ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
     """
     if INSTALLED:
         return _command("run", settings, [], str(settings.get("results") or RESULTS))
@@ -229,16 +230,15 @@ def run_command(settings: Mapping[str, Any]) -> str:
 
 
 def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = RESULTS) -> str:
-    """Return the command that adds effects (``sensor.effect``) to a unit's own settings and runs the campaign.
+    """Return the command that adds effects (``sensor.effect``) to the file of a unit and runs the campaign.
 
-    Effects that ``unit_overrides`` gave the unit for one run are added with them, or the override would be stronger.
+    It also adds the effects that ``unit_overrides`` sets for this run, because that override has precedence.
     """
     overrides = dict(settings.get("unit_overrides") or {})
     others, given = [], []
     for override in overrides.pop(unit, []):
-        found = EFFECTS.fullmatch(override)
-        if found:
-            given += [f"{found[1]}.{name.strip()}" for name in found[2].split(",") if name.strip()]
+        if match := EFFECTS.fullmatch(override):
+            given += [f"{match[1]}.{name.strip()}" for name in match[2].split(",") if name.strip()]
         else:
             others.append(override)
     overrides |= {unit: others} if others else {}
@@ -247,17 +247,16 @@ def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], 
 
 
 def once_command(settings: Mapping[str, Any], unit: str, override: str, results: str = RESULTS) -> str:
-    """Return the command that runs the campaign with one more override of a unit, for this run only."""
-    given = dict(settings)
-    own = {**given.pop("unit_overrides", {})}
+    """Return the command that runs the campaign once with one more override of a unit."""
+    overrides = settings.get("unit_overrides") or {}
     key = override.partition("=")[0]
-    others = [text for text in own.get(unit, []) if text.partition("=")[0] != key]
-    given |= {"unit_overrides": own | {unit: [*others, override]}}
-    return run_command(given | ({"results": results} if results != RESULTS else {}))
+    others = [text for text in overrides.get(unit, []) if text.partition("=")[0] != key]
+    once = {**settings, "unit_overrides": {**overrides, unit: [*others, override]}}
+    return run_command(once | ({"results": results} if results != RESULTS else {}))
 
 
 def _command(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
-    """Return a command of this package on the campaign of a run."""
+    """Return a command of this package for the campaign of a run."""
     program = ["imu-calibration"] if INSTALLED else ["python", "-m", "pipeline"]
     folder = ["--results", results] if results != RESULTS else []
     rest = {key: value for key, value in settings.items() if key not in ("campaign", "results")}
@@ -265,11 +264,11 @@ def _command(command: str, settings: Mapping[str, Any], words: Sequence[str], re
 
 
 def _config(settings: Mapping[str, Any]) -> list[str]:
-    given = [f"{key}={_flow(value, top=True)}" for key, value in settings.items() if value]
-    return ["--config", *given] if given else []
+    pairs = [f"{key}={_flow(value, top=True)}" for key, value in settings.items() if value]
+    return ["--config", *pairs] if pairs else []
 
 
-def _flow(value: Any, *, top: bool = False) -> str:  # noqa: ANN401  (what a command line may hold)
+def _flow(value: Any, *, top: bool = False) -> str:  # noqa: ANN401  (any YAML value)
     """Return a value as YAML on one line."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_flow(str(k))}: {_flow(v)}" for k, v in value.items()) + "}"

@@ -1,15 +1,15 @@
 """The results folder of a campaign: one run at a time, published files replaced as one set, edited files detected.
 
 Locks
-    A run holds ``.run.lock`` while it lasts; each of its jobs holds a share of ``.jobs.lock``. The kernel releases a
-    lock when its process ends, so a held lock is never a left-over. A file system without locks refuses nothing.
+    A run holds an exclusive lock on ``.run.lock`` and each of its jobs a shared lock on ``.jobs.lock``. The kernel
+    releases a lock when its process ends, so no stale lock can remain. A file system without locks refuses nothing.
 Publishing
-    A new set of files is written to a folder of its own, which is renamed to ``.published`` when it is complete. Each
-    of its files and folders is then exchanged with the published one of the same name. The next run completes an
-    exchange that was interrupted.
+    A new set of files is written to a separate folder, which is renamed to ``.published`` when it is complete. Each of
+    its files and folders is then exchanged with the published one of the same name. The next run completes an
+    interrupted exchange.
 Edited files
-    Snakemake does not repeat a job whose output was edited. So each job records in ``logs/written/`` a digest of what
-    it wrote, and how often it was repeated because that differed:
+    Snakemake does not repeat a job whose output was edited. Each job therefore records in ``logs/written/`` a digest of
+    its output and the number of repetitions because the output was edited:
     ``{"again": 0, "files": {"": "5f70bf18..."}}``. ``again`` is part of the settings of the job, so a larger number
     makes Snakemake repeat it. A folder without a record is accepted.
 """
@@ -39,19 +39,19 @@ PUBLISHED = (
 )  # fmt: skip
 RUN_LOCK, JOBS_LOCK = ".run.lock", ".jobs.lock"
 COMPLETE, PLAN = ".published", ".plan.json"
-DELAYED_SIGNALS = {signal.SIGINT, signal.SIGTERM}  # they wait until the exchange is complete: milliseconds
+DELAYED_SIGNALS = {signal.SIGINT, signal.SIGTERM}  # blocked during the exchange, which takes milliseconds
 SNAKEMAKE_TIMESTAMP = ".snakemake_timestamp"  # Snakemake writes it into every output folder
 HELD: list[IO[str]] = []  # locks, open until the process ends
 
 
 class BusyError(PipelineError):
-    """Another run works on the same results."""
+    """Another run uses the same results folder."""
 
     code = "busy"
 
 
 def take_run(results: Path) -> None:
-    """Hold the results of a campaign for this run; raises ``BusyError`` naming the process that holds them."""
+    """Lock the results of a campaign for this run; ``BusyError`` names the process that has locked them."""
     stream = _open(results / RUN_LOCK)
     if not _locked(stream, fcntl.LOCK_EX):
         other = stream.read().strip() or "a process that is not known"
@@ -63,14 +63,14 @@ def take_run(results: Path) -> None:
     HELD.append(stream)
 
 
-def jobs_at_work(results: Path) -> bool:
-    """Return whether jobs of a run that was killed are still at work."""
+def jobs_running(results: Path) -> bool:
+    """Return whether jobs of a killed run are still running."""
     with _open(results / JOBS_LOCK) as stream:
         return not _locked(stream, fcntl.LOCK_EX)
 
 
 def hold_as_job(results: Path) -> None:
-    """Show, while this process lives, that a job works on a campaign's results."""
+    """Mark the results of a campaign as used by a job until this process ends."""
     if results.is_dir():
         stream = _open(results / JOBS_LOCK)
         _locked(stream, fcntl.LOCK_SH)
@@ -95,7 +95,7 @@ def _locked(stream: IO[str], kind: int) -> bool:
 
 
 def publish_all(new: Path, results: Path) -> None:
-    """Replace the published files by the complete set in ``new``, a folder below ``results``, which is removed."""
+    """Replace the published files by the complete set in ``new``, a folder below ``results``; remove ``new``."""
     inodes = {item.name: item.lstat().st_ino for item in new.iterdir()}
     write_atomically(new / PLAN, json.dumps(inodes))
     flush_file_system(results)
@@ -104,7 +104,7 @@ def publish_all(new: Path, results: Path) -> None:
 
 
 def finish_publishing(results: Path) -> None:
-    """Complete an exchange that was begun, if there is one."""
+    """Complete an interrupted exchange, if there is one."""
     complete = results / COMPLETE
     if not (complete / PLAN).is_file():
         shutil.rmtree(complete, ignore_errors=True)
@@ -125,24 +125,24 @@ def finish_publishing(results: Path) -> None:
 
 
 def record_written(results: Path, output: str, again: int, names: Sequence[str] = ("",)) -> None:
-    """Record the digests of what a job wrote to ``output``, below ``results``.
+    """Record the digests of the files that a job wrote to ``output``, below ``results``.
 
-    ``again``: as ``repetitions`` returned when the run was started; ``names``: files and folders below the output, the
-    output itself where all of it is the job's.
+    ``again``: the number that ``repetitions`` returned at the start of the run; ``names``: files and folders below
+    ``output``, or ``""`` for the whole output.
     """
     files = {name: _digest(results / output / name) for name in names}
     write_atomically(_record(results, output), json.dumps({"again": again, "files": files}, sort_keys=True))
 
 
 def repetitions(results: Path, output: str) -> tuple[int, list[str]]:
-    """Return how often an output has been repeated because it was edited, and which of its files are edited now."""
+    """Return the number of repetitions of an output because of edits, and its files that are edited now."""
     try:
         record = json.loads(_record(results, output).read_text(encoding="utf-8"))
         again, files = int(record["again"]), dict(record["files"])
     except (OSError, ValueError, KeyError, TypeError):
         return 0, []
     if not (results / output).exists():
-        return again, []  # Snakemake makes it in any case
+        return again, []  # Snakemake writes a missing output in any case
     paths = {results / output / name: digest for name, digest in files.items()}
     edited = [os.path.normpath(path) for path, digest in paths.items() if _digest(path) != digest]
     return again + bool(edited), edited
@@ -155,16 +155,16 @@ def _record(results: Path, output: str) -> Path:
 def _digest(path: Path) -> str:
     """Return a digest of the names, sizes and times of a file, or of all files below a folder.
 
-    Snakemake sets the time of a pack after its job: the checksums of its members stand for it.
+    Snakemake sets the time of a pack after its job, so the checksums of its members replace the time.
     """
     files = [f"{folder}/{name}" for folder, _, names in os.walk(path) for name in names]
     lines = []
     for file in files if path.is_dir() else [str(path)]:
         if not file.endswith(SNAKEMAKE_TIMESTAMP):
             try:
-                found = os.lstat(file)
-                last = directory_of(file) if file.endswith(".zip") else found.st_mtime_ns
-                state = f"{found.st_size}\0{last}"
+                status = os.lstat(file)
+                version = directory_of(file) if file.endswith(".zip") else status.st_mtime_ns
+                state = f"{status.st_size}\0{version}"
             except FileNotFoundError:
                 state = "absent"
             lines.append(f"{file}\0{state}")

@@ -1,19 +1,19 @@
-"""What the terminal shows of a run in addition to Snakemake's log: progress, failed jobs, the command that recovers.
+"""Print the progress of a run, its failed jobs and the command that recovers, in addition to Snakemake's log.
 
-    time left = max(sum over jobs of seconds left / jobs at a time, longest running job + one of each later kind)
+    time left = max(sum over jobs of remaining time / parallel jobs, longest running job + one job of each later kind)
 
 where
 
-    seconds left   : of a job, units left * seconds a unit, less what the unit at work has taken
-    seconds a unit : geometric mean over the jobs of this kind in this run, weighted by their units, also of what
-                     running ones have done; and over ``PRIOR`` units of ``COST`` times the usual ratio to ``COST``
-    jobs at a time : seconds that jobs have worked / seconds since the first was started
+    remaining time : of a job, remaining units * time per unit - time spent on its current unit
+    time per unit  : geometric mean over the jobs of this kind in this run, weighted by their units, with the finished
+                     units of running jobs, and with ``PRIOR`` units of ``COST`` times the mean ratio time / ``COST``
+    parallel jobs  : sum of the run times of all jobs / time since the first job was started
 
-A job handles a batch of units and writes to its log which one it is at: ``stage: unit (3 of 50)``.
+A job handles a batch of units and writes its current unit to its log: ``stage: unit (3 of 50)``.
 
-The line stands instead of Snakemake's blocks for each job (``--printshellcmds`` and ``--verbose`` keep those, and
-Snakemake's log file always has them). On a terminal it is redrawn each second; elsewhere it is printed each half
-minute, with ``--quiet`` not at all.
+The progress line replaces Snakemake's block for each job on the terminal (not with ``--printshellcmds`` or
+``--verbose``; Snakemake's log file always has the blocks). A terminal shows a new line each second, other output each
+half minute, and ``--quiet`` shows none.
 """
 
 from __future__ import annotations
@@ -33,38 +33,38 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from pipeline.errors import first
-from pipeline.results_folder import jobs_at_work, take_run
+from pipeline.results_folder import jobs_running, take_run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-# Relative seconds a unit, of gather a run: data/demo on two cores (``tests/demo_jobs.csv``); "fit effects": the stage
-# of this name, in a bench of three units. Diagnoses of one run differ by a factor of 40: their logarithms are averaged.
+# Relative time per unit (gather: per run), from data/demo on two cores (``tests/demo_jobs.csv``); "fit effects": from a
+# bench of three units. The times of diagnoses in one run differ by a factor of 40, so logarithms are averaged.
 COST = {
     "ingest": 1.0, "filter": 0.3, "fit": 0.4, "fit effects": 5.0, "validate": 0.35, "diagnose": 15.0,
     "calibration": 0.85, "export": 0.2, "report": 0.85, "summary": 0.5, "gather": 4.0, "verdict": 0.0, "all": 0.0,
 }  # fmt: skip
-PRIOR = 40.0  # units that ``COST`` counts as
+PRIOR = 40.0  # weight of ``COST``, in units
 PER_BATCH = (
     "collect", "ingest", "filter", "fit", "fit effects", "validate", "diagnose", "calibration", "export", "report",
     "summary", "prior",
 )  # fmt: skip
 AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
 EFFECTS = "fit effects"
-SOON = 0.1  # of the usual time of a unit, or of what it has taken: what is left at least of one at work
+LEAST_SHARE = 0.1  # least remaining time of a current unit, as a share of its usual or its elapsed time
 LAST_STAGE = "report"  # its units are counted as done
 NAMED_JOBS, NAMED = 2, 10
-INTERVAL = {True: 1.0, False: 30.0}  # s between lines, by whether it is a terminal
+INTERVAL = {True: 1.0, False: 30.0}  # s between lines, on a terminal and elsewhere
 CLEAR_LINE = "\r\x1b[K"
 BLOCKS = ("JOB_INFO", "JOB_STARTED", "JOB_FINISHED", "PROGRESS", "SHELLCMD", "RUN_INFO", "RESOURCES_INFO", "GROUP_INFO")
 SCHEDULER_MESSAGES = ("Select jobs to execute", "Execute ")
-REFUSALS = ("LockException", "ProtectedOutputException")  # of Snakemake, before any job
+REFUSALS = ("LockException", "ProtectedOutputException")  # Snakemake's errors before any job
 INTERRUPTED = ("Terminating processes on user request", "Shutting down, this might take")  # Ctrl-C; SIGTERM
 
 
 @dataclass
 class Job:
-    """A job of Snakemake: rule, displayed name, number of units, log, start time in s, and how long it took in s."""
+    """A job of Snakemake: rule, displayed name, number of units, log, start time in s, and duration in s."""
 
     rule: str
     name: str
@@ -78,8 +78,8 @@ class Job:
         """Key of ``COST``."""
         return EFFECTS if self.rule == "fit" and self.name.endswith("effects") else self.rule
 
-    def at(self) -> tuple[str, int, float] | None:
-        """Return the unit that the job is at, its number, and when it began with it; None before the first."""
+    def current_unit(self) -> tuple[str, int, float] | None:
+        """Return name, number and start time of the current unit of the job; None before the first unit."""
         try:
             with self.log.open("rb") as stream:
                 stream.seek(max(os.fstat(stream.fileno()).st_size - 2000, 0))
@@ -92,7 +92,7 @@ class Job:
 
 @dataclass
 class Progress:
-    """The jobs of a run: units of each batch, jobs wanted of each kind, running, done, and s that failed ones took."""
+    """The jobs of a run: units per batch, wanted jobs per kind, running and done jobs, time of failed jobs in s."""
 
     batches: Mapping[str, int]
     wanted: Counter[str] = field(default_factory=Counter)
@@ -124,40 +124,41 @@ class Progress:
         units = round(self.wanted.get(LAST_STAGE, 0) * self._mean_batch())
         parts = [f"{len(self.done)} of {sum(self.wanted.values())} jobs"]
         parts += [f"{units_done} of {units} units done"] * bool(units)
-        at = [(job, where) for job in self.running.values() if (where := job.at())]
-        for job, (unit, number, _) in sorted(at, key=lambda a: -a[0].since)[:NAMED_JOBS]:
+        current = [(job, unit) for job in self.running.values() if (unit := job.current_unit())]
+        for job, (unit, number, _) in sorted(current, key=lambda entry: -entry[0].since)[:NAMED_JOBS]:
             parts.append(f"{job.name}: {unit} ({number} of {job.units})")
         left = self._seconds_left()
         return " | ".join([*parts, *([f"about {duration(left)} left"] if left else [])])
 
     def _seconds_left(self) -> float | None:
-        """Return the time that the rest will take, s; None until two jobs are done."""
+        """Return the remaining time of the run, s; None until two jobs are done."""
         if len(self.done) < 2:
             return None
         now, measured = time.time(), [(job.kind, job.units, job.seconds) for job in self.done]
         scale = sum(seconds for *_, seconds in measured) / sum(COST.get(kind, 1.0) * n for kind, n, _ in measured)
-        at_work, worked = [], self.lost + sum(job.seconds for job in self.done)
+        current, worked = [], self.lost + sum(job.seconds for job in self.done)
         for job in self.running.values():
-            _, number, began = job.at() or ("", 1, job.since)
-            at_work.append((job.kind, job.units - number, now - began))
+            _, number, began = job.current_unit() or ("", 1, job.since)
+            current.append((job.kind, job.units - number, now - began))
             measured.append((job.kind, number - 1, began - job.since))
             worked += now - job.since
-        usual = {kind: _usual(kind, scale, measured) for kind in {*self.wanted, *(kind for kind, *_ in at_work)}}
-        measured += [(kind, 1, seconds) for kind, _, seconds in at_work if seconds > usual[kind]]
+        usual = {kind: _usual(kind, scale, measured) for kind in {*self.wanted, *(kind for kind, *_ in current)}}
+        measured += [(kind, 1, seconds) for kind, _, seconds in current if seconds > usual[kind]]
         usual = {kind: _usual(kind, scale, measured) for kind in usual}
         running = [
-            after * usual[k] + max(usual[k] - seconds, SOON * max(usual[k], seconds)) for k, after, seconds in at_work
+            after * usual[kind] + max(usual[kind] - seconds, LEAST_SHARE * max(usual[kind], seconds))
+            for kind, after, seconds in current
         ]
-        to_come = self.wanted - Counter(job.kind for job in (*self.done, *self.running.values()))
-        a_job = {kind: usual[kind] * (self._mean_batch() if kind in PER_BATCH else 1.0) for kind in to_come}
-        whole = sum(running) + sum(a_job[kind] * count for kind, count in to_come.items())
-        jobs_at_a_time = max(worked / max(time.monotonic() - self.started, 1e-3), 1.0)
-        beside = {kind for kind, *_ in at_work}  # what other batches are at
-        in_turn = sum(a_job[kind] * self._in_turn(kind, count) for kind, count in to_come.items() if kind not in beside)
-        return max(whole / jobs_at_a_time, max(running, default=0.0) + in_turn)
+        waiting = self.wanted - Counter(job.kind for job in (*self.done, *self.running.values()))
+        per_job = {kind: usual[kind] * (self._mean_batch() if kind in PER_BATCH else 1.0) for kind in waiting}
+        total = sum(running) + sum(per_job[kind] * count for kind, count in waiting.items())
+        parallel_jobs = max(worked / max(time.monotonic() - self.started, 1e-3), 1.0)
+        later = waiting.keys() - {kind for kind, *_ in current}
+        serial = sum(per_job[kind] * self._serial_jobs(kind, waiting[kind]) for kind in later)
+        return max(total / parallel_jobs, max(running, default=0.0) + serial)
 
-    def _in_turn(self, kind: str, count: int) -> int:
-        """Return how many of so many jobs come one after the other in a batch."""
+    def _serial_jobs(self, kind: str, count: int) -> int:
+        """Return how many of ``count`` jobs follow each other in one batch."""
         return math.ceil(count / (len(self.batches) * (2 if kind.startswith("fit") else 1)))
 
     def _mean_batch(self) -> float:
@@ -165,15 +166,15 @@ class Progress:
 
 
 def _usual(kind: str, scale: float, measured: Sequence[tuple[str, int, float]]) -> float:
-    """Return the seconds a unit of a kind of jobs, by units and seconds of some jobs."""
-    own = [(n, seconds / n) for of, n, seconds in measured if of == kind and n]
-    known = [(PRIOR, scale * COST.get(kind, 1.0)), *own]
-    logarithm = sum(n * math.log(max(seconds, 1e-3)) for n, seconds in known)
-    return math.exp(logarithm / sum(n for n, _ in known))
+    """Return the time per unit of a kind of jobs, s, from ``measured``: kind, units and seconds of jobs."""
+    of_kind = [(n, seconds / n) for measured_kind, n, seconds in measured if measured_kind == kind and n]
+    weighted = [(PRIOR, scale * COST.get(kind, 1.0)), *of_kind]
+    logarithm = sum(n * math.log(max(seconds, 1e-3)) for n, seconds in weighted)
+    return math.exp(logarithm / sum(n for n, _ in weighted))
 
 
 def duration(seconds: float) -> str:
-    """Return a duration, rounded as it is read."""
+    """Return a duration as rounded text."""
     if seconds < 90:
         return f"{max(5 * round(seconds / 5), 5)} s"
     if seconds < 5400:
@@ -182,30 +183,30 @@ def duration(seconds: float) -> str:
 
 
 class Countdown:
-    """How far a command of one process is, and how long it will take: a line that is redrawn on a terminal.
+    """Prints the progress and the remaining time of a command: each second on a terminal, elsewhere each half minute.
 
-    Elsewhere a line is printed each half minute. ``total``: of what is counted, such as units, or bytes of a log.
+    ``total``: total amount of work, in units, bytes of a log ...
     """
 
     def __init__(self, total: float) -> None:
         self.total = total
         self.began = time.monotonic()
-        self.told = float("-inf") if sys.stderr.isatty() else self.began
+        self.printed = float("-inf") if sys.stderr.isatty() else self.began
         self.drawn = False
 
     def left(self, done: float) -> str:
-        """Return the time left in words; empty in the first second and at the end."""
+        """Return the remaining time in words; empty in the first second and at the end."""
         elapsed = time.monotonic() - self.began
         if not 0.0 < done < self.total or elapsed < 1.0:
             return ""
         return f"about {duration(elapsed * (self.total / done - 1.0))} left"
 
     def __call__(self, done: float, words: str) -> None:
-        """Tell how much is done, in words, and how long the rest will take."""
+        """Print the amount of work that is done, ``words``, and the remaining time."""
         now, terminal = time.monotonic(), sys.stderr.isatty()
-        if now - self.told < INTERVAL[terminal]:
+        if now - self.printed < INTERVAL[terminal]:
             return
-        self.told, self.drawn = now, terminal
+        self.printed, self.drawn = now, terminal
         text = " | ".join(filter(None, [f"{100.0 * done / max(self.total, 1):.0f} %", words, self.left(done)]))
         sys.stderr.write(f"{CLEAR_LINE}{text}" if terminal else f"{text}\n")
         sys.stderr.flush()
@@ -221,14 +222,14 @@ class Countdown:
 class Monitor(logging.Handler):
     """Follows the log records of Snakemake and prints the progress of a run in ``results``.
 
-    Snakemake's interface for logger plugins is not used: it needs a top-level package of its own, which Snakemake does
+    Snakemake's interface for logger plugins is not used: it needs a separate top-level package, which Snakemake does
     not find in an editable installation.
     """
 
     def __init__(self, results: Path, batches: Mapping[str, int], effects: int, logger: logging.Logger) -> None:
         super().__init__()
         self.results = results
-        self.effects = effects  # stages ``effects`` of all batches and sensors
+        self.effects = effects  # number of stages ``effects`` of all batches and sensors
         self.progress = Progress(batches)
         self.logger = logger
         self.failed: list[tuple[str, Path]] = []
@@ -241,11 +242,11 @@ class Monitor(logging.Handler):
         atexit.register(self.print_recovery)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Note a record of Snakemake."""
+        """Update the progress from a log record of Snakemake."""
         event, fields = _event(record), vars(record)
         if event == "RUN_INFO":
             wanted = Counter({k: v for k, v in fields["stats"].items() if k != "total"})
-            effects = min(self.effects, wanted["fit"])  # the last stage of its chain, so again where any is
+            effects = min(self.effects, wanted["fit"])  # last stage of its chain: it runs if any stage does
             self.progress.wanted = wanted + Counter({EFFECTS: effects}) - Counter({"fit": effects})
         elif event == "JOB_INFO":
             log = Path((fields["log"] or [os.devnull])[0])
@@ -264,12 +265,12 @@ class Monitor(logging.Handler):
             self.refused = next((name for name in REFUSALS if name in str(record.msg)), self.refused)
 
     def begin(self, *, quiet: bool, plain: bool) -> None:
-        """Hold the results, wait for jobs that a killed run has left, and start to print the progress.
+        """Lock the results, wait for jobs of a killed run, and start to print the progress.
 
-        Raises ``BusyError`` if another run holds the results.
+        Raises ``BusyError`` if another run has locked the results.
         """
         take_run(self.results)
-        while jobs_at_work(self.results):
+        while jobs_running(self.results):
             print("Waiting for jobs of a killed run that are still running ...", file=self.stream, flush=True)
             time.sleep(2)
         terminal = self.stream.isatty() and not plain
@@ -279,7 +280,7 @@ class Monitor(logging.Handler):
             threading.Thread(target=self._print_progress, kwargs={"terminal": terminal}, daemon=True).start()
 
     def print_edited(self, edited: Sequence[str]) -> None:
-        """Print which files were edited or deleted since they were made, and are made again."""
+        """Print the files that are computed again because they were edited or deleted."""
         if edited:
             lines = [
                 "Changed or deleted since the last run, computed again:",
@@ -288,7 +289,7 @@ class Monitor(logging.Handler):
             print("\n".join(lines), file=self.stream, flush=True)
 
     def print_recovery(self) -> None:
-        """Print, after Snakemake's last message, what failed and the command that recovers."""
+        """Print the failed jobs and the command that recovers, after Snakemake's last message."""
         self.ended.set()
         command = shlex.join(["snakemake", *sys.argv[1:]])
         lines = []
@@ -315,7 +316,7 @@ class Monitor(logging.Handler):
             print("\n".join(lines), file=self.stream)
 
     def _filter_job_blocks(self, clear: str) -> None:
-        """Suppress Snakemake's block for each job on the terminal, and clear our line before its other messages."""
+        """Suppress Snakemake's block for each job, and clear the progress line before its other messages."""
 
         def passes(record: logging.LogRecord) -> bool:
             if _event(record) in BLOCKS or str(record.msg).startswith(SCHEDULER_MESSAGES):
@@ -351,5 +352,5 @@ def _cause(log: Path) -> str:
     except OSError as error:
         return f"its log cannot be read ({error.strerror})"
     last = next((line for line in reversed(lines) if line.strip()), "")
-    at = AT_UNIT.findall(last)
-    return f"killed at unit {at[-1][0]}" if at else last or "killed, or could not be started"
+    units = AT_UNIT.findall(last)
+    return f"killed at unit {units[-1][0]}" if units else last or "killed, or could not be started"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline import results_folder, run_progress
-from pipeline.results_folder import BusyError, hold_as_job, jobs_at_work, take_run
+from pipeline.results_folder import BusyError, hold_as_job, jobs_running, take_run
 from pipeline.run_progress import Progress, _cause, duration
 
 
@@ -70,12 +70,12 @@ def test_results_are_held_by_one_run_and_jobs_are_seen(tmp_path: Path, monkeypat
     take_run(tmp_path)
     with pytest.raises(BusyError, match=r"another run works on these results \(process [0-9]+ on"):
         take_run(tmp_path)
-    assert not jobs_at_work(tmp_path)
+    assert not jobs_running(tmp_path)
     hold_as_job(tmp_path)
-    assert jobs_at_work(tmp_path)
+    assert jobs_running(tmp_path)
     for stream in results_folder.HELD:
         stream.close()
-    assert not jobs_at_work(tmp_path)
+    assert not jobs_running(tmp_path)
     results_folder.HELD.clear()
     take_run(tmp_path)
     results_folder.HELD[0].close()
