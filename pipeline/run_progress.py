@@ -124,7 +124,7 @@ class Progress:
         units = round(self.wanted.get(LAST_STAGE, 0) * self._mean_batch())
         parts = [f"{len(self.done)} of {sum(self.wanted.values())} jobs"]
         parts += [f"{units_done} of {units} units done"] * bool(units)
-        current = [(job, unit) for job in self.running.values() if (unit := job.current_unit())]
+        current = [(job, position) for job in self.running.values() if (position := job.current_unit())]
         for job, (unit, number, _) in sorted(current, key=lambda entry: -entry[0].since)[:NAMED_JOBS]:
             parts.append(f"{job.name}: {unit} ({number} of {job.units})")
         left = self._seconds_left()
