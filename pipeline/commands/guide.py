@@ -16,6 +16,7 @@ from pipeline.commands.readings import campaign_of, config_of_log, grouped, reco
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
 from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.rest_means import is_multi_position
 from pipeline.io.files import MESSAGE_FORMATS, recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
@@ -30,7 +31,7 @@ from pipeline.planning.guide import (
     propose,
 )
 from pipeline.preprocessing.checks import check_recordings
-from pipeline.signal.rests import WINDOW_S, find_rests
+from pipeline.signal.rests import NEIGHBOURS, WINDOW_S, find_rests
 from pipeline.simulation.description import BY_HAND
 
 if TYPE_CHECKING:
@@ -47,7 +48,8 @@ FIRST = Turn(0, 2, 180.0)  # about x, while nothing of the gyroscope is known
 EPILOG = """\
 The next rest is the one that reduces the uncertainty of the accelerometer's calibration most. The goal is reached when
 the largest expanded uncertainty (95 %) of the bias, in mg, and of the matrix, in mg at 1 g, is below --goal. With
---gyroscope-goal, turns for the gyroscope's matrix follow (method=rests_and_moves). With --procedure ferraris, the next
+--gyroscope-goal, turns for the gyroscope's matrix follow (method=rests_and_moves); until then each message states its
+uncertainty. With --procedure ferraris, the next
 missing face or turn is named. docs/record.md shows the names of the attitudes.
 
 A recording of a campaign is read as the campaign's configuration says, together with the unit's other recordings. Any
@@ -97,11 +99,18 @@ def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline guide RECORDING...``."""
     arguments = _parser().parse_args(argv)
     source = _source(arguments)
+    faces = source.config["procedure"].get("faces")
+    if faces and (arguments.goal or arguments.gyroscope_goal):
+        name = source.config["procedure"]["name"]
+        raise ConfigurationError(
+            f"procedure {name} needs given faces and turns, whatever their uncertainty: leave out --goal and "
+            "--gyroscope-goal, or take --procedure multi_position"
+        )
     sensor_config = source.config["sensor"]["accelerometer"]
     gravity = float(source.config["table"].get("gravity_g") or 1.0)
     goal = 1e-3 * arguments.goal if arguments.goal else default_goal(sensor_config, gravity, arguments.dwell)
     goals = Goals(goal, arguments.gyroscope_goal)
-    if arguments.goal is None and not source.config["procedure"].get("faces"):
+    if arguments.goal is None and not faces:
         name = source.config["sensor"]["name"]
         print(f"goal: {1e3 * goal:g} mg, what 24 rests 45 deg apart reach with the noise of the sensor file {name}")
     if not arguments.follow:
@@ -184,12 +193,8 @@ class RestLine(NamedTuple):
     recording: str
     start: float  # s
     used: bool
+    final: bool  # whether the rests with whose rate its own is compared are there
     text: str
-
-    def told_in(self, advice: Advice) -> bool:
-        """Return whether an advice has the same rest; more of the log may shift its start and its number."""
-        same = (rest for rest in advice.rests if (rest.recording, rest.used) == (self.recording, self.used))
-        return any(abs(rest.start - self.start) < WINDOW_S for rest in same)
 
 
 class Advice(NamedTuple):
@@ -209,21 +214,32 @@ class Goals(NamedTuple):
 
 def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goals, dwell: float) -> Advice:
     if config["procedure"].get("faces"):
-        done, words = next_face_or_turn(recordings, config["procedure"])
+        done, words = next_face_or_turn(recordings, config["procedure"], dwell)
         return Advice(done, [], words)
     progress = progress_of(recordings, config, dwell)
+    starts = [(r.name, rest.start) for r, rest in (*progress.rests, *progress.left_out)]
+
+    def line(r: Recording, rest: Rest, text: str) -> RestLine:
+        of_recording = [start for name, start in starts if name == r.name]
+        after = sum(start > rest.start for start in of_recording)
+        final = after >= NEIGHBOURS // 2 and len(of_recording) >= NEIGHBOURS
+        return RestLine(r.name, r.time[rest.start], rest.accepted, final, text)
+
     rows = zip(progress.rests, progress.up, progress.held_out, strict=True)
     lines = [
-        RestLine(r.name, r.time[rest.start], used=True, text=f"{k:>4}  {_described(r, rest, up, held=held)}")
+        line(r, rest, f"{k:>4}  {_described(r, rest, up, held=held)}")
         for k, ((r, rest), up, held) in enumerate(rows, start=1)
     ]
     for r, rest in progress.left_out:
-        text = f"   -  {r.name} {r.time[rest.start]:.1f} s: left out: {rest.reason}"
-        lines.append(RestLine(r.name, r.time[rest.start], used=False, text=text))
+        lines.append(line(r, rest, f"   -  {r.name} {r.time[rest.start]:.1f} s: left out: {rest.reason}"))
     done, words = _next(progress, goals.accelerometer, dwell)
-    if done and goals.gyroscope is not None:
-        done, words = _next_turn(recordings, config, progress, goals.gyroscope, dwell)
-    return Advice(done, lines, words)
+    if goals.gyroscope is None:
+        return Advice(done, lines, words)
+    reached, of_gyroscope = _next_turn(recordings, config, progress, goals.gyroscope, dwell)
+    if done:
+        return Advice(reached, lines, of_gyroscope)
+    later = "" if reached else "; turns for it are proposed once the accelerometer's goal is reached"
+    return Advice(enough=False, rests=lines, words=[*words, of_gyroscope[0] + later])
 
 
 def _next_turn(
@@ -232,8 +248,12 @@ def _next_turn(
     """Return whether the gyroscope's goal is reached, and the next turn in words."""
     try:
         found = rests_and_moves.fit(recordings, None, config)
-    except NotObservableError as lack:
-        return False, [f"gyroscope's matrix: not determined yet: {lack.message}", f"next: {FIRST.in_words(dwell)}"]
+    except (NotObservableError, CannotCalibrateError) as lack:
+        if not is_multi_position("gyroscope", recordings):
+            raise
+        reason = lack.message.partition(": ")[0]
+        now = f"gyroscope's matrix: not determined yet: {reason} (goal {goal:g} %)"
+        return False, [now, f"next: {FIRST.in_words(dwell)}"]
     expanded = 100.0 * float(np.max(found.to_json()["expanded_uncertainty"]["matrix"]))
     now = f"expanded uncertainty of the gyroscope's matrix: {expanded:.2g} % (goal {goal:g} %)"
     if expanded <= goal:
@@ -261,7 +281,7 @@ def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str
     proposal = propose(progress, goal)
     if not proposal.further:
         return True, [*lines, "enough: the goal is reached"]
-    lines.append(f"next: {in_words(proposal.up)}; rest it for {dwell:g} s or more")
+    lines.append(f"next: {in_words(proposal.up)}; rest it for {dwell:g} s")
     if progress.next_is_held_out:
         lines.append("      (held out of the fit, to judge it: an attitude far from all others)")
     if proposal.expected > goal:
@@ -276,8 +296,8 @@ def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str
 
 def _follow(source: Source, goals: Goals, dwell: float) -> None:
     """Look at a growing log again and again, and tell what is new, until it is enough."""
-    told: Advice | None = None
-    waiting = ""
+    told: list[RestLine] = []
+    last, waiting = "", ""
     bell = "\a" if sys.stdout.isatty() else ""
     while True:
         try:
@@ -292,13 +312,29 @@ def _follow(source: Source, goals: Goals, dwell: float) -> None:
             print(f"waiting: {problem}", flush=True)
         waiting = problem
         if advice is not None:
-            new = [rest.text for rest in advice.rests if told is None or not rest.told_in(told)]
-            if new or told is None or (not advice.rests and advice.words != told.words):
+            new = _news(advice.rests, told)
+            if new or advice.enough or not last or (not advice.rests and advice.words[-1] != last):
                 print("\n".join([*new, *advice.words]) + bell, flush=True)
-                told = advice
+                last = advice.words[-1]
                 if advice.enough:
                     return
         time.sleep(POLL_S)
+
+
+def _news(rests: Sequence[RestLine], told: list[RestLine]) -> list[str]:
+    """Return the lines of rests that were not told before, and of those that are judged otherwise in the end.
+
+    The rate of a rest is compared with that of its neighbours, so that rests to come may change what is told of it. To
+    tell each rest twice at most, a change is told when the neighbours are there. ``told`` is brought up to date.
+    """
+    new = []
+    for rest in rests:
+        same = (t for t in told if t.recording == rest.recording and abs(t.start - rest.start) < WINDOW_S)
+        before = next(same, None)  # more of the log may shift the start of a rest
+        if before is None or (rest.final and not before.final):
+            new += [rest.text] if before is None or before.used != rest.used else []
+            told[:] = [*(t for t in told if t is not before), rest]
+    return new
 
 
 def _without_last_rest(recording: Recording, dwell: float) -> Recording:

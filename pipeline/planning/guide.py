@@ -27,7 +27,7 @@ with white noise s of the mean of a rest, bias wander q and tau, rests one after
 body.
 
 Faces and turns (procedure ``ferraris``): each of the six faces needs a rest, and each body axis a turn by the stated
-angle from rest to rest; where turns are held out, enough of them that one is. They are recognised as in the fit.
+angle from rest to rest; where turns are held out, one that is. They are recognised as in the fit.
 
 Rests and moves: of turns by A about a level body axis a, from the vertical u, the one with the largest gain
 
@@ -43,7 +43,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise, product
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,7 +56,7 @@ from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
 from pipeline.records import AXES, Recording, SensorCalibration, Values, coverage_factor
 from pipeline.signal.rests import WINDOW_S, Rest, find_rests
-from pipeline.signal.segments import multiples
+from pipeline.signal.segments import turns_by_hand
 from pipeline.simulation.trajectory import rotation_by
 
 if TYPE_CHECKING:
@@ -344,36 +344,35 @@ def most_informative_turn(gyroscope: SensorCalibration, direction: float) -> Tur
     return max(turns, key=gain)
 
 
-def next_face_or_turn(recordings: Sequence[Recording], procedure: Mapping[str, Any]) -> tuple[bool, list[str]]:
-    """Return whether all faces and turns are there, and lines that say what is there and what comes next."""
+def next_face_or_turn(
+    recordings: Sequence[Recording], procedure: Mapping[str, Any], dwell: float
+) -> tuple[bool, list[str]]:
+    """Return whether all faces and turns are there, and lines that say what is there and what comes next.
+
+    ``dwell``: s, of a rest to come.
+    """
     stated = procedure["turns"]
-    faces, turns, angle = dict.fromkeys(FACES, 0), dict.fromkeys(AXES, 0), float(stated["angle_deg"])
+    faces, angle = dict.fromkeys(FACES, 0), float(stated["angle_deg"])
+    turns: dict[str, list[bool]] = {axis: [] for axis in AXES}  # whether each is held out
     for recording in (r for r in recordings if r.role == ROLE):
         rests = [rest for rest in find_rests(recording) if rest.accepted]
         for on in face_of(rest_means(recording, rests)[0])[0].tolist():
             if on >= 0:
                 faces[FACES[on]] += 1
-        if recording.gyroscope is None:
-            continue
-        for before, after in pairwise(rests):
-            move = slice(before.stop - 1, after.start + 1)
-            rate = recording.gyroscope
-            bias = 0.5 * sum(rate[r.start : r.stop].mean(axis=0) for r in (before, after))
-            axis, count = multiples(np.trapezoid(rate[move] - bias, recording.time[move], axis=0), angle)
-            turns[AXES[axis]] += bool(count)
-    every = int(stated["holdout_every"])
-    held_elsewhere = any(r.role == "validation" for r in recordings)
-    needed = 1 if held_elsewhere or not every else every
+        for turn in turns_by_hand(recording, rests, stated):
+            turns[AXES[turn.axis]].append(turn.held_out)
+    judged = bool(int(stated["holdout_every"])) and not any(r.role == "validation" for r in recordings)
+    counts = (f"{axis} {len(held)}" + f" ({sum(held)} held out)" * judged for axis, held in turns.items())
     lines = [
         "faces: " + ", ".join(f"{name} {count}" for name, count in faces.items()) + " rests",
-        f"turns by {angle:g} deg: " + ", ".join(f"{axis} {count}" for axis, count in turns.items()) + f" of {needed}",
+        f"turns by {angle:g} deg: " + ", ".join(counts),
     ]
     face = next((name for name, count in faces.items() if not count), None)
     if face is not None:
-        return False, [*lines, f"next: {face} up; rest it for 4 s or more"]
-    about = next((name for name, count in turns.items() if count < needed), None)
+        return False, [*lines, f"next: {face} up; rest it for {dwell:g} s"]
+    about = next((axis for axis, held in turns.items() if not (any(held) if judged else held)), None)
     if about is None:
         return True, [*lines, "enough: all faces and turns are there"]
-    back = "back " if turns[about] % 2 else ""
-    turn = f"turn it {back}by {angle:g} deg about the vertical"
-    return False, [*lines, f"next: +{about} up; rest it for 4 s, {turn}, rest it for 4 s again"]
+    back = "back " if len(turns[about]) % 2 else ""
+    move = f"turn it {back}by {angle:g} deg about the vertical"
+    return False, [*lines, f"next: +{about} up; rest it for {dwell:g} s, {move}, rest it for {dwell:g} s again"]

@@ -35,11 +35,12 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.records import AXES, Mask, Note, Recording, Values, rate_of_attitude
-from pipeline.signal.rests import RATE_AT_REST_DPS, find_rests, runs
+from pipeline.signal.rests import RATE_AT_REST_DPS, SHORTEST_REST_S, WINDOW_S, find_rests, runs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.signal.rests import Rest
 
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
 BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # of rest that a segment takes with it
@@ -285,7 +286,7 @@ def _useful(group: Sequence[Move]) -> bool:
 
 SCALE = 0.1  # relative: three times the largest scale factor error of the shipped data sheets (MPU-6050: 3 %)
 ACROSS = 0.25  # 15 deg between the turn and a body axis: a chip askew in its case, and a hand
-HALF_S = 2.0  # of a rest that is cut in two: half a second is trimmed, a second is the shortest rest
+HALF_S = WINDOW_S + SHORTEST_REST_S  # half of a rest that is cut in two and found again: a window of it is trimmed
 
 
 def multiples(angle: Values, stated_deg: float) -> tuple[int, int]:
@@ -298,35 +299,50 @@ def multiples(angle: Values, stated_deg: float) -> tuple[int, int]:
     return axis, count if agrees else 0
 
 
-def held_out_windows(recording: Recording, turns: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the windows that cut every k-th turn about each axis out of a recording, as role ``validation``.
+class TurnByHand(NamedTuple):
+    """A turn by the stated angle about one body axis, and the rests before and after it, s from the first sample."""
 
-    Parameters
-    ----------
-    recording : Recording
-    turns : mapping
-        ``angle_deg`` and ``holdout_every`` (k; 0: none).
+    axis: int
+    before: tuple[float, float]
+    after: tuple[float, float]
+    held_out: bool
 
-    Returns
-    -------
-    list of dict
-        As of ``pipeline.signal.segments.cut``, from the middle of the rest before a turn to that of the rest after it;
-        empty where nothing is held out.
+
+def turns_by_hand(recording: Recording, rests: Sequence[Rest], turns: Mapping[str, Any]) -> list[TurnByHand]:
+    """Return the turns by a multiple of the stated angle between the accepted ones of the rests.
+
+    Every k-th about an axis is held out: the first from the k-th on with rests of which either half is a rest again.
+    ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none).
     """
     rate, every = recording.gyroscope, int(turns["holdout_every"])
-    if rate is None or not every:
+    if rate is None:
         return []
-    since = recording.time - recording.time[0]
-    seen, edges = [0, 0, 0], [0.0]
-    for before, after in pairwise(r for r in find_rests(recording) if r.accepted):
+    since, seen, found = recording.time - recording.time[0], [0, 0, 0], []
+    for before, after in pairwise(r for r in rests if r.accepted):
         move = slice(before.stop - 1, after.start + 1)
         bias = 0.5 * sum(rate[r.start : r.stop].mean(axis=0) for r in (before, after))
         axis, count = multiples(np.trapezoid(rate[move] - bias, since[move], axis=0), float(turns["angle_deg"]))
-        seen[axis] += bool(count)
-        ends = [(float(since[r.start]), float(since[r.stop - 1])) for r in (before, after)]
-        if count and seen[axis] % every == 0 and min(stop - start for start, stop in ends) > 2.0 * HALF_S:
-            edges += [0.5 * (start + stop) for start, stop in ends]
-    edges.append(float(since[-1]) + recording.interval)
+        if not count:
+            continue
+        seen[axis] += 1
+        first, last = ((float(since[r.start]), float(since[r.stop - 1])) for r in (before, after))
+        held = 0 < every <= seen[axis] and min(stop - start for start, stop in (first, last)) > 2.0 * HALF_S
+        seen[axis] -= every * held
+        found.append(TurnByHand(axis, first, last, held))
+    return found
+
+
+def held_out_windows(recording: Recording, turns: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the windows that cut every k-th turn about each axis out of a recording, as role ``validation``.
+
+    ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none). The windows are as of ``cut``, from the middle of the
+    rest before a turn to that of the rest after it; there are none where nothing is held out.
+    """
+    edges = [0.0]
+    for turn in turns_by_hand(recording, find_rests(recording), turns):
+        if turn.held_out:
+            edges += [0.5 * (start + stop) for start, stop in (turn.before, turn.after)]
+    edges.append(float(recording.time[-1] - recording.time[0]) + recording.interval)
     roles = ["rests", "validation"] * len(edges)
     spans = zip(pairwise(edges), roles, strict=False)
     return [{"role": role, "start_s": a, "stop_s": b} for (a, b), role in spans if b > a] if len(edges) > 2 else []

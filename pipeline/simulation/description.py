@@ -42,7 +42,7 @@ _, FILE, PROGRAM = KINDS
 UNITS_OF_A_LOT = 25  # of a described count of units: a round number
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
 BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
-# Each turn there and back, the second held out between rests of 4 s and more; 360 deg in some 3 s.
+# Each turn there and back, the second held out between rests of 4 s or longer; 360 deg in some 3 s.
 FACES_AND_TURNS = replace(BY_HAND, dwell_s=5.0, rates_dps=(120.0,), both_directions=True)
 RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
 

@@ -303,7 +303,7 @@ def _choose(
         return held_out, None
     reason = f"no held-out recording holds readings of the {sensor} and a reference for them"
     if by_rests and settings.get("procedure", {}).get("turns"):
-        reason += " (with two turns about each axis between rests of 4 s and more, the second is held out)"
+        reason += " (with two turns about each axis between rests of 4 s or longer, the second is held out)"
     fitted = moving(sensor) or resting(rests_of("rests")) or resting(rests_of(sensor))
     return fitted, reason + ("; judged on the samples of the fit" if fitted else "")
 

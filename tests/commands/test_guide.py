@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,6 +44,11 @@ def test_of_few_rests_it_says_what_they_leave_open_and_what_comes_next(
     assert any(line.startswith("expanded uncertainty: not determined yet") and "goal 0.5 mg" in line for line in lines)
     assert any(line.startswith("next: ") and "rest it for 4 s" in line for line in lines)
     assert "more rests of the fit" in lines[-1]
+    assert main(["guide", str(part), "--sensor", "mpu6050", "--goal", "0.5", "--gyroscope-goal", "1"]) == 0
+    *as_before, last = capsys.readouterr().out.splitlines()
+    assert as_before == lines
+    assert last.startswith("gyroscope's matrix: not determined yet: ")
+    assert last.endswith("(goal 1 %); turns for it are proposed once the accelerometer's goal is reached")
 
 
 def test_a_recording_of_a_campaign_is_read_by_its_configuration(
@@ -57,8 +63,10 @@ def test_a_recording_of_a_campaign_is_read_by_its_configuration(
     assert capsys.readouterr().out.splitlines()[-1] == "enough: both goals are reached"
     assert main(["guide", str(rests), "--goal", "1", "--gyroscope-goal", "0.001"]) == 0
     assert "which stays level, rest it for 4 s again" in capsys.readouterr().out.splitlines()[-1]
-    assert main(["guide", str(rests), "--goal", "0.001"]) == 0
-    assert "the goal is out of reach" in capsys.readouterr().out
+    assert main(["guide", str(rests), "--goal", "0.001", "--gyroscope-goal", "1"]) == 0
+    *_, expected, of_gyroscope = capsys.readouterr().out.splitlines()
+    assert "the goal is out of reach" in expected
+    assert re.fullmatch(r"expanded uncertainty of the gyroscope's matrix: 0\.\d+ % \(goal 1 %\)", of_gyroscope)
 
 
 def test_a_growing_log_is_followed_until_it_is_enough(
@@ -102,6 +110,30 @@ def test_a_rest_that_is_left_out_is_told_once_and_hides_no_later_one(
     assert told[-1] == "enough: the goal is reached"
 
 
+def test_a_rest_whose_rate_is_near_the_limit_is_told_again_once_where_the_end_differs(
+    rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header, *rows = rests.read_text().splitlines()
+    table = np.array([row.split(",")[:7] for row in rows], float)
+    since = table[:, 0]
+    table[(since >= 55.0) & (since < 59.0), 6] += 0.6
+    table[(since >= 57.3) & (since < 59.0), 6] += 0.5
+    lines = [",".join(header.split(",")[:7]), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    times = iter([*np.arange(55.0, 59.6, 0.4), 64.5, 69.5, 74.5])
+
+    def grow(_: float) -> None:
+        until = next(times, None)
+        if until is None:
+            raise KeyboardInterrupt
+        (tmp_path / "log.csv").write_text("\n".join(lines[: 1 + int(np.sum(since < until))]) + "\n")
+
+    monkeypatch.setattr(guide.time, "sleep", grow)
+    options = ["--sensor", "mpu6050", "--goal", "0.001", "--dwell", "2", "--follow"]
+    assert main(["guide", str(tmp_path / "log.csv"), *options]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if "  log 55." in line]
+    assert ["left out" if "left out" in line else "used" for line in told] == ["used", "left out"]
+
+
 def test_a_log_of_two_files_is_guided_by_its_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(3)
     rests = [np.tile(up, (90, 1)) for up in (*np.eye(3), *-np.eye(3))]
@@ -135,9 +167,9 @@ def test_faces_and_turns_that_lack_are_named(tmp_path: Path, capsys: pytest.Capt
     for share in (0.2, 0.7):
         part = tmp_path / "part.csv"
         part.write_text("\n".join(rows[: int(share * len(rows))]) + "\n")
-        assert main(["guide", str(part), "--procedure", "ferraris", "--sensor", "mpu6050"]) == 0
+        assert main(["guide", str(part), "--procedure", "ferraris", "--sensor", "mpu6050", "--dwell", "5"]) == 0
         seen.append(capsys.readouterr().out.splitlines()[-1])
-    assert "up; rest it" in seen[0]
+    assert seen[0].endswith(" up; rest it for 5 s")
     assert all(line.startswith("next: +") and "about the vertical" in line for line in seen[1:])
 
 
@@ -147,6 +179,7 @@ def test_faces_and_turns_that_lack_are_named(tmp_path: Path, capsys: pytest.Capt
         (["none.csv"], "there is no file none.csv; --follow waits for one"),
         (["none.csv", "--procedure", "three_axis_turns"], "recorded on a table"),
         (["none.csv", "--goal", "0"], "--goal is 0; it must be above 0"),
+        (["none.csv", "--procedure", "ferraris", "--gyroscope-goal", "1"], "leave out --goal and --gyroscope-goal"),
     ],
 )
 def test_what_cannot_be_guided_is_refused(

@@ -75,8 +75,8 @@ def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces 
         rows = zip(axis, along, rests.start, tilt, strict=True)
         found = ", ".join(f"{FACES[2 * a + (s < 0)]} at {t:.1f} s ({d:.0f} deg off)" for a, s, t, d in rows)
         raise NotObservableError(
-            f"there is no rest with body {' or '.join(missing)} up, within {NEAR_DEG:g} deg: rest the unit for 3 s or "
-            f"more on each of its six faces. Nearest to up in the rests found: {found}"
+            f"there is no rest with body {' or '.join(missing)} up, within {NEAR_DEG:g} deg: rest the unit for 4 s or "
+            f"longer on each of its six faces. Nearest to up in the rests found: {found}"
         )
     return Faces(face, float(np.radians(stated["accuracy_deg"])))
 

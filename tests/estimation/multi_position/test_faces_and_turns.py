@@ -15,7 +15,8 @@ from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.noise_prior import noise_of
-from pipeline.signal.segments import multiples
+from pipeline.signal.rests import find_rests
+from pipeline.signal.segments import multiples, turns_by_hand
 from pipeline.validation.attitude import gravity_direction
 
 FACE = np.radians(PROCEDURE["faces"]["accuracy_deg"])
@@ -105,6 +106,24 @@ def test_every_second_turn_is_held_out_and_judged(whole: Session) -> None:
     assert [t["axis"] for t in turns] == ["x", "y", "z"]
     assert all(t["stated_deg"] == -360.0 for t in turns)
     assert all(abs(t["angle_deg"]["after"] + 360.0) < 12.0 for t in turns)
+
+
+@pytest.mark.parametrize(("interval", "dwell", "held"), [(0.01, 4.0, 3), (0.1, 4.0, 3), (0.1, 2.0, 0)])
+def test_rests_of_2_s_are_found_and_around_those_of_4_s_a_turn_is_held_out(
+    interval: float, dwell: float, held: int
+) -> None:
+    session = simulated(3, interval_s=interval, course={"dwell_s": dwell})
+    recording, stated = session.recordings[0], session.settings["procedure"]["turns"]
+    rests = find_rests(recording)
+    assert [rest.accepted for rest in rests] == 15 * [True]  # six faces, and three for each axis
+    turns = turns_by_hand(recording, rests, stated)
+    assert [turn.axis for turn in turns] == [0, 0, 1, 1, 2, 2]
+    assert sum(turn.held_out for turn in turns) == held
+    parts = held_out(session).recordings
+    assert [r.role for r in parts].count("validation") == held
+    if held:
+        again = [find_rests(r) for r in parts if r.role == "validation"]
+        assert all(len(found) == 2 and all(rest.accepted for rest in found) for found in again)
 
 
 def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) -> None:
