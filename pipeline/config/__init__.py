@@ -1,6 +1,6 @@
-"""From Hydra groups and ``units.csv`` to checked configurations, batches and each stage's part of them.
+"""Compose Hydra groups and ``units.csv`` into checked configurations, batches, and the settings of each stage.
 
-Only this package knows Hydra; jobs read the JSON that it writes.
+Only this package imports Hydra. Jobs read the JSON files that it writes.
 """
 
 from pipeline.config.campaign import Campaign, UnitRow, load_campaign

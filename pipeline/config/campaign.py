@@ -1,4 +1,4 @@
-"""A campaign: its directory, its units with their configurations, and the batches in which they are worked on."""
+"""Load a campaign: its directory, its units with their configurations, and its batches."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pipeline.config.options import RUN_SETTINGS, Problem, mapping_of, nearest, 
 from pipeline.config.schema import OF_BENCH, RunSettings
 from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import GIVEN, PYTHON
-from pipeline.errors import ConfigurationError
+from pipeline.errors import ConfigurationError, first
 from pipeline.files import CONFIGS, SHIPPED
 from pipeline.history import SENSORS
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
     from pipeline.config.layers import Layers
 
-SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: seconds a job, as long as its start; a minute, to fill all cores
+SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: a job takes some seconds, as its start does; a minute, to fill cores
 
 
 @dataclass(frozen=True)
 class UnitRow:
-    """One unit: its row of ``units.csv``, its configuration, and the key and value of what overrides its settings."""
+    """One unit: its row of ``units.csv``, its configuration, and its overrides (key to value)."""
 
     name: str
     row: dict[str, str]
@@ -42,15 +42,15 @@ class UnitRow:
 
     @cached_property
     def config_sha256(self) -> str:
-        """The digest of the configuration that results carry."""
+        """Digest of the configuration, which results state."""
         return config_sha256(self.config)
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign with everything resolved.
+    """A campaign with all settings resolved.
 
-    ``combine``: ``serial`` for a joint estimate of units that share a serial; ``lot`` for each unit with the prior of
+    ``combine``: ``serial`` estimates units with the same serial jointly; ``lot`` estimates each unit with the prior of
     its lot.
     """
 
@@ -58,52 +58,53 @@ class Campaign:
     directory: Path
     results: Path
     units: dict[str, UnitRow]  # in the order of ``units.csv``
-    batches: dict[str, list[str]]  # units of one chain of stages, cut in the order of ``units.csv``
+    batches: dict[str, list[str]]  # units with equal stages, divided in the order of ``units.csv``
     chains: dict[str, dict[str, list[str]]]  # batch and sensor to the ordered stages of its fit
-    compare: list[Any]  # what the campaign's page compares, resolved to groups of units
-    simulation: Path | None  # the description from which the run makes the recordings; None where they are recorded
-    settings: Mapping[str, Any]  # what ``snakemake --config`` gave
-    page: str | None  # that the campaign asks for in addition to its own
+    compare: list[Any]  # comparisons on the campaign's page, resolved to groups of units
+    simulation: Path | None  # description of the recordings that the run simulates; None for real recordings
+    settings: Mapping[str, Any]  # of ``snakemake --config``
+    page: str | None  # page in addition to the campaign's page
     combine: str | None = None
-    publish_limit: int = 0  # up to how many units each has published files of its own
+    publish_limit: int = 0  # largest number of units whose files are published one by one
 
     @cached_property
     def boards(self) -> dict[str, list[str]]:
-        """The units of each board, in the order of the units table, the reference first."""
+        """The units of each board in the order of the units table; the first is the reference."""
         return boards_of(self.units)
 
     @property
     def recorded(self) -> Path:
-        """Where the recordings are: in the campaign's directory, or among the results of the run that makes them."""
+        """Folder of the recordings: the campaign's directory, or a folder of the results if they are simulated."""
         return self.directory if self.simulation is None else self.results.absolute() / "simulated"
 
     def run_settings(self, unit: str | None = None) -> dict[str, Any]:
-        """Return what ``--config`` gave but for the place of the results; of ``unit_overrides`` those of one unit.
+        """Return the settings of ``--config`` without ``results``, and with the ``unit_overrides`` of this unit only.
 
-        A campaign that ships is named, however it was given, so that the same run has the same settings.
+        A campaign that is part of the package is stated by its name, even if the user gave its path: equal runs then
+        have equal settings.
         """
         ships = self.directory.parent == (SHIPPED / "data")
-        given: dict[str, Any] = {"campaign": self.name if ships else str(self.settings.get("campaign", self.name))}
-        given |= {k: v for k, v in self.settings.items() if k not in ("campaign", "results") and v}
-        if unit is not None and "unit_overrides" in given:
-            own = given.pop("unit_overrides").get(unit)
-            given |= {"unit_overrides": {unit: own}} if own else {}
-        return given
+        stated: dict[str, Any] = {"campaign": self.name if ships else str(self.settings.get("campaign", self.name))}
+        stated |= {k: v for k, v in self.settings.items() if k not in ("campaign", "results") and v}
+        if unit is not None and "unit_overrides" in stated:
+            overrides = stated.pop("unit_overrides").get(unit)
+            stated |= {"unit_overrides": {unit: overrides}} if overrides else {}
+        return stated
 
     def folder(self, unit: str) -> Path:
-        """Return where a unit's recordings lie."""
+        """Return the folder of the recordings of a unit."""
         folder: str = self.units[unit].config["procedure"]["folder"]
         return self.recorded / folder
 
     def truth(self, unit: str) -> Path:
-        """Return where the truth behind a unit's recordings is, if they were simulated."""
+        """Return the file of the true parameters of a unit, which exists if its recordings were simulated."""
         return self.recorded / "truth" / f"{self.folder(unit).name}.json"
 
 
 def load_campaign(settings: Mapping[str, Any]) -> Campaign:
-    """Load and check a campaign; raises ``ConfigurationError`` with one message for everything that is wrong.
+    """Load and check a campaign; one ``ConfigurationError`` states all problems.
 
-    ``settings`` are those of ``snakemake --config``, as named below.
+    ``settings``: those of ``snakemake --config``, as named below.
     """
     valid = ("campaign", "results", "overrides", "unit_overrides", PYTHON)
     unknown = sorted(set(settings) - set(valid))
@@ -125,7 +126,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
             for line in str(problem).splitlines():
                 problems.setdefault(line, []).append(name)
     if problems:
-        lines = [f"  unit {_few(names)}: {text}" for text, names in problems.items()]
+        lines = [f"  unit {', '.join(first(names, 5))}: {text}" for text, names in problems.items()]
         raise ConfigurationError("the configuration is refused:\n" + "\n".join(lines), str(directory / "units.csv"))
     of_run = run_settings(layers.of_run)
     batches, chains = cut_batches(units, None if of_run.batch_size == "auto" else of_run.batch_size)
@@ -133,8 +134,8 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     split = [board for board, chips in boards_of(units).items() if len({batch_of[chip] for chip in chips}) > 1]
     if split:
         raise ConfigurationError(
-            f"column board: the chips of {_few(split)} are estimated together; expected consecutive rows with the same "
-            "method",
+            f"column board: the chips of {', '.join(first(split, 5))} are estimated together; "
+            "expected consecutive rows with the same method",
             str(directory / "units.csv"),
         )
     results = Path(str(settings.get("results", "results"))) / directory.name
@@ -152,7 +153,7 @@ def read_layers(directory: Path, settings: Mapping[str, Any]) -> tuple[Composer,
 
 
 def find_campaign(name: str) -> Path:
-    """Return the directory of a campaign: one that ships, by name, or any directory with a ``units.csv``."""
+    """Return the directory of a campaign: ``name`` is a campaign of the package, or a directory with ``units.csv``."""
     for directory in (SHIPPED / "data" / name, Path(name)):
         if os.path.lexists(directory / "units.csv"):
             return directory.resolve()
@@ -163,7 +164,7 @@ def find_campaign(name: str) -> Path:
 
 
 def run_settings(overrides: Sequence[str]) -> RunSettings:
-    """Return the settings of the run that its overrides, weakest first, give; ``ConfigurationError``: one is wrong."""
+    """Return the settings of the run from its overrides, weakest first; raises ``ConfigurationError``."""
     settings = {name: value for name, value in mapping_of(CONFIGS / "config.yaml").items() if name in RUN_SETTINGS}
     try:
         settings |= dict(map(parse, overrides))
@@ -179,17 +180,18 @@ def run_settings(overrides: Sequence[str]) -> RunSettings:
 def cut_batches(
     units: Mapping[str, UnitRow], size: int | None
 ) -> tuple[dict[str, list[str]], dict[str, dict[str, list[str]]]]:
-    """Cut units of one chain of stages into batches, in the order of the units table.
+    """Divide the units of each method into batches, in the order of the units table.
 
-    Appending units touches the last batch of their chain only. Whether effects are fitted does not cut batches anew:
-    a batch has the stage if any of its units asks for it. Without a size, a batch is as large as all before it, from 25
-    to 160 units: a bench runs side by side, and a fleet does not spend its time on starting jobs.
+    Appended units change only the last batch of their method. A batch has the stage ``effects`` if any of its units
+    fits effects, so a changed list of effects does not change the batches. Without a size, a batch is as large as all
+    batches before it together, within 25 to 160 units: a few units then run in parallel, and the start of jobs takes a
+    small share of the time of a fleet.
     """
     by_chain: dict[str, list[str]] = {}
     for name, unit in units.items():
         method = unit.config["method"]
-        named = [method["name"], *(method[sensor] or f"no_{sensor}" for sensor in SENSORS)]
-        by_chain.setdefault("+".join(dict.fromkeys(named)), []).append(name)
+        methods = [method["name"], *(method[sensor] or f"no_{sensor}" for sensor in SENSORS)]
+        by_chain.setdefault("+".join(dict.fromkeys(methods)), []).append(name)
     batches: dict[str, list[str]] = {}
     chains: dict[str, dict[str, list[str]]] = {}
     for chain, names in by_chain.items():
@@ -199,13 +201,13 @@ def cut_batches(
             while 0 < stop < len(names) and (board := units[names[stop]].row.get("board")):
                 if board != units[names[stop - 1]].row.get("board"):
                     break
-                stop += 1  # the chips of a board stay together
+                stop += 1  # the chips of a board are in one batch
             batch = f"{chain}-{number:04d}"
             batches[batch] = names[start:stop]
             configs = [units[n].config for n in batches[batch]]
             of_bench = any(c["table"].get(key) for c in configs for key in OF_BENCH)
-            asked = {sensor: of_bench or any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
-            effects = {sensor: asked[sensor] and configs[0]["method"][sensor] != GIVEN for sensor in SENSORS}
+            wanted = {sensor: of_bench or any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
+            effects = {sensor: wanted[sensor] and configs[0]["method"][sensor] != GIVEN for sensor in SENSORS}
             stages = configs[0]["method"]["stages"]
             chains[batch] = {sensor: stages[sensor] + ["effects"] * effects[sensor] for sensor in SENSORS}
             start = stop
@@ -215,14 +217,9 @@ def cut_batches(
 
 
 def boards_of(units: Mapping[str, UnitRow]) -> dict[str, list[str]]:
-    """Return the units of each board that has several."""
-    found: dict[str, list[str]] = {}
+    """Return the units of each board that has more than one."""
+    boards: dict[str, list[str]] = {}
     for name, unit in units.items():
         if unit.row.get("board"):
-            found.setdefault(unit.row["board"], []).append(name)
-    return {board: chips for board, chips in found.items() if len(chips) > 1}
-
-
-def _few(names: Sequence[str]) -> str:
-    """Return up to five names, and how many more there are."""
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+            boards.setdefault(unit.row["board"], []).append(name)
+    return {board: chips for board, chips in boards.items() if len(chips) > 1}

@@ -1,22 +1,23 @@
-"""What the campaign's page compares: ``compare`` of ``campaign.yaml``, resolved to named groups of units.
+"""Resolve the comparisons of the campaign's page (``compare`` in ``campaign.yaml``) to named groups of units.
 
 Each entry of the list is one comparison::
 
     - title: Stages against least squares
-      where: {sensor: [mpu6050, stim300]}    # units that count; all where it is left out
-      groups:                                # by name: units, or what columns say
+      where: {sensor: [mpu6050, stim300]}    # units of the comparison; default: all
+      groups:                                # by name: a list of units, or columns and their values
         stages: {method: staged}
         least squares: {method: reference_least_squares}
-      pairs: serial                          # units that agree in it are one device: differences are taken within it
-      against: stages                        # what the others are compared with; the first where it is left out
+      pairs: serial                          # units with equal values are one device; differences are within a device
+      against: stages                        # the group that the others are compared with; default: the first
     - title: Rates
-      by: [method, rate_dps]                 # a group for each value of a column, or of several
-      sensors: accelerometer                 # only this one; both where it is left out
-      x: table_time                          # the error is drawn against it: a column of numbers, or table_time
-    - [U1, U2]                               # or {title, units}: unit against unit
+      by: [method, rate_dps]                 # a group for each value of a column, or combination of values
+      sensors: accelerometer                 # default: both
+      x: table_time                          # abscissa of the chart of errors: a column of numbers, or table_time
+    - [U1, U2]                               # or {title, units}: a group for each unit
 
-Columns are those of ``units.csv``, and the groups of the configuration that each unit ends up with (sensor, table,
-procedure, method, filter, ingest). With several columns in ``by``, the last runs along a curve, the others tell curves.
+Columns are those of ``units.csv``, and the groups of the resolved configuration of each unit (sensor, table, procedure,
+method, filter, ingest). With several columns in ``by``, the last one varies along a curve; each combination of the
+others is a curve.
 """
 
 from __future__ import annotations
@@ -45,21 +46,21 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
     Returns
     -------
     list of dict
-        ``title``; ``groups``, each ``name, series, label, units``; ``sensors``; ``against``; ``pairs`` (unit to what
-        it shares with its pair, or None) and ``x`` (``label``; ``values`` by unit, None for the table time; ``named``:
-        the points' names are drawn beside them), or None.
+        ``title``; ``groups``, each ``name, series, label, units``; ``sensors``; ``against``; ``pairs`` (unit to the
+        value that identifies its device) or None; ``x`` (``label``; ``values`` by unit, None for the table time;
+        ``named``: whether points are labelled with their names) or None.
     """
     columns = _Columns({n: unit.row | {g: unit.config[g]["name"] for g in GROUPS} for n, unit in units.items()})
-    out, problems = [], []
+    comparisons, problems = [], []
     for number, entry in enumerate(entries, 1):
         try:
-            out.append(_comparison(entry, number, columns))
+            comparisons.append(_comparison(entry, number, columns))
         except Problem as problem:
             title = entry.get("title") if isinstance(entry, dict) else None
             problems.append(f"compare, {f'{title!r}' if title else f'entry {number}'}: {problem}")
     if problems:
         raise ConfigurationError("\n  ".join(problems), file)
-    return out
+    return comparisons
 
 
 class _Columns:
@@ -78,7 +79,7 @@ class _Columns:
         """Return the units of a list of names, or those whose columns have the values of a mapping."""
         if isinstance(wanted, dict):
             values = {str(c): _names(v) for c, v in wanted.items()}
-            return [u for u in among if all(self.cell(u, c) in those for c, those in values.items())]
+            return [u for u in among if all(self.cell(u, column) in valid for column, valid in values.items())]
         if not isinstance(wanted, list):
             form = "columns and their values, for example {method: staged}"
             raise Problem(f"a list of units is expected, or {form}, got {wanted!r}")
@@ -114,28 +115,28 @@ def _comparison(entry: Any, number: int, columns: _Columns) -> JSON:  # noqa: AN
 
 
 def _groups(entry: JSON, columns: _Columns) -> list[JSON]:
-    """Return the groups of an entry: at least two, none empty, each unit in one of them."""
-    given = [k for k in ("units", "groups", "by") if k in entry]
-    if len(given) != 1:
-        raise Problem(f"{FORM} is expected, got {' and '.join(given) or 'none of them'}")
-    among, content = columns.select(entry.get("where") or {}, list(columns.of_unit)), entry[given[0]]
-    if given[0] == "by":
+    """Return the groups of an entry: at least two, none empty, without common units."""
+    keys = [k for k in ("units", "groups", "by") if k in entry]
+    if len(keys) != 1:
+        raise Problem(f"{FORM} is expected, got {' and '.join(keys) or 'none of them'}")
+    among, content = columns.select(entry.get("where") or {}, list(columns.of_unit)), entry[keys[0]]
+    if keys[0] == "by":
         groups = _by(_names(content), str(entry.get("x", "")), among, columns)
     else:
-        if given[0] == "units":
+        if keys[0] == "units":
             content = {unit: [unit] for unit in columns.select(content, among)}
         if not isinstance(content, dict):
             raise Problem(f"groups: a mapping of names to units or columns is expected, got {content!r}")
-        found = {str(name): columns.select(wanted, among) for name, wanted in content.items()}
-        groups = [{"name": name, "series": "", "label": name, "units": units} for name, units in found.items()]
-    seen: dict[str, str] = {}
+        units_of = {str(name): columns.select(wanted, among) for name, wanted in content.items()}
+        groups = [{"name": name, "series": "", "label": name, "units": units} for name, units in units_of.items()]
+    group_of: dict[str, str] = {}
     for group in groups:
         if not group["units"]:
-            raise Problem(f"group {group['name']!r} is empty: no unit is as it asks for")
+            raise Problem(f"group {group['name']!r} is empty: no unit has these values")
         for unit in group["units"]:
-            if unit in seen:
-                raise Problem(f"unit {unit} is in {seen[unit]!r} and in {group['name']!r}; it can be in one")
-            seen[unit] = group["name"]
+            if unit in group_of:
+                raise Problem(f"unit {unit} is in {group_of[unit]!r} and in {group['name']!r}; it can be in one")
+            group_of[unit] = group["name"]
     if len(groups) < 2:
         raise Problem(f"two groups or more are expected, got {len(groups)}")
     return groups
@@ -144,14 +145,14 @@ def _groups(entry: JSON, columns: _Columns) -> list[JSON]:
 def _by(names: list[str], x: str, among: list[str], columns: _Columns) -> list[JSON]:
     """Return a group for each combination of values, in the order of the units table."""
     along = names.index(x) if x in names else len(names) - 1
-    found: dict[tuple[str, ...], list[str]] = {}
+    units_with: dict[tuple[str, ...], list[str]] = {}
     for unit in among:
         values = tuple(columns.cell(unit, name) for name in names)
         if all(values):
-            found.setdefault(values, []).append(unit)
+            units_with.setdefault(values, []).append(unit)
     return [
         {"name": ", ".join(v), "series": ", ".join(v[:along] + v[along + 1 :]), "label": v[along], "units": units}
-        for v, units in found.items()
+        for v, units in units_with.items()
     ]
 
 
@@ -171,6 +172,6 @@ def _x(column: str, members: list[str], by: list[str], columns: _Columns) -> JSO
 
 
 def _names(value: Any) -> list[str]:  # noqa: ANN401  (the user's)
-    """Return one value or a list of them as texts, as the units table holds them."""
+    """Return a value, or a list of values, as a list of texts."""
     values = value if isinstance(value, list) else [value]
     return [str(v) for v in values]

@@ -1,12 +1,12 @@
-"""Composition of one unit's configuration with Hydra.
+"""Compose the configuration of a unit with Hydra.
 
-Groups are chosen first, values are merged after them; within each, what comes later in the order of precedence wins:
-group defaults, then the layers of ``pipeline.config.layers``.
+Options of groups are chosen first, then values are merged. The order of precedence is: group defaults, then the layers
+of ``pipeline.config.layers``, weakest first.
 
-Hydra composes once for each choice of groups (65 ms). What differs from unit to unit is merged into plain dicts, and a
-plain number is parsed by a regular expression: OmegaConf takes 46 ms to merge one value into a unit's configuration and
-64 ms to build it, Hydra's parser 0.6 ms an override, which is 20 minutes and 12 s for 10,000 units. Units share the
-sections that no override of theirs changes.
+Hydra composes each choice of groups once (65 ms). The values of single units are merged into plain dicts, and a regular
+expression parses a plain number. OmegaConf would take 46 ms to merge one value into a configuration and 64 ms to build
+it, and Hydra's parser 0.6 ms per override: 20 minutes and 12 s for 10,000 units. Units share the sections that their
+overrides do not change.
 """
 
 from __future__ import annotations
@@ -58,21 +58,21 @@ if TYPE_CHECKING:
 Groups: TypeAlias = tuple[tuple[str, str], ...]  # group and option
 INSTANCE = "${ingest.instance}"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
-OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.effects.mounting)
+OF_A_SETUP = ("mounting", "bias")  # effects that exist only for one setup (pipeline.model.effects.mounting)
 
 
 class Composer:
-    """Composes configurations for the units of one campaign.
+    """Composes the configurations of the units of one campaign.
 
-    The files ``configs/<group>/*.yaml`` of the campaign's directory are options too, its ``effects/*.yaml`` effects, as
-    are the Python files that the command line names. ``ConfigurationError``: one of them is not as it should be.
+    Options include the files ``configs/<group>/*.yaml`` of the campaign. Effects include its files ``effects/*.yaml``
+    and the Python files that the command line names. Raises ``ConfigurationError`` if one of the files is not valid.
     """
 
     def __init__(self, campaign: Path, python_effects: Sequence[str] = ()) -> None:
         self.campaign = campaign
-        own = campaign / "configs"
-        self.searchpath = [own.resolve()] if own.is_dir() else []
-        for file in sorted(own.rglob("*.yaml")):  # before Hydra opens any of them
+        configs = campaign / "configs"
+        self.searchpath = [configs.resolve()] if configs.is_dir() else []
+        for file in sorted(configs.rglob("*.yaml")):  # checks each file before Hydra opens it
             mapping_of(file)
         self.options = {
             group: {f.stem for root in (CONFIGS, *self.searchpath) for f in (root / group).glob("*.yaml")}
@@ -81,14 +81,14 @@ class Composer:
         self.user_effects: UserEffects = load_user_effects(campaign, [*self.searchpath, CONFIGS], python_effects)
         self.effects = {f.stem for f in (CONFIGS / "effect").glob("*.yaml")} | set(self.user_effects.effects)
         self._bases: dict[Groups, tuple[dict[str, Any], bool]] = {}
-        self._checked_bases: dict[int, dict[str, Any]] = {}  # by the identity of a section of ``_bases``
+        self._checked_bases: dict[int, dict[str, Any]] = {}  # by the id of a section of ``_bases``
         self._resolved: dict[str, dict[str, Any]] = {}
         self._valid_ingest: set[str] = set()
 
     def unit(self, name: str, layers: Sequence[str]) -> dict[str, Any]:
         """Return the checked configuration of a unit from its overrides, weakest first.
 
-        Raises ``Problem`` with one line for each thing that is wrong.
+        Raises ``Problem`` with one line for each error.
         """
         groups, values = self.split(layers)
         key = repr((sorted(groups.items()), values))
@@ -101,10 +101,7 @@ class Composer:
         return {**resolved, **given, "unit": name, "procedure": {**procedure, "folder": folder}}
 
     def split(self, layers: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, Any]]]:
-        """Return the choice of each group that is chosen, and the values in the order of the layers.
-
-        Raises ``Problem``.
-        """
+        """Split overrides into the chosen options by group, and the values in their order; raises ``Problem``."""
         groups: dict[str, str] = {}
         values: list[tuple[str, Any]] = []
         for text in layers:
@@ -125,7 +122,7 @@ class Composer:
                 values.append((key, value))
         sensor = self._read("sensor", groups.get("sensor") or default_option("sensor"))
         try:
-            return groups, [found for key, value in values for found in range_settings(key, value, sensor)]
+            return groups, [setting for key, value in values for setting in range_settings(key, value, sensor)]
         except ConfigurationError as error:
             raise Problem(error.message) from None
 
@@ -143,21 +140,21 @@ class Composer:
                 merged = with_references(merged, merged)
             except ConfigurationError as error:
                 raise Problem(error.message) from error
-        checked, findings = {}, []
+        checked, errors = {}, []
         for section, content in merged.items():
             try:
                 checked[section] = self._checked(section, content, of_base=content is base.get(section))
             except ValidationError as error:
-                findings += [{**e, "loc": (section, *e["loc"])} for e in error.errors()]
-        if findings:
-            raise Problem("\n".join(_explain(e, merged) for e in findings))
+                errors += [{**e, "loc": (section, *e["loc"])} for e in error.errors()]
+        if errors:
+            raise Problem("\n".join(_explain(e, merged) for e in errors))
         checked["method"] = self._with_stages(checked["method"])
-        checked["procedure"] = _without_need(checked["procedure"], checked["method"])
+        checked["procedure"] = _with_unused_optional(checked["procedure"], checked["method"])
         self._check_meaning(checked)
         return checked | self.user_effects.section()
 
     def _checked(self, section: str, content: Any, *, of_base: bool) -> dict[str, Any]:  # noqa: ANN401  (the user's)
-        """Return a section as the schema has it, one of a base as before; raises ``ValidationError``."""
+        """Validate a section against the schema (a section of a base once); raises ``ValidationError``."""
         if of_base and id(content) in self._checked_bases:
             return self._checked_bases[id(content)]
         if section not in SECTIONS:
@@ -170,7 +167,7 @@ class Composer:
         return checked
 
     def complete(self, groups: dict[str, str]) -> dict[str, str]:
-        """Fill in the defaults that depend on other choices: the procedure's table, the table's method."""
+        """Add the defaults that depend on other options: the table of the procedure, and the method."""
         chosen = dict(groups)
         procedure = self._read("procedure", chosen.get("procedure", "three_axis_turns"))
         chosen.setdefault("table", str(procedure["table"]))
@@ -184,11 +181,11 @@ class Composer:
         return read_option(group, option, tuple(self.searchpath))
 
     def _base(self, groups: dict[str, str]) -> tuple[dict[str, Any], bool]:
-        """Return what Hydra composes of a choice of groups, and whether it holds references."""
+        """Return the configuration that Hydra composes from a choice of groups, and whether it contains references."""
         key = tuple(sorted(groups.items()))
         if key not in self._bases:
             try:
-                composed = _with_own(key, self.searchpath) if self.searchpath else _shipped(key)
+                composed = _compose(key, self.searchpath) if self.searchpath else _compose_shipped(key)
             except (HydraException, OmegaConfBaseException) as error:
                 cause = f" ({error.__cause__})" if error.__cause__ else ""
                 raise Problem(f"{str(error).splitlines()[0]}{cause}") from error
@@ -202,21 +199,21 @@ class Composer:
         return self._bases[key]
 
     def _with_stages(self, method: dict[str, Any]) -> dict[str, Any]:
-        """Return a method with the stages of the method chosen for each sensor."""
+        """Return the method with the stages of the method that is chosen for each sensor."""
         stages = {sensor: [NOT_WANTED] for sensor in SENSORS if method[sensor] is None}
         if len(stages) == len(SENSORS):
-            raise Problem("method.accelerometer and method.gyroscope are both null: nothing is left to calibrate")
+            raise Problem("method.accelerometer and method.gyroscope are both null: no sensor would be calibrated")
         for sensor in (s for s in SENSORS if s not in stages):
             name = method[sensor]
             if name not in self.options["method"]:
                 raise Problem(f"method.{sensor}={name}: no such method{nearest(name, self.options['method'])}")
-            own = method["stages"] if name == method["name"] else self._read("method", name)["stages"]
-            if not own.get(sensor):
-                fit = [m for m in self.options["method"] if self._read("method", m)["stages"].get(sensor)]
-                raise Problem(f"method.{sensor}={name}: {name} has no stages for the {sensor}{nearest(name, fit)}")
-            stages[sensor] = list(own[sensor])
-        own_only = ("file", "format") if GIVEN not in method.values() else ()
-        return {**{key: value for key, value in method.items() if key not in own_only}, "stages": stages}
+            of_method = method["stages"] if name == method["name"] else self._read("method", name)["stages"]
+            if not of_method.get(sensor):
+                valid = [m for m in self.options["method"] if self._read("method", m)["stages"].get(sensor)]
+                raise Problem(f"method.{sensor}={name}: {name} has no stages for the {sensor}{nearest(name, valid)}")
+            stages[sensor] = list(of_method[sensor])
+        unused = ("file", "format") if GIVEN not in method.values() else ()
+        return {**{key: value for key, value in method.items() if key not in unused}, "stages": stages}
 
     def _check_effect(self, sensor: str, whole: str, procedure: dict[str, Any]) -> None:
         name, separator, setup = whole.partition("@")
@@ -229,10 +226,10 @@ class Composer:
                 return
         if name not in self.effects:
             raise Problem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
-        own = self.user_effects.effects.get(name)
-        if own and separator:
-            raise Problem(f"effects.{sensor}: {whole}: an effect of your own cannot be one setup's own")
-        applies = own.sensors if own else read_option("effect", name, ()).get("sensors", [sensor])
+        user_effect = self.user_effects.effects.get(name)
+        if user_effect and separator:
+            raise Problem(f"effects.{sensor}: {whole}: an effect that you define cannot apply to one setup only")
+        applies = user_effect.sensors if user_effect else read_option("effect", name, ()).get("sensors", [sensor])
         if sensor not in applies:
             raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
 
@@ -243,8 +240,8 @@ class Composer:
             for name in [] if names == "auto" else names:
                 self._check_effect(sensor, name, config["procedure"])
             for name in [] if names == "auto" else [*of_bench, *names]:
-                own = self.user_effects.effects.get(name)
-                contains = own.contains if own else read_option("effect", name, ()).get("contains", [])
+                user_effect = self.user_effects.effects.get(name)
+                contains = user_effect.contains if user_effect else read_option("effect", name, ()).get("contains", [])
                 if within := [other for other in names if other in contains]:
                     raise Problem(f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them")
         ingest = repr((config["ingest"], config["procedure"]))
@@ -261,8 +258,8 @@ class Composer:
             )
 
 
-def _with_own(groups: Groups, folders: Sequence[Path] = ()) -> DictConfig:
-    """Return what Hydra composes of a choice of groups, with the files of a campaign's own folders."""
+def _compose(groups: Groups, folders: Sequence[Path] = ()) -> DictConfig:
+    """Compose a choice of groups with Hydra, with options from the folders of a campaign."""
     overrides = [f"{group}={option}" for group, option in groups]
     if folders:
         overrides.append(f"hydra.searchpath=[{','.join(map(_quoted, folders))}]")
@@ -271,11 +268,11 @@ def _with_own(groups: Groups, folders: Sequence[Path] = ()) -> DictConfig:
         return compose("config", overrides)
 
 
-_shipped = cache(_with_own)  # these files do not change; commands load a campaign several times
+_compose_shipped = cache(_compose)  # these files do not change; commands load a campaign several times
 
 
-def _without_need(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str, Any]:
-    """Return the procedure, with recordings for a sensor that is not calibrated made optional."""
+def _with_unused_optional(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str, Any]:
+    """Return the procedure with optional recordings for a sensor that is not calibrated."""
     unused = {sensor for sensor in SENSORS if method[sensor] is None}
     entries = procedure["recordings"].items()
     recordings = {name: {**e, "optional": True} if e["role"] in unused else e for name, e in entries}
@@ -283,12 +280,12 @@ def _without_need(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str
 
 
 def _quoted(folder: Path) -> str:
-    """Return a folder as a text of Hydra's grammar, which gives commas, braces and quotes meanings of their own."""
+    """Quote a folder for Hydra's grammar, in which commas, braces and quotes have special meanings."""
     return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + "\\'" * bool(m[2]), f"file://{folder}") + "'"
 
 
 def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: ANN401
-    """Set a value on a copy of each branch above it; a key that does not exist is set too, and found by the schema."""
+    """Set a value on copies of the branches above it; the schema refuses a key that does not exist later."""
     for i, key in enumerate(path[:-1]):
         node = tree.get(key, {})
         if not isinstance(node, dict):
@@ -298,8 +295,8 @@ def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: AN
     tree[path[-1]] = value
 
 
-def _explain(error: Any, config: dict[str, Any]) -> str:  # noqa: ANN401  (pydantic's own TypedDict)
-    """Turn one finding of the schema into a sentence with key, value and nearest valid name."""
+def _explain(error: Any, config: dict[str, Any]) -> str:  # noqa: ANN401  (pydantic's TypedDict)
+    """Describe an error of pydantic in a sentence with key, value and nearest valid name."""
     path = [str(p) for p in error["loc"]]
     key = ".".join(path)
     if error["type"] == "extra_forbidden":

@@ -1,8 +1,8 @@
-"""Effects of one unit, added to or removed from its file ``<campaign>/devices/<unit>.yaml``.
+"""Add effects to, or remove them from, the file of one unit, ``<campaign>/devices/<unit>.yaml``.
 
-The file keeps its comments and its other content: an entry is replaced where it stands, or a new one is put behind the
-last. A layer that is stronger than the file (``units.csv``, the command line) would make the edit ineffective, so it is
-refused with the place to edit.
+The file keeps its comments and its other content: an entry is replaced in place, a new one is added behind the last. If
+a layer with precedence over the file (``units.csv``, the command line) sets the effects, the edit would have no result:
+it is refused, and the message names the place to edit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ KEY = "overrides"
 
 
 class Edit(NamedTuple):
-    """A device file, its new content (None: it is removed), and a line on each effect."""
+    """A device file, its new content (None: the file is removed), and a line about each effect."""
 
     file: Path
     text: str | None
@@ -37,7 +37,7 @@ class Edit(NamedTuple):
 
 
 def sensor_and_effect(text: str) -> tuple[str, str]:
-    """Split ``SENSOR.EFFECT``; raises ``ConfigurationError`` if it has another form, or names no sensor."""
+    """Split ``SENSOR.EFFECT``; raises ``ConfigurationError`` for another form or an unknown sensor."""
     sensor, dot, effect = text.partition(".")
     if not dot or not effect:
         raise ConfigurationError(f"{text!r}: SENSOR.EFFECT is expected, for example gyroscope.g_sensitivity")
@@ -49,13 +49,13 @@ def sensor_and_effect(text: str) -> tuple[str, str]:
 def edit_effects(
     unit: str, effects: Sequence[tuple[str, str]], layers: Layers, composer: Composer, *, remove: bool = False
 ) -> Edit:
-    """Return the unit's device file with effects, each sensor and name, added or removed.
+    """Add effects (sensor and name) to the device file of a unit, or remove them; return the edit.
 
-    Raises ``ConfigurationError`` if the unit or an effect is unknown, a stronger layer sets the effects, or the file
-    cannot be edited.
+    Raises ``ConfigurationError`` if the unit or an effect is unknown, if a stronger layer sets the effects, or if the
+    file cannot be edited.
     """
     file = _file(unit, layers, composer.campaign)
-    text = file.read_bytes().decode() if file.is_file() else ""  # line ends as they are
+    text = file.read_bytes().decode() if file.is_file() else ""  # keeps line ends
     of_unit = layers.of(unit)
     changes: list[str] = []
     for sensor in dict.fromkeys(sensor for sensor, _ in effects):
@@ -88,7 +88,7 @@ def edit_effects(
 
 
 def _file(unit: str, layers: Layers, directory: Path) -> Path:
-    """Return the device file of a unit, which must exist and share its name with no serial of another."""
+    """Return the device file of a unit; the unit must exist, and its name must not be the serial of another unit."""
     rows, units_table = layers.units_table.rows, str(directory / "units.csv")
     if unit not in rows:
         raise ConfigurationError(f"no unit {unit!r}{nearest(unit, rows)}", units_table)
@@ -100,24 +100,24 @@ def _file(unit: str, layers: Layers, directory: Path) -> Path:
 
 
 def set_override(text: str, key: str, override: str | None, file: str) -> str:
-    """Return a device file with the override of a key replaced, added, or (None) removed; all else stays as it is.
+    """Replace, add or (``override`` None) remove the override of a key in the text of a device file.
 
     Raises ``ConfigurationError`` if the file has a form that cannot be edited in place.
     """
-    wanted = _changed([(entry, entry) for entry in _overrides(text)], key, override, override)
+    expected = _changed([(entry, entry) for entry in _overrides(text)], key, override, override)
     edited = _edited(text, key, override)
     try:
-        as_wanted = _overrides(edited) == wanted
+        correct = _overrides(edited) == expected
     except (yaml.YAMLError, ConfigurationError):
-        as_wanted = False
-    if not as_wanted:
+        correct = False
+    if not correct:
         what = f"remove {key}" if override is None else f"write {override!r}"
         raise ConfigurationError(f"cannot be edited in place: {what} yourself, in its list '{KEY}'", file)
     return edited
 
 
 def _changed(entries: Sequence[tuple[str, str]], key: str, override: str | None, written: str | None) -> list[str]:
-    """Return the texts of entries (value, text), that of the key replaced by ``written``, added or (None) removed."""
+    """Return the texts of entries (value, text) after the entry of a key is replaced, added or (None) removed."""
     if override is None or written is None:
         return [text for value, text in entries if key_of(value) != key]
     texts = [written if key_of(value) == key else text for value, text in entries]
@@ -125,7 +125,7 @@ def _changed(entries: Sequence[tuple[str, str]], key: str, override: str | None,
 
 
 def _edited(text: str, key: str, override: str | None) -> str:
-    """Return the text with the entry changed in place; unchanged where a comment would be lost."""
+    """Return the text with the entry changed in place, or the same text if a comment would be lost."""
     root = yaml.compose(text, yaml.SafeLoader)
     pairs = root.value if isinstance(root, yaml.MappingNode) else []
     node = next((value for name, value in pairs if name.value == KEY), None)
@@ -136,7 +136,7 @@ def _edited(text: str, key: str, override: str | None) -> str:
     if isinstance(node, yaml.SequenceNode) and not node.flow_style:
         return _edited_lines(text, node.value, key, written)
     start, stop = node.start_mark.index, node.end_mark.index
-    if isinstance(node, yaml.ScalarNode):  # one override as a text, or nothing
+    if isinstance(node, yaml.ScalarNode):  # one override as a text, or no value
         entries = [(node.value, json.dumps(node.value, ensure_ascii=False))] if node.tag.endswith(":str") else []
     else:
         entries = [(item.value, text[item.start_mark.index : item.end_mark.index]) for item in node.value]
@@ -147,16 +147,16 @@ def _edited(text: str, key: str, override: str | None) -> str:
 
 
 def _edited_lines(text: str, items: Sequence[yaml.Node], key: str, written: str | None) -> str:
-    """Return the text with an item of a block list replaced, added behind the last, or (None) removed with its line."""
-    found = [item for item in items if key_of(item.value) == key]
-    for item in reversed(found):
+    """Return the text with an item of a block list replaced, added as the last, or (None) removed with its line."""
+    of_key = [item for item in items if key_of(item.value) == key]
+    for item in reversed(of_key):
         first, last = item.start_mark.index, item.end_mark.index
         if written is None:
             after = text.find("\n", last)
             text = text[: text.rfind("\n", 0, first) + 1] + (text[after + 1 :] if after >= 0 else "")
         else:
             text = text[:first] + written + text[last:]
-    if found or written is None:
+    if of_key or written is None:
         return text
     end = text.find("\n", items[-1].end_mark.index)
     end = len(text) if end < 0 else end
@@ -173,7 +173,7 @@ def _overrides(text: str) -> list[str]:
 
 
 def _refuse_stronger(layers: Sequence[Layer], key: str, directory: Path, unit: str) -> None:
-    """Refuse where a layer above the device file sets the effects."""
+    """Raise ``ConfigurationError`` if a layer with precedence over the device file sets the effects."""
     for origin, text in layers:
         if key_of(text) not in (key, "effects"):
             continue
@@ -192,8 +192,8 @@ def _refuse_stronger(layers: Sequence[Layer], key: str, directory: Path, unit: s
 
 
 def _value(layers: Sequence[Layer], key: str) -> list[str]:
-    """Return the effects that layers give, weakest first."""
-    sensor, found = key.partition(".")[2], []
+    """Return the effects that the strongest of the layers (weakest first) sets."""
+    sensor, effects = key.partition(".")[2], list[str]()
     for origin, text in layers:
         name, value = parse(text)
         if name == "effects" and isinstance(value, dict) and sensor in value:
@@ -205,5 +205,5 @@ def _value(layers: Sequence[Layer], key: str) -> list[str]:
                 f"{text} ({origin}): the effects are no list, so none can be added to or removed from it; "
                 f"write {key}=[...] there"
             )
-        found = [str(v) for v in value]
-    return found
+        effects = [str(v) for v in value]
+    return effects

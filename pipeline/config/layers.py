@@ -1,22 +1,22 @@
-"""``units.csv``, and the overrides of each unit, weakest first, each with the place where it stands.
+"""Read ``units.csv``, and collect the overrides of each unit, weakest first, each with its origin.
 
     campaign.yaml < models < lots < devices/<name>.yaml < units.csv < overrides= < unit_overrides=
 
 where
 
-    models, lots : keys of ``campaign.yaml``: the name of a sensor config, or a lot of ``units.csv``, to overrides
+    models, lots : mappings in ``campaign.yaml``: name of a sensor config, or lot of ``units.csv``, to overrides
     devices      : folder with a file ``{overrides: [...]}`` for a serial or a unit of ``units.csv``; the file of a unit
-                   is stronger than that of its serial
-    units.csv    : the columns that name a config of a group, then those of the column ``overrides``
+                   has precedence over the file of its serial
+    units.csv    : the columns that name a config of a group, then the column ``overrides``
 
-``campaign.yaml``, all of it optional::
+``campaign.yaml``, with optional keys::
 
     overrides: [filter=rc_low_pass]   # Hydra overrides of every unit, and settings of the run
     models: {mpu6050: [filter=none]}  # of the units of a sensor model
     lots: {"12": [filter.order=2]}    # of the units of a production lot
-    compare: [[U1, U2]]               # what the campaign's page compares; see pipeline.config.comparisons
-    simulate: true                    # the run makes the recordings, from simulation.yaml in this folder
-    page: thesis                      # the run makes this page in addition to the campaign's own
+    compare: [[U1, U2]]               # comparisons on the campaign's page; see pipeline.config.comparisons
+    simulate: true                    # the run simulates the recordings that simulation.yaml in this folder describes
+    page: thesis                      # the run writes this page in addition to the campaign's page
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, default_option, nearest, parse
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
-from pipeline.errors import ConfigurationError
+from pipeline.errors import ConfigurationError, first
 from pipeline.io.files import not_regular, read_text, wrong_name
 from pipeline.io.yaml_file import read_yaml
 
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")  # all but tab and line ends
-MEANT = ("unit", "overrides", *GROUPS, "serial", "lot", "date", "board")
-ALIKE = 0.85  # similarity of a name that is taken for a slip: overide 0.88, procedur 0.94; material for serial 0.71
+CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")  # all except tab and line ends
+KNOWN_COLUMNS = ("unit", "overrides", *GROUPS, "serial", "lot", "date", "board")
+SIMILARITY = 0.85  # of a misspelt name: overide 0.88, procedur 0.94; but material and serial: 0.71
 LARGEST_BYTES = 100_000_000  # a million units of 100 characters each
 
 
@@ -55,18 +55,15 @@ class UnitsTable(NamedTuple):
 
 
 def read_units_table(path: Path) -> UnitsTable:
-    """Read ``units.csv``; refuses bad names, duplicates and ragged rows, all in one message.
-
-    Raises ``ConfigurationError``.
-    """
+    """Read ``units.csv``; one ``ConfigurationError`` states all invalid names, duplicates and ragged rows."""
     columns, rows = _table(path)
     if PYTHON in columns:
         raise ConfigurationError(f"column {PYTHON}: {ONLY_FROM_THE_COMMAND_LINE}", f"{path}:1")
     if "unit" not in columns:
-        raise ConfigurationError(f"has no column 'unit'{_why(columns)}", f"{path}:1")
-    found: dict[str, dict[str, str]] = {}
+        raise ConfigurationError(f"has no column 'unit'{_hint(columns)}", f"{path}:1")
+    units: dict[str, dict[str, str]] = {}
     lines: dict[str, int] = {}
-    alike: dict[str, str] = {}
+    by_lower_case: dict[str, str] = {}
     problems = [f"line 1: column {c!r} stands twice" for c in sorted({c for c in columns if columns.count(c) > 1})]
     problems += [
         f"line 1: column {c!r} is not known; nearest: {m}; correct it, or rename a column of your own"
@@ -81,11 +78,11 @@ def read_units_table(path: Path) -> UnitsTable:
             f"line {line}: column {k!r} holds a control character" for k, v in row.items() if CONTROL.search(v)
         ]
         name = row["unit"]
-        wrong = wrong_name(name)
-        twin = alike.setdefault(name.casefold(), name)
-        if wrong:
-            problems.append(f"line {line}: unit {name[:60]!r}: {wrong}")
-        elif name in found:
+        problem = wrong_name(name)
+        twin = by_lower_case.setdefault(name.casefold(), name)
+        if problem:
+            problems.append(f"line {line}: unit {name[:60]!r}: {problem}")
+        elif name in units:
             problems.append(f"line {line}: unit {name!r} stands twice")
         elif twin != name:
             problems.append(
@@ -93,17 +90,16 @@ def read_units_table(path: Path) -> UnitsTable:
                 "the same on disks that make no difference; rename one"
             )
         else:
-            found[name], lines[name] = row, line
-    if not found and not problems:
+            units[name], lines[name] = row, line
+    if not units and not problems:
         problems.append("has no units")
     if problems:
-        more = [f"and {len(problems) - 20} more"] * (len(problems) > 20)
-        raise ConfigurationError("; ".join([*problems[:20], *more]), str(path))
-    return UnitsTable(found, lines)
+        raise ConfigurationError("; ".join(first(problems, 20)), str(path))
+    return UnitsTable(units, lines)
 
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str | Any, Any]]]]:
-    """Return the columns, and each row with the line on which it ends."""
+    """Return the columns, and each row with the number of its last line."""
     text = read_text(path, LARGEST_BYTES, "a units table")
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:
@@ -114,27 +110,28 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str | Any, Any]]
         raise ConfigurationError(f"cannot be read after line {reader.line_num}: {error}", str(path)) from error
 
 
-def _why(columns: list[str]) -> str:
-    """Return what a header without a column ``unit`` looks like, and what to do."""
+def _hint(columns: list[str]) -> str:
+    """Describe a header without a column ``unit``, and what to do."""
     for sign, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(columns) < 2 and columns and "unit" in [c.strip() for c in columns[0].split(sign)]:
             return (
                 f": its columns are separated by {name}, where commas are expected; save it again as CSV with commas "
                 "(quote a cell that holds a comma)"
             )
-    close = difflib.get_close_matches("unit", columns, 1, ALIKE)
+    close = difflib.get_close_matches("unit", columns, 1, SIMILARITY)
     names = ", ".join(repr(c[:60])[1:-1] for c in columns[:20])
     return (f"; nearest: {close[0]}" if close else "") + f"; its columns are {names or 'none'}"
 
 
 def _misspelt(columns: list[str]) -> list[tuple[str, str]]:
-    """Return columns that are not known, with the known one that each nearly is; plot is not taken for lot."""
-    found = []
+    """Return the misspelt columns, each with the nearest known column; a short name (plot, lot) must differ by an s."""
+    misspelt = []
     for column in columns:
-        close = difflib.get_close_matches(column.casefold(), MEANT, 1, ALIKE)
-        if column not in MEANT and close and (len(close[0]) > 4 or column.casefold() in (close[0], close[0] + "s")):
-            found.append((column, close[0]))
-    return found
+        close = difflib.get_close_matches(column.casefold(), KNOWN_COLUMNS, 1, SIMILARITY)
+        is_near = close and (len(close[0]) > 4 or column.casefold() in (close[0], close[0] + "s"))
+        if column not in KNOWN_COLUMNS and is_near:
+            misspelt.append((column, close[0]))
+    return misspelt
 
 
 DEVICES = "devices"
@@ -154,7 +151,7 @@ ByName = Annotated[
 
 
 class DeviceFile(BaseModel):
-    """A file of ``devices/``. The description of a field is what its refusal says is expected."""
+    """A file of ``devices/``. Error messages quote the description of a field."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     overrides: Overrides = []
@@ -176,7 +173,7 @@ File = TypeVar("File", bound=DeviceFile)
 
 
 class Layer(NamedTuple):
-    """One override and where it stands."""
+    """One override and its origin."""
 
     origin: str
     text: str
@@ -184,27 +181,27 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Layers:
-    """Everything that overrides settings of units."""
+    """All overrides of a campaign and of the command line."""
 
     units_table: UnitsTable
-    campaign: CampaignFile  # its ``overrides`` without those of the run
+    campaign: CampaignFile  # without the settings of the run
     of_run: list[str]  # settings of the run, from ``campaign.yaml`` and the command line
     devices: dict[str, list[str]]  # serial or unit to the overrides of its file
     command: list[str]  # ``overrides=`` of the command line
     per_unit: dict[str, list[str]]  # ``unit_overrides=`` of the command line
-    simulation: Path | None  # the description from which the run makes the recordings; None where they are recorded
+    simulation: Path | None  # description of the recordings that the run simulates; None for real recordings
 
     def of(self, unit: str) -> list[Layer]:
-        """Return a unit's overrides, weakest first."""
+        """Return the overrides of a unit, weakest first."""
         row, line = self.units_table.rows[unit], f"units.csv line {self.units_table.lines[unit]}"
-        own = [o for o in map(str.strip, BETWEEN_OVERRIDES.split(row.get("overrides", ""))) if o]
+        of_row = [o for o in map(str.strip, BETWEEN_OVERRIDES.split(row.get("overrides", ""))) if o]
         lot = row.get("lot", "")
         below = _layers("campaign.yaml", self.campaign.overrides)
         above = _layers(f"campaign.yaml, lots, {lot}", self.campaign.lots.get(lot, ()))
         for name in dict.fromkeys([row.get("serial", ""), unit]):
             above += _layers(f"{DEVICES}/{name}.yaml", self.devices.get(name, ()))
         above += [Layer(f"{line}, column {g}", f"{g}={row[g]}") for g in GROUPS if row.get(g)]
-        above += _layers(f"{line}, column overrides", own)
+        above += _layers(f"{line}, column overrides", of_row)
         above += _layers("command line, overrides=", self.command)
         above += _layers("command line, unit_overrides=", self.per_unit.get(unit, ()))
         if self.campaign.models:
@@ -217,7 +214,7 @@ class Layers:
 def load_layers(directory: Path, settings: Mapping[str, Any], sensors: Iterable[str]) -> Layers:
     """Read the overrides of a campaign and of the command line; ``ConfigurationError`` names the file and the key.
 
-    ``settings`` are those of ``--config``, ``sensors`` the names of the sensor configs.
+    ``settings``: of ``--config``; ``sensors``: names of the sensor configs.
     """
     units_table, path = read_units_table(directory / "units.csv"), directory / "campaign.yaml"
     file = _read(path, CampaignFile) if os.path.lexists(path) else CampaignFile()
@@ -250,7 +247,7 @@ def load_layers(directory: Path, settings: Mapping[str, Any], sensors: Iterable[
 
 
 def as_list(value: Any, where: str, what: str = LIST) -> list[str]:  # noqa: ANN401  (the user's)
-    """Return overrides as a list: a list of strings as it is, a plain string as one."""
+    """Return a string, or a list of strings, as a list; raises ``ConfigurationError`` for other values."""
     if isinstance(value, str):
         value = [value]
     if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
@@ -293,28 +290,27 @@ def _read(path: Path, model: type[File]) -> File:
 
 
 def _read_devices(directory: Path, units_table: UnitsTable) -> dict[str, list[str]]:
-    """Read ``devices/*.yaml``: serial or unit to overrides; all files that are refused are named in one message."""
+    """Read ``devices/*.yaml``: serial or unit to overrides; one ``ConfigurationError`` names all invalid files."""
     known = set(units_table.rows) | {row["serial"] for row in units_table.rows.values() if row.get("serial")}
-    found, problems = {}, []
+    devices, problems = {}, []
     for file in sorted((directory / DEVICES).glob("*.yaml")):
         if file.stem not in known:
             problems.append(f"{file}: no unit or serial {file.stem!r} in units.csv{nearest(file.stem, known)}")
             continue
         try:
-            run, found[file.stem] = _split(_read(file, DeviceFile).overrides)
+            run, devices[file.stem] = _split(_read(file, DeviceFile).overrides)
         except ConfigurationError as error:
             problems.append(str(error))
             continue
         if run:
             problems.append(f"{file}: {run[0]}: is a setting of the run, not of a device; set it in campaign.yaml")
     if problems:
-        more = [f"and {len(problems) - 5} more files"] * (len(problems) > 5)
-        raise ConfigurationError("the configuration is refused:\n  " + "\n  ".join([*problems[:5], *more]))
-    return found
+        raise ConfigurationError("the configuration is refused:\n  " + "\n  ".join(first(problems, 5, "files")))
+    return devices
 
 
 def _check_models_and_lots(campaign: CampaignFile, units_table: UnitsTable, sensors: set[str], file: str) -> None:
-    """Refuse overrides of models and lots that do not exist, of the run, and models that choose another model."""
+    """Refuse unknown models and lots, settings of the run, and overrides of a model that choose another model."""
     lots = {row["lot"] for row in units_table.rows.values() if row.get("lot")}
     for key, what, named, known in (
         ("models", "sensor config", campaign.models, sensors),
@@ -327,8 +323,8 @@ def _check_models_and_lots(campaign: CampaignFile, units_table: UnitsTable, sens
             if run:
                 raise ConfigurationError(f"{key}, {name}: {run[0]} is a setting of the run, not of units", file)
             try:
-                another = key == "models" and any(parse(o)[0] == "sensor" for o in overrides)
+                chooses_model = key == "models" and any(parse(o)[0] == "sensor" for o in overrides)
             except Problem as problem:
                 raise ConfigurationError(str(problem)) from problem
-            if another:
+            if chooses_model:
                 raise ConfigurationError(f"models, {name}: the overrides of a model cannot choose another", file)

@@ -1,9 +1,9 @@
-r"""The options of Hydra groups, overrides and references, as files and the command line hold them.
+r"""Read the options of Hydra groups, parse overrides, and resolve references.
 
 A reference ``${group.key}`` in a value stands for the value of that setting, and ``\${`` for the characters ``${``.
-OmegaConf does not resolve them: its resolvers, such as ``${oc.env:NAME}``, would put the environment of whoever runs a
-campaign into its pages, and it takes 64 ms to build a unit's configuration. A reference names a value or a list of
-values, and none that is a reference itself; so the cost of a file grows with its size.
+OmegaConf does not resolve them: its resolvers, such as ``${oc.env:NAME}``, would write environment variables of the
+user into the pages of a campaign, and it takes 64 ms to build a configuration. A reference names a value or a list of
+values that is not a reference itself, so the time is proportional to the size of a file.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 RUN_SETTINGS = tuple(RunSettings.model_fields)
-LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160
+LARGEST_CONFIG = 10_000  # values of an option; the largest in configs/ has 160
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
-LONGEST = 10_000  # characters of a value with references; names and units are meant
+LONGEST = 10_000  # characters of a value with references, such as a name or a unit
 FORM = "a reference is ${group.key}, for example ${sensor.accelerometer.counts_per_unit}"
 
 
-class Problem(Exception):  # noqa: N818  (one of many: they are collected, then raised as one ConfigurationError)
-    """One thing that is wrong with a configuration."""
+class Problem(Exception):  # noqa: N818  (problems are collected, then raised as one ConfigurationError)
+    """One error in a configuration."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a hint at the nearest valid name, and all of them where there are few."""
+    """Return a hint with the nearest valid name, and with all valid names if they are at most 12."""
     known = sorted(known)
     close = difflib.get_close_matches(name, known, 1, 0.5)
     hint = f"; nearest: {close[0]}" if close else ""
@@ -50,9 +50,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def parse(text: str) -> tuple[str, Any]:
     """Parse one Hydra override to its key and value.
 
-    A plain number, which is what differs from unit to unit, is read without Hydra's parser: that costs 0.6 ms each.
-
-    Raises ``Problem`` if it is no override, a sweep or a deletion.
+    A plain number, the usual override of a single unit, is read without Hydra's parser, which takes 0.6 ms. Raises
+    ``Problem`` if the text is not an override, or is a sweep or a deletion.
     """
     number = NUMBER.fullmatch(text)
     if number:
@@ -79,7 +78,7 @@ _hydras_parser = cache(OverridesParser.create)
 
 @cache
 def read_option(group: str, option: str, searchpath: tuple[Path, ...]) -> dict[str, Any]:
-    """Return what the file of a group's option holds; nothing where there is none."""
+    """Return the content of the file of an option; ``{}`` if the file does not exist."""
     for root in (*searchpath, CONFIGS):
         file = root / group / f"{option}.yaml"
         if file.is_file():
@@ -88,7 +87,7 @@ def read_option(group: str, option: str, searchpath: tuple[Path, ...]) -> dict[s
 
 
 def mapping_of(file: Path) -> dict[Any, Any]:
-    """Read the file of an option; raises ``ConfigurationError`` if it is no mapping or holds a resolver."""
+    """Read the file of an option; raises ``ConfigurationError`` if it is not a mapping or contains a resolver."""
     content = read_yaml(file, LARGEST_CONFIG)
     if not isinstance(content, dict):
         raise ConfigurationError("a mapping of settings is expected", str(file))
@@ -98,7 +97,7 @@ def mapping_of(file: Path) -> dict[Any, Any]:
 
 @cache
 def default_option(group: str) -> str:
-    """Return the option of a group where nothing chooses one."""
+    """Return the default option of a group."""
     for entry in mapping_of(CONFIGS / "config.yaml")["defaults"]:
         if not isinstance(entry, str) and group in entry:
             return str(entry[group])
@@ -106,10 +105,7 @@ def default_option(group: str) -> str:
 
 
 def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN401  (any YAML value)
-    """Refuse ``${...}`` that is more than the name of a setting, anywhere below a value.
-
-    Raises ``ConfigurationError`` naming the text.
-    """
+    """Raise ``ConfigurationError`` if a value contains ``${...}`` with more than the name of a setting."""
     if isinstance(value, dict):
         for key, below in value.items():
             check_references(key, where)
@@ -122,10 +118,9 @@ def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN
 
 
 def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (dict, list or value)
-    """Return a copy of a node in which each reference is replaced by what it names in the tree ``root``.
+    """Return a copy of a node in which the value from the tree ``root`` replaces each reference.
 
-    Raises ``ConfigurationError`` if a reference names no setting, a group of settings, or a setting that is a reference
-    too.
+    Raises ``ConfigurationError`` if a reference names no setting, a group of settings, or another reference.
     """
     if isinstance(node, dict):
         return {with_references(key, root): with_references(below, root) for key, below in node.items()}
@@ -136,25 +131,26 @@ def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (d
     check_references(node)
     whole = TOKEN.fullmatch(node)
     if whole and whole.group(2):
-        return _named(whole.group(2), root, node)
+        return _value_of(whole.group(2), root, node)
     text, end = "", 0
     for token in TOKEN.finditer(node):
-        if token.group(2) and _named(token.group(2), root, node) is None:
+        value = None if token.group(1) else _value_of(token.group(2), root, node)
+        if not token.group(1) and value is None:
             raise ConfigurationError(f"{node[:200]!r}: {token.group(2)} is null; set it")
-        text += node[end : token.start()] + ("${" if token.group(1) else str(_named(token.group(2), root, node)))
+        text += node[end : token.start()] + ("${" if token.group(1) else str(value))
         end = token.end()
         if len(text) > LONGEST:
             raise ConfigurationError(f"{node[:200]!r}: has more than {LONGEST} characters with its references")
     return text + node[end:]
 
 
-def _named(name: str, root: dict[str, Any], text: str) -> Any:  # noqa: ANN401
-    found: Any = root
+def _value_of(name: str, root: dict[str, Any], text: str) -> Any:  # noqa: ANN401
+    value: Any = root
     for key in name.split("."):
-        if not isinstance(found, dict) or key not in found:
+        if not isinstance(value, dict) or key not in value:
             raise ConfigurationError(f"{text[:200]!r}: no setting is called {name}")
-        found = found[key]
-    values = found if isinstance(found, list) else [found]
+        value = value[key]
+    values = value if isinstance(value, list) else [value]
     if any(isinstance(v, (dict, list)) or (isinstance(v, str) and "${" in v) for v in values):
         raise ConfigurationError(f"{text[:200]!r}: {name} is a group of settings or a reference; name one value")
-    return found
+    return value

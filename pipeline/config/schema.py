@@ -1,7 +1,7 @@
-"""The schema of one unit's configuration: names, types and ranges, in one place.
+"""Define the schema of the configuration of a unit: names, types and ranges.
 
-Comments in ``configs/`` state what each key means. Unknown keys are refused everywhere but in ``ingest`` column maps
-and effect limits, whose keys are names of channels and parameters.
+Comments in ``configs/`` explain each key. Unknown keys are refused, except in column maps of ``ingest`` and in limits
+of effects, whose keys are names of channels and effects.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Sensor(Section):
     gyroscope: DataSheet
 
 
-OF_BENCH = ("seat_deg", "time_offset_s", "clock_accuracy_ppm", "lag_s")  # of a table: the priors in configs/effect
+OF_BENCH = ("seat_deg", "time_offset_s", "clock_accuracy_ppm", "lag_s")  # keys of a table: priors in configs/effect
 
 
 class Table(Section):
@@ -83,13 +83,13 @@ class Table(Section):
 
 
 class Rest(Section):
-    """A rest in a table's program."""
+    """A rest in the program of a table."""
 
     rest_s: NonNegative
 
 
 class Turn(Section):
-    """A turn in a table's program, with trapezoidal rate."""
+    """A turn in the program of a table, with trapezoidal rate."""
 
     turn_deg: float
     rate_dps: Positive
@@ -97,7 +97,7 @@ class Turn(Section):
 
 
 class Repeated(Section):
-    """Steps of a table's program, some times over."""
+    """Repeated steps in the program of a table."""
 
     repeat: Annotated[int, Field(ge=1)]
     steps: list[Rest | Turn]
@@ -144,7 +144,7 @@ class HandTurns(Section):
 
 
 class Procedure(Section):
-    """Which recordings a calibration consists of."""
+    """The recordings of a calibration."""
 
     name: str
     table: str
@@ -165,7 +165,7 @@ class Stages(Section):
 
 
 class Method(Section):
-    """How each sensor is fitted."""
+    """The method for each sensor."""
 
     name: str
     accelerometer: str | None
@@ -196,19 +196,19 @@ class Effects(Section):
 
 
 class Uncertainty(Section):
-    """How uncertainties are found."""
+    """Settings of the uncertainty computation."""
 
     monte_carlo: Annotated[int, Field(ge=0, le=10_000_000)]
 
 
 class Diagnosis(Section):
-    """How much a diagnosis computes."""
+    """Settings of the diagnosis."""
 
     depth: Literal["standard", "full"]
 
 
 class SensorLimits(Section):
-    """What a unit must keep to pass; None is not checked."""
+    """Limits that a unit must keep to pass; None is not checked."""
 
     held_out_rms_error: Positive | None
     held_out_mean_abs_error: Positive | None
@@ -225,10 +225,10 @@ class Limits(Section):
 
 
 class Ingest(Section):
-    """How files become recordings; ``pipeline.io`` documents the keys of ``csv``, ``mcap`` and ``checks``.
+    """The format of recordings; ``pipeline.io`` documents the keys of ``csv``, ``mcap`` and ``checks``.
 
-    ``instance``: which sensor of a log that holds several; names in ``csv`` and ``mcap`` refer to it. A profile of text
-    logs needs no ``mcap``, one of logs of messages no ``csv``.
+    ``instance`` selects a sensor in a log of several sensors; names in ``csv`` and ``mcap`` refer to it. A profile of
+    text logs needs no ``mcap``, a profile of message logs no ``csv``.
     """
 
     name: str
@@ -251,7 +251,7 @@ class Organisation(Section):
 
 
 class Item(Section):
-    """What was calibrated."""
+    """The calibrated item."""
 
     manufacturer: Text = None
     description: Text = None
@@ -266,14 +266,14 @@ class Performed(Section):
 
 
 class Person(Section):
-    """Who authorises a report."""
+    """The person who authorises a report."""
 
     name: Text = None
     role: Text = None
 
 
 class MethodStated(Section):
-    """The laboratory's own procedure."""
+    """The procedure of the laboratory."""
 
     document: Text = None
     deviations: Text = None
@@ -289,14 +289,14 @@ class Equipment(Section):
 
 
 class Conformity(Section):
-    """What a statement of conformity is about."""
+    """The subject of a statement of conformity."""
 
     specification: Text = None
     decision_rule: Text = None
 
 
 class Certificate(Section):
-    """What a laboratory states in its calibration report; None is not stated."""
+    """Statements of a laboratory in its calibration report; None is not stated."""
 
     name: str
     number: Text = None
@@ -338,7 +338,7 @@ class Unit(Section):
 
 
 class RunSettings(Section):
-    """Settings of a run, of ``campaign.yaml`` or the command line. A description says what is expected."""
+    """Settings of a run, from ``campaign.yaml`` or the command line. Error messages quote a description."""
 
     batch_size: Literal["auto"] | Annotated[int, Field(ge=1)] = Field(description="auto or a whole number from 1 on")
     combine: Literal["serial", "lot"] | None = Field(description="serial, lot or null")

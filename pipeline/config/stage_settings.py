@@ -1,9 +1,8 @@
-"""What decides whether a job is done again: the settings that its stage reads, and the code that it runs.
+"""Determine what makes Snakemake repeat a job: the settings that its stage reads, and the code that it runs.
 
-A job reads no settings but those of a file named after its content, which is an input of its rule: a changed setting
-reruns exactly the stages that read it. Settings that all units of a batch share stand there once, under ``common``.
-Snakemake sees the shell command of a rule, not the package that it calls, so a digest of the code is a parameter of the
-rule.
+A job reads its settings from one file, an input of its rule that is named after its content. A changed setting
+therefore repeats exactly the stages that read it. ``common`` in the file holds the settings that all units of a batch
+share. A digest of the code is a parameter of the rule, because Snakemake does not detect changes of the package.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ if TYPE_CHECKING:
     from pipeline.config.campaign import Campaign, UnitRow
 
 PACKAGE = Path(__file__).resolve().parents[1]
-CAMPAIGN = "campaign"  # no batch: their names end in a number
-EFFECTS = CONFIGS / "effect"  # what pipeline.model.effects reads
-# An import of the package, or of jinja2: module and names, or module alone. ``ast`` takes 0.5 s for all files.
+CAMPAIGN = "campaign"  # cannot be a batch, because their names end in a number
+EFFECTS = CONFIGS / "effect"  # read by pipeline.model.effects
+# An import of the package, or of jinja2: module and names, or only a module. ``ast`` takes 0.5 s for all files.
 IMPORT = re.compile(
     r"^[ \t]*(?:from (pipeline[\w.]*|jinja2) import (\([^)]*\)|.*)|import (pipeline[\w.]*))", re.MULTILINE
 )
-# Dotted keys that a stage reads; {sensor} is the sensor that the stage is about.
+# Dotted keys that a stage reads; {sensor} is the sensor of the stage.
 BOTH = ("accelerometer", "gyroscope")
 NOISE = ("noise_density", "bias_wander", "wander_time_s")
 BY_HAND = tuple(f"procedure.{key}" for key in ("holdout_every", "faces", "turns"))
@@ -49,11 +48,11 @@ FIT_OF_SENSOR = (
 FIT = (
     *(f"table.{key}" for key in FIT_OF_TABLE),
     *(f"sensor.{{sensor}}.{key}" for key in FIT_OF_SENSOR),
-    *(f"sensor.accelerometer.{key}" for key in (*NOISE, "cross_axis")),  # its fit by hand is part of the gyroscope's
+    *(f"sensor.accelerometer.{key}" for key in (*NOISE, "cross_axis")),  # by hand, a gyroscope fit includes its fit
     "sensor.temperature_accuracy_degc", *BY_HAND, "method.{sensor}", "method.as_printed", "method.given",
     "uncertainty.monte_carlo",
 )  # fmt: skip
-# Effects that explain a departure of table, clock or gyroscope: the checks of the recordings read their limits.
+# Effects that explain a deviation of table, clock or gyroscope: the checks of recordings read their limits.
 LIMITS_OF_CHECKS = (
     "time_offset", "low_pass_lag", "clock_rate", "table_encoder_error", "table_rate_ripple", "table_backlash",
     "table_tilt", "table_axis_nonorthogonality", "g_sensitivity", "g_squared_sensitivity", "bias_drift",
@@ -96,26 +95,26 @@ WITH_DIGEST = [stage for stage, keys in READS.items() if "config_sha256" in keys
 
 
 def config_sha256(config: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a unit's whole configuration as canonical JSON, without what a certificate states."""
+    """Return the SHA-256 of the configuration of a unit as canonical JSON, without the section ``certificate``."""
     return hashlib.sha256(_canonical({k: v for k, v in config.items() if k != "certificate"})).hexdigest()
 
 
 def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, Any]:
     """Return the settings of a unit that a stage reads: a key of ``READS``, or a stage of the fit of a sensor."""
-    out: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     paths = _paths(stage, sensor)
     mounted = config["table"].get("seat_deg") is not None or "mounting" in (config["effects"]["gyroscope"] or ())
-    if stage == "effects" and sensor == "gyroscope" and mounted:  # with a mounting of the unit in each recording,
-        paths = paths + _paths(stage, "accelerometer")  # which gravity determines
+    if stage == "effects" and sensor == "gyroscope" and mounted:  # gravity determines the mounting of the unit in
+        paths = paths + _paths(stage, "accelerometer")  # each recording
     for *branch, leaf in paths:
         source: Any = config
-        target = out
+        target = settings
         for step in branch:
             source = source[step]
             target = target.setdefault(step, {})
         if leaf in source or (branch[-1:] != ["effects"] and leaf != "given"):  # a sensor file limits some effects
             target[leaf] = source[leaf]
-    return out
+    return settings
 
 
 @cache
@@ -124,7 +123,7 @@ def _paths(stage: str, sensor: str) -> list[list[str]]:
 
 
 class SettingsFile(NamedTuple):
-    """The settings of a job: a file that is named after its content."""
+    """The settings of a job, in a file that is named after its content."""
 
     name: str
     content: bytes
@@ -133,10 +132,10 @@ class SettingsFile(NamedTuple):
 def settings_of_jobs(
     campaign: Campaign, again: Callable[[str], int] = lambda _: 0
 ) -> dict[str, dict[str, SettingsFile]]:
-    """Return the settings of every job, by batch and by what it writes: ``fit/gyroscope/bias``.
+    """Return the settings of every job, by batch and output, such as ``fit/gyroscope/bias``.
 
-    Those of ``gather`` and ``lots`` are of the batch ``CAMPAIGN``. ``again`` is how often an output, by its path below
-    the results, is repeated because it was edited (``pipeline.results_folder``).
+    The settings of ``gather`` and ``lots`` are in the batch ``CAMPAIGN``. ``again`` returns the number of repetitions
+    of an output (path below the results) because it was edited (``pipeline.results_folder``).
     """
     configs, sections = _sections(campaign)
     compared = sorted({unit for c in campaign.compare for g in c["groups"] for unit in g["units"]})
@@ -147,16 +146,16 @@ def settings_of_jobs(
         }
         for name, unit in campaign.units.items()
     }  # fmt: skip
-    found: dict[str, dict[str, SettingsFile]] = {}
+    files: dict[str, dict[str, SettingsFile]] = {}
     for batch, units in campaign.batches.items():
         rows = [campaign.units[unit] for unit in units]
         fits = [(s, stage) for s in BOTH for stage in campaign.chains[batch][s]]
         outputs = {f"fit/{s}/{stage}": (stage if stage == "effects" else "fit", s) for s, stage in fits}
         outputs |= {stage: (stage, "") for stage in READS if stage not in ("fit", "effects", "prior")}
         outputs |= {"prior": ("prior", "")} if campaign.combine == "lot" else {}
-        found[batch] = {
-            output: _file(output, _content(campaign, rows, *of, summaries), again(f"batches/{batch}/{output}.zip"))
-            for output, of in outputs.items()
+        files[batch] = {
+            output: _file(output, _content(campaign, rows, *stage, summaries), again(f"batches/{batch}/{output}.zip"))
+            for output, stage in outputs.items()
         }
     of_gather = {
         "campaign": campaign.name,
@@ -170,10 +169,10 @@ def settings_of_jobs(
         "publish_limit": campaign.publish_limit,
         "truths": {unit: str(campaign.truth(unit)) for unit in compared},
     }
-    found[CAMPAIGN] = {"gather": _file("gather", of_gather, again(""))}
+    files[CAMPAIGN] = {"gather": _file("gather", of_gather, again(""))}
     if campaign.combine == "lot":
-        found[CAMPAIGN]["lots"] = _file("lots", {"batches": campaign.batches}, again("batches/lots.zip"))
-    return found
+        files[CAMPAIGN]["lots"] = _file("lots", {"batches": campaign.batches}, again("batches/lots.zip"))
+    return files
 
 
 def _file(output: str, content: dict[str, Any], again: int) -> SettingsFile:
@@ -184,13 +183,13 @@ def _file(output: str, content: dict[str, Any], again: int) -> SettingsFile:
 def _content(
     campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: str, summaries: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the settings of some units that a stage, of a fit of a sensor, reads."""
+    """Return the settings that a stage reads for the units of a batch; ``sensor``: of a stage of a fit."""
     digests = [{"config_sha256": r.config_sha256} if stage in WITH_DIGEST else {} for r in rows]
     settings = {r.name: select_settings(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
     if stage == "report":
         for row in rows:
-            own = {c: row.row[c] for c in ("serial", "lot", "date") if row.row.get(c)}
-            settings[row.name] |= {"row": own, "run": campaign.run_settings(row.name)}
+            cells = {c: row.row[c] for c in ("serial", "lot", "date") if row.row.get(c)}
+            settings[row.name] |= {"row": cells, "run": campaign.run_settings(row.name)}
     if stage == "summary":
         settings = {row.name: settings[row.name] | summaries[row.name] for row in rows}
     if stage == "calibration" and campaign.boards:
@@ -208,20 +207,20 @@ def _content(
 
 
 def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> str | None:
-    """Return a digest of the names, sizes and times of the recordings; None where the run makes them."""
+    """Return a digest of the names, sizes and times of the recordings; None if the run simulates them."""
     if campaign.simulation:
         return None
     digest = hashlib.sha256()
     for row in rows:
         files = recording_files(row.config["procedure"], row.config["ingest"], campaign.folder(row.name))
         for path in sorted({path for paths in files.values() for path in paths}):
-            found = path.stat()
-            digest.update(f"{path}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
+            status = path.stat()
+            digest.update(f"{path}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
     return digest.hexdigest()[:16]
 
 
 def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Split the settings of units into those that all share and the rest of each.
+    """Split the settings of units into the settings that all share and the other settings of each unit.
 
     ``pipeline.stages.batch.merge_common`` merges them again.
     """
@@ -229,35 +228,35 @@ def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], d
         return {}, dict(settings)
     first, *others = settings.values()
     shared: dict[str, Any] = {}
-    own = {unit: dict(each) for unit, each in settings.items()}
+    specific = {unit: dict(each) for unit, each in settings.items()}
     for key, value in first.items():
         if all(key in each and each[key] == value for each in others):
             shared[key] = value
-            for each in own.values():
+            for each in specific.values():
                 del each[key]
         elif all(isinstance(each.get(key), dict) for each in settings.values()):
             shared[key], below = in_common({unit: each[key] for unit, each in settings.items()})
-            for unit, each in own.items():
+            for unit, each in specific.items():
                 each[key] = below[unit]
-    return shared, own
+    return shared, specific
 
 
 def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, Any]]:
-    """Return the digest of each section of each unit's configuration, and the section behind each digest."""
-    known: dict[int, str] = {}  # units share the sections that no override of theirs changes
+    """Return the digests of the sections of the configuration of each unit, and the sections by digest."""
+    known: dict[int, str] = {}  # digest by the id of a section; units share sections that no override changes
     values: dict[str, Any] = {}
-    found: dict[str, dict[str, str]] = {}
+    digests: dict[str, dict[str, str]] = {}
     for name, unit in campaign.units.items():
-        found[name] = {}
+        digests[name] = {}
         for section, content in unit.config.items():
             if section in ("unit", "certificate"):
                 continue
-            own = {k: v for k, v in content.items() if k != "folder"} if section == "procedure" else content
+            value = {k: v for k, v in content.items() if k != "folder"} if section == "procedure" else content
             if section == "procedure" or id(content) not in known:
-                known[id(content)] = digest(own)
-                values.setdefault(known[id(content)], own)
-            found[name][section] = known[id(content)]
-    return found, values
+                known[id(content)] = digest(value)
+                values.setdefault(known[id(content)], value)
+            digests[name][section] = known[id(content)]
+    return digests, values
 
 
 def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
@@ -266,10 +265,10 @@ def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
 
 @cache
 def code_digest(module: str) -> str:
-    """Return a digest of a module's source and of every module of the package that it imports, at any depth.
+    """Return a digest of the source of a module and of every module of the package that it imports, at any depth.
 
-    A package counts with all files in its folder where it finds its modules on disk, a module
-    that imports jinja2 with its folder ``templates``, the effects with their files in ``configs/effect/``.
+    It includes all files of a package that imports its modules by name, the folder ``templates`` of a module that
+    imports jinja2, and ``configs/effect/`` with the effects.
     """
     digest = hashlib.sha256()
     for file in sorted(_closure(module)):
@@ -294,16 +293,16 @@ def _imports(file: Path) -> tuple[Path, ...]:
     if file.suffix != ".py":
         return ()
     source = file.read_bytes()
-    found: list[Path | None] = []
+    files: list[Path | None] = []
     if file.name == "__init__.py" and b"import_module(" in source:
-        found += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
+        files += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
     if file == PACKAGE / "model" / "effects" / "__init__.py":
-        found += [f for f in sorted(EFFECTS.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
+        files += [f for f in sorted(EFFECTS.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
     for module, names, whole in IMPORT.findall(source.decode()):
         if module == "jinja2":
-            found += (file.parent / "templates").glob("*")
-        found += [_file_of(module or whole), *(_file_of(f"{module}.{name}") for name in re.findall(r"\w+", names))]
-    return tuple(f for f in found if f)
+            files += (file.parent / "templates").glob("*")
+        files += [_file_of(module or whole), *(_file_of(f"{module}.{name}") for name in re.findall(r"\w+", names))]
+    return tuple(f for f in files if f)
 
 
 @cache

@@ -1,7 +1,7 @@
-"""What a campaign brings in addition to its settings: effects of the user's own, and calibrations that are given.
+"""Load the effects that a user defines, and the calibrations of ``method=given``.
 
-Formulas are files of the campaign, Python files are named on the command line only. The content of the calibration
-that ``method=given`` takes from a file is a setting: where it changes, exactly the stages that read it run again.
+Effects by formula are files of the campaign; only the command line can name Python files. The calibration that
+``method=given`` reads from a file becomes a setting: if it changes, exactly the stages that read it are repeated.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
 
 PYTHON = "python_effects"
-GIVEN = "given"  # the method
-BUILT_IN = r"(?m)^built_in: true"  # a file of configs/effect/ that ships
+GIVEN = "given"  # name of the method
+BUILT_IN = r"(?m)^built_in: true"  # marks an effect of the package
 ONLY_FROM_THE_COMMAND_LINE = (
     "an effect in Python is code, and is loaded only where the command line names it: "
     "--config 'python_effects=[path/to/my_effect.py]'"
@@ -36,51 +36,51 @@ ONLY_FROM_THE_COMMAND_LINE = (
 
 @dataclass(frozen=True)
 class UserEffects:
-    """The effects of the user's own."""
+    """The effects that the user defines."""
 
     effects: dict[str, Effect] = field(default_factory=dict)
-    python: dict[str, dict[str, str]] = field(default_factory=dict)  # of those in Python, by name: path, sha256
+    python: dict[str, dict[str, str]] = field(default_factory=dict)  # path and sha256 of Python effects, by name
 
     def section(self) -> dict[str, Any]:
-        """Return what goes into the configuration of each unit; empty where there are none."""
+        """Return the section ``user_effects`` for the configuration of each unit; empty without such effects."""
         if not self.effects:
             return {}
         formulas = [e.definition for name, e in self.effects.items() if name not in self.python]
         return {"user_effects": {"formulas": formulas, "python": list(self.python.values())}}
 
     def add_limits(self, sensor_configs: dict[str, Any]) -> None:
-        """Add the effects' limits to those of the sensor files, which take precedence."""
-        for each in self.effects.values():
-            for sensor in each.sensors:
-                given = sensor_configs[sensor]["effects"]
-                if each.name not in given:
-                    sensor_configs[sensor]["effects"] = {**each.limits(sensor), **given}
+        """Add the limits of the effects to those of the sensor files, which have precedence."""
+        for effect in self.effects.values():
+            for sensor in effect.sensors:
+                limits = sensor_configs[sensor]["effects"]
+                if effect.name not in limits:
+                    sensor_configs[sensor]["effects"] = {**effect.limits(sensor), **limits}
 
 
 def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[str]) -> UserEffects:
     """Read ``<campaign>/effects``, ``<configs>/effect`` and the Python files that the command line names.
 
-    Raises ``ConfigurationError`` with a line for each file that is not as it should be.
+    Raises ``ConfigurationError`` with a line for each invalid file.
     """
-    found: dict[str, Effect] = {}
+    loaded: dict[str, Effect] = {}
     places: dict[str, str] = {}
     hashes: dict[str, dict[str, str]] = {}
     problems: list[str] = []
 
     def add(effects: Mapping[str, Effect], place: Path) -> None:
-        for name, each in effects.items():
-            if name in found:
+        for name, effect in effects.items():
+            if name in loaded:
                 problems.append(f"{place}: the effect {name} is also in {places[name]}; name one of them otherwise")
-            found[name], places[name] = each, str(place)
+            loaded[name], places[name] = effect, str(place)
 
     folders = [campaign / "effects", *(root / "effect" for root in configs)]
-    own, shipped = campaign.resolve(), CONFIGS / "effect"
+    directory, shipped = campaign.resolve(), CONFIGS / "effect"
     files = {
         folder: [
             f
             for f in sorted(folder.glob("*.yaml"))
             if not re.search(BUILT_IN, read_text(f, LARGEST_BYTES, "an effect"))
-            or (f.resolve().is_relative_to(own) and f.resolve().parent != shipped)
+            or (f.resolve().is_relative_to(directory) and f.resolve().parent != shipped)
         ]
         for folder in folders
     }
@@ -88,30 +88,30 @@ def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[
         return UserEffects()
     from pipeline.model.effects import load_python_effect, read_effect_files  # noqa: PLC0415  (imports numpy)
 
-    for folder, those in files.items():
+    for folder, files_of_folder in files.items():
         try:
-            add(read_effect_files(those), folder)
+            add(read_effect_files(files_of_folder), folder)
         except PipelineError as error:
             problems.append(str(error))
     for text in python:
         path = Path(text).expanduser().resolve()
         try:
-            each = load_python_effect(path)
+            effect = load_python_effect(path)
         except PipelineError as error:
             problems.append(str(error))
             continue
-        add({each.name: each}, path)
-        hashes[each.name] = {"path": str(path), "sha256": str((each.definition or {})["sha256"])}
+        add({effect.name: effect}, path)
+        hashes[effect.name] = {"path": str(path), "sha256": str((effect.definition or {})["sha256"])}
     if problems:
         raise ConfigurationError("the configuration is refused:\n" + "\n".join(f"  {p}" for p in problems))
-    return UserEffects(found, hashes)
+    return UserEffects(loaded, hashes)
 
 
 def effects_for(stage: str, sensor: str, configs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return those effects of the user's own that a stage of some units needs; empty where there are none.
+    """Return the section ``user_effects`` that a stage needs for some units; empty if it needs none.
 
-    A fit needs those that are asked for, or all where they are selected; diagnosis and report know all of them. The
-    other stages read fitted effects, which carry their formulas themselves, but not their Python.
+    A fit needs the configured effects, or all effects for ``auto``. Diagnosis and report need all of them. The other
+    stages read fitted effects, which contain their formulas but not their Python code.
     """
     units = list(configs)
     section = next((c["user_effects"] for c in units if "user_effects" in c), None)
@@ -120,8 +120,8 @@ def effects_for(stage: str, sensor: str, configs: Iterable[Mapping[str, Any]]) -
     if stage not in ("diagnose", "report"):
         wanted: set[str] = set()
         for config in units:
-            for of, names in config["effects"].items():
-                if sensor in ("", of):
+            for of_sensor, names in config["effects"].items():
+                if sensor in ("", of_sensor):
                     wanted |= {"auto"} if names == "auto" else set(names)
         everything = "auto" in wanted
         formulas = section["formulas"] if stage == "effects" else []
@@ -133,11 +133,11 @@ def effects_for(stage: str, sensor: str, configs: Iterable[Mapping[str, Any]]) -
 
 
 def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str, Any]:
-    """Return the sections ``method`` and ``effects`` of a unit, with the calibration that its file holds.
+    """Return the sections ``method`` and ``effects`` of a unit with the calibration from its file ``method.file``.
 
-    ``method.given``: ``source`` (for texts), ``sha256``, ``notes``, and each sensor's bias, matrix, effects and
-    uncertainties as in ``calibrations/<unit>.json``. The effects of the file that belong to the sensor are those of
-    the model. Raises ``Problem``.
+    ``method.given``: ``source`` (for texts), ``sha256``, ``notes``, and bias, matrix, effects and uncertainties of each
+    sensor as in ``calibrations/<unit>.json``. ``effects``: the effects of the file that the sensor causes. Raises
+    ``Problem``.
     """
     from pipeline.exports.reading import counts_of, read_any  # noqa: PLC0415  (only for this method)
     from pipeline.model.effects import owner_of  # noqa: PLC0415  (as above)
@@ -150,11 +150,11 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
         raise Problem(f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null")
     file = campaign / method["file"].replace("{unit}", unit)
     try:
-        found = read_any(file, method["format"], counts_of(config["sensor"]))
+        content = read_any(file, method["format"], counts_of(config["sensor"]))
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
     except PipelineError as error:
         raise Problem(f"method.file: {error}") from error
-    given: dict[str, Any] = {"source": f"{file.name} ({found.format_name})", "sha256": digest, "notes": found.notes}
+    given: dict[str, Any] = {"source": f"{file.name} ({content.format_name})", "sha256": digest, "notes": content.notes}
     for sensor in SENSORS:
         if method[sensor] != GIVEN:
             continue
@@ -162,14 +162,14 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
             raise Problem(
                 f"effects.{sensor}: method=given takes the effects from its file; to fit effects, choose another method"
             )
-        calibration = found.sensors.get(sensor)
+        calibration = content.sensors.get(sensor)
         if calibration is None:
             given[sensor] = None
             continue
-        own = [e for e in calibration.effects if owner_of(e) == Owner.SENSOR]
-        effects[sensor] = [e.name for e in own]
+        of_sensor = [e for e in calibration.effects if owner_of(e) == Owner.SENSOR]
+        effects[sensor] = [e.name for e in of_sensor]
         part = calibration.to_json() | {"stages": []}
         part["uncertain"] = calibration.covariance is not None
-        part["of_the_bench"] = [e.name for e in calibration.effects if e not in own]
+        part["of_the_bench"] = [e.name for e in calibration.effects if e not in of_sensor]
         given[sensor] = part
     return {"method": {**method, "given": given}, "effects": effects}

@@ -1,4 +1,4 @@
-"""The calibration of one sensor after each stage of a fit, its uncertainty budget, and their JSON form.
+"""The calibration of one sensor after a stage of a fit, the lines of its uncertainty budget, and their JSON form.
 
 reading = bias + matrix^-1 @ truth + effects + noise
 truth   = matrix @ (reading - bias - effects)
@@ -27,9 +27,9 @@ class StageResult:
 
     name: str
     parameters: dict[str, Any]  # name to {"value", "unit", "standard_uncertainty"}; the uncertainty may be None
-    residual_rms: float | None = None  # of the fit's own error measure after this stage, unit of the sensor
-    # How readings are corrected up to and including this stage, where matrix and bias alone do not say it; the method's
-    # module in pipeline.estimation defines its keys.
+    residual_rms: float | None = None  # of the error that the fit minimises, after this stage, unit of the sensor
+    # Correction of readings after this stage, if it is more than matrix and bias. The module of the method in
+    # pipeline.estimation defines the keys.
     correction: dict[str, Any] | None = None
     details: dict[str, Any] = field(default_factory=dict)  # for the report: condition number, samples used, iterations
 
@@ -38,8 +38,8 @@ class StageResult:
 class FittedEffect:
     """A fitted effect; ``parameters`` map names to ``{"value", "unit", "expanded_uncertainty"}``.
 
-    ``definition`` is the content of the file of a user's effect, so that the calibration can be applied without it;
-    None for a built-in effect.
+    ``definition`` is the content of the file of a user's effect, so that the calibration can be applied without that
+    file; None for a built-in effect.
     """
 
     name: str
@@ -56,8 +56,8 @@ class FittedEffect:
 class SensorCalibration:
     """Calibration of one sensor after a stage.
 
-    ``convergence`` is the evidence that the estimate is a minimum: ``cosine``, the largest between the residual and a
-    column of the Jacobian; ``condition`` and ``rank`` of its scaled columns; ``parameters``, their number.
+    ``convergence`` is the evidence that the estimate is a minimum: ``cosine``, the largest cosine between the residual
+    and a column of the Jacobian; ``condition`` and ``rank`` of its scaled columns; ``parameters``, their number.
     """
 
     sensor: str
@@ -65,17 +65,17 @@ class SensorCalibration:
     matrix: Values = field(default_factory=lambda: np.eye(3))  # (3, 3), dimensionless
     stages: tuple[StageResult, ...] = ()
     effects: tuple[FittedEffect, ...] = ()
-    # (p, p), of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then of each effect's parameters; with every line of
-    # the uncertainty budget.
+    # (p, p), of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then of the parameters of each effect; it includes all
+    # lines of the uncertainty budget.
     covariance: Values | None = None
-    degrees_of_freedom: float = float("inf")  # the smallest of the parameters
+    degrees_of_freedom: float = float("inf")  # smallest of all parameters
     converged: bool = True
     freedom: Values | None = None  # (p,), effective degrees of freedom; None: ``degrees_of_freedom`` for all
     budget: dict[str, Any] | None = None  # as published; see pipeline.estimation.uncertainty_budget
     convergence: dict[str, Any] | None = None
 
     def parameter_names(self) -> list[str]:
-        """Return the names of the covariance's rows."""
+        """Return the names of the rows of the covariance."""
         names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
         return names + [f"{e.name}.{p}" for e in self.effects for p in e.parameters]
 
@@ -86,7 +86,7 @@ class SensorCalibration:
         return np.full(len(self.parameter_names()), self.degrees_of_freedom)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the sensor's part of ``calibrations/<unit>.json``."""
+        """Return the part of ``calibrations/<unit>.json`` for this sensor."""
         size = len(self.parameter_names())
         covariance = np.zeros((size, size)) if self.covariance is None else self.covariance
         freedom = self.effective_freedom()
@@ -114,7 +114,7 @@ class SensorCalibration:
 
     @classmethod
     def from_json(cls, sensor: str, data: dict[str, Any]) -> Self:
-        """Read back what ``to_json`` wrote."""
+        """Return the object from the value of ``to_json``."""
         freedom = data.get("effective_degrees_of_freedom")
         return cls(
             sensor=sensor,
@@ -132,20 +132,20 @@ class SensorCalibration:
 
 
 def _shaped(values: Values) -> dict[str, Any]:
-    """Return the values of bias and matrix in the shapes of these."""
+    """Return the first 12 values in the shapes of bias and matrix."""
     return {"bias": values[:3].tolist(), "matrix": values[3:12].reshape(3, 3).tolist()}
 
 
 def coverage_factor(degrees_of_freedom: ArrayLike, probability: float = 0.95) -> Values:
-    """Return the two-sided coverage factor k of Student's t, of the shape of its argument.
+    """Return the two-sided coverage factor k of Student's t, in the shape of ``degrees_of_freedom``.
 
     k solves ``P(|t_nu| <= k) = probability`` (JCGM 100:2008, annex G); for infinite ``nu`` it is the normal quantile.
     """
-    from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (0.1 s, needed where uncertainties are written only)
+    from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (0.1 s, only needed to write uncertainties)
 
     nu, upper = np.asarray(degrees_of_freedom, float), 0.5 + probability / 2.0
-    known = np.isfinite(nu)
-    factors: Values = np.where(known, stdtrit(np.where(known, nu, 1.0), upper), ndtri(upper))[()]
+    limited = np.isfinite(nu)
+    factors: Values = np.where(limited, stdtrit(np.where(limited, nu, 1.0), upper), ndtri(upper))[()]
     return factors
 
 
@@ -154,36 +154,36 @@ class Contribution:
     """One line of an uncertainty budget: the share of one source (JCGM 100:2008, 8 and annex H)."""
 
     source: str
-    kind: str  # A (from the scatter of these recordings) or B (from any other knowledge)
-    distribution: str  # assumed, of the input
+    kind: str  # A (from the scatter of these recordings) or B (from other knowledge)
+    distribution: str  # assumed for the input
     covariance: Values  # (p, p), of the parameters, from this source only
     degrees_of_freedom: Values  # (p,)
-    input_uncertainty: float | None = None  # standard uncertainty; None where the source is not a single quantity
+    input_uncertainty: float | None = None  # standard uncertainty; None if the source is not a single quantity
     input_unit: str = ""
-    independent: int = 1  # quantities of this uncertainty that the input stands for (stops of a table, axes)
-    parts: dict[str, Values] = field(default_factory=dict)  # (p,), standard uncertainties it consists of, where known
+    independent: int = 1  # number of independent quantities with this uncertainty (stops of a table, axes)
+    parts: dict[str, Values] = field(default_factory=dict)  # known components, (p,) standard uncertainties
     remark: str = ""
 
     @property
     def standard_uncertainty(self) -> Values:
-        """Its share of each parameter's standard uncertainty: (p,) array."""
+        """Standard uncertainty of each parameter from this source: (p,) array."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
-    def of(self, kept: slice) -> Contribution:
-        """Return the contribution to some of the parameters."""
-        parts = {name: values[kept] for name, values in self.parts.items()}
-        freedom = self.degrees_of_freedom[kept]
-        return replace(self, covariance=self.covariance[kept, kept], degrees_of_freedom=freedom, parts=parts)
+    def of(self, selected: slice) -> Contribution:
+        """Return the contribution to the selected parameters."""
+        parts = {name: values[selected] for name, values in self.parts.items()}
+        freedom = self.degrees_of_freedom[selected]
+        return replace(self, covariance=self.covariance[selected, selected], degrees_of_freedom=freedom, parts=parts)
 
     def placed(self, place: Values) -> Contribution:
-        """Return the contribution to q parameters that include these p: ``place`` is (q, p), zeros and ones."""
+        """Return the contribution to q parameters that include these p; ``place``: (q, p) selection matrix."""
         parts = {name: place @ values for name, values in self.parts.items()}
         freedom = np.full(len(place), np.inf)
         freedom[np.argmax(place, axis=0)] = self.degrees_of_freedom
         return replace(self, covariance=place @ self.covariance @ place.T, degrees_of_freedom=freedom, parts=parts)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the line as published; the sensitivity is contribution / input uncertainty."""
+        """Return the published line; the sensitivity is contribution / input uncertainty."""
         contribution, u = self.standard_uncertainty, self.input_uncertainty
         return {
             "source": self.source,
@@ -201,5 +201,5 @@ class Contribution:
 
 
 def finite(values: Values) -> list[float | None]:
-    """Return a list for JSON, with None for infinite values."""
+    """Return a list for JSON, with None in place of values that are not finite."""
     return [float(v) if np.isfinite(v) else None for v in values]

@@ -1,4 +1,4 @@
-"""A recording (the samples of one file), the noise of one sensor, and the motion of the body, with attitudes.
+"""The data classes of a recording, of the noise of a sensor and of the motion of the body; functions of attitudes.
 
 Units: time in integer nanoseconds since power-on, specific force in g (9.80665 m/s^2), angular rate in deg/s, angles in
 deg, temperature in degC. A channel that the file does not contain is ``None``.
@@ -13,7 +13,7 @@ Quaternions are (w, x, y, z), body to level with z up. The angular rate follows 
     omega = 2 vec(conj(q) dq/dt)
 
 by a quintic spline through the components: at 0.12 s between samples and 200 deg/s its truncation error is below
-1e-3 deg/s; that of a central difference is 1 %.
+1e-3 deg/s; the error of a central difference is 1 %.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-# The arrays of all annotations: quantities, samples that are chosen, whole numbers, places of samples.
+# Types of arrays: quantities, masks of samples, integers, indices of samples.
 Values: TypeAlias = "NDArray[np.float64]"
 Mask: TypeAlias = "NDArray[np.bool_]"
 Integers: TypeAlias = "NDArray[np.int64]"
@@ -51,8 +51,8 @@ MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard d
 class Note:
     """A machine-readable remark on an input: what was found or repaired, how often and where.
 
-    ``first`` and ``last`` line of the file concerned count from 1; 0 where lines do not apply. ``start_s`` and
-    ``end_s`` are the times of the first and the last sample concerned, in the clock of the file.
+    ``first`` and ``last`` are line numbers in the file, from 1, or 0 if lines do not apply. ``start_s`` and ``end_s``
+    are the times of the first and the last sample concerned, in the clock of the file.
     """
 
     code: str
@@ -69,14 +69,14 @@ class Recording:
     """The samples of one recording.
 
     ``role``: ``accelerometer`` or ``gyroscope`` (turns for that sensor), ``rests`` (rests and moves without a table),
-    ``validation`` (held out from every fit) or ``static`` (pins the noise model). ``filter``: name and settings of the
-    filter that was applied; ``delay_s`` of its output (0 where it is zero-phase), and ``noise_gain``, the factor on the
-    standard deviation of white noise.
+    ``validation`` (held out from every fit) or ``static`` (determines the noise model). ``filter``: name and settings
+    of the applied filter; ``delay_s`` of its output (0 if it is zero-phase); ``noise_gain``, its factor on the standard
+    deviation of white noise.
     """
 
     name: str  # in the procedure, for example accel_x
     role: str
-    axis: str | None  # body axis that the table turns about (x, y, z), None where there is no single axis
+    axis: str | None  # body axis of the table's turns (x, y, z), None without a single axis
     time_ns: Integers  # (n,), ns since power-on
     accelerometer: Values | None = None  # (n, 3), g
     gyroscope: Values | None = None  # (n, 3), deg/s
@@ -85,15 +85,15 @@ class Recording:
     table_rate: Values | None = None  # (n,), deg/s about the turn axis; in held-out motion its magnitude
     table_attitude: Values | None = None  # (n, 4), unit quaternion (w, x, y, z), body to level with z up
     flags: NDArray[np.uint16] | None = None  # (n,), bit 0: a gap before this sample, 1: clipped, 2: stuck, 3: repaired
-    source: dict[str, Any] = field(default_factory=dict)  # file, sha256, rows of the input
+    source: dict[str, Any] = field(default_factory=dict)  # of the input: file, sha256, rows
     notes: tuple[Note, ...] = ()
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
     clock_shared: bool = True  # whether the time between this recording and the unit's others is known
-    setup: str = ""  # which of several tables, mountings or sessions it was made in; empty where there is one alone
-    # Body axis (+x, -z ..) that points up throughout a turn about a vertical axis; empty elsewhere: the table's angle
-    # says which one does.
+    setup: str = ""  # table, mounting or session of the recording; empty if the unit has only one
+    # Body axis (+x, -z ..) that points up during a turn about a vertical axis; empty for other turns, where it follows
+    # from the table's angle.
     up: str = ""
-    sense: int = 1  # 1 or -1: the table's log counted right-handed about the body axis, or about its opposite
+    sense: int = 1  # 1 if the table's log counts right-handed about the body axis, -1 if left-handed
 
     @cached_property
     def time(self) -> Values:
@@ -113,24 +113,24 @@ class Recording:
 
     @cached_property
     def cache(self) -> dict[Any, Any]:
-        """Results computed from this recording that several steps use: smoothed temperature, reference motions."""
+        """Cached results for several steps: smoothed temperature, reference motions."""
         return {}
 
     @property
     def table_seconds(self) -> float:
-        """Seconds by the table's own clock in one of the sensor's, as aligned; 1 where both have one clock."""
+        """Seconds of the table's clock per second of the sensor's clock, after alignment; 1 for a common clock."""
         return 1.0 + 1e-6 * float(self.source.get("table_clock", {}).get("drift_ppm", 0.0))
 
     @cached_property
     def logged_rate(self) -> Values | None:
-        """Rate of the table, deg/s: as logged, else by central differences of its angle; None without either."""
+        """Rate of the table, deg/s: the logged rate, else central differences of its angle; None without both."""
         if self.table_rate is not None or self.table_angle is None or self.samples < 2:
             return self.table_rate
         return np.asarray(np.gradient(self.table_angle, self.time))
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Which samples ingest did not flag as clipped or stuck: (n,) array. A sample after a gap is valid."""
+        """Mask of the samples that ingest did not flag as clipped or stuck: (n,). A sample after a gap is valid."""
         if self.flags is None:
             return np.ones(self.samples, bool)
         return np.asarray((self.flags & CLIPPED_OR_STUCK) == 0)
@@ -145,13 +145,13 @@ class Recording:
 
 
 def files_of_readings(source: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the files that hold a recording's readings: ``source`` and those joined, without logs of a table."""
+    """Return the files with readings of a recording: ``source`` and the joined files, without logs of a table."""
     return [file for file in (source, *source.get("joined", [])) if not file.get("table_only")]
 
 
 @dataclass(frozen=True)
 class WanderLikelihood:
-    """Log likelihood of a static recording at each wander tried, relative to that without wander."""
+    """Log likelihood of a static recording on a grid of wander values, relative to no wander."""
 
     correlation_time: Values  # (t,), s
     wander: Values  # (w,), standard deviation in the unit of the sensor
@@ -162,11 +162,11 @@ class WanderLikelihood:
 class Noise:
     """White noise of a sample (before any filter) and Gauss-Markov bias wander: (3,) standard deviations.
 
-    ``source``, ``wander_source``, ``time_source`` are those of the white noise, the wander and its correlation time:
-    ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in turns
-    about a local polynomial) or ``sensor_file`` (the sensor file). ``length``, s, is that of the static rest, else 0;
-    the relative uncertainty of its wander is about ``sqrt(correlation_time / length)``. ``likelihood``: None where no
-    static recording determines it.
+    ``source``, ``wander_source`` and ``time_source`` name the source of the white noise, the wander and its correlation
+    time: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in
+    turns about a local polynomial) or ``sensor_file``. ``length`` is the duration of the static rest, s, else 0; the
+    relative uncertainty of its wander is about ``sqrt(correlation_time / length)``. ``likelihood`` is None without a
+    static recording.
     """
 
     white: Values
@@ -186,7 +186,7 @@ class Noise:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
-        """Read back what ``to_json`` wrote."""
+        """Return the object from the value of ``to_json``."""
         values: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in data.items()}
         if data["likelihood"] is not None:
             values["likelihood"] = WanderLikelihood(**{k: np.array(v) for k, v in data["likelihood"].items()})
@@ -196,68 +196,67 @@ class Noise:
 def noise_of_steps(step: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
     """Return the standard deviation of white noise, ``median |x[n+1] - x[n]| / 0.9539``, along an axis.
 
-    ``step`` are the absolute differences of successive samples. Slow signals and outliers hardly change the result.
+    ``step``: absolute differences of successive samples. Slow signals and outliers hardly change the result.
     """
     return np.asarray(median(step, axis, keepdims=keepdims) / MEDIAN_STEP)
 
 
 def median(values: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
-    """Return ``numpy.median`` along an axis: for a thousand values in half of its time, for matrices in a fifth."""
+    """Return the median along an axis, 2 (a thousand values) to 5 (matrices) times as fast as ``numpy.median``."""
     ordered, half = np.sort(values, axis), values.shape[axis] // 2
     one, two, last = (ordered.take(k, axis) for k in (half, half - 1 + values.shape[axis] % 2, -1))
-    found = np.where(np.isnan(last), last, 0.5 * (one + two))  # NaN stands last
-    return np.expand_dims(found, axis) if keepdims else found
+    middle = np.where(np.isnan(last), last, 0.5 * (one + two))  # NaN is sorted last
+    return np.expand_dims(middle, axis) if keepdims else middle
 
 
 @dataclass(frozen=True)
 class Motion:
-    """The true motion, from a table's log (without noise) or from calibrated signals, in the body frame.
+    """The true motion in the body frame, from the log of a table (without noise) or from calibrated signals.
 
-    ``at_offset(offset=tau)`` is the motion at ``time + tau`` (tau a float or (n,) array, s), from the same interpolated
-    trajectory, and ``at_lag(lag=tau, offset=0.0)`` what a first-order lag of time constant tau, s, leaves of that; None
-    where the trajectory is not known between the samples.
+    ``at_offset(offset=tau)`` returns the motion at ``time + tau`` (tau: float or (n,) array, s) on the same
+    interpolated trajectory. ``at_lag(lag=tau, offset=0.0)`` returns that motion after a first-order lag with time
+    constant tau, s. Both are None if the trajectory between the samples is unknown.
     """
 
     time: Values  # (n,), s since power-on
     specific_force: Values  # (n, 3), g
     angular_rate: Values  # (n, 3), deg/s
     angular_acceleration: Values  # (n, 3), deg/s^2
-    specific_force_rate: Values  # (n, 3), g/s, as the body sees it: for gravity alone -omega x f, omega in rad/s
-    temperature: Values | None  # (n,), degC, smoothed over 30 s: sensor noise in a regressor would bias what is fitted
+    specific_force_rate: Values  # (n, 3), g/s, in the body frame: for gravity alone -omega x f, omega in rad/s
+    temperature: Values | None  # (n,), degC, smoothed over 30 s: noise of a regressor would bias the estimates
     angle: Values | None  # (n,), deg
     rate: Values | None  # (n,), deg/s
     axis: int | None  # of the turn
-    still: Mask  # (n,), samples at which the body rests and has settled
+    still: Mask  # (n,), samples at rest, after settling
     at_offset: Callable[..., Motion | None] | None = None
     at_lag: Callable[..., Motion | None] | None = None
-    level: Values | None = None  # (n, 3, 3), rows: the level frame's axes in the body frame; None: heading not known
-    # (n, 3), unit vector of the turn that goes on or, at rest, of the last one; zeros before the first. None: not
+    level: Values | None = None  # (n, 3, 3), rows: axes of the level frame in the body frame; None: unknown heading
+    # (n, 3), unit vector of the current turn or, at rest, of the last turn; zeros before the first turn. None: not
     # computed yet (pipeline.model.effects.base.turning_direction).
     direction: Values | None = None
-    reference_valid: Mask | None = None  # (n,), around which the table's log is dense enough to be interpolated
-    timed_by: str = ""  # clock by which the rate follows from the angle, "sensor" or "table"; empty: a rate is logged
+    reference_valid: Mask | None = None  # (n,), samples near which the table's log is dense enough for interpolation
+    timed_by: str = ""  # clock of the angle that gives the rate, "sensor" or "table"; empty: logged rate
     recording: str = ""
-    setup: str = ""  # table, mounting or session of the recording; empty where there is one alone
+    setup: str = ""  # table, mounting or session of the recording; empty if the unit has only one
 
     def select(self, index: NDArray[Any]) -> Motion:
         """Return the motion at some samples (a mask or integers), without the trajectory between samples."""
-        found = {n: v[index] for n, v in vars(self).items() if isinstance(v, np.ndarray)}
-        return replace(self, **found, at_offset=None, at_lag=None)
+        selected = {n: v[index] for n, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **selected, at_offset=None, at_lag=None)
 
 
 def motion_at_rest(time: NDArray[np.float64]) -> Motion:
-    """Return the motion of a unit at rest in an unknown attitude: forces and rates are zeros."""
-    nothing = np.zeros((len(time), 3))
+    """Return the motion of a unit at rest in an unknown attitude: forces and rates are zero."""
+    zeros = np.zeros((len(time), 3))
     still = np.ones(len(time), bool)
-    return Motion(time, nothing, nothing, nothing, nothing, None, None, None, None, still)
+    return Motion(time, zeros, zeros, zeros, zeros, None, None, None, None, still)
 
 
 def continuous(attitude: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return unit quaternions without jumps in sign (q and -q are one attitude): (n, 4) array."""
     q = attitude / np.linalg.norm(attitude, axis=1, keepdims=True)
     flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
-    found: NDArray[np.float64] = q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
-    return found
+    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
 
 
 def conjugate_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -273,9 +272,8 @@ def level_in_body(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rate_of_attitude(time: NDArray[np.float64], attitude: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the magnitude of the angular rate, (n,), deg/s, of an (n, 4) attitude at n >= 6 increasing times, s."""
-    from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs only)
+    """Return the magnitude of the angular rate, (n,), deg/s, from an (n, 4) attitude at n >= 6 increasing times, s."""
+    from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, only needed for attitude logs)
 
     rate = make_interp_spline(time, continuous(attitude), k=5)(time, 1)
-    size: NDArray[np.float64] = 2.0 * np.degrees(np.linalg.norm(rate, axis=1))
-    return size
+    return np.asarray(2.0 * np.degrees(np.linalg.norm(rate, axis=1)))

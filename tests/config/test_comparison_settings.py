@@ -75,7 +75,7 @@ def test_values_of_columns_make_groups_whose_last_column_runs_along_a_curve(reso
     ("entry", "message"),
     [
         (["A1", "A9"], r"entry 1: no unit 'A9' in units.csv; nearest: A2"),
-        ({"groups": {"a": {"method": "stagd"}, "b": ["A1"]}}, "group 'a' is empty: no unit is as it asks for"),
+        ({"groups": {"a": {"method": "stagd"}, "b": ["A1"]}}, "group 'a' is empty: no unit has these values"),
         ({"groups": {"a": {"metod": "staged"}, "b": ["A1"]}}, "units have no column 'metod'; nearest: method"),
         ({"title": "Mine", "groups": {"a": ["A1", "A2"], "b": ["A1"]}}, "'Mine': unit A1 is in 'a' and in 'b'"),
         ({"by": "serial", "where": {"serial": "S1"}}, "two groups or more are expected, got 1"),

@@ -117,5 +117,5 @@ def test_a_log_of_one_sensor_is_compensated(done: Bench) -> None:
 
 def test_a_method_without_any_sensor_is_refused(done: Bench) -> None:
     overrides = ["method.accelerometer=null", "method.gyroscope=null"]
-    with pytest.raises(ConfigurationError, match="nothing is left to calibrate"):
+    with pytest.raises(ConfigurationError, match="no sensor would be calibrated"):
         load_campaign({"campaign": str(done.campaign), "overrides": overrides})
