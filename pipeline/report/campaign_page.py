@@ -65,7 +65,8 @@ def render(
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     fleet = [told for sensor in SENSORS for told in _fleet_figure(sensor, frame)]
-    plots = strips(rows, parameter_table({}) if parameters is None else parameters)
+    fitted = parameter_table({}) if parameters is None else parameters
+    plots = strips(rows, fitted)
     text: str = template("campaign.html").render(
         campaign=campaign,
         published=published,
@@ -89,7 +90,7 @@ def render(
         far_shown=FAR_SHOWN,
         far=FAR,
         causes=_causes(failures),
-        found=verdict_groups(findings),
+        found=verdict_groups(findings) + _beyond_limits(fitted),
         commands=next_commands(findings, settings or {"campaign": campaign}),
         history=history,
         history_data=script_data({"units": history["units"]}) if history else None,
@@ -104,6 +105,12 @@ def render(
         beside=page,
     )
     return text
+
+
+def _beyond_limits(parameters: pd.DataFrame) -> list[tuple[str, list[str]]]:
+    """Return the units with a parameter beyond a limit of the sensor file, by sensor."""
+    beyond = parameters[parameters["value"].abs() > parameters["limit"]].groupby("sensor")["unit"].unique()
+    return [(f"{sensor}, beyond the sensor file's limits", list(units)) for sensor, units in beyond.items()]
 
 
 def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:

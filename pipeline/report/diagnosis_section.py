@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.errors import first
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, parameter_limits
 from pipeline.records import AXES, SENSOR_UNITS, Values
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 GATE = LINEAR_TO  # delta BIC, strong evidence: A. E. Raftery, Sociological Methodology 25 (1995) 139, table 6
 CLOSE = 0.8  # share of the selected effect's delta BIC from which another effect is named as a rival
-MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart has room for
+MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart or its caption has room for
 MOST_LIMITS = 8  # upper limits that a chart has room for
 COLOURS = {2: "selected", 4: "above the threshold", 3: "below the threshold"}
 ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, bins being correlated
@@ -80,7 +81,8 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
     finding, caption, _ = sentences("limits", count=len(shown), excluded=excluded, others=len(shown) - MOST_LIMITS)
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
     figure = Figure(f"{sensor}-limits", finding, caption)
-    return bars(figure, points, "upper limit over the sensor file's limit", levels={"limit of the sensor file": 1.0})
+    label = "upper limit over the sensor file's limit (logarithmic)"
+    return bars(figure, points, label, levels={"limit of the sensor file": 1.0})
 
 
 def ranking_rows(found: JSON) -> list[JSON]:
@@ -97,7 +99,7 @@ def ranking_rows(found: JSON) -> list[JSON]:
 
 
 def ranking(sensor: str, found: JSON) -> Figure | None:
-    """Draw the ranking of a diagnosis, and which effects are not observable; None where it ranked nothing."""
+    """Draw the ranking of a diagnosis, and name the effects that are not observable; None where it ranked nothing."""
     entries, hidden = found.get("ranking") or [], found.get("not_observable") or []
     selected = found.get("selected") or []
     if not entries:
@@ -117,10 +119,9 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
         passes=best is not None and _evidence(best) > GATE,
         brackets=brackets,
         others=len(entries) - len(shown),
-        hidden=len(hidden[MOST_HIDDEN:]),
+        hidden=first([plain(h["effect"]) for h in hidden], MOST_HIDDEN),
     )
     legend = tuple((f"c{c}", t) for c, t in COLOURS.items() if c in {row.colour for row in rows})
-    rows += [Point(f"{plain(h['effect'])}: not observable", None, note=h["reason"]) for h in hidden[:MOST_HIDDEN]]
     figure = Figure(f"{sensor}-ranking", finding, caption, legend)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"
     return bars(figure, rows, label, levels={f"threshold {GATE:g}": GATE}, kind="symlog", brackets=brackets)

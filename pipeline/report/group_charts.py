@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 ROW, LEFT, RIGHT = 30, 6, 64  # px
 BRACKET = 48  # px, width of a bracket
-LONGEST = 66  # letters of a note that fit into a row
 COLOURS = 6  # of the style sheet: c0 to c5
 DECADE = 8.0  # largest over smallest place from which an axis x is logarithmic: a decade is nearly filled
 LOWEST = -100.0  # value at which a bar on a symlog axis ends
@@ -34,7 +33,7 @@ class Point:
 
     ``interval``: low and high of a mean, drawn instead of the bar; ``units``: the values behind the mean; ``floor``:
     what noise alone gives in this row; ``x, series``: place in ``curves``, which joins the points of a series;
-    ``note``: part of the description, drawn where there is no value.
+    ``note``: part of the description.
     """
 
     label: str
@@ -115,10 +114,7 @@ def _row(row: Point, axis: Axis, top: int) -> str:
     said = f"{row.label}: {number(row.value)}" if row.interval else row.label
     out = text(LEFT, top + 11, said, "b")
     if row.value is None:
-        note = row.note or "not known"
-        short = note if len(note) <= LONGEST else note[: LONGEST - 1].rstrip(" ,;:") + "…"
-        words = text(LEFT, top + 11, said, "off") + text(LEFT, top + 23, short, "off small")
-        return f"<g><title>{escape(note)}</title>{words}</g>"
+        return text(LEFT, top + 11, f"{said}: not known", "off")
     end = axis.pixels(row.value)
     if row.interval is None:
         zero = axis.pixels(0.0)  # the start of a logarithmic axis

@@ -49,7 +49,16 @@ def measured(value: float | None, expanded: float | None) -> str:
     if decimals > 9:
         return f"{number(value, 7)} ± {number(expanded, 2)}"
     decimals = max(0, decimals)
-    return f"{value:.{decimals}f} ± {expanded:.{decimals}f}".replace("-", MINUS)
+    return f"{value:z.{decimals}f} ± {expanded:.{decimals}f}".replace("-", MINUS)
+
+
+def span(low: float, high: float) -> str:
+    """Return an interval of positive values, both to the decimals of the high end; without a low end that is 0 then."""
+    if not 1e-4 <= high < 1e5:
+        return f"{number(low)} to {number(high)}"
+    upper = number(high)
+    lower = f"{low:.{len(upper.partition('.')[2])}f}"
+    return f"{lower} to {upper}" if float(lower) else f"at most {upper}"
 
 
 def percent(share: object) -> str:
@@ -57,9 +66,12 @@ def percent(share: object) -> str:
     return f"{number(100.0 * share, 2)} %" if isinstance(share, int | float) else NOTHING
 
 
-def percent_change(logarithm: float) -> str:
-    """Return a ratio, given by its logarithm, as a change in percent, or where it is more than twofold as a factor."""
-    if logarithm > math.log(2.0):
+def percent_change(logarithm: float, largest: float) -> str:
+    """Return a ratio, given by its logarithm, as a change in percent, or as a factor.
+
+    It is a factor where the largest of the ratios beside it, which are written alike, is more than twofold.
+    """
+    if largest > math.log(2.0):
         return f"× {number(math.exp(logarithm))}"
     return f"{100.0 * math.expm1(logarithm):+.1f} %".replace("-", MINUS)
 

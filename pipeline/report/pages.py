@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
 
 FOLDER = Path(__file__).parent / "templates"
-OF_NUMBERS = ("aligned", "measured", "number", "percent", "percent_change", "probability", "typeset")  # filters
+OF_NUMBERS = ("aligned", "measured", "number", "percent", "percent_change", "probability", "span", "typeset")  # filters
 PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # of a campaign's page
 
 

@@ -8,16 +8,21 @@ errors and cross-axis sensitivities, which are elements of ``K = M^-1`` in ``rea
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pipeline.errors import first
 from pipeline.estimation.candidates import is_held
 from pipeline.records import AXES
-from pipeline.report.numbers import measured, number, plain, unit_text
+from pipeline.report.numbers import measured, number, percent, plain, unit_text
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 JSON = dict[str, Any]
 LEFT_OUT = "marked ones, and those that the method does not use: beside rests or steady turns, or of a vague log"
+NAMED = 5  # parameters beyond the limits of the sensor file that the top of a page names
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
 
 
@@ -95,9 +100,10 @@ def reading_errors(part: JSON) -> list[Parameter]:
 
 
 def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
-    """Return bias, scale factor errors, cross-axis terms and effects: ``p``, ``name`` and ``limit`` (or None).
+    """Return bias, scale factor errors, cross-axis terms and effects.
 
-    ``part``: the sensor's part of the calibration; ``sensor_config``: its section of the configuration with the limits.
+    A row has ``p``, ``name``, ``limit`` (or None) and ``share`` of the limit. ``part``: the sensor's part of the
+    calibration; ``sensor_config``: its section of the configuration with the limits.
     """
     fitted, effects = fitted_parameters(part), sensor_config.get("effects") or {}
     found = [(p, p.words.capitalize(), sensor_config.get("bias")) for p in fitted[:3]]
@@ -109,7 +115,19 @@ def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
             found.append((p, f"Scale factor error {axes}", sensor_config.get("scale_factor")))
     found += [(p, _of_effect(p), effects.get(p.name.partition(".")[0])) for p in fitted[12:]]
     bounds = (limit if isinstance(limit, int | float) and limit > 0 else None for *_, limit in found)
-    return [{"p": p, "name": name, "limit": bound} for (p, name, _), bound in zip(found, bounds, strict=True)]
+    return [
+        {"p": p, "name": name, "limit": bound, "share": abs(p.value) / bound if bound else 0.0}
+        for (p, name, _), bound in zip(found, bounds, strict=True)
+    ]
+
+
+def beyond_limits(rows: Sequence[JSON]) -> list[str]:
+    """Return the parameters beyond the limits of the sensor file with their share of it, the largest first.
+
+    ``rows``: of ``parameter_rows``.
+    """
+    largest = sorted((row for row in rows if row["share"] > 1.0), key=lambda row: -row["share"])
+    return first([f"{row['name'].lower()} ({percent(row['share'])})" for row in largest], NAMED)
 
 
 def _of_effect(p: Parameter) -> str:
@@ -128,8 +146,8 @@ def stage_details(stage: JSON) -> list[str]:
     return list(texts.values())
 
 
-def parameter_texts(parameters: JSON | None) -> list[str]:
-    """Return ``name = value ± uncertainty unit`` of a stage or an effect.
+def parameter_texts(parameters: JSON | None, *, uncertain: bool = True) -> list[str]:
+    """Return ``name = value ± uncertainty unit`` of an effect, or of a stage without its uncertainty.
 
     Where only a standard uncertainty is stated, twice its value is shown, which covers about 95 %.
     """
@@ -141,7 +159,8 @@ def parameter_texts(parameters: JSON | None) -> list[str]:
             continue
         standard = p.get("standard_uncertainty")
         expanded = p.get("expanded_uncertainty", 2.0 * standard if standard else None)
-        texts.append(f"{name} = {measured(p.get('value'), expanded)} {unit_text(p.get('unit'))}".rstrip())
+        value = measured(p.get("value"), expanded if uncertain else None)
+        texts.append(f"{name} = {value} {unit_text(p.get('unit'))}".rstrip())
     return texts
 
 

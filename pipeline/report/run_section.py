@@ -39,7 +39,7 @@ def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[i
         words = change.words() if change else []
         for sensor in SENSORS:
             told = uncertainty_words(before.get(sensor) or {}, state.get(sensor) or {}, SENSOR_UNITS[sensor])
-            words += [f"{sensor}, {told.replace('->', '→')}"] if told else []
+            words += [f"{sensor}: {told.replace('->', '→')}"] if told else []
         entries.append({"run": run, "time": times[run], "state": state, "change": change, "words": words})
         before = state
     figures = [figure for sensor in SENSORS if (figure := _chart(sensor, entries))]

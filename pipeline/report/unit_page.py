@@ -26,7 +26,7 @@ from pipeline.report.held_out_section import (
 )
 from pipeline.report.noise_section import allan, remarks, term_rows
 from pipeline.report.pages import template
-from pipeline.report.parameters import fitted_parameters, parameter_rows
+from pipeline.report.parameters import beyond_limits, fitted_parameters, parameter_rows
 from pipeline.report.recording_section import (
     environment,
     files_read,
@@ -105,6 +105,7 @@ def _sensor(
     limits, kind = limit_rows(sensor, found, sensor_config), VERDICTS.get(found.get("verdict", ""), "")
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
     steps = [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)]
+    parameters = parameter_rows(part, sensor_config)
     return {
         "held_out": held_out,
         "before": first.get("rms_error"),
@@ -119,7 +120,9 @@ def _sensor(
         "noise_terms": term_rows(at_rest),
         "noise_remarks": remarks(at_rest),
         "matrix": fitted_parameters(part)[3:12],
-        "parameters": parameter_rows(part, sensor_config),
+        "parameters": parameters,
+        "beyond_limits": beyond_limits(parameters),
+        "mounted": table.get("motion", "none") != "none",
         "rests": rest_rows(part),
         "diagnosis": found,
         "ranking": ranking_rows(found),

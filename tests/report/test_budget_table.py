@@ -45,5 +45,5 @@ def test_the_page_says_whether_the_fit_converged_and_by_what_it_shows(unit: Unit
     sentence = str(template("budget.html").module.convergence(part)).partition(">")[2].partition("<")[0]
     page = render({**unit.calibration, "gyroscope": part}, *unit.arguments[1:])
     assert sentence in " ".join(Text(page).text.split())
-    assert "condition 1.75 in scaled columns, 12 of 12 determined" in sentence
+    assert "the recordings determine all parameters (condition 1.75 in scaled columns; largest cosine" in sentence
     assert ("did not converge" in sentence) != converged

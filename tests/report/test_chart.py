@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.report.axis import Axis, log_ticks, round_ticks, tick_label
 from pipeline.report.chart import Area, Dots, Figure, Panel, Samples, chart
-from pipeline.report.numbers import measured, number, typeset
+from pipeline.report.numbers import measured, number, span, typeset
 
 FIGURE = Figure("n", "t")
 
@@ -76,6 +76,10 @@ def test_a_constant_series_still_has_an_axis(array: np.ndarray, ends: tuple[floa
 def test_a_measured_value_has_two_digits_of_its_uncertainty() -> None:
     assert measured(0.0312345, 0.00123) == "0.0312 ± 0.0012"
     assert measured(-12.3456, 3.7) == "−12.3 ± 3.7"
+    assert measured(-1e-6, 0.00025) == "0.00000 ± 0.00025"
+    assert span(0.00983, 0.0363) == "0.0098 to 0.0363"
+    assert span(9.01e-8, 0.00155) == "at most 0.00155"
+    assert span(3e-8, 4e-5) == "3.00e−08 to 4.00e−05"
     assert measured(0.5, None) == "0.50000"
     assert number(None) == number(float("nan")) == "–"
 

@@ -143,13 +143,14 @@ def test_the_page_tells_each_group_with_its_interval_and_its_difference(x: dict[
     assert slow["verdicts"].to_dict() == {"nothing_missing": 4}
     logs = {n: np.log([level + 0.0005 * i for i in range(4)]) for n, level in (("slow", 0.010), ("fast", 0.020))}
     theirs = stats.ttest_ind(logs["fast"], logs["slow"], equal_var=False)
-    low, high = (100.0 * math.expm1(v) for v in theirs.confidence_interval(0.95))
-    change = 100.0 * math.expm1(logs["fast"].mean() - logs["slow"].mean())
+    low, high = (math.exp(v) for v in theirs.confidence_interval(0.95))
+    change = math.exp(logs["fast"].mean() - logs["slow"].mean())
     assert fast["compared"].result == "larger"
     assert after["figure"].finding == "Smallest with slow: 0.0107 (0.00976 to 0.0118); all others are larger"
     assert sensor["parameters"]["rows"][1]["cells"][0]["value"] == "0.120"
     page = render("bench", [], [], [made])
-    assert f'>+{change:.1f} %<br><small class="faint">+{low:.1f} % to × {1.0 + high / 100.0:.2f}</small>' in page
+    assert low < change < 2.0 < high  # one of them is more than twofold: all are written as factors
+    assert f'>× {change:.2f}<br><small class="faint">× {low:.2f} to × {high:.2f}</small>' in page
     assert '<td class="keep">4 nothing missing</td>' in page
     assert "Rates &lt;i&gt;" in page
     assert "fast &lt;b&gt;" in page

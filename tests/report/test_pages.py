@@ -14,8 +14,8 @@ import pytest
 
 from pipeline.report import campaign_page
 from pipeline.report.chart import Figure, Panel, Samples, chart
-from pipeline.report.fleet import write_summary
-from pipeline.report.summary import COLUMNS, summary_row
+from pipeline.report.fleet import parameter_table, write_summary
+from pipeline.report.summary import COLUMNS, summary_row, unit_parameters
 from pipeline.report.unit_page import render
 
 from .conftest import Unit, build_unit
@@ -79,7 +79,7 @@ def test_the_unit_page_asks_no_other_host_for_anything(page: str) -> None:
 def test_the_unit_page_says_the_figures_it_was_given(page: str) -> None:
     text = Text(page).text
     for expected in (
-        "0.0689 → 0.00310 g rms of the magnitude, held out",
+        "0.0689 → 0.00310 g, rms error on held-out motion",
         "Quadratic nonlinearity is missing.",
         "effects.accelerometer=[quadratic_nonlinearity]",
         "the table turned too slowly",
@@ -161,7 +161,7 @@ def test_what_the_limit_of_the_sensor_file_determines_alone_is_said(unit: Unit) 
     calibration = unit.calibration | {"accelerometer": {**unit.calibration["accelerometer"], **lack}}
     text = Text(render(calibration, unit.validation, unit.diagnosis, [], unit.settings)).text
     assert "Uncertainty: the rests do not determine misalignment_yx." in text
-    assert "8 of 9 determined, the others by the limit of the sensor file" in text
+    assert "determine 8 of 9 parameters, the limit of the sensor file the others" in text
 
 
 def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_summary(unit: Unit) -> None:
@@ -174,9 +174,31 @@ def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_sum
     row = summary_row("U", calibration, unit.validation, unit.diagnosis, {})
     assert (row["accelerometer_implausible"], row["gyroscope_implausible"]) == (None, "scale_factor_x")
     page = Text(campaign_page.render("bench", [row], []))
-    assert "1 sensor beyond the sensor file's limits" in page.text
-    assert "U , gyroscope: scale_factor_x" in page.text
+    assert "1 sensor far beyond the sensor file's limits" in page.text
+    assert "U , gyroscope: scale factor x" in page.text
     assert "beyond the sensor file's limits" not in Text(campaign_page.render("bench", rows(unit, 2), [])).text
+
+
+def test_a_parameter_beyond_a_limit_is_named_at_the_top_of_both_pages(unit: Unit) -> None:
+    bias = abs(np.array(unit.calibration["accelerometer"]["bias"]))
+    x, y, _ = np.argsort(-bias)
+    limit = float(bias[[x, y]].mean())  # the largest bias exceeds it, the others do not
+    sheet = {**unit.settings["sensor"]["accelerometer"], "bias": limit, "cross_axis": 1.0, "scale_factor": 1.0}
+    settings = {**unit.settings, "sensor": {**unit.settings["sensor"], "accelerometer": sheet}}
+    top = Text(render(unit.calibration, unit.validation, unit.diagnosis, [], settings)).text.partition("Diagnosis")[0]
+    assert f"Beyond the sensor file's limits: bias {'xyz'[x]} ({100.0 * bias[x] / limit:.0f} %)." in top
+    own = {"U0": unit_parameters(unit.calibration, {"accelerometer": sheet})}
+    page = campaign_page.render("bench", rows(unit, 2), [], parameters=parameter_table(own))
+    assert "accelerometer, beyond the sensor file's limits: U0 " in Text(page.partition('<h2 id="units">')[0]).text
+
+
+def test_a_page_states_one_uncertainty_of_a_parameter(unit: Unit) -> None:
+    of_stage = {"bias_x": {"value": 0.0431, "unit": "g", "standard_uncertainty": 0.0007}}
+    stages = [{"name": "reference_least_squares", "parameters": of_stage, "residual_rms": 0.003}]
+    part = {**unit.calibration["accelerometer"], "stages": stages}
+    text = Text(render({**unit.calibration, "accelerometer": part}, *unit.arguments[1:])).text
+    assert "bias_x = 0.043100 g" in text
+    assert "bias_x = 0.0431 ±" not in text
 
 
 def test_a_row_of_a_large_campaign_is_small(unit: Unit) -> None:
