@@ -163,14 +163,14 @@ def _source(arguments: argparse.Namespace) -> Source:
 
 
 def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration whose procedure is recorded by hand."""
+    """Return a configuration whose procedure is recorded by hand; its recording gets as many rests as are needed."""
     procedure = config["procedure"]
     if config["table"]["motion"] != "none":
         raise ConfigurationError(
             f"procedure {procedure['name']} is recorded on a table; guide is for those recorded by hand: "
             "multi_position, orientations_24, six_positions, ferraris (docs/record.md)"
         )
-    return config
+    return {**config, "procedure": {**procedure, "holdout_from": 0}}
 
 
 def _whole(entry: dict[str, Any]) -> dict[str, Any]:

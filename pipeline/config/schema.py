@@ -152,6 +152,7 @@ class Procedure(Section):
     folder: str
     recordings: dict[str, RecordingFile]
     holdout_every: Annotated[int, Field(ge=0)]
+    holdout_from: Annotated[int, Field(ge=0)] = 0
     mounting_tolerance_deg: Positive = 5.0
     faces: Faces | None = None
     turns: HandTurns | None = None

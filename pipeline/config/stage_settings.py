@@ -35,7 +35,7 @@ IMPORT = re.compile(
 # Dotted keys that a stage reads; {sensor} is the sensor of the stage.
 BOTH = ("accelerometer", "gyroscope")
 NOISE = ("noise_density", "bias_wander", "wander_time_s")
-BY_HAND = tuple(f"procedure.{key}" for key in ("holdout_every", "faces", "turns"))
+BY_HAND = tuple(f"procedure.{key}" for key in ("holdout_every", "holdout_from", "faces", "turns"))
 FIT_OF_TABLE = (
     "motion", "gravity_g", "latitude_deg", "azimuth_deg", "azimuth_of", "angle_accuracy_deg", "rate_accuracy",
     "orthogonality_deg",

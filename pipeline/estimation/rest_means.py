@@ -38,10 +38,21 @@ class RestSplit:
 
 
 def holdout_interval(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> int:
-    """Return k where every k-th rest is held out; 0 where none is, as with a recording for validation."""
-    if any(recording.role == "validation" for recording in recordings):
+    """Return k where every k-th rest is held out; 0 where none is.
+
+    ``settings``: section ``procedure``: ``holdout_every``, and ``holdout_from``, the number of rests below which none
+    is held out. None is with a recording for validation either.
+    """
+    procedure = settings["procedure"]
+    every, fewest = (int(procedure.get(key) or 0) for key in ("holdout_every", "holdout_from"))
+    if not every or any(recording.role == HELD_OUT for recording in recordings):
         return 0
-    return int(settings["procedure"].get("holdout_every") or 0)
+    return every if not fewest or count_of_rests(recordings) >= fewest else 0
+
+
+def count_of_rests(recordings: Sequence[Recording]) -> int:
+    """Return how many rests the recordings of role ``rests`` have, without those in which the sensor moved."""
+    return sum(len(split_rests(recording, 0).used) for recording in recordings if recording.role == ROLE)
 
 
 def split_rests(recording: Recording, every: int) -> RestSplit:
@@ -51,7 +62,9 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
 
     ``recording``: by the table's log where it has one, else by its readings.
     """
-    rests = rests_from_table(recording) or find_rests(recording)
+    if "rests" not in recording.cache:
+        recording.cache["rests"] = rests_from_table(recording) or find_rests(recording)
+    rests: list[Rest] = recording.cache["rests"]
     sound = [rest for rest in rests if rest.accepted]
     held = set(range(every // 2, len(sound), every)) if every else set()
     return RestSplit(

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.rest_means import held_out_rests, split_rests
+from pipeline.estimation.rest_means import count_of_rests, held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.model.measurement import linear_truth
@@ -302,8 +302,12 @@ def _choose(
     if held_out:
         return held_out, None
     reason = f"no held-out recording holds readings of the {sensor} and a reference for them"
-    if by_rests and settings.get("procedure", {}).get("turns"):
+    stated = settings.get("procedure", {})
+    if by_rests and stated.get("turns"):
         reason += " (with two turns about each axis between rests of 4 s or longer, the second is held out)"
+    elif count_of_rests(recordings) < stated.get("holdout_from", 0) and all(r.role != "validation" for r in recordings):
+        count, fewest, every = count_of_rests(recordings), stated["holdout_from"], stated["holdout_every"]
+        reason += f" ({count} rests all go to the fit; of {fewest} and more, one of {every} is held out)"
     fitted = moving(sensor) or resting(rests_of("rests")) or resting(rests_of(sensor))
     return fitted, reason + ("; judged on the samples of the fit" if fitted else "")
 

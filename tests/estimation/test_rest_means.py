@@ -61,6 +61,13 @@ def test_nothing_is_held_out_where_the_procedure_says_so() -> None:
     assert held_out_rests([_steps(4)], {"procedure": {"holdout_every": 0}}) == {}
 
 
+def test_of_few_rests_none_is_held_out() -> None:
+    settings = {"procedure": {"holdout_every": 3, "holdout_from": 8}}
+    assert held_out_rests([_steps(7)], settings) == {}
+    assert len(held_out_rests([_steps(8)], settings)["recording"]) == 3
+    assert held_out_rests([_steps(5), _steps(3)], settings)["recording"]
+
+
 def test_rests_of_other_roles_are_not_held_out() -> None:
     assert held_out_rests([_steps(4, "static", "static")], SETTINGS) == {}
 

@@ -10,6 +10,12 @@ import numpy as np
 import pytest
 from whole_run import run_campaign
 
+from pipeline.config.campaign import load_campaign
+from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.noise import estimate_noise
+from pipeline.io.read import read_recordings
+from pipeline.validation.heldout import validate
+
 from .conftest import ROOT, Bench
 
 pytestmark = pytest.mark.workflow
@@ -148,6 +154,19 @@ def test_the_page_of_evidence_tells_what_the_shipped_campaign_gives(shipped: Ben
 def test_ten_rests_are_not_enough_to_tell_an_effect(shipped: Bench) -> None:
     part = document(shipped, "diagnoses", "mpu6050")["accelerometer"]
     assert "10 rests are too few" in " ".join(entry["reason"] for entry in part["not_observable"])
+
+
+def test_ten_rests_without_a_recording_for_validation_calibrate_both_sensors() -> None:
+    campaign = load_campaign({"campaign": str(SHIPPED)})
+    config = campaign.units["mpu6050"].config
+    recordings = read_recordings(config["procedure"], config["ingest"], config["sensor"], campaign.folder("mpu6050"))
+    alone = [r for r in recordings if r.role != "validation"]
+    found = rests_and_moves.fit(alone, None, config)
+    assert found.stages[-1].details["rests"] == 10
+    assert np.abs(np.diag(found.matrix) / AUTHORS["gyroscope"] - 1)[1:].max() < 9e-4
+    part = validate(found, alone, estimate_noise("gyroscope", alone, config["sensor"]["gyroscope"]), config)
+    assert not part["held_out"]
+    assert "10 rests all go to the fit; of 15 and more, one of 3 is held out" in part["reason"]
 
 
 def test_bias_and_scale_agree_with_those_that_the_authors_published(shipped: Bench) -> None:
