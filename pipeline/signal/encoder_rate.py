@@ -1,17 +1,18 @@
-"""The table's rate where its log holds the angle alone, by the table's own clock where it has one.
+"""Compute the rate of a table whose log holds the angle only; by the table's own clock where it has one.
 
-A fine angle is differentiated: by a cubic spline, or by central differences where it bends between two samples. Errors
-of the angle that are independent from sample to sample hide the rate: the resolution q of an encoder, its noise, or
-time stamps that scatter about the times of the samples. Then the angle A is smoothed,
+A fine angle is differentiated: by a cubic spline, or by central differences where it bends between two samples. The
+differentiation amplifies errors of the angle that are independent from sample to sample: the resolution q of an
+encoder, its noise, or time stamps that scatter about the times of the samples. Where they are significant, the angle A
+is smoothed,
 
     minimize  sum (y_i - A_i)^2 / R + sum (D^k A)_i^2 h / S,    R = q^2 / 12, or the variance that the log shows,
 
 where D^k is the k-th divided difference over times h apart. S is the density of a random acceleration (k = 2), jerk (3)
 or derivative of the jerk (4); k and S maximize the likelihood of the log. The covariance of A is
 ``(I / R + D^T D h / S)^-1``, the inverse of a band matrix. The rate is the central difference of A. In addition to its
-covariance, the rate varies between the samples about this mean, by ``S h^(2k - 3) / (2 (2k - 1) (k - 1)!^2)``. Where
-most of a motion is at a steady rate, that part alone says so too, and the larger noise counts: ramps make k = 3 likely,
-which has no room for the ripple of a motor.
+covariance, the rate varies between the samples about this mean, by ``S h^(2k - 3) / (2 (2k - 1) (k - 1)!^2)``. Ramps
+make k = 3 likely, which does not describe the ripple of a motor. So where most of a motion has a steady rate, the noise
+is also estimated from that part alone, and the larger noise is used.
 
 Source: H. L. Weinert, Fast Compact Algorithms and Software for Spline Smoothing, 2013; the likelihood is that of G.
 Wahba, Annals of Statistics 13 (1985), 1378, for a noise of known variance.
@@ -31,33 +32,33 @@ from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 if TYPE_CHECKING:
     from pipeline.records import Mask, Recording, Values
 
-VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; below it a doubtful rate does no harm
+VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; a smaller error of the rate does no harm
 WHOLE = 1e-3  # of a step, to which the angles of an encoder are multiples of it: printed decimals
 ORDERS = (2, 3, 4)  # a motor that ripples, a program of constant accelerations, motion by a wheel
-EDGE = 5  # samples of rest at both ends of a motion, which say that it begins and ends at zero
+EDGE = 5  # samples of rest added at both ends of a motion, which begins and ends at zero rate
 FEWEST_MOVED = 100  # changes of the angle: their autocorrelation is known to 0.1
 ROUNDED = -0.35  # autocorrelation, half way between that of rounding errors and that of ramps
 BEYOND = 1.5  # times the errors of rounding, above which errors are not rounding alone
 MOST, LEFT = 0.95, 0.759  # of the second differences, without the corners of ramps; their share of a normal variance
 AROUND = 9  # second differences over which an acceleration is taken as constant
 FEWEST = 6  # samples from which a rate and its derivative follow
-STEADY, MOSTLY = 0.05, 0.5  # of the median rate, within which a rate is steady; share of a motion that then judges it
+STEADY, MOSTLY = 0.05, 0.5  # of the median rate, within which a rate is steady; share of a motion with such a rate
 DENSITIES = (1e-6, 1e12)  # S, (deg/s)^2/s^(2k - 3): from a table at rest to 10,000 deg/s^2 in 0.1 s
-GAP = 1.5  # sampling intervals, above which the angle in between is not known
+GAP = 1.5  # sampling intervals, above which the angle in between is unknown
 
 
 @dataclass(frozen=True)
 class EncoderRate:
-    """Angle and rate of a table by the log of its angle: (n,) arrays."""
+    """Angle and rate of a table from the log of its angle: (n,) arrays."""
 
     angle: Values  # deg, smoothed where the encoder is coarse
     rate: Values  # deg/s
-    noise: Values  # deg/s, standard deviation of the rate by the encoder's resolution; 0 of a fine one and at rest
-    vague: Mask  # where the rate is not known: at a bend of a fine angle, at a gap of a coarse one
+    noise: Values  # deg/s, standard deviation of the rate from the errors of the angle; 0 of a fine one and at rest
+    vague: Mask  # where the rate is unreliable: at a bend of a fine angle, at a gap of a coarse one
 
 
 def rate_by_angle(recording: Recording) -> EncoderRate | None:
-    """Return the rate by the angle, None where the table logs a rate or no angle, or below 6 samples."""
+    """Return the rate from the angle; None where the table logs a rate or no angle, or below 6 samples."""
     if recording.table_rate is not None or recording.table_angle is None or recording.samples < FEWEST:
         return None
     key = "encoder_rate"
@@ -83,11 +84,12 @@ def _rate_of(time: Values, angle: Values) -> EncoderRate:
 
 
 def _errors(time: Values, angle: Values) -> tuple[float, float]:
-    """Return the step of an encoder whose rounding hides the rate, deg, else 0, and the angle's independent errors.
+    """Return the step of an encoder, deg, and the standard deviation of the angle's independent errors, deg.
 
-    The second differences of a moving angle are then those of independent errors: their autocorrelation at lag 1 is
-    -2/3, where that of a program's ramps is positive. Their mean over neighbours, the acceleration, is subtracted.
-    Errors are rounding where all changes are multiples of a step and the second differences are not larger.
+    Independent errors are found by the second differences of the moving angle, minus their mean over neighbours, the
+    acceleration: their autocorrelation at lag 1 is -2/3, while that of a program's ramps is positive. Both results are
+    0 if there are none. The errors are rounding if all changes are multiples of a step and the second differences are
+    not larger; else the step is 0.
     """
     rounding = 1e-9 * max(float(np.abs(angle).max()), 1.0)
     changes, intervals = np.abs(np.diff(angle)), np.diff(time)
@@ -106,15 +108,15 @@ def _errors(time: Values, angle: Values) -> tuple[float, float]:
     distinct = np.diff(np.unique(changes), prepend=0.0)
     step = float(np.min(distinct[distinct > rounding]))
     multiples = changes / step
-    whole = float(np.abs(multiples - np.rint(multiples)).max()) <= WHOLE * max(1.0, float(multiples.max()))
-    return (step, step / np.sqrt(12.0)) if whole and error <= BEYOND * step / np.sqrt(12.0) else (0.0, error)
+    is_multiple = float(np.abs(multiples - np.rint(multiples)).max()) <= WHOLE * max(1.0, float(multiples.max()))
+    return (step, step / np.sqrt(12.0)) if is_multiple and error <= BEYOND * step / np.sqrt(12.0) else (0.0, error)
 
 
 def _smoothed(time: Values, angle: Values, step: float, error: float) -> EncoderRate:
-    """Return the smoothed log of an angle with errors, stretch by stretch between rests: each has a motion of its own.
+    """Smooth the log of an angle with errors, separately in each stretch between rests.
 
-    The table rests where the angle stays the same for longer than a step takes at the rate that counts as rest, and
-    without a step for some samples. Each stretch then has errors of its own.
+    The table rests where the angle is constant for longer than a step takes at the rate that counts as rest or, for an
+    angle without a step, for some samples. The errors are then estimated for each stretch.
     """
     n, interval = len(time), float(np.median(np.diff(time)))
     smooth, rate, noise = angle.copy(), np.zeros(n), np.zeros(n)
@@ -135,22 +137,22 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
         size = error if step else (_errors(time[around], angle[around])[1] or error)
         found, spread = _stretch(time[around], angle[around], size)
         slope = np.gradient(found, time[around])
-        start, stop = _steady(slope)
+        start, stop = _longest_steady(slope)
         if stop - start >= MOSTLY * len(slope):
             spread = max(spread, _stretch(time[around][start:stop], angle[around][start:stop], size)[1])
         smooth[own], noise[own], rate[own] = found[part], spread, slope[part]
     return EncoderRate(smooth, rate, noise, vague)
 
 
-def _steady(rate: Values) -> tuple[int, int]:
-    """Return where the rate stays longest near its median."""
+def _longest_steady(rate: Values) -> tuple[int, int]:
+    """Return start and stop of the longest run in which the rate is near its median."""
     usual = float(np.median(rate))
     spans = runs(np.abs(rate - usual) < STEADY * abs(usual))
     return max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
 
 
 def _split(spans: list[tuple[int, int]], at: list[int]) -> list[tuple[int, int]]:
-    """Return spans of indices, cut where one of them begins anew."""
+    """Cut spans of indices at the indices ``at``."""
     ends = [sorted({first, last, *(i for i in at if first < i < last)}) for first, last in spans]
     return [pair for cut in ends for pair in itertools.pairwise(cut)]
 
@@ -203,7 +205,7 @@ class _Smoother:
         return factor, cho_solve_banded((factor, False), self.angle / self.variance)
 
     def loss(self, log_density: float) -> float:
-        """Return -2 log likelihood of the density but for a constant."""
+        """Return -2 log likelihood of the density, without its constant."""
         factor, smooth = self.solve(log_density)
         weight = self.apart * np.exp(-log_density)
         difference = sum(self.rows[j] * smooth[j : len(smooth) - self.order + j] for j in range(self.order + 1))

@@ -1,4 +1,4 @@
-"""Filters of the readings, and the smoothed temperature.
+"""Filter the readings, and smooth the temperature.
 
 RC low-pass (Sudsanguan 2019, eqs 3.3 to 3.14, an RC circuit discretised backwards), per axis:
 
@@ -7,31 +7,31 @@ RC low-pass (Sudsanguan 2019, eqs 3.3 to 3.14, an RC circuit discretised backwar
 where
 
     r, a  : reading before and after
-    dt[n] : time since the sample before, s; at a lost sample it is twice as long, so the equation holds over gaps
+    dt[n] : time since the sample before, s; longer where samples are lost, so that the equation holds over gaps
     RC    : time constant, s
     f_c   : cutoff, Hz
 
-Butterworth low-pass, high-pass, band-pass and band-stop as second-order sections at the recording's median interval; at
-a gap (an interval above 1.5 medians) such a filter starts anew, because its state knows nothing of what was lost.
+Butterworth low-pass, high-pass, band-pass and band-stop are second-order sections at the recording's median interval.
+At a gap (an interval above 1.5 medians) such a filter restarts, because its state does not include the lost samples.
 
-A causal filter begins as if the first reading had lasted for ever, so a constant passes from the first sample on. Its
+A causal filter starts in the steady state of the first reading, so that a constant passes from the first sample on. Its
 output is late by the group delay,
 
     delay = -d arg H / d omega = Re(sum n b_n z^-n / sum b_n z^-n) - Re(sum n a_n z^-n / sum a_n z^-n)
 
-with z = e^(i omega dt) (RC for the RC filter); a zero-phase filter runs forwards, then backwards, and has none, at the
-square of the attenuation. Both multiply the standard deviation of white noise by
+with z = e^(i omega dt) (RC for the RC filter). A zero-phase filter runs forwards, then backwards: it has no delay, and
+the square of the attenuation. Both multiply the standard deviation of white noise by
 
     noise_gain = sqrt(sum_n h[n]^2) = sqrt(mean over frequency of |H|^2)          (|H|^4 where zero-phase)
 
-As a regressor, the temperature is smoothed: the noise of the thermometer would bias the coefficients (errors in
-variables). A moving average is biased at the ends of a file; a locally linear kernel is not:
+The temperature is smoothed before it is used as a regressor, because the noise of the thermometer would bias the
+coefficients (errors in variables). A moving average is biased at the ends of a file; a locally linear kernel is not:
 
     T(t) = a,  (a, b) = argmin sum_i exp(-(t_i - t)^2 / (2 h^2)) (T_i - a - b (t_i - t))^2
 
-where h is the bandwidth; a straight ramp passes it unchanged, at the ends of a file too. A corner of a ramp does not:
-it is rounded by 0.4 h times the change of slope. So h is halved as long as half of it gives another temperature, by
-more than the thermometer's noise s allows:
+where h is the bandwidth. A straight ramp passes it unchanged, also at the ends of a file. A corner of a ramp is rounded
+by 0.4 h times the change of slope. So h is halved as long as the halved bandwidth changes the temperature by more than
+the thermometer's noise s explains:
 
     max_t |T_h(t) - T_{h/2}(t)| > 6 s sqrt(5 dt / (sqrt(pi) h))
 
@@ -68,12 +68,12 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
 
 
 def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
-    """Filter the accelerometer and gyroscope readings of a recording; everything else stays as it is.
+    """Filter the accelerometer and gyroscope readings of a recording; all other channels are unchanged.
 
     ``settings``: ``name`` (``none``, ``rc_low_pass``, ``low_pass``, ``high_pass``, ``band_pass``, ``band_stop``),
-    ``cutoff_hz``, ``time_constant_s``, ``low_hz``, ``high_hz``, ``order``, ``zero_phase``. The result's ``filter``
-    holds them, ``delay_s`` (at 0 Hz; of a band-pass at the middle of its band; 0 for a high-pass, which does not delay
-    what is far above its cutoff) and ``noise_gain``.
+    ``cutoff_hz``, ``time_constant_s``, ``low_hz``, ``high_hz``, ``order``, ``zero_phase``. ``filter`` of the result has
+    these settings, ``delay_s`` (at 0 Hz; for a band-pass at the middle of its band; 0 for a high-pass, which does not
+    delay signals far above its cutoff) and ``noise_gain``.
 
     Raises ``ConfigurationError`` if a setting is missing or a cutoff is not below half the sampling rate,
     ``InputError`` if the recording is too short to have a sampling interval.
@@ -102,7 +102,7 @@ def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
 
 
 def filtered(values: Values, recording: Recording) -> Values:
-    """Return (n, k) values at the samples of a recording behind the filter that its readings went through."""
+    """Filter (n, k) values at the samples of a recording as its readings were filtered."""
     return values if recording.filter["name"] == "none" else _filter_of(recording, recording.filter)[1](values)
 
 
@@ -119,7 +119,7 @@ def _filter_of(recording: Recording, settings: dict[str, Any]) -> tuple[Values, 
 
 
 def impulse_response(recording: Recording, samples: int) -> Values:
-    """Return the answer of a recording's filter to an impulse in the middle of evenly spaced samples: (n,) array."""
+    """Return the response of a recording's filter to an impulse in the middle of evenly spaced samples: (n,) array."""
     impulse = np.zeros((samples, 1))
     impulse[samples // 2] = 1.0
     time_ns = np.round(np.arange(samples) * recording.interval * 1e9).astype(np.int64)
@@ -265,7 +265,7 @@ def stretch_starts(recording: Recording) -> list[int]:
 
 
 def _timing_notes(recording: Recording) -> tuple[Note, ...]:
-    """Say where the samples are not what a filter of evenly spaced samples expects."""
+    """Return notes on gaps and uneven intervals, which a filter of evenly spaced samples does not expect."""
     notes = []
     starts = stretch_starts(recording)
     if len(starts) > 2:
@@ -305,7 +305,7 @@ def smooth_temperature(time: Values, temperature: Values, bandwidth: float = 10.
         return _local_line(time, temperature, bandwidth)
     step = np.abs(np.diff(temperature))
     noise, least = float(noise_of_steps(step)), ROUNDING * float(np.abs(temperature).max())
-    if noise == 0.0 and step.any():  # coarse: half of a count says nothing
+    if noise == 0.0 and step.any():  # a coarse thermometer: a change below half a count is not significant
         noise = float(step[step > 0].min())
         least += 0.5 * noise
     interval = (time[-1] - time[0]) / (len(time) - 1)
@@ -320,7 +320,7 @@ def smooth_temperature(time: Values, temperature: Values, bandwidth: float = 10.
 
 
 def temperature_of(recording: Recording) -> Values:
-    """Return the smoothed temperature of a recording that logs it: (n,) array, degC; shared."""
+    """Return the smoothed temperature of a recording that logs it: (n,) array, degC; cached."""
     assert recording.temperature is not None  # noqa: S101
     if "temperature" not in recording.cache:
         recording.cache["temperature"] = smooth_temperature(recording.time, recording.temperature)
@@ -330,7 +330,7 @@ def temperature_of(recording: Recording) -> Values:
 def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:
     """Return the value of the local line at each time: (n,) array, degC."""
     cell = np.floor((time - time[0]) / (bandwidth / 5.0)).astype(np.int64)
-    cell = np.concatenate([[0], np.cumsum(cell[1:] != cell[:-1])])  # without empty ones, as times increase
+    cell = np.concatenate([[0], np.cumsum(cell[1:] != cell[:-1])])  # skip empty cells; times increase
     count = np.bincount(cell)
     t = np.bincount(cell, time) / count
     value = np.bincount(cell, temperature) / count
@@ -350,7 +350,7 @@ def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:
     if len(t) == 1:
         return np.full_like(time, level[0])
     smooth: Values = np.interp(time, t, level)
-    # np.interp holds the end cells' means; go on along their slope instead.
+    # np.interp is constant beyond the end cells: extrapolate linearly instead.
     before, after = time < t[0], time > t[-1]
     smooth[before] = level[0] + (time[before] - t[0]) * (level[1] - level[0]) / (t[1] - t[0])
     smooth[after] = level[-1] + (time[after] - t[-1]) * (level[-1] - level[-2]) / (t[-1] - t[-2])

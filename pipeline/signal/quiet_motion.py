@@ -1,18 +1,18 @@
-"""Rotation that a rest hides: creep of the seat, and turns about the vertical.
+"""Detect rotation within a rest: creep, and turns about the vertical.
 
-Creep is the slow, steady tilt of a unit within a rest, as its seat gives way or a hand tires.
+Creep is the slow, steady tilt of a unit within a rest: its support yields, or a hand drifts.
 
-A body that turns at the rate omega sees gravity u turn by ``du/dt = -omega x u``, so that the accelerometer shows the
-two components of omega across gravity:
+In a body that turns at the rate omega, the direction of gravity u changes by ``du/dt = -omega x u``. The accelerometer
+thus shows the two components of omega across gravity:
 
     omega_across = (du/dt) x u
 
 du/dt is the slope of the readings of a rest; with white noise s of a sample, n samples and a rest of T seconds its
 standard deviation is ``s sqrt(12 / n) / T`` on each axis. s follows from the readings minus a parabola in time, so that
-creep does not count as noise. A mean over directions that spread by the variance v (rad^2, both axes together) is too
-short by the share v/2.
+creep does not count as noise. The mean of a vector whose direction has the variance v (rad^2, both axes together) is
+too short by the share v/2.
 
-The gyroscope also turns while the accelerometer is quiet: in turns about the vertical, and at the ends of moves.
+In turns about the vertical, and at the ends of moves, the unit turns while the accelerometer is quiet.
 
 With the mean rate m and the variance v of a short window about each sample, the unit turns where
 
@@ -21,10 +21,10 @@ With the mean rate m and the variance v of a short window about each sample, the
 where
 
     n   : samples of the window, 0.2 s and at least 3
-    r   : median of m in the stretch that the accelerometer calls quiet, which contains bias, g-sensitivity and a steady
-          creep; where it departs from the median of the stretches around it by more than the limit of a rest's rate,
-          the stretch is mostly a turn, and that median replaces it; of one or two stretches, where it departs from the
-          mean of their first and last window, which agree, that mean
+    r   : median of m in the stretch in which the accelerometer is quiet; it contains bias, g-sensitivity and a steady
+          creep. Where it differs from the median of the stretches around it by more than the limit of a rest's rate,
+          the stretch is mostly a turn, and that median replaces it. With one or two stretches only, the mean of the
+          first and last window of a stretch is used for this, if the two agree
     s_c : white noise of a sample, by the differences of successive samples
     d_c : 1.4826 times the median of |m_c - r_c| in the stretch: the standard deviation of m, tremor of a hand included,
           where the unit rests for more than half of the stretch; q d_c is limited to a hand's largest tremor
@@ -34,8 +34,8 @@ where
 Readings that are coarse against their noise repeat their value: the limit of a mean is at least one count, and V at
 least the variance of rounding, ``sum_c count_c^2 / 12``, in which a single flip of a count stays below the limit.
 
-Of a stretch that is mostly a turn, d and V are the medians of all stretches. A stretch is cut where the unit turns. Of
-pieces between which it turned by less than the limit of a rest, the longest is kept.
+For a stretch that is mostly a turn, d and V are the medians of all stretches. A stretch is cut where the unit turns. Of
+pieces between which it turned by less than the limit of a rest, only the longest is used.
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ class Creep:
     """The tilt within one rest."""
 
     rate: Values  # (3,), deg/s, omega across gravity, in the axes of the readings; zero where it is not significant
-    measured: Values  # (3,), deg/s, the same, also where it may be noise
-    uncertainty: float  # deg/s, the standard one of each of its two components
+    measured: Values  # (3,), deg/s, the same, also where it is not significant
+    uncertainty: float  # deg/s, standard uncertainty of each of its two components
     shortening: float  # share by which the mean of the readings is too short; 0 where the rate is zero
     squares: Values  # (3,), sum of squares of the readings about their parabola
-    freedom: int  # degrees of freedom of the squares, an axis
+    freedom: int  # degrees of freedom of the squares of each axis
 
 
 def posterior_creep_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
@@ -77,8 +77,8 @@ def posterior_creep_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, floa
 
         rate = w c^2 / (c^2 + e^2),   error^2 = c^2 e^2 / (c^2 + e^2),   c^2 = mean(|w|^2 / 2 - e^2)
 
-    and c = 0 where noise alone explains the rates: ``|w|^2 / (2 e^2)`` has mean and variance 1 then. The rate about
-    gravity, which the accelerometer does not show, has the standard deviation c, too.
+    and c = 0 where noise alone explains the rates: ``|w|^2 / (2 e^2)`` then has mean and variance 1. The rate about
+    gravity, which the accelerometer does not show, is given the same standard deviation c.
 
     Returns the rates, (m, 3), the standard uncertainty of each of their two components, (m,), and c, all deg/s.
     """
@@ -93,10 +93,10 @@ def posterior_creep_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, floa
 
 
 def component_along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
-    """Return the readings of a rest along its mean, (n,) array, g, and whether the unit creeps in it.
+    """Return the readings of a rest along their mean, (n,) array, g, and whether the unit creeps in the rest.
 
-    A tilt by theta changes the component along gravity by theta times the bias across it, which is not known yet: where
-    the unit creeps, a parabola in time is subtracted.
+    A tilt by theta changes the component along gravity by theta times the bias across gravity, which is unknown here.
+    So where the unit creeps, a parabola in time is subtracted.
     """
     mean = force.mean(axis=0)
     along = force @ (mean / np.linalg.norm(mean))
@@ -114,7 +114,7 @@ def _parabolas(time: Values) -> Values:
 
 
 def creep_of_rest(recording: Recording, start: int, stop: int) -> Creep:
-    """Return how a unit tilts in the samples ``start <= n < stop`` of a recording, without marked or missing ones."""
+    """Return the creep in the samples ``start <= n < stop`` of a recording, without flagged and missing ones."""
     key = "creep", start, stop
     if key not in recording.cache:
         force = recording.accelerometer
@@ -128,9 +128,9 @@ def creep_of_rest(recording: Recording, start: int, stop: int) -> Creep:
 
 
 def creep_of_readings(time: Values, force: Values, share: float = 0.0) -> Creep:
-    """Return how a unit tilts within a rest of n readings of the accelerometer, g.
+    """Return the creep within a rest from n readings of the accelerometer, g.
 
-    ``share`` is the variance of their mean by white noise over that of one; 0 stands for 1/n.
+    ``share`` is the variance of their mean over the variance of one reading, for white noise; 0 stands for 1/n.
     """
     n = len(time)
     mean = force.mean(axis=0) if n else np.zeros(3)
@@ -142,7 +142,7 @@ def creep_of_readings(time: Values, force: Values, share: float = 0.0) -> Creep:
     along = basis.T @ force
     squares = np.sum((force - basis @ along) ** 2, axis=0)
     freedom = n - DEGREE - 1
-    across = along - np.outer(along @ u, u)  # what turns gravity
+    across = along - np.outer(along @ u, u)  # the change of direction
     path, line = basis[:, 1:] @ across[1:], basis[:, 1:2] @ across[1:2]
     white = float(np.sqrt(squares.sum() / (3 * freedom)))
     error = white * np.sqrt(12.0 * max(share, 1.0 / n)) / span
@@ -158,15 +158,15 @@ WINDOW_S, FEWEST = 0.2, 3  # shorter than a move; samples that have a variance
 SIGNIFICANT = 6.0  # q above
 NEIGHBOURS = 5  # stretches: their median withstands two that turned
 RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
-# Of a window's mean, however much the stretch trembles. The rests of a published MPU-6050 recording in a hand reach 1.7
-# but for the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
+# Of a window's mean, whatever the tremor of the stretch. The rests of a published MPU-6050 recording in a hand reach
+# 1.7 except at the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
 TREMOR_LIMIT_DPS = 2.5
 SAME_DEG = 2.0  # the limit of a rest in ``pipeline.signal.rests``
 ROUNDING = 1e-6  # relative, of a difference of decimals
 
 
 def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: float, shortest: int) -> Spans:
-    """Cut stretches in which the accelerometer is quiet where the gyroscope turns.
+    """Cut stretches in which the accelerometer is quiet at the samples where the gyroscope turns.
 
     ``rate``: (n, 3), deg/s, finite in the stretches; ``stretches``: start and stop of each, in order; ``interval``:
     mean time between samples, s; ``shortest``: samples of the shortest piece that is a rest.
@@ -195,15 +195,15 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
         turned = np.vstack([np.zeros(3), np.cumsum((parts[i] - reference[i]) * interval, axis=0)])
         found = _rests(quiet, turned, shortest)
         if not (found or resting[i]):
-            found = [(0, stop - start)]  # for the caller to refuse, with the reason
+            found = [(0, stop - start)]  # the caller refuses it, with the reason
         pieces += [(start + a, start + b) for a, b in found]
     return pieces
 
 
 def counts_of(differences: Values) -> Values:
-    """Return the smallest step between successive readings of each axis, (k,), by their absolute differences (n, k).
+    """Return the smallest nonzero step between successive readings of each axis, (k,), from their steps' sizes (n, k).
 
-    Of coarse readings it is one count; of fine ones it is negligible against their noise.
+    In coarse readings it is one count; in fine ones it is negligible against their noise.
     """
     smallest = np.min(differences, axis=0, where=differences > 0.0, initial=np.inf)
     return np.asarray(np.where(np.isfinite(smallest), smallest, 0.0))
@@ -221,7 +221,10 @@ def windows(values: Values, size: int) -> tuple[Values, Values]:
 
 
 def _references(medians: Values, ends: Values) -> tuple[Values, Mask]:
-    """Return the rate at rest of each stretch, and which of them mostly rest; ``ends`` are (m, 2, 3)."""
+    """Return the rate at rest of each stretch, and which stretches are mostly rest.
+
+    ``ends``: means of the first and last window of each stretch, (m, 2, 3).
+    """
     out, resting = medians.copy(), np.ones(len(medians), bool)
     if len(medians) <= 2:
         middle = ends.mean(axis=1)
@@ -245,7 +248,7 @@ def _widened(turns: Mask, half: int, samples: int) -> Mask:
 
 
 def _rests(quiet: Mask, turned: Values, shortest: int) -> Spans:
-    """Return the quiet runs, of those between which the unit did not turn the longest alone."""
+    """Return the quiet runs; of runs between which the unit did not turn, only the longest."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(np.int8)))
     found = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= shortest]
     out: Spans = []

@@ -1,21 +1,21 @@
-"""Rests in a recording: from a table's log, or from the sensor's own readings.
+"""Find the rests in a recording: from the log of a table, or from the readings of the sensor.
 
-By the readings (after Tedaldi, Pretto & Menegatti, ICRA 2014, section IV), a sample rests where the variance of the
-specific force in a short window, summed over the axes, is below a multiple of the sensor's own,
+From the readings (after Tedaldi, Pretto & Menegatti, ICRA 2014, section IV), a sample is at rest where the variance of
+the specific force in a short window, summed over the axes, is below a multiple of the sensor's noise,
 
     v[n] = sum_axes var(f[n .. n+W-1]) < m v_0
 
 where
 
     W   : window, 0.5 s and at least 5 samples
-    v_0 : the noise: the 5th percentile of v, so that no part of the recording has to be known to rest, and at least
-          that of rounding, by the smallest step between successive readings
+    v_0 : the noise: the 5th percentile of v, so that no part of the recording must be known to be a rest; at least the
+          variance of rounding, by the smallest step between successive readings
     m   : the multiple, from the widest range over which the number of rests stays the same
 
 A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.signal.quiet_motion``), as a turn about
-the vertical does not change the specific force. A rest in which the sensor still turned or shook is refused: its
-angular rate departs from that of the neighbouring rests, its direction moves, or it scatters beyond the noise. A turn
-by theta shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
+the vertical does not change the specific force. A rest is refused if its angular rate differs from that of the
+neighbouring rests, the direction of the specific force moves, or the readings scatter more than noise. A turn by theta
+shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ GAP_S = 1.0  # longer than any regular interval of a log
 SHORTEST_REST_S = 1.0  # two windows
 MULTIPLES = np.geomspace(4.0, 1000.0, 25)  # of a variance: 2 to 30 times the noise, in steps of an eighth
 SMALLEST_VARIANCE = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
-NEIGHBOURS = 5  # rests: their median withstands two that turned
+NEIGHBOURS = 5  # rests: their median is robust against two that turned
 TURN_LIMIT_DEG = 2.0  # 0.05 mg, see above
-# A steady tilt is modelled up to this rate (``pipeline.signal.quiet_motion``); units in hands or on soft seats
+# A steady tilt is modelled up to this rate (``pipeline.signal.quiet_motion``); units in a hand or on a soft support
 # creep by up to 0.3 deg/s.
 CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0
 SCATTER_LIMIT = 3.0  # times the noise; noise alone stays below 1.3 in the 100 samples of a rest at 100 Hz
 SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg
 SIGNIFICANT = 6.0  # standard deviations
-EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # of a rest that may still move, at most a third of it, and samples that show it
+EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # edge of a rest that may move, at most a third of it; samples that this needs
 SETTLED = 8.0  # of the noise between successive samples: white noise passes in 1e-14
 
 
@@ -80,10 +80,10 @@ def _edges(mask: Mask) -> tuple[Integers, Integers]:
 
 
 def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> Mask:
-    """Return which samples rest and have settled, by a table's rate in deg/s: (n,) array of bool.
+    """Return which samples are at rest and settled, by a table's rate in deg/s: (n,) array of bool.
 
-    A rest begins where |rate| falls under 0.02 deg/s; its first ``settling`` seconds are left out, unless the recording
-    begins with it.
+    A rest begins where |rate| falls below 0.02 deg/s. Its first ``settling`` seconds are not included, unless the
+    recording begins with the rest.
     """
     still = np.abs(rate) < RATE_AT_REST_DPS
     starts, stops = _edges(still)
@@ -95,9 +95,9 @@ def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> M
 
 
 def rests_from_table(recording: Recording) -> list[Rest]:
-    """Return the rests by the table's rate, or by the derivative of its angle; none without such a log.
+    """Return the rests by the rate of the table, or by the derivative of its angle; none without such a log.
 
-    Their first 0.3 s, and the delay of the recording's filter, are left out.
+    Their first 0.3 s, and the delay of the recording's filter, are not included.
     """
     rate = recording.logged_rate
     if rate is None:
@@ -107,9 +107,9 @@ def rests_from_table(recording: Recording) -> list[Rest]:
 
 
 def find_rests(recording: Recording) -> list[Rest]:
-    """Find the rests of a hand-held recording from its readings: in order of time, at least 1 s long.
+    """Find the rests of a hand-held recording from its readings, in order of time, each at least 1 s long.
 
-    Those that moved are refused, with the reason; readings of the gyroscope show rests that still turned.
+    A rest in which the sensor moved is marked as refused, with the reason.
     """
     force = recording.accelerometer
     size = max(5, round(WINDOW_S / _interval(recording))) if recording.samples > 1 else 5
@@ -129,16 +129,16 @@ def find_rests(recording: Recording) -> list[Rest]:
 
 
 def _interval(recording: Recording) -> float:
-    """Return the mean time between samples, s, without gaps; of stamps that come in bursts the median is none."""
+    """Return the mean time between samples, s, without gaps; the median would be wrong for stamps in bursts."""
     steps = np.diff(recording.time_ns)
     short = steps[steps < GAP_S * 1e9]
     return float(short.mean()) / 1e9 if short.size else recording.interval
 
 
 def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noise_variance: float) -> list[Rest]:
-    """Return rests of given start and stop; those in which the sensor moved are refused.
+    """Return rests of given start and stop; a rest in which the sensor moved is marked as refused.
 
-    ``noise_variance`` is that of the specific force at rest, g^2, summed over the axes.
+    ``noise_variance``: of the specific force at rest, g^2, summed over the axes.
     """
     rests = [Rest(start, stop) for start, stop in intervals]
     reasons = [_turn(recording, r) or _scatter(recording, r, noise_variance) for r in rests]
@@ -162,7 +162,7 @@ def _spoilt(recording: Recording, size: int) -> Mask:
 
 
 def _below(variance: Values, threshold: float, recording: Recording, size: int) -> Spans:
-    """Return the trimmed stretches whose windows stay under a threshold, if long enough."""
+    """Return the trimmed stretches whose windows are below a threshold, if they are long enough."""
     interval = _interval(recording)
     lag = int(np.ceil(5.0 * float(recording.filter.get("delay_s", 0.0)) / interval))
     shortest = max(size, round(SHORTEST_REST_S / interval))
@@ -189,7 +189,7 @@ def _scatter(recording: Recording, rest: Rest, noise_variance: float) -> str:
 
 
 def _turn(recording: Recording, rest: Rest) -> str:
-    """Compare the directions of the rest's four quarters, minus a straight line where it creeps steadily."""
+    """Compare the directions of the four quarters of a rest, after subtraction of a steady creep."""
     assert recording.accelerometer is not None  # noqa: S101
     force = recording.accelerometer[rest.start : rest.stop]
     creep = creep_of_rest(recording, rest.start, rest.stop)
@@ -211,9 +211,9 @@ def _turn(recording: Recording, rest: Rest) -> str:
 
 
 def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
-    """Compare each rest's mean angular rate with the median of the rests around it.
+    """Compare the mean angular rate of each rest with the median of its neighbours in time.
 
-    The bias itself wanders with the temperature, so that neighbours in time are compared, not all rests.
+    Not of all rests, because the bias changes with the temperature.
     """
     rate = recording.gyroscope
     if rate is None or len(rests) < 3:
@@ -234,7 +234,7 @@ def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
 
 
 def stretches_of(recording: Recording, mask: Mask) -> Spans:
-    """Return the runs of a mask, cut at gaps in time."""
+    """Return the runs of True in a mask, cut at gaps in time."""
     cuts = np.array(stretch_starts(recording)[1:-1], int)
     pieces: Spans = []
     for start, stop in runs(mask):
@@ -243,7 +243,7 @@ def stretches_of(recording: Recording, mask: Mask) -> Spans:
 
 
 def usable(recording: Recording, values: Values) -> Mask:
-    """Return which samples are neither missing nor marked by ingest: (n,) array."""
+    """Return which samples are neither missing nor flagged by ingest: (n,) array."""
     with np.errstate(invalid="ignore"):
         finite = np.isfinite(values @ np.ones(values.shape[1]))  # a tenth of the time of ``all`` over three columns
     return np.asarray(finite & recording.valid)
@@ -259,20 +259,20 @@ def rest_readings(recording: Recording, sensor: str, *, whole_recording: bool) -
         if not found and recording.role == "rests":
             found = find_rests(recording)
         resting = np.zeros(recording.samples, bool)
-        memory = len(filter_autocovariance(recording)) - 1  # so long a filter's output holds what was before the rest
+        memory = len(filter_autocovariance(recording)) - 1  # samples for which the output depends on earlier readings
         ahead = memory if recording.filter.get("zero_phase") else 0
         for rest in found:
             first = rest.start + memory * (rest.start > 0)
             resting[first : rest.stop - ahead * (rest.stop < recording.samples)] = rest.accepted
         still &= resting
-    if whole_recording:  # a gap does not end a static rest: the likelihood knows the times
+    if whole_recording:  # a gap does not end a static rest: the likelihood uses the times
         return [(recording.time[still], values[still])] if still.any() else []
     settled = _settled(recording, values, stretches_of(recording, still))
     return [(recording.time[a:b], values[a:b]) for a, b in settled if b - a > 2]
 
 
 def _settled(recording: Recording, values: Values, stretches: Spans) -> Spans:
-    """Return rests without the samples at their edges that still move: the sensor's clock may be off the table's."""
+    """Remove samples that still move at the edges of rests: the clocks of sensor and table may differ."""
     ends = np.array(stretches, int).reshape(-1, 2)
     lengths = ends[:, 1] - ends[:, 0]
     edges = np.minimum(int(EDGE_S / recording.interval) + 1, lengths // 3)

@@ -1,10 +1,10 @@
-"""Segmentation of one long recording: moves of a table, or turns by hand that are held out.
+"""Divide one long recording into segments: moves of a table, or turns by hand for held-out data.
 
-Moves of one kind about one axis make a segment, with the adjacent rests. Steps that stop in four attitudes or more
-are for the accelerometer, turns for the gyroscope; where an axis has one kind only it serves both, and of turns about
-one axis in two segments the slower ones are for the accelerometer. Motion about several axes is held out, a rest of a
-minute or more determines the noise. Where the sensor moves and the table does not, the unit is being mounted: no
-segment contains such samples.
+Moves of one kind about one axis make a segment, with the adjacent rests. Steps that stop in four attitudes or more are
+for the accelerometer, turns for the gyroscope. Where an axis has moves of one kind only, they are for both sensors; if
+they are turns in two segments, the slower ones are for the accelerometer. Motion about several axes is held-out data. A
+rest of a minute or more determines the noise. Where the sensor moves and the table does not, the unit is being mounted:
+no segment contains such samples.
 
 A move of the table is
 
@@ -15,13 +15,13 @@ A move of the table is
 where r is the rate of the table (logged, or that of its angle or attitude), w the angular rate that the sensor reads,
 and b the median of w while the table rests.
 
-Turns by hand go by a stated angle A about one body axis, from rest to rest; every k-th about each axis is held out:
+Turns by hand are by a stated angle A about one body axis, from rest to rest; every k-th about each axis is held out:
 
     Y = integral (y - b) dt,   n = round(Y_a / A),   |Y_a - n A| < min(|n A| / 10, A / 4),   |Y - Y_a e_a| < |Y_a| / 4
 
 where
 
-    y, b : angular rate as it was read, and the mean of both rests
+    y, b : reading of the angular rate, and the mean of both rests
     a, A : the axis with the largest |Y_a|, and the stated angle; n is not 0
 """
 
@@ -43,18 +43,18 @@ if TYPE_CHECKING:
     from pipeline.signal.rests import Rest
 
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
-BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # of rest that a segment takes with it
+BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # largest length of the adjacent rest that a segment includes
 SHORTEST_STATIC_S, SHORTEST_FREE_S = 60.0, 10.0  # shorter rests determine no bias wander, shorter motion no mean error
 SLOWER = 1.2  # rates that differ by less are one rate
 FEWEST_OF_A_SPLINE = 6  # samples of a quintic
-AGREES = 0.05  # of the mean rate: a gimbal alone differs from the attitude's rate by far more
+AGREES = 0.05  # of the mean rate: the rate of one gimbal differs from that of the attitude by far more
 SHORT_NAMES = {
     "accelerometer": "accel", "gyroscope": "gyro", "rests": "rests", "validation": "validation", "static": "static",
 }  # fmt: skip
 ONE_AXIS = 0.8  # share of the energy of a turn about a body axis that is misaligned by 27 deg
 ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1  # one sample of 50 ms at 100 deg/s; a coarse log of the rate
 HALF_A_TURN_DEG = 180.0
-HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5  # above bias and vibration of a resting unit; the logs' clocks may be off
+HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5  # above bias and vibration of a resting unit; the logs' clocks may differ
 
 
 class Segment(NamedTuple):
@@ -87,13 +87,13 @@ class Move(NamedTuple):
 def cut(
     recording: Recording, windows: Sequence[Mapping[str, Any]] | None = None, *, found: bool = False
 ) -> list[Recording]:
-    """Return the segments of one long recording as recordings of their own.
+    """Return the segments of one long recording as separate recordings.
 
-    ``windows``: ``role``, ``axis``, ``start_s`` and ``stop_s`` (in the recording's own time, from its first sample), in
-    place of what is found here; ``found``: whether they were found in the recording. Raises ``InputError`` if nothing
-    is found, or a window holds no samples.
+    ``windows``: ``role``, ``axis``, ``start_s`` and ``stop_s`` (s since the first sample) of each segment, instead of
+    finding segments here. ``found``: whether the windows were computed from the recording, for the notes. Raises
+    ``InputError`` if no segment is found, or a window contains no samples.
     """
-    segments = _find_segments(recording) if windows is None else [_of_window(recording, w) for w in windows]
+    segments = _find_segments(recording) if windows is None else [_segment_of_window(recording, w) for w in windows]
     out: list[Recording] = []
     count: dict[str, int] = {}
     for segment in segments:
@@ -117,7 +117,7 @@ def cut(
 
 
 def _size_of_rate(part: Recording) -> Values | None:
-    """Return the size of the table's rate: the logged one, unless by the attitude it is of one gimbal alone."""
+    """Return the magnitude of the table's rate: as logged, or from the attitude if the log has one gimbal only."""
     logged = None if part.table_rate is None else np.abs(part.table_rate)
     if part.table_attitude is None or part.samples < FEWEST_OF_A_SPLINE:
         return logged
@@ -135,7 +135,7 @@ def _note(recording: Recording, segment: Segment, *, found: bool) -> Note:
     return Note("N-SEGMENT", segment.stop - segment.start, 0, 0, detail, start, end)
 
 
-def _of_window(recording: Recording, window: Mapping[str, Any]) -> Segment:
+def _segment_of_window(recording: Recording, window: Mapping[str, Any]) -> Segment:
     since = recording.time - recording.time[0]
     start, stop = np.searchsorted(since, [float(window["start_s"]), float(window["stop_s"])])
     if stop - start < 2:
@@ -170,14 +170,14 @@ def _find_segments(recording: Recording) -> list[Segment]:
 
 
 def _rate_of_table(recording: Recording) -> Values | None:
-    """Return the rate of the table, its size where only that is known: (n,) array, deg/s."""
+    """Return the rate of the table, or its magnitude where only an attitude is logged: (n,) array, deg/s."""
     if recording.logged_rate is not None or recording.table_attitude is None:
         return recording.logged_rate
     return rate_of_attitude(recording.time, recording.table_attitude)
 
 
 class _Session:
-    """A long recording with the table's rate and the sensor's, deg/s: its moves, and their groups."""
+    """The moves in a long recording, and their groups; rates of table and sensor in deg/s."""
 
     def __init__(self, recording: Recording, rate: Values, gyro: Values) -> None:
         self.recording, self.rate, self.gyro = recording, rate, gyro
@@ -190,7 +190,7 @@ class _Session:
         self.groups = self._groups()
 
     def _handled(self) -> Mask:
-        """Return the samples at which the sensor turns and the table does not."""
+        """Return at which samples the sensor turns and the table does not."""
         if self.moving.all():
             return np.zeros(len(self.moving), bool)
         near = np.convolve(self.moving, np.ones(2 * self.margin + 1), "same") > 0.5
@@ -207,14 +207,14 @@ class _Session:
         return Move(start, stop, axis if alone else None, angle, float(rate.max()))
 
     def _encoder_agrees(self, start: int, stop: int, angle: float) -> bool:
-        """Return whether the logged angle moves as the rate says: else it is not that of the gimbal that turns."""
+        """Return whether the logged angle changes by the integrated rate; else it is the angle of another gimbal."""
         if self.recording.table_angle is None:
             return True
         passed = float(np.sum(np.abs(np.diff(self.recording.table_angle[max(start - 1, 0) : stop + 1]))))
         return abs(passed - angle) < ENCODER_AGREES_DEG + ENCODER_AGREES * angle
 
     def _groups(self) -> list[list[Move]]:
-        """Return moves of one kind that follow each other, unless the sensor was mounted anew between."""
+        """Group successive moves of one kind; a new mounting of the sensor begins a new group."""
         group, numbers = 0, [0] * len(self.moves)
         for k, (last, move) in enumerate(pairwise(self.moves), 1):
             group += last.kind != move.kind or bool(self.handled[last.stop : move.start].any())
@@ -223,15 +223,15 @@ class _Session:
         return [[move for _, move in together] for _, together in groupby(pairs, key=lambda pair: pair[0])]
 
     def segments(self, group: list[Move]) -> list[Segment]:
-        """Return what a group of moves is for: one segment, two where an axis has no other, none for a transit."""
+        """Return the segments of a group of moves: two where it is for both sensors, none for a transit."""
         first = group[0]
-        if first.axis is None:  # without the short moves around it, which bring the table there and back
+        if first.axis is None:  # without short moves before and after it, in which the table approaches and returns
             lasting = [k for k, move in enumerate(group) if self._seconds(move.start, move.stop) >= SHORTEST_FREE_S]
             group = group[lasting[0] : lasting[-1] + 1] if lasting else group
             if self._seconds(group[0].start, group[-1].stop) < SHORTEST_FREE_S:
                 return []
             return [Segment(*self._extent(group), "validation", None, "motion about several axes")]
-        if not _useful(group):
+        if not _is_useful(group):
             return []
         axis = AXES[first.axis]
         rates = sorted({round(m.rate, 1) for m in group})
@@ -244,7 +244,7 @@ class _Session:
 
     def _roles(self, group: list[Move]) -> list[str]:
         """Return the sensors that a group of moves about one axis is for."""
-        others = [g for g in self.groups if g[0].axis == group[0].axis and g is not group and _useful(g)]
+        others = [g for g in self.groups if g[0].axis == group[0].axis and g is not group and _is_useful(g)]
         if any(g[0].kind != group[0].kind for g in others):
             return ["accelerometer" if group[0].kind[1] == "step" else "gyroscope"]
         rate, rates = max(m.rate for m in group), [max(m.rate for m in g) for g in others]
@@ -253,13 +253,12 @@ class _Session:
         return ["accelerometer"] if rate < min(rates) else ["gyroscope"]
 
     def _extent(self, group: list[Move]) -> tuple[int, int]:
-        """Return the samples of a group with half of the adjacent rests, 30 s at most, and nothing handled."""
+        """Return the samples of a group with half of each adjacent rest, 30 s at most, without handled samples."""
         first, last = group[0].start, group[-1].stop
         margin = int((BESIDE_S if group[0].axis is not None else BESIDE_FREE_S) / self.recording.interval)
-        before = max((m.stop for m in self.moves if m.stop <= first), default=-first)  # none: from the first sample
-        after = min(
-            (m.start for m in self.moves if m.start >= last), default=2 * self.recording.samples - last
-        )  # none: to the last
+        # without a move before: from the first sample; without one after: to the last
+        before = max((m.stop for m in self.moves if m.stop <= first), default=-first)
+        after = min((m.start for m in self.moves if m.start >= last), default=2 * self.recording.samples - last)
         start, stop = max((before + first) // 2, first - margin), min((last + after) // 2, last + margin)
         early = np.flatnonzero(self.handled[start:first])
         late = np.flatnonzero(self.handled[last:stop])
@@ -268,7 +267,7 @@ class _Session:
         return min(start, first), max(stop, last)
 
     def static(self, others: Sequence[Segment]) -> list[Segment]:
-        """Return the longest rest that no other segment has taken, if it is long enough."""
+        """Return the longest rest outside the other segments, if it is long enough."""
         still = ~self.moving & ~self.handled
         for other in others:
             still[other.start : other.stop] = False
@@ -280,17 +279,17 @@ class _Session:
         return [Segment(start, stop, "static", None, "a long rest")]
 
 
-def _useful(group: Sequence[Move]) -> bool:
+def _is_useful(group: Sequence[Move]) -> bool:
     return group[0].kind[1] == "turn" or (group[0].kind[1] == "step" and len(group) >= FEWEST_STOPS - 1)
 
 
 SCALE = 0.1  # relative: three times the largest scale factor error of the shipped data sheets (MPU-6050: 3 %)
-ACROSS = 0.25  # 15 deg between the turn and a body axis: a chip askew in its case, and a hand
-HALF_S = WINDOW_S + SHORTEST_REST_S  # half of a rest that is cut in two and found again: a window of it is trimmed
+ACROSS = 0.25  # 15 deg between the turn and a body axis: misalignment of the chip in its case, and error of the hand
+HALF_S = WINDOW_S + SHORTEST_REST_S  # shortest half of a divided rest that is found again: a window is trimmed
 
 
 def multiples(angle: Values, stated_deg: float) -> tuple[int, int]:
-    """Return the axis that an integrated rate (3,), deg, is about, and of how many stated angles it is; 0 for none."""
+    """Return the axis of an integrated rate (3,), deg, and the number of stated angles in it; 0: not a multiple."""
     axis = int(np.argmax(np.abs(angle)))
     along = float(angle[axis])
     count = round(along / stated_deg)
@@ -309,9 +308,9 @@ class TurnByHand(NamedTuple):
 
 
 def turns_by_hand(recording: Recording, rests: Sequence[Rest], turns: Mapping[str, Any]) -> list[TurnByHand]:
-    """Return the turns by a multiple of the stated angle between the accepted ones of the rests.
+    """Return the turns by a multiple of the stated angle between accepted rests.
 
-    Every k-th about an axis is held out: the first from the k-th on with rests of which either half is a rest again.
+    Every k-th about an axis is held out, or the next one whose rests are long enough to be cut into two rests each.
     ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none).
     """
     rate, every = recording.gyroscope, int(turns["holdout_every"])
@@ -333,10 +332,10 @@ def turns_by_hand(recording: Recording, rests: Sequence[Rest], turns: Mapping[st
 
 
 def held_out_windows(recording: Recording, turns: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the windows that cut every k-th turn about each axis out of a recording, as role ``validation``.
+    """Return the windows that make every k-th turn about each axis a recording of the role ``validation``.
 
-    ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none). The windows are as of ``cut``, from the middle of the
-    rest before a turn to that of the rest after it; there are none where nothing is held out.
+    ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none). The windows are for ``cut``, from the middle of the rest
+    before a turn to the middle of the rest after it; there are none where nothing is held out.
     """
     edges = [0.0]
     for turn in turns_by_hand(recording, find_rests(recording), turns):

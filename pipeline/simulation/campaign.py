@@ -1,10 +1,10 @@
-"""Write a simulated campaign: units.csv, campaign.yaml, the recordings, and the truth behind them.
+"""Write a simulated campaign: units.csv, campaign.yaml, the recordings, and the true parameters.
 
     <directory>/units.csv, campaign.yaml, simulation.yaml
     <directory>/raw/<unit>/<recording>.csv (or .mcap)
     <directory>/truth/<unit>.json     bias, matrix, effects and noise of each sensor
 
-The truth is for tests and for the reader; no stage reads it.
+``truth`` is for tests and for the reader; no stage reads it.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def write_campaign(
 ) -> None:
     """Simulate every unit of a description and write the campaign; files of the same names are replaced.
 
-    ``progress`` gets a line for each unit that is done. ``sheet_only``: write ``units.csv`` without recordings and
-    truth, for a campaign whose run makes them.
+    ``progress`` is called with a line for each finished unit. ``sheet_only``: write ``units.csv`` without recordings
+    and truth, for a campaign whose run simulates them.
     """
     for name, text in programs_of(description.units).items():
         path = directory / "configs" / "procedure" / f"{name}.yaml"
@@ -88,7 +88,7 @@ def write_campaign(
 
 
 def _sheet_rows(description: Description) -> list[dict[str, Any]]:
-    """Return the rows of ``units.csv``: units, their variants from the same recordings, further rows."""
+    """Return the rows of ``units.csv``: units, variants with the recordings of a unit, further rows."""
     rows: list[dict[str, Any]] = [
         {"unit": unit.unit, "sensor": unit.sensor, "table": unit.table, "procedure": unit.procedure}
         | columns_of(unit)
@@ -106,9 +106,9 @@ def _sheet_rows(description: Description) -> list[dict[str, Any]]:
 def simulate_unit(
     unit: UnitDescription, seed: int, number: int, extra: Sequence[Planned] = ()
 ) -> tuple[list[Recording], dict[str, Any]]:
-    """Return the recordings of one unit and the truth behind them.
+    """Return the recordings of one unit and its true parameters.
 
-    The seed and the unit's number in its campaign determine every random number. ``extra``: further recordings after
+    The seed and the unit's number in its campaign determine every random number. ``extra``: recordings to make after
     those of the procedure.
     """
     streams, course = Streams(seed, number), course_of(unit)
@@ -116,7 +116,7 @@ def simulate_unit(
     effects = drawn_effects(unit.effects, sensor_configs, streams["effects"])
 
     def bench_of(other: Mapping[str, Any]) -> Bench:
-        """Return the bench of the description with ``other`` settings; the same sensors, mounted anew."""
+        """Return the bench of the description, changed by ``other`` settings; with the same sensors."""
         table = read_config("table", other.get("table", unit.table))
         rng = streams["bench"]
         imperfections = {
@@ -135,7 +135,7 @@ def simulate_unit(
     table = bench.table
     by_hand = table["angle_accuracy_deg"] if table["motion"] == "none" else 0.0
     mover = streams["motion"] if unit.motion is None else Streams(seed, unit.motion)["motion"]
-    planned = [*_wanted(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
+    planned = [*_selected(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
     total = sum(p.trajectory.duration + course.pause_s for p in planned)
     ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
     environment = random_environment(streams["room"], ramp=ramp, ramp_period=total / 1.5)
@@ -152,8 +152,8 @@ def simulate_unit(
     return recordings, truth | ({"table_clock": clock} if clock else {})
 
 
-def _wanted(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
-    """Return the recordings that the unit's description asks for."""
+def _selected(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
+    """Return the planned recordings that the unit's description selects."""
     unknown = set(unit.recordings) - {p.name for p in planned}
     if unknown:
         known = ", ".join(p.name for p in planned)
@@ -197,7 +197,7 @@ def _truth(sensor: SimulatedSensor, effects: Hidden, interval: float) -> dict[st
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    """Return units.csv: the known columns that any row has, then the others."""
+    """Return the text of units.csv: the known columns that any row has, then the others."""
     found = dict.fromkeys(key for row in rows for key in row)
     columns = [c for c in COLUMNS if c in found] + [c for c in found if c not in COLUMNS]
     text = io.StringIO()

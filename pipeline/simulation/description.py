@@ -1,4 +1,4 @@
-"""What is to be simulated, as a file ``simulation.yaml`` describes it.
+"""Read the description of a simulation, ``simulation.yaml``.
 
     seed: 2019                       # every number follows from it
     defaults: {...}                  # keys of a unit, for all units
@@ -8,11 +8,11 @@
         table: acutronic             # configs/table
         procedure: three_axis_turns
         ...
-    variants:                        # every unit once more, from the same recordings, with other columns
+    variants:                        # every unit again, with the same recordings and other columns
       - {suffix: -staged, columns: {method: staged, filter: rc_low_pass}}
-    rows: [...]                      # further rows of units.csv, for units whose recordings another one has made
+    rows: [...]                      # further rows of units.csv, for units that use the recordings of another unit
 
-What a unit leaves out is drawn at random from the sensor file. The keys of a unit are the attributes of
+Parameters that are not stated are drawn at random from the sensor file. The keys of a unit are the attributes of
 ``UnitDescription``.
 """
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 FORMATS = ("csv", "mcap")
 KINDS = ("rows", "file", "program")
 _, FILE, PROGRAM = KINDS
-UNITS_OF_A_LOT = 25  # of a described count of units: a round number
+UNITS_OF_A_LOT = 25  # for units that are described by a count: a round number
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
 BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
 # Each turn there and back, the second held out between rests of 4 s or longer; 360 deg in some 3 s.
@@ -51,11 +51,11 @@ RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
 class TableLog:
     """How the table is logged."""
 
-    kind: str = "rows"  # rows: in the sensor's rows; file: in a file of its own; program: not at all
+    kind: str = "rows"  # rows: in the sensor's rows; file: in a separate file; program: not at all
     interval_s: float = 0.01  # of a file
     offset_s: float | None = None  # of the file's clock; None: at random, 0 to 100 s
-    drift_ppm: float | None = None  # of the file's clock; None: at random, of 50 ppm
-    wrapped: bool = False  # whether the encoder starts again at 360 deg
+    drift_ppm: float | None = None  # of the file's clock; None: at random, standard deviation 50 ppm
+    wrapped: bool = False  # whether the encoder restarts at 360 deg
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -73,28 +73,28 @@ class UnitDescription:
     procedure: str = "three_axis_turns"
     columns: dict[str, Any] = field(default_factory=dict)  # of units.csv: serial, lot, date, method, overrides ...
     course: dict[str, Any] = field(default_factory=dict)  # attributes of ``procedures.Course``
-    samples: int | None = None  # about how many rows the recordings have together
+    samples: int | None = None  # approximate total number of rows of the recordings
     interval_s: float = 0.12
     lost: float = 0.0  # share of the samples that the radio link loses
     format: str = "csv"
-    # bias (g or deg/s), matrix, or in its place scale_factor (of the correction), non_orthogonality_deg (yx, zx, zy),
-    # mounting_deg (turns about x, then y, then z); noise_density, bias_wander, wander_time_s: not of the sensor file
+    # bias (g or deg/s), matrix, or instead of it scale_factor (of the correction), non_orthogonality_deg (yx, zx, zy),
+    # mounting_deg (turns about x, then y, then z); noise_density, bias_wander, wander_time_s replace the sensor file's
     accelerometer: dict[str, Any] = field(default_factory=dict)
     gyroscope: dict[str, Any] = field(default_factory=dict)
     # sensor.effect, or effect alone for both sensors, to null (a typical size, at random), a number (that size, with
-    # random signs), the list of the parameters' values, or a formula of its own (``sensor``)
+    # random signs), the list of the parameters' values, or a new formula (``sensor``)
     effects: dict[str, Any] = field(default_factory=dict)
-    # what the table does otherwise than commanded: tilt_deg (2,) and the settings of ``rate_table.random_errors``; what
-    # is left out follows from the accuracies of the table's configuration. And how the unit is mounted: mounting_deg
-    # (recording to a rotation vector, body frame), zero_deg (recording to what the table shows at the convention's
-    # angle 0), sense (-1: the table counts the other way)
+    # errors of the table: tilt_deg (2,) and the settings of ``rate_table.random_errors``, by default from the
+    # accuracies of the table's configuration. And the mounting of the unit: mounting_deg (recording to a rotation
+    # vector, body frame), zero_deg (recording to the logged angle at the convention's angle 0), sense (-1: the table
+    # counts the other way)
     imperfections: dict[str, Any] = field(default_factory=dict)
-    # where held-out motion and long rest are recorded elsewhere: table, imperfections, accelerometer, gyroscope
+    # for held-out motion and long rest on another bench: table, imperfections, accelerometer, gyroscope
     held_out: dict[str, Any] = field(default_factory=dict)
     temperature: dict[str, Any] = field(default_factory=dict)  # ambient, warm_up, drift in degC, if not at random
-    copy_of: str | None = None  # the unit whose recordings these are once more, in another format or table_log
-    recordings: list[str] = field(default_factory=list)  # those of the procedure's that are made; empty: all
-    motion: int | None = None  # number of the random motion: units of one number and course move alike; None: its own
+    copy_of: str | None = None  # unit whose recordings are written again, in another format or table_log
+    recordings: list[str] = field(default_factory=list)  # recordings of the procedure to make; empty: all
+    motion: int | None = None  # seed of the random motion: units with one seed and course move equally; None: separate
     table_log: dict[str, Any] = field(default_factory=dict)  # attributes of ``TableLog``
 
     def __post_init__(self) -> None:
@@ -124,7 +124,7 @@ class UnitDescription:
 
 
 def course_of(unit: UnitDescription) -> Course:
-    """Return how the unit's procedure is run: as described, and fitted to its number of samples."""
+    """Return how the unit's procedure is run, with lengths that give its number of samples."""
     base = Course() if unit.procedure in TABLE_PROCEDURES else BY_HAND
     base = FACES_AND_TURNS if unit.procedure == FERRARIS else base
     wanted: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in unit.course.items()}
@@ -136,7 +136,7 @@ def course_of(unit: UnitDescription) -> Course:
 
 @dataclass(frozen=True)
 class Description:
-    """A campaign to be simulated; ``rows`` are further ones of ``units.csv``."""
+    """A campaign to simulate; ``rows``: further rows of ``units.csv``."""
 
     seed: int
     units: tuple[UnitDescription, ...]
@@ -145,12 +145,15 @@ class Description:
 
 
 def read_description(path: Path) -> Description:
-    """Read a ``simulation.yaml``; ``MissingInputError``: there is none, ``ConfigurationError``: a key is not known."""
+    """Read a ``simulation.yaml``.
+
+    Raises ``MissingInputError`` if there is none, ``ConfigurationError`` if a key is unknown.
+    """
     return description_from(_read_mapping(path), str(path))
 
 
 def description_from(data: dict[str, Any], origin: str) -> Description:
-    """Return the description that a mapping gives; ``origin`` is named in messages."""
+    """Return the description from a mapping; ``origin`` is named in messages."""
     _refuse_unknown(data, {"seed", "defaults", "units", "variants", "rows"}, origin)
     known = {f.name for f in fields(UnitDescription)}
     units = []
@@ -159,7 +162,7 @@ def description_from(data: dict[str, Any], origin: str) -> Description:
         _refuse_unknown(merged, known, f"{origin}: unit {entry.get('unit')}")
         if "unit" not in merged:
             raise ConfigurationError(f"{origin}: a unit has no name; give it one with the key unit")
-        units += _counted(merged)
+        units += _units_of_entry(merged)
     names = [u.unit for u in units]
     if not names or len(set(names)) < len(names):
         raise ConfigurationError(f"{origin}: there must be at least one unit, and each needs a name of its own")
@@ -182,7 +185,7 @@ def _read_mapping(path: Path) -> dict[str, Any]:
 
 
 def read_config(group: str, name: str) -> dict[str, Any]:
-    """Return ``read_option``; of a sensor, ``completed``. Each call returns a copy, which a caller may change."""
+    """Return ``read_option``, for a sensor ``completed``; each call returns a new copy."""
     return deepcopy(_config(group, name))
 
 
@@ -193,7 +196,7 @@ def _config(group: str, name: str) -> dict[str, Any]:
 
 
 def read_option(group: str, name: str) -> dict[str, Any]:
-    """Read one configuration of a group as its file states it; ``ConfigurationError``: there is none of that name."""
+    """Read one configuration file of a group; raise ``ConfigurationError`` if there is none of that name."""
     path = CONFIGS / group / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
@@ -201,8 +204,8 @@ def read_option(group: str, name: str) -> dict[str, Any]:
     return _read_mapping(path)
 
 
-def _counted(entry: dict[str, Any]) -> list[UnitDescription]:
-    """Return the units of an entry; with a count, its name is a prefix."""
+def _units_of_entry(entry: dict[str, Any]) -> list[UnitDescription]:
+    """Return the units of an entry; with a count, its name is the prefix of their names."""
     count = entry.get("count", 1)
     if count == 1:
         return [UnitDescription(**entry)]
@@ -219,9 +222,9 @@ def _refuse_unknown(data: dict[str, Any], known: set[str], origin: str) -> None:
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of what is recorded and how, to a parser with ``argument_default=argparse.SUPPRESS``.
+    """Add the options for the bench and the procedure to a parser with ``argument_default=argparse.SUPPRESS``.
 
-    ``simulate`` and ``plan`` share them, so that a planned procedure can be simulated with the same options.
+    ``simulate`` and ``plan`` share them: a planned procedure can be simulated with the same options.
     """
     add = parser.add_argument
     add("--sensor", metavar="NAME", help="configs/sensor (mpu6050)")
@@ -254,7 +257,7 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
 
 
 def described(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys of a unit of ``simulation.yaml`` that the parsed options give; other options are ignored."""
+    """Return the keys of a unit of ``simulation.yaml`` from the parsed options; other options are ignored."""
     procedure = arguments.get("procedure", "three_axis_turns")
     unit: dict[str, Any] = {"table": "acutronic" if procedure in TABLE_PROCEDURES else "hand"}
     unit |= {name: arguments[name] for name in RECORDED if name in arguments}

@@ -1,4 +1,4 @@
-"""What is recorded: the table's program of every recording of a procedure.
+"""Plan the recordings of a procedure: the program of the table, or the attitudes and moves by hand, for each.
 
 ``three_axis_turns`` and ``thermal_ramp`` (Sudsanguan 2019, chapter 4): about each axis, stop-and-go or continuous turns
 for the accelerometer, turns at one or several rates between rests for the gyroscope; then held-out random motion and a
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 ONE_RECORDING, FERRARIS = "one_recording", "ferraris"
-AGAIN = 0.1  # of a face's tilt, by which a rest on the same face differs
+AGAIN = 0.1  # of a face's tilt: difference between two rests on the same face
 TRANSIT = "transit"  # name and role of a move between recordings
 TRANSIT_RATE_DPS = 20.0  # as between stops
 LEAST_ANGLE_DEG = 1e-6  # below it nothing moves: rounding
@@ -100,8 +100,8 @@ class Course:
 def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy: float = 0.0) -> list[Planned]:
     """Return the recordings of a procedure, in the order in which they are made.
 
-    Without a table, attitudes are set with the standard deviation ``hand_accuracy``, deg. ``ConfigurationError``: there
-    is no such procedure.
+    Without a table, attitudes are set with the standard deviation ``hand_accuracy``, deg. Raises ``ConfigurationError``
+    if there is no such procedure.
     """
     if procedure in TABLE_PROCEDURES:
         planned = _turns(course) + _heldout(course, rng)
@@ -128,10 +128,10 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
 
 @cache
 def fit_to_samples(procedure: str, course: Course, samples: int, interval: float, *, keep_step: bool) -> Course:
-    """Return the course with dwells, rests and held-out motion of a length that gives about ``samples`` rows a unit.
+    """Scale the dwells, rests and held-out motion of a course so that a unit has about ``samples`` rows.
 
-    Unless ``keep_step``, a larger step of stop-and-go may be taken for a short recording. ``interval``: s.
-    ``ConfigurationError``: the procedure cannot be run in so few samples.
+    Unless ``keep_step``, a short recording may use a larger step of stop-and-go. ``interval``: s. Raises
+    ``ConfigurationError`` if the procedure cannot be run in so few samples.
     """
     target = samples * interval
 
@@ -194,7 +194,7 @@ def _static(course: Course) -> list[Planned]:
 
 
 def _rests(attitudes: Values, course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
-    """Return rests in the attitudes, set within ``accuracy`` deg, and the shortest move from each to the next."""
+    """Return rests in the attitudes, with a setting error of ``accuracy`` deg, and the shortest moves between them."""
     attitudes = attitudes @ rotation_by(accuracy * rng.standard_normal((len(attitudes), 3)))
     steps, axes = [rest(max(course.warm_up_rest_s, course.dwell_s))], []
     for before, after in pairwise(attitudes):
@@ -205,9 +205,9 @@ def _rests(attitudes: Values, course: Course, rng: np.random.Generator, accuracy
 
 
 def _with_transits(planned: Sequence[Planned], course: Course) -> list[Planned]:
-    """Return recordings with what lies between them: half a pause, the move to where the next begins, half a pause.
+    """Insert transits between recordings: half a pause, the move to the start of the next one, half a pause.
 
-    Held-out motion begins and ends at rest here, where a file of its own begins and ends within it.
+    Held-out motion begins and ends at rest here; in a separate file it begins and ends in motion.
     """
     planned = [replace(p, trajectory=p.trajectory.eased()) if isinstance(p.trajectory, Gimbals) else p for p in planned]
     out = [planned[0]]
@@ -223,7 +223,7 @@ def _with_transits(planned: Sequence[Planned], course: Course) -> list[Planned]:
 
 
 def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
-    """Return rests on six faces, then turns about each axis with its face up; a face and an axis keep their errors."""
+    """Return rests on six faces, then turns about each axis with its face up; with fixed errors of each."""
     positions, tilt = six_positions(), accuracy * rng.standard_normal((6, 3))
     off = np.radians(course.turn_axis_error_deg) * rng.standard_normal((3, 3)) * (1.0 - np.eye(3))
     acceleration, stay = course.acceleration_dps2, rest(course.dwell_s)

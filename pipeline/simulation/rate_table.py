@@ -1,4 +1,4 @@
-"""The errors with which a rate table follows its commanded program (``pipeline.io.commanded_motion.Program``).
+"""Simulate the errors of a rate table against its commanded program (``pipeline.io.commanded_motion.Program``).
 
 A turn is commanded to the angle ``phi(t)`` and reaches
 
@@ -10,7 +10,7 @@ about the axis ``u = (e + d) / |e + d|``, where
 C_k, D_k : commanded and true angle of stop k, deg: step quantisation, angle errors, lost steps (rate errors), backlash
 A, B     : encoder error (eccentricity), deg
 a, b     : rate ripple once a revolution: ``dtheta/dt = (1 + a cos phi + b sin phi) dphi/dt``, relative
-v(t)     : vibration while the table moves, ``V sin(2 pi f t)``, deg; with it goes a shaking of the plate, in g
+v(t)     : vibration while the table moves, ``V sin(2 pi f t)``, deg; it also accelerates the plate, in g
 d        : error of the axis direction, rad, across the nominal axis e
 
 The true rate and acceleration are the derivatives of theta(t), by the chain rule. The Mark 2 table (Sudsanguan 2019,
@@ -39,12 +39,12 @@ def rest(seconds: float) -> Step:
 
 
 def turn(angle: float, rate: float, acceleration: float) -> Step:
-    """Return a turn as a step: deg (signed), at most at a rate in deg/s, with ramps in deg/s^2."""
+    """Return a turn as a step of a program: angle in deg, signed; largest rate in deg/s; ramps in deg/s^2."""
     return {"turn_deg": angle, "rate_dps": rate, "acceleration_dps2": acceleration}
 
 
 def turn_with_plateau(angle: float, rate: float, acceleration: float) -> Step:
-    """Return a turn that passes ``angle`` at full ``rate``, with the ramps before and after."""
+    """Return a turn that covers ``angle`` at full ``rate``, plus the ramps before and after."""
     return turn(angle + float(np.sign(angle)) * rate**2 / acceleration, rate, acceleration)
 
 
@@ -55,7 +55,7 @@ class TurnErrors:
     encoder: Values = field(default_factory=lambda: np.zeros(2))  # A and B above, deg
     ripple: Values = field(default_factory=lambda: np.zeros(2))  # a and b above, relative
     stops: Values | None = None  # (moves + 1,), deg: angle error D_k - C_k of each stop of the program
-    backlash: float = 0.0  # deg by which the table lags behind, in the direction of the last move
+    backlash: float = 0.0  # lag of the angle in the direction of the last move, deg
     direction: Values = field(default_factory=lambda: np.zeros(2))  # d along the next two axes, cyclically, rad
     vibration: float = 0.0  # amplitude V, deg
     shaking: float = 0.0  # g, of the vibration along each body axis, 120 deg apart in phase
@@ -69,7 +69,7 @@ class TurnErrors:
         return unit
 
     def force(self, program: Program, time: Values) -> Values | None:
-        """Return the specific force of the shaking plate: (n, 3) array, g, or None where it is quiet."""
+        """Return the specific force of the plate's vibration: (n, 3) array, g, or None without vibration."""
         if not self.shaking:
             return None
         phase = 2.0 * np.pi * (self.vibration_frequency * time[:, None] + np.arange(3) / 3.0)
@@ -93,7 +93,7 @@ class TurnErrors:
         return angle, true_rate, true_acceleration
 
     def _stops(self, program: Program, phi: Values, move: Index) -> tuple[Values, Values]:
-        """Return the angle between its stops, and its slope in the commanded angle."""
+        """Return the angle interpolated between the true stops, and its derivative by the commanded angle."""
         if (self.stops is None and not self.backlash) or len(program.stops) < 2:
             return phi, np.ones_like(phi)
         error = np.zeros_like(program.stops) if self.stops is None else self.stops
@@ -114,11 +114,11 @@ class TurnErrors:
 
 
 def random_errors(program: Program, rng: np.random.Generator, settings: Mapping[str, Any], axis: int) -> TurnErrors:
-    """Return the errors of one recording about an axis of a table; those that ``settings`` leave out are zero.
+    """Draw the errors of one recording about an axis of a table.
 
-    They are ``angle_accuracy_deg`` (standard deviation of each stop), ``rate_error`` (3,) (share by which every move
-    falls short, negative, or goes too far), ``step_deg`` (of the motor), ``ripple`` (relative amplitude),
-    ``direction_deg`` (3, 2), ``vibration_deg``, ``shaking_g``, ``vibration_hz``.
+    ``settings``, each 0 by default: ``angle_accuracy_deg`` (standard deviation of each stop), ``rate_error`` (3,)
+    (relative error of every move), ``step_deg`` (of the motor), ``ripple`` (relative amplitude), ``direction_deg``
+    (3, 2), ``vibration_deg``, ``shaking_g``, ``vibration_hz``.
     """
     phase = rng.uniform(0.0, 2.0 * np.pi)
     travelled = np.cumsum(np.diff(program.stops) * settings.get("rate_error", np.zeros(3))[axis])

@@ -1,16 +1,16 @@
-"""A simulated sensor: its true motion in a recording, its readings, and how its parameters are drawn.
+"""Simulate a sensor: its true motion in a recording, its readings, and the random draw of its parameters.
 
     f = g up + [omega x (omega x r) + alpha x r] / 9.80665 + shaking,   omega_sensed = omega + level^T Omega_earth
 
 at the true time of the sensor's clock, ``t' = t + tau + epsilon t``, where
 
-up      : (3,) the true vertical in the body frame; in the table's own level frame it is tilted
+up      : (3,) the true vertical in the body frame; it may be tilted against the level frame of the table
 r       : (3,) position of the accelerometer from the turn axes, m, body frame
 tau     : time offset, s: the reading at t shows the motion at t + tau
 epsilon : relative error of the sensor's clock
 
-A lag is a first-order low pass of the true motion, ``y(t) = integral_0^inf exp(-s) u(t - lag s) ds``, by Gauss'
-rule on short panels: the corners of a ramp lie anywhere in the past, and no smooth rule would follow them.
+A lag is a first-order low pass of the true motion, ``y(t) = integral_0^inf exp(-s) u(t - lag s) ds``. It is integrated
+by Gauss' rule on short panels, because a rule for smooth functions would be inaccurate at the corners of ramps.
 
 Effects of place, mounting, table and timing use exact geometry instead of the linear columns that the estimation uses.
 Each of ``ALTERATIONS`` takes a scene and the parameters (in units of ``configs/effect``), and returns the scene
@@ -26,20 +26,20 @@ where
 
 c      : counts per g or deg/s
 white  : noise density * sqrt(1 / (2 dt)): the band up to Nyquist, unit of the sensor
-wander : standard deviation of the bias wander m, a Gauss-Markov process with correlation time T, which goes on between
-         the recordings of a session
+wander : standard deviation of the bias wander m, a Gauss-Markov process with correlation time T, which continues
+         between the recordings of a session
 S, n   : (3,) scale factors of the correction (body = matrix @ (reading - bias)), and non-orthogonality, rad
 R_m    : mounting, which takes body vectors to the sensor's axes: turns about x, then y, then z
 
-What a description leaves out is drawn: limits of the sensor file are taken for three standard deviations; the mounting
-lies within 1 deg (Sudsanguan 2019, chapter 3). A description may also hide an effect by a formula:
+Parameters that a description does not state are drawn: limits of the sensor file are three standard deviations; the
+mounting angles are within 1 deg (Sudsanguan 2019, chapter 3). A description may also hide an effect by a formula:
 
     effects:
       gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: [0.03, 0.03, 0.03]}
 
-The keys are those of an effect's file (``pipeline.model.effects.declaration``), of which only ``terms`` is needed, and
-``values``: of the parameters, one size, or nothing where there are ``limits``. It is not in the catalogue, so it is
-unknown to a diagnosis.
+The keys are the keys of an effect's file (``pipeline.model.effects.declaration``), of which only ``terms`` is required,
+and ``values``: the parameters' values, or one size; not needed where there are ``limits``. The effect is not in the
+catalogue of a diagnosis.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Scene:
     mounting: Values = field(default_factory=lambda: np.eye(3))  # columns: axes of the unit in the trajectory's body
 
     def motion(self, time: Values, temperature: Values | None = None) -> Motion:
-        """Return the motion that the sensor shows at times of the log: s since power-on, (n,) array."""
+        """Return the motion that the sensor reads at times of the log, (n,) array, s since power-on."""
         shown = time + self.offset + self.clock * time
         motion = self._without_lag(shown, temperature)
         if self.lag > 0.0:
@@ -157,7 +157,7 @@ def _added(field_name: str, factor: float = 1.0) -> Alteration:
 
 
 def _of_turn(field_name: str, shape: tuple[int, ...] = (3, 2)) -> Alteration:
-    """Return an effect that adds its parameters, one row an axis, to a field of the errors of a turn."""
+    """Return an effect that adds its parameters, one row for each axis, to a field of the errors of a turn."""
 
     def altered(scene: Scene, values: Values) -> Scene:
         turn = scene.trajectory
@@ -185,14 +185,14 @@ ALTERATIONS: dict[str, Alteration] = {
 
 
 def alter(scene: Scene, effects: Mapping[str, Values]) -> Scene:
-    """Return the scene with those of the effects in it that are not the sensor's own."""
+    """Apply to a scene the effects that change the motion (``ALTERATIONS``)."""
     for name in [name for name in effects if name in ALTERATIONS]:
         scene = ALTERATIONS[name](scene, effects[name])
     return scene
 
 
 KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
-NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # instead of those of the sensor file
+NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # they replace figures of the sensor file
 POSITIVE = {"time_constant", "tau"}  # parameters without a sign
 
 
@@ -204,7 +204,7 @@ class SimulatedSensor:
     sensor_config: Mapping[str, Any]  # its section of the configuration: full scale, counts, noise
     bias: Values  # (3,), g or deg/s
     matrix: Values  # (3, 3), of a perfect calibration: body = matrix @ (reading - bias - effects)
-    effects: Hidden = field(default_factory=dict)  # those on the reading
+    effects: Hidden = field(default_factory=dict)  # effects on the reading
 
     def exact(self, motion: Motion) -> Values:
         """Return the reading without noise and quantisation: (n, 3) array."""
@@ -219,7 +219,7 @@ class SimulatedSensor:
         return float(self.sensor_config["noise_density"]) * float(np.sqrt(0.5 / interval))
 
     def quantised(self, reading: Values) -> Values:
-        """Return the reading in whole counts, at most at full scale: (n, 3) array, g or deg/s."""
+        """Round the reading to whole counts and clip it at full scale: (n, 3) array, g or deg/s."""
         counts = np.round(reading * self.sensor_config["counts_per_unit"])
         top = self.sensor_config["full_scale"] * self.sensor_config["counts_per_unit"]
         kept: Values = np.clip(counts, -top, top - 1.0) / self.sensor_config["counts_per_unit"]
@@ -227,14 +227,14 @@ class SimulatedSensor:
 
 
 def decimals_of(sensor_config: Mapping[str, Any]) -> int:
-    """Return the decimals that keep a printed reading within a tenth of a count."""
+    """Return the number of decimals that prints a reading to a tenth of a count."""
     return int(np.ceil(np.log10(sensor_config["counts_per_unit"]))) + 1
 
 
 def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.Generator) -> list[Values]:
-    """Return a stationary Gauss-Markov process of unit variance for three axes: (n, 3) array of each recording.
+    """Draw a stationary Gauss-Markov process of unit variance for three axes: (n, 3) array for each recording.
 
-    ``sessions``: (n,) sample times of one recording after the other, s, each evenly sampled.
+    ``sessions``: (n,) sample times of successive recordings, s, each evenly sampled.
     """
     from scipy.signal import lfilter  # noqa: PLC0415  (0.3 s, needed where readings are made alone)
 
@@ -257,9 +257,9 @@ def drawn_sensors(
     effects: Mapping[str, Hidden],
     rng: np.random.Generator,
 ) -> dict[str, SimulatedSensor]:
-    """Return accelerometer and gyroscope of a unit, from the section of the configuration and the description of each.
+    """Return accelerometer and gyroscope of a unit, from the configuration and the description of each.
 
-    ``ConfigurationError``: a key of the description is not known.
+    Raises ``ConfigurationError`` if a key of the description is unknown.
     """
     mounting = rng.uniform(-1.0, 1.0, 3)
     out = {}
@@ -272,11 +272,11 @@ def drawn_sensors(
             **sensor_configs[sensor],
             **{key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])},
         }
-        own = {name: hidden for name, hidden in effects[sensor].items() if name not in ALTERATIONS}
+        of_sensor = {name: hidden for name, hidden in effects[sensor].items() if name not in ALTERATIONS}
         drawn = _limited(sensor_config["bias"], rng)
         bias = np.array(given[sensor].get("bias", drawn), float)
         out[sensor] = SimulatedSensor(
-            sensor, sensor_config, bias, _matrix(sensor_config, given[sensor], mounting, rng), own
+            sensor, sensor_config, bias, _matrix(sensor_config, given[sensor], mounting, rng), of_sensor
         )
     return out
 
@@ -300,7 +300,7 @@ def _matrix(
 
 
 def _limited(limit: float, rng: np.random.Generator) -> Values:
-    """Return three normal numbers with the limit at three standard deviations, cut there."""
+    """Draw three normal numbers with the limit at three standard deviations, clipped at the limit."""
     return np.clip(rng.standard_normal(3) * limit / 3.0, -limit, limit)
 
 
@@ -309,7 +309,7 @@ def drawn_effects(
 ) -> dict[str, Hidden]:
     """Return the effects that a description's ``effects`` hide in each sensor.
 
-    ``ConfigurationError``: there is no such effect, it does not apply, its formula or the number of values is wrong.
+    Raises ``ConfigurationError`` if an effect does not exist or apply, or its formula or number of values is wrong.
     """
     out: dict[str, Hidden] = {sensor: {} for sensor in SENSORS}
     for key, value in specification.items():

@@ -1,9 +1,9 @@
-"""A session: one unit goes through all recordings of its procedure, on one clock since power-on, with the table's log.
+"""Simulate a session: all recordings of one unit's procedure, on one clock since power-on, with the table's log.
 
-Every stream of random numbers has its own generator, ``default_rng([seed, unit, stream])``, so that a change in one
-(say, lost samples) leaves the others as they are.
+Every stream of random numbers has a separate generator, ``default_rng([seed, unit, stream])``, so that a change in one
+(say, lost samples) does not change the others.
 
-The table's log stands in the sensor's rows, in a file with a clock of its own, or is only the commanded program.
+The table's log is in the sensor's rows, in a file with a separate clock, or only the commanded program is known.
 
     tau = t + d + k t
 
@@ -12,8 +12,8 @@ where
 t, tau : the sensor's and the table's clock, s
 d, k   : offset and drift of the table's clock, s and 1
 
-A file has the sampling interval of the table's computer. For a table without encoders only the program is known: it is
-written as a procedure of its own.
+A file has the sampling interval of the table's computer. For a table without encoders the program is written as a
+separate procedure.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ if TYPE_CHECKING:
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 NANOSECONDS = 1_000_000_000  # in a second
-ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: far below any noise
+ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: rounding far below any noise
 
 
 class Streams:
-    """The random numbers of one unit, a generator for each purpose."""
+    """The generators of random numbers for one unit, one for each stream."""
 
     def __init__(self, seed: int, unit: int) -> None:
         self._key = (seed, unit)
@@ -110,7 +110,7 @@ def random_environment(rng: np.random.Generator, *, ramp: float = 0.0, ramp_peri
 
 @dataclass(frozen=True)
 class Bench:
-    """Where a recording is made: table, what it does otherwise than commanded, and the sensors as mounted there."""
+    """Where a recording is made: the table, its errors, and the sensors as mounted on it."""
 
     table: Mapping[str, Any]
     imperfections: Mapping[str, Any]
@@ -127,10 +127,10 @@ def record(
     pause: float,
     streams: Streams,
 ) -> list[Recording]:
-    """Make the recordings of a unit, of which the sampling interval and the share of lost samples count.
+    """Simulate the recordings of a unit with its sampling interval and share of lost samples.
 
-    ``benches``: role to bench, ``""`` for all roles that are not named; ``effects``: sensor to its effects, of which
-    those of mounting, table and timing change the motion; ``pause``: s, between the recordings and before the first.
+    ``benches``: role to bench, ``""`` for all other roles; ``effects``: sensor to its effects, of which effects of
+    mounting, table and timing change the motion; ``pause``: s, between the recordings and before the first.
     """
     times = _times(planned, unit.interval_s, pause)
     seconds = [t / NANOSECONDS for t in times]
@@ -194,7 +194,7 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
 
 
 def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:
-    """Return what the table logs: the commanded motion."""
+    """Return the table's log of the commanded motion."""
     trajectory = plan.trajectory
     if bench.table["motion"] == "none":
         return {}
@@ -212,31 +212,31 @@ def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:
 
 
 def received(count: int, lost: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return which samples the radio link delivers, all but a share of ``lost``; the first and the last always."""
+    """Draw which samples the radio link delivers: all but a share ``lost``; always the first and the last."""
     kept = rng.random(count) >= lost
     kept[[0, -1]] = True
     return kept
 
 
 def _rounded(values: Values, decimals: int) -> Values:
-    """Return what a reader of the printed values finds."""
+    """Round values as their printed form is read."""
     rounded: Values = np.rint(values * 10.0**decimals) / 10.0**decimals
     return rounded
 
 
-MARGIN_S = 2.0  # by which a log of its own begins earlier and ends later than the recording
-LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a clock at random: the drift is a standard deviation, that of a quartz
+MARGIN_S = 2.0  # by which a separate log begins earlier and ends later than the recording
+LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a random clock; the drift is the standard deviation of quartz clocks
 NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
-INGEST = "table_log"  # configs/ingest that reads a log of its own
+INGEST = "table_log"  # configs/ingest that reads a separate log
 COMMENT = "# The table has no encoders: its program instead of its log. Written by python -m pipeline simulate.\n"
 
 
 def with_table_log(
     unit: UnitDescription, planned: Sequence[Planned], recordings: list[Recording], rng: np.random.Generator
 ) -> tuple[list[Recording], dict[str, float] | None]:
-    """Return recordings as they are laid out, and the clock of a table's log of its own.
+    """Arrange recordings and the table's log as the unit's ``TableLog`` states; return the clock of a separate log.
 
-    Logs of their own follow the recordings, each named after the one that it belongs to.
+    Separate logs follow the recordings, each with the name of its recording.
     """
     log = unit.log
     starts = [float(r.time[0]) for r in recordings]
@@ -253,13 +253,13 @@ def with_table_log(
     offset = float(offset if log.offset_s is None else log.offset_s)
     drift = 1e-6 * float(ppm if log.drift_ppm is None else log.drift_ppm)
     logs = []
-    for recording, own, begins in groups:
-        last = begins[-1] + own[-1].trajectory.duration
-        begin, end = (t + offset + drift * t for t in (begins[0] - MARGIN_S, last + MARGIN_S))
+    for recording, plans, plan_starts in groups:
+        last = plan_starts[-1] + plans[-1].trajectory.duration
+        begin, end = (t + offset + drift * t for t in (plan_starts[0] - MARGIN_S, last + MARGIN_S))
         tau: Values = begin + log.interval_s * np.arange(int((end - begin) / log.interval_s), dtype=float)
-        channels: dict[str, Any] = _logged(own, begins, (tau - offset) / (1.0 + drift), wrapped=log.wrapped)
-        if unit.procedure != ONE_RECORDING:  # of a turn the encoder, else the attitude
-            turn = isinstance(own[0].trajectory, Turn)
+        channels: dict[str, Any] = _logged(plans, plan_starts, (tau - offset) / (1.0 + drift), wrapped=log.wrapped)
+        if unit.procedure != ONE_RECORDING:  # a turn has the encoder, other motion the attitude
+            turn = isinstance(plans[0].trajectory, Turn)
             known = ("table_angle", "table_rate") if turn else ("table_attitude",)
             channels = {name: channels[name] for name in known}
         time_ns = np.rint(tau * NANOSECONDS).astype(np.int64)
@@ -275,7 +275,7 @@ def _wrapped(recording: Recording) -> Recording:
 def _joined(
     recordings: Sequence[Recording], planned: Sequence[Planned], starts: Sequence[float], *, wrapped: bool
 ) -> Recording:
-    """Return recordings that follow each other as one, with the table's angle, rate and attitude throughout."""
+    """Join successive recordings to one, with the table's angle, rate and attitude throughout."""
     blocks: dict[str, Any] = {
         name: np.concatenate([getattr(r, name) for r in recordings])
         for name in ("time_ns", "accelerometer", "gyroscope", "temperature")
@@ -304,13 +304,13 @@ def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values, *
 
 
 def as_program(program: Program) -> list[dict[str, Any]]:
-    """Return a table's program as the steps of a procedure's ``program``, repeated ones together."""
+    """Return a table's program as the steps of a procedure's ``program``, with repeated pairs folded."""
     steps = [{key: round(float(value), 9) for key, value in step.items()} for step in program.steps]
     return _folded([step for step in steps if step.get("rest_s") != 0.0])
 
 
 def _folded(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return steps with a pair that repeats itself written once."""
+    """Replace repetitions of a pair of steps by one pair with its count."""
     out: list[dict[str, Any]] = []
     i = 0
     while i < len(steps):
@@ -327,14 +327,14 @@ def _folded(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def columns_of(unit: UnitDescription) -> dict[str, str]:
-    """Return the columns of ``units.csv`` that the layout asks for."""
+    """Return the columns of ``units.csv`` that the unit's table log requires."""
     return {FILE: {"ingest": INGEST}, PROGRAM: {"procedure": f"{unit.procedure}_commanded"}}.get(unit.log.kind, {})
 
 
 def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
-    """Return the procedures of tables that log nothing, each with its program: name to YAML.
+    """Return the procedures of tables without a log, each with its program: name to YAML.
 
-    ``ConfigurationError``: units of one procedure follow different programs.
+    Raises ``ConfigurationError`` if units of one procedure have different programs.
     """
     found: dict[str, str] = {}
     for unit in units:

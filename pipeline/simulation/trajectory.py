@@ -1,6 +1,6 @@
-"""Attitude of the body over time: turns about one axis, rests with moves between them, motion of three gimbals.
+"""Compute the attitude of the body over time: turns about one axis, rests and moves, motion of three gimbals.
 
-Everything is evaluated analytically, at any time. A turn by A about the unit axis u has
+All quantities are evaluated analytically, at any time. A turn by A about the unit axis u has
 
     level = level_0 R_u(A),   omega = u dA/dt,   alpha = u d2A/dt2
 
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 
-SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])  # 42 deg of the middle gimbal: all attitudes evenly (``random_gimbals``)
-PERIOD_S = 40.0  # longest period of the sinusoids before the speed is chosen; its value cancels
+SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])  # 42 deg of the middle gimbal: uniform attitudes (``random_gimbals``)
+PERIOD_S = 40.0  # longest period of the sinusoids before the speed is scaled; its value cancels
 SINUSOIDS = 4  # for each gimbal
-COMES_UP_S = 5.0  # for a table to start from rest, see ``Eased``
+COMES_UP_S = 5.0  # time in which a table starts from rest, see ``Eased``
 
 
 class Pose(NamedTuple):
@@ -46,7 +46,7 @@ class Pose(NamedTuple):
     angle: Values | None = None  # (n,), deg, about the turn axis
     rate: Values | None = None  # (n,), deg/s
     direction: Values | None = None  # (n, 3), unit vector of the present or, at rest, the last turn; zeros before
-    force: Values | None = None  # (n, 3), g, body frame: of a shaking plate, in addition to gravity
+    force: Values | None = None  # (n, 3), g, body frame: of the plate's vibration, in addition to gravity
 
 
 def mounted(pose: Pose, rotation: Values) -> Pose:
@@ -69,7 +69,7 @@ def rotation_by(vector_deg: Values) -> Values:
 
 @dataclass(frozen=True)
 class Turn:
-    """Turns about one body axis, as commanded by a program, with the table's errors."""
+    """Turns about one body axis by a commanded program, with the table's errors."""
 
     axis: int
     program: Program
@@ -94,7 +94,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Moves:
-    """Rests in several attitudes and moves between them, each a turn about an axis of its own."""
+    """Rests in several attitudes and moves between them, each a turn about its axis."""
 
     program: Program  # move k turns from stops[k] to stops[k + 1]
     axes: Values  # (m, 3), unit axis of each move, body frame
@@ -125,7 +125,7 @@ class Moves:
 
 @dataclass(frozen=True)
 class Gimbals:
-    """Random motion of a three-axis table: each gimbal angle a steady turn plus a sum of m sinusoids."""
+    """Random motion of a three-axis table: each gimbal angle is a steady turn plus a sum of m sinusoids."""
 
     drift: Values  # (3,), deg/s, steady rates of the gimbals about x (inner), y, z (outer)
     amplitude: Values  # (3, m), deg
@@ -174,16 +174,16 @@ class Gimbals:
         return Pose(attitude_matrix(self.quaternion(time)), np.degrees(omega), np.degrees(alpha))
 
     def eased(self) -> Eased:
-        """Return the same motion that begins and ends at rest; it is longer by that."""
+        """Return the same motion with a start and an end at rest; it is longer."""
         duration = max(self.duration, COMES_UP_S) + COMES_UP_S
         return Eased(self.drift, self.amplitude, self.frequency, self.phase, duration)
 
 
 @dataclass(frozen=True)
 class Eased(Gimbals):
-    """Motion of a table that begins and ends at rest: its path is run through at the time s(t).
+    """Motion of a table that begins and ends at rest: the motion of ``Gimbals`` at the time s(t).
 
-    While it begins, ``s(t) = T u^4 (5/2 - 3 u + u^2)``, ``u = t / T``, with ``T = COMES_UP_S``; while it ends, likewise
+    At the start, ``s(t) = T u^4 (5/2 - 3 u + u^2)``, ``u = t / T``, with ``T = COMES_UP_S``; at the end, the same
     backwards.
     """
 
@@ -212,7 +212,7 @@ def _growth(u: Values) -> Values:
 
 @dataclass(frozen=True)
 class Planned:
-    """One recording to be made: its name, role, turn axis (index or None) and trajectory."""
+    """One recording to simulate: its name, role, turn axis (index or None) and trajectory."""
 
     name: str
     role: str
@@ -221,10 +221,11 @@ class Planned:
 
 
 def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) -> Gimbals:
-    """Return a random motion whose |angular rate| peaks at ``peak_rate`` (deg/s).
+    """Draw a random motion whose |angular rate| has the maximum ``peak_rate`` (deg/s).
 
-    The inner gimbal turns on and the middle one swings by 42 deg rms, so that the mean squares of the three components
-    of the vertical are equal: the attitudes cover the sphere evenly. The speed along the path is chosen for the peak.
+    The inner gimbal turns steadily and the middle one swings by 42 deg rms. Then the mean squares of the three
+    components of the vertical are equal: the attitudes cover the sphere evenly. The speed is scaled to the maximum
+    rate.
     """
     frequency = np.exp(rng.uniform(0.0, np.log(3.0), (3, SINUSOIDS))) / PERIOD_S
     weight = rng.uniform(0.5, 1.0, (3, SINUSOIDS))
@@ -237,7 +238,7 @@ def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) 
         return Gimbals(drift * speed, amplitude, frequency * speed, phase, duration)
 
     time = np.linspace(0.0, duration, max(50, int(2.0 * duration)))
-    low, high = 1e-3, 1e3  # a faster run shows more of the path, so its peak grows with the speed, if not in proportion
+    low, high = 1e-3, 1e3  # a faster motion covers more of the path: its maximum grows with the speed
     for _ in range(24):
         middle = float(np.sqrt(low * high))
         peak = np.linalg.norm(at_speed(middle).pose(time).omega, axis=1).max()
@@ -248,7 +249,8 @@ def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) 
 def axis_and_angle(rotation: Values) -> tuple[Values, float]:
     """Return the unit axis and the angle in deg, 0 to 180, of a rotation matrix.
 
-    The quaternion is the eigenvector of Bar-Itzhack's matrix for its largest eigenvalue; it is good at 180 deg too.
+    The quaternion is the eigenvector of Bar-Itzhack's matrix for its largest eigenvalue; it is accurate also at 180
+    deg.
     """
     d, off = rotation, np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]])
     skew = off - np.array([d[1, 2], d[2, 0], d[0, 1]])
