@@ -1,4 +1,4 @@
-"""The blind study: how often the diagnosis names what is hidden in simulated units.
+"""The blind study: measure how often the diagnosis finds the effects that are hidden in simulated units.
 
-A case is drawn, simulated and diagnosed in memory; its truth goes to a file that the diagnosis never reads.
+A case is drawn, simulated and diagnosed in memory. Its truth is written to a file that the diagnosis never reads.
 """

@@ -1,12 +1,12 @@
-"""Recordings of a case, simulated with exact geometry, with noise and physics that the diagnosis does not model.
+"""Simulate the recordings of a case, with exact geometry, and with noise and physics that the diagnosis does not model.
 
-Further noise continues over all recordings of a unit, at the time t:
+Additional noise continues over all recordings of a unit:
 
     ar_06, ar_09 : first-order autoregression with that coefficient, of the white noise's standard deviation
     random_walk  : sigma_b sqrt(t / T), the sensor file's wander sigma_b per its correlation time T
     one_over_f   : amplitudes of a spectrum 1/f, scaled to three times the sensor file's wander
 
-and physics in another functional form than the catalogue's, with its own size and sign on each axis:
+and physics in a functional form that is not in the catalogue, with a separate size and sign on each axis:
 
     gear_mesh        : A cos(5 angle)
     temperature_step : A (1 + tanh((x - 1/2) / 0.04)) / 2
@@ -14,21 +14,22 @@ and physics in another functional form than the catalogue's, with its own size a
     exponential      : A (exp(3 x) - 1) / (exp(3) - 1)
     band             : A where 4 < |omega| < 7 deg/s
 
-where x is the true temperature from the coldest sample of the unit, 0, to the warmest, 1, and A is ``AMPLITUDE``.
+where x is the true temperature, scaled from 0 at the coldest sample of the unit to 1 at the warmest, and A is
+``AMPLITUDE``.
 
-The signal of a hidden effect over the noise is
+The signal-to-noise ratio of a hidden effect is
 
     lambda = sum over axes of s^T C^-1 (s - P s)
 
 where
 
-    s : what the effect adds to an axis' readings: the unit with it minus the same unit, and the same noise, without it
+    s : the signal of the effect in an axis: readings of the unit minus readings without the effect, at the same noise
     C : covariance of the true white noise and bias wander (``pipeline.estimation.gauss_markov``)
-    P : the projection, in the metric C^-1, onto bias, truth and what each other hidden effect adds
+    P : the projection, in the metric C^-1, onto bias, truth and the signals of the other hidden effects
 
-A test with known noise and equation gains lambda in 2 log L on average, against the k log N + 10 (40 to 100) that a
-selection asks of k parameters. The rounding to whole counts differs between the two units and adds c^2 / 6 a sample on
-average, where c is one count; this is subtracted.
+A test with known noise and equation gains lambda in 2 log L on average. A selection of k parameters needs a gain of
+k log N + 10 (40 to 100). The rounding to whole counts differs between the two simulations and adds c^2 / 6 per sample
+on average, where c is one count; this is subtracted.
 """
 
 from __future__ import annotations
@@ -67,9 +68,9 @@ GAUSS_MARKOV = ("normal", "wander")  # families of noise for which lambda is kno
 
 
 def recordings_of(case: Case) -> list[Recording]:
-    """Return the recordings of a case; nothing in them tells what is hidden."""
+    """Return the recordings of a case, without its truth."""
     sensor_configs = read_config("sensor", case.model)
-    own = {
+    noise_settings = {
         sensor: {
             "bias_wander": case.wander * sensor_configs[sensor]["bias_wander"],
             "noise_density": 0.0 if case.noise in OF_WHITE else sensor_configs[sensor]["noise_density"],
@@ -81,11 +82,11 @@ def recordings_of(case: Case) -> list[Recording]:
         sensor=case.model,
         course=COURSES["stop_and_go" if case.procedure == "at_rest" else case.procedure],
         lost=0.1 if case.noise == "lost" else 0.0,
-        accelerometer=own["accelerometer"],
-        gyroscope=own["gyroscope"],
+        accelerometer=noise_settings["accelerometer"],
+        gyroscope=noise_settings["gyroscope"],
         effects={f"{case.sensor}.{name}": values for name, values in case.hidden.items()},
         temperature={} if case.room_degc is None else {"drift": case.room_degc},
-        imperfections=PERFECT,  # a table's own accuracy would be an effect that the study does not know of
+        imperfections=PERFECT,  # errors of the table would be effects that are not in the truth of the case
     )
     recordings, _ = simulate_unit(unit, case.seed, case.number)
     if case.procedure == "at_rest":
@@ -103,7 +104,7 @@ def recordings_of(case: Case) -> list[Recording]:
 
 
 def _at_rest(recording: Recording) -> Recording:
-    """Return the samples at which a table stands still; of held-out motion, all."""
+    """Return the samples at which the table does not move; all samples of held-out motion."""
     if recording.table_angle is None or recording.table_rate is None:
         return recording
     return recording.select((recording.table_rate == 0.0) & (np.diff(recording.table_angle, prepend=0.0) == 0.0))
@@ -112,7 +113,7 @@ def _at_rest(recording: Recording) -> Recording:
 def _with_noise(
     recordings: list[Recording], sensor: str, noise: str, sensor_config: dict[str, Any], rng: np.random.Generator
 ) -> list[Recording]:
-    """Add noise of a family other than the simulator's to one sensor, over all recordings of the unit."""
+    """Add noise that the simulator does not have to one sensor, continuous over all recordings of the unit."""
     first = min(float(r.time[0]) for r in recordings)
     last = max(float(r.time[-1]) for r in recordings)
     count = int((last - first) / INTERVAL_S) + 2
@@ -152,13 +153,13 @@ def _one_over_f(count: int, rng: np.random.Generator) -> Values:
 
 
 def _with_shape(recordings: list[Recording], case: Case) -> list[Recording]:
-    """Add physics in another functional form than the catalogue's."""
+    """Add physics in a functional form that is not in the catalogue."""
     if case.shape in OF_TEMPERATURE:
         room = random_environment(Streams(case.seed, case.number)["room"])
         room = room if case.room_degc is None else replace(room, drift=case.room_degc)
-        warmth = [room.temperature(r.time) for r in recordings]
-        low, high = min(float(w.min()) for w in warmth), max(float(w.max()) for w in warmth)
-        signals = [_of_temperature(case.shape, (w - low) / (high - low)) for w in warmth]
+        temperatures = [room.temperature(r.time) for r in recordings]
+        low, high = min(float(w.min()) for w in temperatures), max(float(w.max()) for w in temperatures)
+        signals = [_of_temperature(case.shape, (w - low) / (high - low)) for w in temperatures]
     else:
         signals = [_of_motion(case.shape, r) for r in recordings]
     size = AMPLITUDE[case.shape][case.sensor] * np.array(case.amplitude)
@@ -190,7 +191,7 @@ def _added(recording: Recording, sensor: str, values: Values) -> Recording:
 
 
 def signals_left(case: Case) -> dict[str, float]:
-    """Return lambda of each hidden effect; nothing where the noise is of another family."""
+    """Return lambda of each hidden effect; empty where the true noise is not white noise and Gauss-Markov wander."""
     if not case.hidden or case.noise not in GAUSS_MARKOV:
         return {}
     recordings = _used(case)
@@ -214,19 +215,20 @@ def signals_left(case: Case) -> dict[str, float]:
     rounding = 3 * n / (6.0 * sensor_config["counts_per_unit"] ** 2 * white**2)
     found = {}
     for k, name in enumerate(case.hidden):
-        left = 0.0
+        residual = 0.0
         for axis in range(3):
-            own = 4 + 3 * k + axis
-            others = [*range(4), *(c for c in range(4 + axis, len(size), 3) if c != own)]
-            left += _beside(products, own, others)
-        found[name] = max(0.0, left - rounding)
+            column = 4 + 3 * k + axis
+            others = [*range(4), *(c for c in range(4 + axis, len(size), 3) if c != column)]
+            residual += _squared_residual(products, column, others)
+        found[name] = max(0.0, residual - rounding)
     return found
 
 
 def at_detection(case: Case) -> Case:
-    """Return a case of a family ``limit`` with its effect at a share of the detection size: lambda is that of a gate.
+    """Scale the effect of a case of the families ``limit`` to the stated share of its detection size.
 
-    lambda grows as the square of the size, but for a time constant, which stays as it is.
+    At the detection size, lambda is the threshold of the selection. lambda grows as the square of the size; a time
+    constant is not scaled. Cases of other families are returned unchanged.
     """
     if case.kind != "limit":
         return case
@@ -238,16 +240,16 @@ def at_detection(case: Case) -> Case:
     return replace(case, hidden={name: np.where(kept, values, share * np.array(values)).tolist()})
 
 
-def _beside(products: Values, own: int, others: list[int]) -> float:
-    """Return the square of a column that the projection onto the others leaves, from the products of all columns."""
-    cross, inner = products[others, own], products[np.ix_(others, others)]
+def _squared_residual(products: Values, column: int, others: list[int]) -> float:
+    """Return the squared norm of a column minus its projection onto others, from the products of all columns."""
+    cross, inner = products[others, column], products[np.ix_(others, others)]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
     inverse = np.linalg.pinv(inner * np.outer(scale, scale), rcond=1e-12, hermitian=True)
-    return float(products[own, own] - (scale * cross) @ inverse @ (scale * cross))
+    return float(products[column, column] - (scale * cross) @ inverse @ (scale * cross))
 
 
 def _used(case: Case) -> list[Recording]:
-    """Return the recordings that a fit uses, in the order of time."""
+    """Return the recordings that a fit uses, in order of time."""
     return sorted((r for r in recordings_of(case) if r.role in SENSORS), key=lambda r: int(r.time_ns[0]))
 
 

@@ -1,24 +1,24 @@
-"""The cases of a study: which effects of which size a unit hides, and how it is recorded.
+"""Draw the cases of a study: the hidden effects of a unit with their sizes, and how the unit is recorded.
 
-Every case follows from its family, number and the study's seed. Families:
+The family, the number and the study's seed determine a case. Families:
 
     single, small, tiny  one observable effect at the sensor file's size, x0.3, x0.1
     pairs, pairs_wander  two of them; with five times the bias wander
     triples              three
     null_<noise>         nothing; both sensors are judged
     unseen               an effect that the procedure cannot show
-    removed              one effect, which the catalogue is then left without
+    removed              one effect, which is then removed from the catalogue
     one_axis             an effect on one axis only
-    shape_<shape>        physics in another functional form than the catalogue's
+    shape_<shape>        physics in a functional form that is not in the catalogue
     lost, coarse, cold   one effect; a tenth of the samples lost, temperature in steps of 0.5 degC, no temperature
-    cycle_<shape>        a form of the temperature's, in a room that warms and cools by some degrees
+    cycle_<shape>        such a function of temperature, in a room that warms and cools by some degrees
     staged               one effect, in a unit whose base is calibrated stage by stage
     limit_<percent>      one effect at 30, 60 or 100 % of its detection size (``pipeline.study.bench.at_detection``)
 
-Effects have the size of the data sheet. Sizes of the MPU-6050 are those of the MPU-6000/6050 product specification 3.4,
-of the STIM300 those of its data sheet TS1524 and of the STIM210's gyroscopes, where they state them; the others, like
-the shares and rates below, are assumptions. One number is for all parameters, with random signs. A lag is at least the
-shortest of the register map.
+Effects have the size that the data sheet states: for the MPU-6050 the MPU-6000/6050 product specification 3.4, for the
+STIM300 its data sheet TS1524 and that of the STIM210's gyroscopes. Other sizes, like the shares and rates below, are
+assumptions. One number stands for all parameters, with random signs. A lag is at least the shortest of the register
+map.
 """
 
 from __future__ import annotations
@@ -61,35 +61,35 @@ CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 
 @dataclass(frozen=True)
 class Case:
-    """One unit of a study: its truth."""
+    """The truth of one unit of a study."""
 
     family: str
     number: int
     seed: int
     model: str
-    sensor: str  # the one in which something is hidden
+    sensor: str  # the sensor with the hidden effects
     procedure: str
     hidden: dict[str, list[float]] = field(default_factory=dict)  # effects and their parameters
-    wander: float = 1.0  # bias wander over that of the sensor file
+    wander: float = 1.0  # bias wander, relative to the sensor file
     noise: str = "normal"
-    left_out: tuple[str, ...] = ()  # effects that the catalogue is left without
+    left_out: tuple[str, ...] = ()  # effects that are removed from the catalogue
     shape: str = ""  # of physics that is not in the catalogue
-    amplitude: tuple[float, ...] = ()  # of that physics on each axis, over ``bench.AMPLITUDE``
-    room_degc: float | None = None  # swing of the room's temperature, where it is not the usual one
+    amplitude: tuple[float, ...] = ()  # of that physics on each axis, relative to ``bench.AMPLITUDE``
+    room_degc: float | None = None  # swing of the room's temperature; None: the simulator's
     method: str = REFERENCE  # by which the base is calibrated
 
     @property
     def key(self) -> str:
-        """What identifies it in a study's files."""
+        """The identifier of the case in a study's files."""
         return f"{self.family}-{self.number:05d}"
 
     @property
     def kind(self) -> str:
-        """The first word of its family."""
+        """The first word of the family."""
         return self.family.partition("_")[0]
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON holds it."""
+        """Return the case as a JSON document."""
         return {"key": self.key, **asdict(self)}
 
 
@@ -140,7 +140,7 @@ def _names(kind: str, model: str, sensor: str, procedure: str, rng: np.random.Ge
 
 
 def _on_one_axis(sensor: str, name: str, values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the parameters of one axis, the others zero; per-axis parameters are named ``.._x`` or ``.._x?``."""
+    """Set the parameters to zero on all axes but one; per-axis parameters are named ``.._x`` or ``.._x?``."""
     each = values.reshape(3, -1).copy()
     each[np.arange(3) != rng.integers(3)] = 0.0
     found: np.ndarray = each.ravel() if len(values) == len(effect(name).parameters(sensor)) else values
@@ -148,7 +148,7 @@ def _on_one_axis(sensor: str, name: str, values: np.ndarray, rng: np.random.Gene
 
 
 def _unseen(number: int, seed: int, rng: np.random.Generator) -> Case:
-    """Draw an effect that the procedure cannot show: in one direction, of the table to a gyroscope, at rest."""
+    """Draw an effect that is not observable: in turns in one direction, of the table to a gyroscope, or at rest."""
     cells = [("one_way", "gyroscope", name) for name in sorted(ONE_WAY["gyroscope"])]
     cells += [(way, "gyroscope", name) for way in ("stop_and_go", "one_way") for name in UNSEEN_GYROSCOPE]
     cells += [("at_rest", "accelerometer", name) for name in AT_REST]
@@ -232,14 +232,14 @@ SIZES: dict[str, dict[str, dict[str, float | tuple[float, ...]]]] = {
     },
 }
 
-# Cells in which a procedure shows nothing, or less than a detection takes (the theory of each: the effect's own page).
+# Effects that a procedure does not show, or shows by less than a detection needs (theory: the page of the effect).
 UNSEEN_GYROSCOPE = ("table_tilt", "table_backlash", "table_axis_nonorthogonality")
-SAME_GYROSCOPE = ("table_encoder_error",)  # to a gyroscope the derivative of an angle's error is a ripple of the rate
+SAME_GYROSCOPE = ("table_encoder_error",)  # in a gyroscope its derivative equals a ripple of the rate
 ONE_WAY = {
     "accelerometer": {"vibration_rectification", "rate_dependence", "table_backlash"},
     "gyroscope": {"scale_factor_asymmetry", "vibration_rectification"},
 }
-# Where the noise is known, its square signal over base and noise, whitened, is below 150; a detection takes 40 to 100.
+# Their lambda (``pipeline.study.bench``) is below 150; a detection takes 40 to 100.
 FAINT = {
     "mpu6050": {"accelerometer": {"scale_factor_temperature"}, "gyroscope": {"scale_factor_temperature"}},
     "stim300": {
@@ -254,7 +254,7 @@ AT_REST = (
 
 
 def observable(model: str, sensor: str, procedure: str) -> list[str]:
-    """Return the effects that a procedure shows at their size."""
+    """Return the effects that are observable with a procedure at their size."""
     hidden = set(FAINT[model][sensor])
     if sensor == "gyroscope":
         hidden |= {*UNSEEN_GYROSCOPE, *SAME_GYROSCOPE}

@@ -1,4 +1,4 @@
-"""A study as a Markdown page: its scores, and tables of what the diagnosis said of which hidden effect and size."""
+"""Render a study as a Markdown page: its scores, and tables of the answers for each hidden effect and size."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ JSON = dict[str, Any]
 Rows = list[list[Any]]
 LISTED = 40  # cases on the page that miss a goal
 OF_SIZE = ("single", "small", "tiny")
-BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))  # of lambda, around the 40 to 100 that a selection asks
+BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))  # of lambda; a selection needs 40 to 100
 DIAGRAM = "reliability.svg"
 
 
 def page(cases: Sequence[JSON], command: str) -> str:
-    """Return the page; ``command`` makes it again."""
+    """Return the page; ``command``: the command that reproduces it."""
     said, families = table_of(cases), family_scores(cases)
     text: str = template("study.md").render(
         command=command,
@@ -83,30 +83,30 @@ def _said(case: JSON) -> str:
 
 
 def found_at(said: pd.DataFrame) -> Rows:
-    """Return for each sensor and effect in how many of how many cases of each size it was selected first."""
-    own = said[said["family"].isin(OF_SIZE) & (said["model"] == "mpu6050")]
+    """Return for each sensor and effect in how many cases of each size it was selected first, ``n of m``."""
+    rows_of_size = said[said["family"].isin(OF_SIZE) & (said["model"] == "mpu6050")]
     rows: dict[tuple[str, str], dict[str, str]] = {}
-    for (sensor, name, size), first in own.groupby(["sensor", "hidden", "family"])["first"]:
+    for (sensor, name, size), first in rows_of_size.groupby(["sensor", "hidden", "family"])["first"]:
         row = rows.setdefault((sensor, name), dict.fromkeys(OF_SIZE, ""))
         row[size] = f"{first.sum()} of {len(first)}"
     return [[sensor, f"`{name}`", *row.values()] for (sensor, name), row in rows.items()]
 
 
 def confusions(said: pd.DataFrame) -> Rows:
-    """Return how often one hidden effect was called something else, the most frequent first."""
-    own = said[~said["left_out"] & (said["family"] != "unseen") & ~said["alone"]]
-    counts = own.groupby(["sensor", "hidden", "said"]).size().sort_values(ascending=False, kind="stable")
+    """Return how often another effect was named for one hidden effect, the most frequent first."""
+    wrong = said[~said["left_out"] & (said["family"] != "unseen") & ~said["alone"]]
+    counts = wrong.groupby(["sensor", "hidden", "said"]).size().sort_values(ascending=False, kind="stable")
     return [[sensor, f"`{name}`", other, count] for (sensor, name, other), count in counts.items()]
 
 
 def instead(said: pd.DataFrame) -> Rows:
-    """Return what was said of effects that the catalogue was left without, and whether with a warning."""
+    """Return the answers for effects that were removed from the catalogue, with or without a warning."""
     counts = said[said["left_out"]].groupby(["sensor", "hidden", "said", "warned"]).size()
     return [[sensor, f"`{name}`", *rest, count] for (sensor, name, *rest), count in counts.items()]
 
 
 def by_signal(cases: Iterable[JSON]) -> Rows:
-    """Return how many effects were selected, of how many, by the signal that each leaves beside the others."""
+    """Return the share of the hidden effects that were selected, by bins of their lambda."""
     found = pd.DataFrame(
         [
             (left, any(named(case, name, selected) for selected in case["selected"]))
@@ -126,20 +126,20 @@ def by_signal(cases: Iterable[JSON]) -> Rows:
 
 
 def of_shapes(cases: Sequence[JSON]) -> Rows:
-    """Return a row for each form of unknown physics: what was said of it, and what that does to held-out motion."""
+    """Return a row for each form of unknown physics: the answers, and their effect on the held-out error."""
     rows = []
     for family in sorted({case["family"] for case in cases if case["shape"]}):
-        own = [case for case in cases if case["family"] == family and "error" not in case]
-        if not own:
+        cases_of_family = [case for case in cases if case["family"] == family and "error" not in case]
+        if not cases_of_family:
             continue
-        unexplained = sum(case["verdict"] == "unexplained" for case in own)
-        with_warning = sum(case["verdict"] != "unexplained" and warned(case) for case in own)
-        unwarned = [outside_answered(case) for case in own if case["selected"] and not warned(case)]
+        unexplained = sum(case["verdict"] == "unexplained" for case in cases_of_family)
+        with_warning = sum(case["verdict"] != "unexplained" and warned(case) for case in cases_of_family)
+        unwarned = [outside_answered(case) for case in cases_of_family if case["selected"] and not warned(case)]
         answered, silent = sum(unwarned), len(unwarned) - sum(unwarned)
-        name, count = Counter(map(_said, own)).most_common(1)[0]
-        gone = "".join(f"{100 * mean.value:.0f} % (n = {mean.total})" for mean in mean_excess_gone(own))
-        nothing = len(own) - unexplained - with_warning - len(unwarned)
-        counts = [len(own), unexplained, with_warning, answered, silent, nothing]
+        name, count = Counter(map(_said, cases_of_family)).most_common(1)[0]
+        gone = "".join(f"{100 * mean.value:.0f} % (n = {mean.total})" for mean in mean_excess_gone(cases_of_family))
+        nothing = len(cases_of_family) - unexplained - with_warning - len(unwarned)
+        counts = [len(cases_of_family), unexplained, with_warning, answered, silent, nothing]
         rows.append([family.replace("_", " "), *counts, f"{name} ({count})", gone])
     return rows
 

@@ -1,13 +1,13 @@
-"""Run the cases of a study in several processes, and store what the diagnosis says of each.
+"""Run the cases of a study in several processes, and store the diagnosis of each.
 
-    <directory>/truth.jsonl      what is hidden in each case, and how far it stands out of the noise
-    <directory>/results.jsonl    what the diagnosis said of it, and a digest of the code that said it
+    <directory>/truth.jsonl      the hidden effects of each case, and their signal-to-noise ratio
+    <directory>/results.jsonl    the diagnosis of each case, and a digest of the code
 
-A case whose result is there is not run again, so that a study can be interrupted and made larger.
+A case that has a result is not run again, so that a study can be interrupted and extended.
 
-A result holds the diagnosis and the held-out error after adding what it selects. The diagnosis gets recordings and the
-configuration of a unit as the product composes it, never the truth; every step is the function that the stage of a run
-calls.
+A result has the diagnosis and the held-out error after the selected effects are added. The diagnosis gets the
+recordings and the composed configuration of a unit, never the truth. Every step calls the same function as the stage of
+a run.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def run_study(
 ) -> None:
     """Run the first ``count`` cases of each family that have no result in ``directory``.
 
-    ``progress`` gets how many of how many are done. Raises ``ConfigurationError`` if the directory holds cases of
-    another seed.
+    ``progress`` is called with the numbers of finished and of all cases. Raises ``ConfigurationError`` if the directory
+    has cases of another seed.
     """
     directory.mkdir(parents=True, exist_ok=True)
     others = {line["seed"] for line in read_lines(directory / TRUTH)} - {seed}
@@ -93,24 +93,24 @@ def _judged(planned: Sequence[_Planned], processes: int) -> Iterator[tuple[JSON,
 
 
 def _judged_or_fault(planned: _Planned) -> tuple[JSON, list[JSON]]:
-    """Return the truth of a case and what was said of it; a fault is a result, not the end of the study."""
+    """Return the truth and the results of a case; an exception is a result and does not end the study."""
     case = at_detection(draw(*planned))
     hidden = {**case.to_json(), "signal_left": signals_left(case)}
     try:
         return hidden, judge(case)
-    except Exception as error:  # noqa: BLE001  (whatever it is, it is what the diagnosis did with this case)
+    except Exception as error:  # noqa: BLE001  (any exception is a result of the case)
         return hidden, [{"key": case.key, "sensor": case.sensor, "error": f"{type(error).__name__}: {error}"}]
 
 
 def read_lines(path: Path) -> list[JSON]:
-    """Return the entries of a file of one JSON document a line; none where it is not there."""
+    """Return the entries of a file with one JSON document per line; none if the file does not exist."""
     if not path.is_file():
         return []
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
 
 
 def judge(case: Case) -> list[JSON]:
-    """Return what is said of a case: one entry, or one for each sensor where nothing is hidden."""
+    """Return the results of a case: one entry, or one for each sensor where nothing is hidden."""
     recordings = refined(recordings_of(case))
     out = []
     for sensor in SENSORS if case.kind == "null" else (case.sensor,):
@@ -128,9 +128,9 @@ def judge(case: Case) -> list[JSON]:
 def say(
     recordings: list[Recording], model: str, sensor: str, left_out: Sequence[str] = (), method: str = REFERENCE
 ) -> JSON:
-    """Return the diagnosis of recordings, as far as a study judges it.
+    """Diagnose recordings, and return the part of the diagnosis that a study scores.
 
-    The catalogue is left without the effects ``left_out``; the base is calibrated by ``method``.
+    ``left_out``: effects to remove from the catalogue; ``method``: by which the base is calibrated.
     """
     settings = settings_of(model, method)
     noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
@@ -165,9 +165,9 @@ def calibrated(recordings: list[Recording], sensor: str, settings: JSON) -> Sens
 
 
 def _held_out(recordings: list[Recording], model: str, sensor: str, names: Sequence[str], method: str) -> JSON:
-    """Return the held-out error before and after the effects are added, and the floor.
+    """Return the held-out error before and after the effects are added, and the noise floor.
 
-    The vector error where the attitude is logged, else that of the magnitude.
+    It is the error of the vector where the attitude is logged, else of the magnitude.
     """
     settings = settings_of(model, method)
     noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
@@ -190,7 +190,7 @@ def _held_out(recordings: list[Recording], model: str, sensor: str, names: Seque
 
 @cache
 def settings_of(model: str, method: str = REFERENCE) -> JSON:
-    """Return the configuration of a unit as a run composes and checks it; everything else is the default."""
+    """Return the configuration of a unit as a run composes and checks it, with defaults for all other settings."""
     with TemporaryDirectory() as folder:
         (Path(folder) / "units.csv").write_text(f"unit,sensor,method\nU1,{model},{method}\n", encoding="utf-8")
         return load_campaign({"campaign": folder}).units["U1"].config

@@ -1,12 +1,11 @@
-"""Scores of a study: which diagnoses are right, and shares with n and a 95 % interval (Wilson's, of scipy).
+"""Score a study: count the right diagnoses, as shares with n and a 95 % interval (Wilson's, by scipy).
 
-A *case* here is a dict with the truth of a unit and what the diagnosis said of one of its sensors. An effect counts as
-named by its look-alike where the document declares that one reproduces over 95 % of the other's signal.
+A *case* here is a dict with the truth of a unit and the diagnosis of one of its sensors. A selected look-alike counts
+as the hidden effect where the diagnosis states that it reproduces over 95 % of the other's signal.
 
-Of the posterior, answer sets, probabilities and upper limits are scored. The truth of a case is the set of its hidden
-effects, or the empty set where nothing is hidden or nothing can be seen. It counts only under its own name: no
-look-alike stands for it here. An upper limit is judged by each parameter of the hidden effect where that was not
-selected.
+Answer sets, probabilities and upper limits of the posterior are scored, too. For them the truth of a case is the set of
+its hidden effects, or the empty set where nothing is hidden or observable; look-alikes do not count. An upper limit is
+compared with each parameter of a hidden effect that was not selected.
 """
 
 from __future__ import annotations
@@ -27,20 +26,20 @@ Z = 1.96  # standard normal quantile of a 95 % interval
 OF_WHICH = "... of those in which each stands out (lambda >= 100)"
 IN_THE_CATALOGUE = ("single", "pairs", "triples", "one_axis")
 MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "triples")
-ALIKE = 0.95  # share of a signal from which one effect stands for another, as the pages call look-alikes
-EXCESS = 0.05  # of the noise floor: from which a held-out excess is counted
-STANDS_OUT = 100.0  # lambda: the most that a selection asks for
+ALIKE = 0.95  # share of a signal above which effects are look-alikes, as on the pages
+EXCESS = 0.05  # of the noise floor: smallest held-out excess that is counted
+STANDS_OUT = 100.0  # lambda: the largest that a selection needs
 DOUBTFUL = ("reference_in_doubt", "unexplained", "floor_in_doubt")
 
 
 def cases_of(truth: Iterable[JSON], results: Iterable[JSON]) -> list[JSON]:
-    """Return the cases whose truth and result are both there."""
+    """Return the cases that have both a truth and a result."""
     known = {line["key"]: line for line in truth}
     return [{**known[line["key"]], **line} for line in results if line["key"] in known]
 
 
 def named(case: JSON, hidden: str, name: str) -> bool:
-    """Return whether a selected effect is the hidden one or declares that it looks like it."""
+    """Return whether a selected effect is the hidden one or its declared look-alike."""
     return name == hidden or case["look_alikes"].get(name, {}).get(hidden, 0.0) > ALIKE
 
 
@@ -50,7 +49,7 @@ def first_is_right(case: JSON) -> bool:
 
 
 def exact(case: JSON) -> bool:
-    """Return whether the hidden effects, or declared look-alikes, are exactly what was selected."""
+    """Return whether exactly the hidden effects, or their declared look-alikes, were selected."""
     hidden = [name for name in case["hidden"] if name not in case["selected"]]
     selected = [name for name in case["selected"] if name not in case["hidden"]]
     for name in hidden:
@@ -62,7 +61,7 @@ def exact(case: JSON) -> bool:
 
 
 def not_seen(case: JSON) -> bool:
-    """Return whether an effect that cannot be seen is listed as not observable, and was not selected."""
+    """Return whether an unobservable hidden effect is listed as not observable, and was not selected."""
     name = next(iter(case["hidden"]))
     return name in case["not_observable"] and name not in case["selected"]
 
@@ -73,23 +72,23 @@ def warned(case: JSON) -> bool:
 
 
 def outside_answered(case: JSON) -> bool:
-    """Return whether one of the answers is something outside the catalogue."""
+    """Return whether one of the answers is an effect outside the catalogue."""
     return any(name.startswith(OTHER) for answer in case.get("answer_set") or [] for name in answer["effects"])
 
 
 def not_silent(case: JSON) -> bool:
-    """Return whether no effect was reported, or only with a warning; for what the catalogue does not hold."""
+    """Return whether no effect was selected, or with a warning; for effects that are not in the catalogue."""
     return not case["selected"] or warned(case)
 
 
 def hard_to_replace(case: JSON) -> bool:
-    """Return whether the whole catalogue names the effect and no other one has a share of over 0.95 of it."""
+    """Return whether the complete catalogue names the removed effect first, and it has no look-alike above 0.95."""
     name, whole = case["left_out"][0], case["whole"]
     return bool(whole["selected"][:1] == [name]) and max(whole["look_alikes"][name].values(), default=0.0) <= ALIKE
 
 
 def excess_gone(case: JSON) -> float | None:
-    """Return the share of the held-out excess over the noise floor that is gone; None where it is under 5 %."""
+    """Return the share of the held-out excess over the noise floor that was removed; None for an excess below 5 %."""
     held = case.get("held_out")
     if not held or held["before"] < (1.0 + EXCESS) * held["floor"]:
         return None
@@ -152,7 +151,7 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
 
 
 def share(name: str, right: Mapping[str, bool] | Sequence[bool], goal: str = "") -> list[Score]:
-    """Return the share of what is right, by the name of each case or without names; nothing of no cases."""
+    """Return the share of the true values in ``right``, a mapping by case or a sequence; an empty list for no cases."""
     named_cases = right if isinstance(right, Mapping) else dict(enumerate(right))
     hits, total = sum(map(bool, named_cases.values())), len(named_cases)
     misses = tuple(str(case) for case, good in named_cases.items() if not good)
@@ -160,12 +159,12 @@ def share(name: str, right: Mapping[str, bool] | Sequence[bool], goal: str = "")
 
 
 def _judged(cases: Iterable[JSON], right: Callable[[JSON], bool]) -> dict[str, bool]:
-    """Return for each case whether ``right`` holds; of a fault it never does."""
+    """Return for each case whether ``right`` is true; False for a fault."""
     return {_name(case): "error" not in case and right(case) for case in cases}
 
 
 def _name(case: JSON) -> str:
-    """Return what names a case; with its sensor where both are judged."""
+    """Return the name of a case, with its sensor where both sensors are scored."""
     return f"{case['key']} {case['sensor']}" if is_null(case) and "error" not in case else str(case["key"])
 
 
@@ -175,25 +174,25 @@ def is_null(case: JSON) -> bool:
 
 
 def family_scores(cases: Sequence[JSON]) -> list[Score]:
-    """Return the scores of every family that was run, and the held-out excess that is gone."""
+    """Return the scores of every family that was run, and the share of the held-out excess that was removed."""
     found: list[Score] = []
     for family, name, right, goal in PLAN:
-        own = [c for c in cases if c["family"] == family]
+        family_cases = [c for c in cases if c["family"] == family]
         if family == "removed":
-            own = [c for c in own if "error" in c or hard_to_replace(c)]
-        found += share(name, _judged(own, right), goal)
-        able = [c for c in own if stands_out(c)]
-        if family in MAY_HIDE and len(able) < len(own):
-            found += share(OF_WHICH, _judged(able, right))
+            family_cases = [c for c in family_cases if "error" in c or hard_to_replace(c)]
+        found += share(name, _judged(family_cases, right), goal)
+        strong = [c for c in family_cases if stands_out(c)]
+        if family in MAY_HIDE and len(strong) < len(family_cases):
+            found += share(OF_WHICH, _judged(strong, right))
     for family in sorted({c["family"] for c in cases if is_null(c)}):
-        own = [c for c in cases if c["family"] == family]
+        family_cases = [c for c in cases if c["family"] == family]
         name = f"nothing hidden, {family.removeprefix('null_')}: nothing selected"
-        found += share(name, _judged(own, lambda case: not case["selected"]), ">= 99 %")
+        found += share(name, _judged(family_cases, lambda case: not case["selected"]), ">= 99 %")
     return found + mean_excess_gone(in_the_catalogue(cases))
 
 
 def mean_excess_gone(cases: Iterable[JSON]) -> list[Score]:
-    """Return the mean over the units whose held-out excess is over 5 % of the noise floor; nothing below two units."""
+    """Return the mean of ``excess_gone`` over the units that have it; an empty list for fewer than two units."""
     gone = [excess_gone(case) for case in cases if "error" not in case]
     values = np.array([value for value in gone if value is not None])
     if len(values) < 2:
@@ -204,7 +203,7 @@ def mean_excess_gone(cases: Iterable[JSON]) -> list[Score]:
 
 
 def in_the_catalogue(cases: Iterable[JSON]) -> list[JSON]:
-    """Return the cases in which effects of the catalogue are hidden at their usual size, at the usual wander."""
+    """Return the cases in which effects of the catalogue are hidden at the usual size and wander."""
     return [case for case in cases if case["family"] in IN_THE_CATALOGUE]
 
 
@@ -213,7 +212,7 @@ SETS = (
 )  # fmt: skip  # families whose truth is a set of effects of the catalogue that the recordings can show
 # Family: the share of the detection size, and the goal of the median limit over the truth.
 LIMITS = {"limit_30": ("0.3", 4.0), "limit_60": ("0.6", 2.2), "limit_100": ("1", 1.6)}
-EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)  # of said probabilities
+EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)  # of stated probabilities
 GOAL, FAMILY_GOAL, SIZE_GOAL = ">= 93.6 %", ">= 90 %", 3.0
 STYLE = (
     "<style>.chart{background:#fff}text{font:12px sans-serif;fill:#57606a}.e{text-anchor:end}.m{text-anchor:middle}"
@@ -223,12 +222,12 @@ STYLE = (
 
 
 def family_of(case: JSON) -> str:
-    """Return the family of a case, all noises of "nothing hidden" together."""
+    """Return the family of a case; one family for all noises with nothing hidden."""
     return "null" if is_null(case) else str(case["family"])
 
 
 def true_set(case: JSON) -> list[str]:
-    """Return the effects that a perfect answer names."""
+    """Return the effects of the right answer."""
     return [] if family_of(case) == "unseen" else sorted(case["hidden"])
 
 
@@ -244,17 +243,17 @@ def best_is_exact(case: JSON) -> bool:
 
 
 def answered(cases: Iterable[JSON]) -> list[JSON]:
-    """Return the cases whose truth an answer set can hold, and the faults among them."""
+    """Return the cases of families with answer sets, including faults."""
     return [c for c in cases if family_of(c) in SETS and ("error" in c or "answer_set" in c)]
 
 
 def answer_scores(cases: Sequence[JSON]) -> list[Score]:
-    """Return the scores of answer sets and upper limits: which hold the truth, and how large they are."""
+    """Return the scores of answer sets and upper limits: how often they contain the truth, and their sizes."""
     known = answered(cases)
     found = share("truth in the 95 % answer set", _judged(known, in_the_set), GOAL)
     for family in SETS:
-        own = [c for c in known if family_of(c) == family]
-        found += share(f"... {family}", _judged(own, in_the_set), "" if family == "triples" else FAMILY_GOAL)
+        family_cases = [c for c in known if family_of(c) == family]
+        found += share(f"... {family}", _judged(family_cases, in_the_set), "" if family == "triples" else FAMILY_GOAL)
     found += share("most probable answer: exactly the truth", _judged(known, best_is_exact))
     found += share("... selected: exactly the truth", _judged(known, lambda c: exact({**c, "hidden": true_set(c)})))
     over = {size: ratios(cases, family) for family, (size, _) in LIMITS.items()}
@@ -270,7 +269,7 @@ def answer_scores(cases: Sequence[JSON]) -> list[Score]:
 
 
 def ratios(cases: Iterable[JSON], family: str) -> np.ndarray:
-    """Return the upper limits over the true parameters of the hidden effects that were not selected: (n,) array."""
+    """Return the ratios of upper limits to true parameters of hidden effects that were not selected: (n,) array."""
     over = []
     for case in cases:
         if case["family"] == family and "error" not in case:
@@ -281,7 +280,7 @@ def ratios(cases: Iterable[JSON], family: str) -> np.ndarray:
 
 
 def reliability(cases: Sequence[JSON]) -> list[Score]:
-    """Return the share that is true of what was said with a probability; the name is the mean probability of a bin."""
+    """Return the share of true effects in each bin of stated probability; the name is the bin's mean probability."""
     pairs = [
         (probability, name in true_set(case))
         for case in answered(cases)
@@ -294,7 +293,7 @@ def reliability(cases: Sequence[JSON]) -> list[Score]:
 
 
 def reliability_diagram(cases: Sequence[JSON]) -> str:
-    """Return the said probabilities against the true shares as an SVG file; empty where none was said."""
+    """Return a chart of true shares against stated probabilities as an SVG file; empty without probabilities."""
     bins = reliability(cases)
     if not bins:
         return ""

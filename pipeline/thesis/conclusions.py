@@ -1,8 +1,8 @@
-"""What the thesis concludes, judged over many seeds: confirmed, refuted, no difference or not decided.
+"""Test the conclusions of the thesis over many seeds: confirmed, refuted, no difference or not decided.
 
-A comparison of two procedures is the mean over seeds of the difference of their held-out errors, drawn with the same
-number, with its 95 % interval by Student's t. It is decided where the interval leaves zero on one side; an interval
-that lies within 1 % of the error itself is no difference, whatever its sign.
+A comparison of two procedures is the mean over seeds of the difference of their held-out errors at the same seed, with
+its 95 % interval by Student's t. It is decided if the interval does not contain zero. An interval within 1 % of the
+error is no difference, whatever its sign.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 CONFIRMED, REFUTED, NONE, OPEN = "confirmed", "refuted", "no difference", "not decided"
 KINDS = {CONFIRMED: "good", REFUTED: "bad", NONE: "warn", OPEN: "warn"}  # CSS classes
-SMALLEST = 0.01  # of the error: differences within it are none
-ALIKE = 0.05  # of the error: by how much rates that are called alike may differ
+SMALLEST = 0.01  # of the error: smaller differences are negligible
+ALIKE = 0.05  # of the error: largest difference between rates that count as equal
 READINGS = {"printed": "as printed", "staged": "errata corrected"}
 FILTERS = {
     "same-gain": "growth behind a filter of the same gain without delay",
@@ -46,13 +46,13 @@ class Line(NamedTuple):
 
 
 def verdict_of(lines: Sequence[Line]) -> str:
-    """Return the verdict that all comparisons of a conclusion share, else the counts of each."""
+    """Return the common verdict of all comparisons of a conclusion, or the count of each verdict."""
     counts = {v: n for v in KINDS if (n := sum(line.verdict == v for line in lines))}
     return ", ".join(v if n == len(lines) else f"{v} in {n} of {len(lines)}" for v, n in counts.items())
 
 
 class Errors:
-    """Held-out errors of the study by set of recordings, method and seed: deg/s, of the accelerometer mg."""
+    """Held-out errors of the study by set of recordings, method and seed: deg/s, or mg for accelerometers."""
 
     def __init__(self, rows: pd.DataFrame) -> None:
         judged = rows[(rows["cause"] == CAUSES.index(LOST)) & rows["error"].notna()]
@@ -64,7 +64,7 @@ class Errors:
         return mean_of(self._errors[name, method])
 
     def line(self, what: str, smaller: Place, larger: Place) -> Line:
-        """Compare two (set, method), of which the thesis says that the first has the smaller error."""
+        """Compare two (set, method); the thesis concludes that the first has the smaller error."""
         first = self._errors[smaller]
         return _compared(what, first, self._errors[larger], SMALLEST * mean_of(first).value)
 
@@ -76,12 +76,12 @@ class Errors:
             for device, name in DEVICES.items()
         ]
 
-    def against_the_best(self, own: str, others: Iterable[str], methods: Mapping[str, str]) -> list[Line]:
+    def against_the_best(self, procedure_name: str, others: Iterable[str], methods: Mapping[str, str]) -> list[Line]:
         """Compare a procedure with the best of the others on each device by each method."""
         return [
             self.line(
-                f"{name}{reading and ', '}{reading}: {_short(own)} against the best other, {_short(best)}",
-                (f"{device}-{own}", method),
+                f"{name}{reading and ', '}{reading}: {_short(procedure_name)} against the best other, {_short(best)}",
+                (f"{device}-{procedure_name}", method),
                 (f"{device}-{best}", method),
             )
             for method, reading in methods.items()
@@ -107,7 +107,7 @@ class Errors:
         return line._replace(verdict=CONFIRMED if high < least else REFUTED if low > least else OPEN)
 
     def ordered(self, device: str, procedures: Iterable[str], method: str) -> list[str]:
-        """Return procedures in the order of a device's mean errors, the smallest first."""
+        """Sort procedures by a device's mean error, the smallest first."""
         return sorted(procedures, key=lambda procedure: self.mean(f"{device}-{procedure}", method).value)
 
 
@@ -115,18 +115,18 @@ def _short(procedure: str) -> str:
     return in_words(procedure).removeprefix("gyro ")
 
 
-def _compared(what: str, first: pd.Series[float], second: pd.Series[float], smallest: float) -> Line:
+def _compared(what: str, first: pd.Series[float], second: pd.Series[float], negligible: float) -> Line:
     """Compare the smaller value of each seed with the larger one."""
     difference = mean_of((second - first).dropna())
     low, high = difference.interval
     verdict = CONFIRMED if low > 0.0 else REFUTED if high < 0.0 else OPEN
-    if max(abs(low), abs(high)) < smallest:
+    if max(abs(low), abs(high)) < negligible:
         verdict = NONE
     return Line(what, mean_of(first), mean_of(second), difference, verdict)
 
 
 def gain_of_filter(rate: float) -> float:
-    """Return what the campaign's filter leaves of the amplitude of a turn at ``rate`` deg/s."""
+    """Return the gain of the campaign's filter for the sinusoid of a turn at ``rate`` deg/s."""
     k = INTERVAL_S / (INTERVAL_S + TIME_CONSTANT_S)
     return float(k / abs(1.0 - (1.0 - k) * np.exp(-1j * np.radians(rate) * INTERVAL_S)))
 
@@ -142,10 +142,14 @@ def conclusions(rows: pd.DataFrame) -> dict[str, list[Line]]:
         for device, name in devices
     ]
     least_squares = [
-        errors.line(f"{name}, {reading}: staged against least squares", (own, method), (own, "least-squares"))
+        errors.line(
+            f"{name}, {reading}: staged against least squares",
+            (recordings, method),
+            (recordings, "least-squares"),
+        )
         for method, reading in READINGS.items()
         for device, name in devices
-        for own in [f"{device}-{'continuous-0.5dps' if device == 'stim300' else 'stop-1s'}"]
+        for recordings in [f"{device}-{'continuous-0.5dps' if device == 'stim300' else 'stop-1s'}"]
     ]
     cholesky = [
         errors.line(f"{name}, {reading}", (f"{device}-gyro-20dps", "staged"), (f"{device}-gyro-20dps", method))

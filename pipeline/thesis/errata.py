@@ -1,9 +1,9 @@
-"""The figures that show the errata of the thesis, and the agreement of our parameters with the printed ones.
+"""Compute the evidence for the errata of the thesis, and the agreement of our parameters with the printed ones.
 
-The evidence is from the printed tables and from the campaign. The agreement is, of each quantity, over devices,
-procedures and elements,
+The evidence is from the printed tables and from the campaign. The agreement of a quantity is, over devices, procedures
+and elements,
 
-    largest |ours - other|,    and how many of them lie within the bound
+    largest |ours - other|,    and the number of differences within the bound
 
 where
 
@@ -11,15 +11,15 @@ other : the median of the printed biases (accelerometer: they differ between pro
     scale factors (O M S), the printed row (gyroscope), or the staged method on the same recordings (Cholesky and LU, as
     a share of the expanded uncertainty of the difference)
 
-The share of the printed scatter of O and S that follows from picking the largest samples: of a device, over its printed
+The selection of the largest samples explains a share of the printed scatter of O and S. For a device, over its printed
 rows and the axes y and z (x is the reference of O),
 
     D_O = sqrt(mean (1 - O)^2),    D_S = sqrt(mean (S M - S_0)^2)
 
-of the printed values and over all seeds; S_0 is the true scale factor, and S that of readings multiplied by M: as
-printed M holds the bias (see the errata), which shifts S and is no scatter. What noise and lost samples do not explain
-is ``sqrt(max(0, D_printed^2 - D_seeds^2))``. A table that shakes as the home-made one does is the upper bound of what
-vibration can do on the precise one.
+are computed for the printed values and over all seeds. S_0 is the true scale factor. S is multiplied by M, because the
+printed M contains the bias (see the errata), which shifts S and is no scatter. Noise and lost samples do not explain
+``sqrt(max(0, D_printed^2 - D_seeds^2))``. A table that vibrates like the home-made one is the upper bound for the
+effect of vibration on the precise table.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ BIAS = [f"b_{a}_g" for a in AXES]
 
 
 def evidence(printed: Path, results: Results, rows: pd.DataFrame) -> JSON:
-    """Return the figures that show the errata, which ``thesis.html`` states; ``rows``: of the study over seeds."""
+    """Return the evidence for the errata, for ``thesis.html``; ``rows``: of the study over seeds."""
     parameters, errors = (read_printed(printed, name) for name in ("accel_parameters", "errors"))
     a_zero = -0.1285  # of z of MPU6050 (1), table 5.1
     a_max = 1.0 / 0.980 + a_zero  # table 5.23
@@ -102,10 +102,12 @@ def evidence(printed: Path, results: Results, rows: pd.DataFrame) -> JSON:
 
 
 def _subtracted_again(results: Results) -> float | None:
-    """Return the most that the stages subtract a second time, g; None where no unit was calibrated."""
+    """Return the largest bias that the stages subtract a second time, g; None if no unit was calibrated."""
     fits = (results.correction(f"{device}-stop-1s-printed", "accelerometer") or {"steps": []} for device in DEVICES)
-    again = [v for fit in fits for step in [s["subtract"] for s in fit["steps"] if "subtract" in s][1:] for v in step]
-    return max(map(abs, again), default=None)
+    repeated = [
+        v for fit in fits for step in [s["subtract"] for s in fit["steps"] if "subtract" in s][1:] for v in step
+    ]
+    return max(map(abs, repeated), default=None)
 
 
 def _order_of_matrix(results: Results) -> float:
@@ -117,10 +119,10 @@ def _order_of_matrix(results: Results) -> float:
 
 
 def _forward_matrix(rows: pd.DataFrame) -> list[JSON]:
-    """Return how far the printed matrix of Cholesky and LU is from the inverse of the staged one, and from itself."""
+    """Return the differences of the printed Cholesky and LU matrix from the staged matrix and from its inverse."""
     found = []
-    for device, own in rows[rows["sensor"] == "gyroscope"].groupby("device"):
-        matrices = {row["method"]: matrix_of(row, "R") for row in own.to_dict("records")}
+    for device, device_rows in rows[rows["sensor"] == "gyroscope"].groupby("device"):
+        matrices = {row["method"]: matrix_of(row, "R") for row in device_rows.to_dict("records")}
         staged, other = matrices["staged"], matrices["cholesky_lu"]
         if staged[2, 2] > 1.9:  # misprint, see erratum 5
             staged[2, 2], staged[1, 2] = 1.007, -0.009
@@ -130,21 +132,21 @@ def _forward_matrix(rows: pd.DataFrame) -> list[JSON]:
 
 
 def _misalignment(parameters: pd.DataFrame, results: Results, device: str) -> JSON:
-    """Return M of a device: from the printed biases alone, here as printed, and printed."""
-    own = parameters[(parameters["device"] == device) & (parameters["rate_table"] == "acutronic")]
+    """Return M of a device: from the printed biases alone, from our staged method as printed, and the printed M."""
+    device_rows = parameters[(parameters["device"] == device) & (parameters["rate_table"] == "acutronic")]
     return {
         "device": DEVICES[device],
-        "of_bias": float(np.prod(np.sqrt(1.0 - own[BIAS].median() ** 2))),
+        "of_bias": float(np.prod(np.sqrt(1.0 - device_rows[BIAS].median() ** 2))),
         "ours": results.parameter(f"{device}-stop-1s-printed", "accelerometer", "misalignment", "M_P_x"),
-        "printed": sorted({f"{m:.3f}" for m in own["M_x"]}),
+        "printed": sorted({f"{m:.3f}" for m in device_rows["M_x"]}),
     }
 
 
 def agreements(printed: Path, results: Results) -> pd.DataFrame:
-    """Return how near the parameters come, a row a quantity and method.
+    """Return the agreement of the parameters, with a row for each quantity and method.
 
     Columns: ``what``, ``method``, ``bound`` (in the quantity's unit), ``largest`` (NaN where no unit was calibrated),
-    ``within`` (how many differences lie within the bound) and ``count``.
+    ``within`` (number of differences within the bound) and ``count``.
     """
     found: list[tuple[str, str, float, list[Values]]] = []
     rows = _on_precise_table(printed, "accel_parameters")
@@ -190,24 +192,26 @@ def _cholesky(results: Results) -> Iterator[Values]:
 def scatters(printed: Path, seeds: pd.DataFrame) -> pd.DataFrame:
     """Return the scatter of O, S and b of each device on the precise table.
 
-    Columns: ``device``, ``quantity``, ``printed``, one for each of ``CAUSES`` (each includes those before it),
-    ``unexplained`` and ``share``, which noise and lost samples explain of the printed variance.
+    Columns: ``device``, ``quantity``, ``printed``, one for each of ``CAUSES`` (each includes the causes before it),
+    ``unexplained``, and ``share``: the share of the printed variance that noise and lost samples explain.
     """
     rows = _on_precise_table(printed, "accel_parameters")
     seeds = seeds[seeds["method"] == "printed"]
     out = []
     for device in DEVICES:
-        own = rows[rows["device"] == device]
-        by_cause = seeds[seeds["set"].isin(own["set"])].groupby("cause")
+        device_rows = rows[rows["device"] == device]
+        by_cause = seeds[seeds["set"].isin(device_rows["set"])].groupby("cause")
         for quantity, centre in (
             ("O", {"y": 1.0, "z": 1.0}),
             ("S", dict(zip(AXES, TRUE_SCALE[device], strict=True))),
-            ("b", dict(zip(AXES, own[BIAS].median(), strict=True))),
+            ("b", dict(zip(AXES, device_rows[BIAS].median(), strict=True))),
         ):
             unit = "_g" if quantity == "b" else ""
             columns = [f"{quantity}_{a}" for a in centre]
-            told = own[[f"{c}{unit}" for c in columns]].mul(own["M_x"] if quantity == "S" else 1.0, axis=0)
-            row: JSON = {"device": device, "quantity": quantity, "printed": _size(told, centre)}
+            printed_values = device_rows[[f"{c}{unit}" for c in columns]].mul(
+                device_rows["M_x"] if quantity == "S" else 1.0, axis=0
+            )
+            row: JSON = {"device": device, "quantity": quantity, "printed": _size(printed_values, centre)}
             for cause, drawn in by_cause:
                 found = drawn[columns].mul(drawn["M"] if quantity == "S" else 1.0, axis=0)
                 row[CAUSES[cause]] = _size(found, centre)

@@ -1,7 +1,7 @@
-"""The page of the thesis: its tables and figures compared with ours, its errata, and a verdict on each conclusion.
+"""Render the page of the thesis: its tables and figures beside ours, its errata, and a verdict on each conclusion.
 
-Each cell that differs from the printed one by more than a quarter has a letter that stands for the reason. The figures
-are those of chapter 5: error per procedure, held-out motion, error before and after, and the comparison of methods.
+A letter marks each cell that differs from the printed one by more than a quarter, and refers to the reason. The figures
+follow chapter 5: error per procedure, held-out motion, error before and after, and the comparison of methods.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ JSON = dict[str, Any]
 
 
 def render(campaign: Path, folder: Path) -> str:
-    """Return ``thesis.html`` of a campaign with ``printed/`` and ``seeds.csv``, and the folder of its results."""
+    """Render ``thesis.html`` from a campaign with ``printed/`` and ``seeds.csv``, and the folder of its results."""
     printed, results = campaign / "printed", Results(folder)
     rows = pd.read_csv(campaign / "seeds.csv")
     scatter = scatters(printed, rows)
@@ -69,7 +69,7 @@ def render(campaign: Path, folder: Path) -> str:
 
 
 def _text(value: float, digits: int, sign: str = "") -> str:
-    """Return a value of a cell to so many decimals, with its sign where ``sign`` is ``+``."""
+    """Format the value of a cell with ``digits`` decimals, and with its sign where ``sign`` is ``+``."""
     if math.isnan(value):
         return NOTHING
     rounded = f"{value:{sign}.{digits}f}"
@@ -77,7 +77,7 @@ def _text(value: float, digits: int, sign: str = "") -> str:
 
 
 def _difference(estimate: Estimate) -> tuple[str, str]:
-    """Return a difference and its interval, to the decimals that two digits of the interval's half need."""
+    """Format a difference and its interval, rounded to two digits of half the interval."""
     half = estimate.expanded_uncertainty or 0.0
     decimals = max(0, 1 - math.floor(math.log10(half))) if half > 0.0 else 3
     value, low, high = (f"{v:+.{decimals}f}".replace("-", MINUS) for v in (estimate.value, *estimate.interval))
@@ -85,7 +85,7 @@ def _difference(estimate: Estimate) -> tuple[str, str]:
 
 
 def key_of(explanations: Sequence[JSON], cell: JSON) -> str:
-    """Return the key of the first explanation that holds for a cell, or nothing."""
+    """Return the key of the first explanation whose pattern matches a cell; empty for none."""
     place = "|".join(cell[name] for name in ("table", "block", "row", "column"))
     return next((str(e["key"]) for e in explanations if re.search(e["where"], place)), "")
 
@@ -107,23 +107,23 @@ OURS = ("printed", "ours, as printed", "ours, errata corrected")
 def all_figures(printed: Path, results: Results, rows: pd.DataFrame, scatter: pd.DataFrame) -> list[Figure]:
     """Return the figures in the order of the thesis's groups; ``rows``: of the study over seeds."""
     errors = read_printed(printed, "errors")
-    told = errors[errors["metric"] == "mean_abs_error"].set_index("set")["after"]
+    printed_errors = errors[errors["metric"] == "mean_abs_error"].set_index("set")["after"]
     methods = read_printed(printed, "method_comparison").set_index(["sensor", "device", "method"])["mean_error_after"]
     out: list[Figure | None] = []
     for sensor, shown in (("accelerometer", ("stop-10s", "continuous-1dps")), ("gyroscope", ("gyro-100dps",))):
         for device in DEVICES:
             out.append(_motion(results, device, sensor, shown[0]))
             out += [_before_and_after(results, f"{device}-{p}", sensor) for p in shown]
-            out.append(_per_procedure(results, told, device, sensor))
-        own = "stop-1s" if sensor == "accelerometer" else "gyro-60dps"
-        out.append(_before_and_after(results, f"mpu6050-1-mark2-{own}", sensor))
+            out.append(_per_procedure(results, printed_errors, device, sensor))
+        procedure = "stop-1s" if sensor == "accelerometer" else "gyro-60dps"
+        out.append(_before_and_after(results, f"mpu6050-1-mark2-{procedure}", sensor))
         out.append(_methods(results, methods[sensor], sensor))
-    out += [_tables(results, told), _speed(rows), _scatter(scatter, "O"), _scatter(scatter, "S")]
+    out += [_tables(results, printed_errors), _speed(rows), _scatter(scatter, "O"), _scatter(scatter, "S")]
     return [figure for figure in out if figure is not None]
 
 
 def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figure | None:
-    """Draw what the sensor read in the held-out motion."""
+    """Draw the readings of the sensor in the held-out motion."""
     held_out = results.recordings(f"{device}-{procedure}-printed", "validation")
     if not held_out:
         return None
@@ -140,7 +140,7 @@ def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figur
 
 
 def _before_and_after(results: Results, name: str, sensor: str) -> Figure | None:
-    """Draw e before and after calibration over the held-out motion."""
+    """Draw the error e before and after calibration over the held-out motion."""
     held_out = results.recordings(f"{name}-printed", "validation")
     samples = samples_of_motion(sensor, held_out[0], SILENT, {"gravity_g": 1.0}) if held_out else None
     if samples is None:
@@ -169,12 +169,12 @@ def _after(results: Results, name: str, sensor: str, methods: Sequence[str]) -> 
     return [float(np.nan_to_num(results.errors(f"{name}-{method}", sensor)[1])) for method in methods]
 
 
-def _per_procedure(results: Results, told: pd.Series[float], device: str, sensor: str) -> Figure:
-    """Draw the error after calibration by procedure: printed, and ours in both readings."""
+def _per_procedure(results: Results, printed_errors: pd.Series[float], device: str, sensor: str) -> Figure:
+    """Draw the error after calibration by procedure: printed, and ours as printed and with errata corrected."""
     groups = {}
     for procedure in PROCEDURES[sensor]:
         name = f"{device}-{procedure}"
-        groups[_short(procedure)] = [told[name], *_after(results, name, sensor, ("printed", "staged"))]
+        groups[_short(procedure)] = [printed_errors[name], *_after(results, name, sensor, ("printed", "staged"))]
     finding = f"{DEVICES[device]}, {sensor}: error after calibration by procedure"
     figure = Figure(f"procedures-{device}-{sensor}", finding, legend=_legend(OURS))
     return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", BELOW[sensor])
@@ -185,7 +185,7 @@ def _short(procedure: str) -> str:
     return value.removesuffix("dps") if value.endswith("dps") else f"{value[:-1]} s"
 
 
-def _methods(results: Results, told: pd.Series[float], sensor: str) -> Figure:
+def _methods(results: Results, printed_errors: pd.Series[float], sensor: str) -> Figure:
     """Draw the change of the error by the methods of tables 5.24 and 5.26."""
     if sensor == "accelerometer":
         procedure, other, methods = "stop-1s", "nonlinear_least_squares", ("printed", "staged", "least-squares")
@@ -198,15 +198,16 @@ def _methods(results: Results, told: pd.Series[float], sensor: str) -> Figure:
                   "Cholesky and LU, inverted")  # fmt: skip
         finding = "Gyroscope: inverted, Cholesky and LU leave what the stages leave"
     groups = {
-        name: [told[device, m] for m in ("staged", other)] + _after(results, f"{device}-{procedure}", sensor, methods)
+        name: [printed_errors[device, m] for m in ("staged", other)]
+        + _after(results, f"{device}-{procedure}", sensor, methods)
         for device, name in DEVICES.items()
     }
     figure = Figure(f"methods-{sensor}", finding, f"From the recordings of {procedure}.", _legend(legend))
     return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", "device")
 
 
-def _tables(results: Results, told: pd.Series[float]) -> Figure:
-    """Draw the error after calibration on both tables, as a share of that before."""
+def _tables(results: Results, printed_errors: pd.Series[float]) -> Figure:
+    """Draw the error after calibration on both tables, as a share of the error before."""
     groups = {}
     for sensor, procedure, printed_before in (
         ("accelerometer", "stop-1s", 0.069),
@@ -217,7 +218,7 @@ def _tables(results: Results, told: pd.Series[float]) -> Figure:
         for table, infix in (("", ""), (", home", "mark2-")):
             name = f"mpu6050-1-{infix}{procedure}"
             ours = [v / before for v in _after(results, name, sensor, ("printed", "staged"))]
-            groups[f"{short}{table}"] = [100.0 * v for v in (told[name] / printed_before, *ours)]
+            groups[f"{short}{table}"] = [100.0 * v for v in (printed_errors[name] / printed_before, *ours)]
     figure = Figure("tables", "The home-made table leaves more of the error", "MPU6050 (1).", _legend(OURS))
     return stems(figure, groups, "after, % of before", "sensor; home: on the home-made table")
 
@@ -242,9 +243,9 @@ def _speed(rows: pd.DataFrame) -> Figure:
 
 
 def _scatter(scatter: pd.DataFrame, quantity: str) -> Figure:
-    """Draw the printed scatter and what picking explains, cause by cause."""
-    own = scatter[scatter["quantity"] == quantity].set_index("device")[["printed", *CAUSES]]
-    groups = {DEVICES[str(device)]: list(row) for device, row in own.iterrows()}
+    """Draw the printed scatter, and the scatter that the selection of single samples explains, by cause."""
+    by_device = scatter[scatter["quantity"] == quantity].set_index("device")[["printed", *CAUSES]]
+    groups = {DEVICES[str(device)]: list(row) for device, row in by_device.iterrows()}
     finding = f"Scatter of {quantity}: printed, and by picking single samples"
-    figure = Figure(f"scatter-{quantity}", finding, legend=_legend(own.columns))
+    figure = Figure(f"scatter-{quantity}", finding, legend=_legend(by_device.columns))
     return stems(figure, groups, f"rms deviation of {quantity}", "device")

@@ -1,4 +1,4 @@
-"""What was printed, and what a run of the campaign found, by device, procedure and method."""
+"""Read the printed figures, and the results of a run of the campaign, by device, procedure and method."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ TABLES = {"acutronic": "precise table", "mark2": "home-made table"}
 STOPS = ("stop-1s", "stop-5s", "stop-10s")
 CONTINUOUS = tuple(f"continuous-{rate}dps" for rate in ("0.5", "1", "5", "10", "30"))
 RATES = tuple(f"gyro-{rate}dps" for rate in (20, 60, 80, 100, 200))
-SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # for mean errors, which do not depend on it
+SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # mean errors do not depend on the noise
 
 
 def read_printed(folder: Path, name: str) -> pd.DataFrame:
-    """Read a file of printed figures, a row a line of a printed table.
+    """Read a file of printed figures, with a row for each line of a printed table.
 
     Devices are named as in the campaign; ``procedure`` and ``set`` name the recordings of a row.
     """
@@ -83,12 +83,12 @@ class Results:
         return np.nan
 
     def correction(self, unit: str, sensor: str) -> JSON | None:
-        """Return how the last stage of a fit corrects readings."""
+        """Return the correction of readings after the last stage of a fit."""
         stages = (self.fit(unit, sensor) or {}).get("stages", ())
         return stages[-1]["correction"] if stages else None
 
     def errors(self, unit: str, sensor: str, metric: str = "mean_abs_error") -> tuple[float, float, float]:
-        """Return a held-out error of the raw readings, that after the last stage, and the change in percent, or NaN."""
+        """Return a held-out error before calibration, after the last stage, and the change in percent, or NaN."""
         steps = (_read(self.folder / "validations" / f"{unit}.json").get(sensor) or {}).get("steps", ())
         before, after = (
             float(np.array([np.nan, *(s[metric] for s in steps if s["name"].startswith(kind))], float)[-1])
@@ -105,7 +105,7 @@ class Results:
         return []
 
     def with_printed(self, name: str, sensor: str, parameters: Mapping[str, float]) -> float:
-        """Return the mean |e| that printed parameters leave on the held-out motion of a set of recordings, or NaN.
+        """Return the mean |e| on the held-out motion of a set of recordings with printed parameters, or NaN.
 
         ``S (O M a - b)`` for the accelerometer (eq. 3.2), ``(g - b) M S`` for the gyroscope (3.45).
         """
@@ -124,12 +124,12 @@ class Results:
 
 
 def values(row: Mapping[str, float], pattern: str) -> Values:
-    """Return the printed values of x, y and z, whose columns ``pattern`` names: (3,) array."""
+    """Return the printed values of x, y and z from the columns ``pattern``: (3,) array."""
     return np.array([row[pattern.format(axis)] for axis in AXES])
 
 
 def matrix_of(row: Mapping[str, float], letter: str) -> Values:
-    """Return a printed matrix, of the columns ``M11`` to ``M33``: (3, 3) array."""
+    """Return a printed matrix from the columns ``<letter>11`` to ``<letter>33``: (3, 3) array."""
     return np.array([[row[f"{letter}{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
 
 

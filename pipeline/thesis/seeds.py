@@ -1,22 +1,24 @@
-"""The thesis's comparisons over many seeds: a row a seed, set of recordings, cause of disturbance and method.
+"""Repeat the comparisons of the thesis over many seeds.
+
+A row is for one seed, set of recordings, cause of disturbance and method, with
 
     error = mean |e_n| of the held-out motion (Sudsanguan 2019, eqs 5.1 to 5.4), with the noise of the same seed
 
-For the accelerometer as printed, a row also holds what the stages found: O of y and z, M, b, and S (mean of both
-sides). "zero-phase" runs the RC filter forwards and backwards, so its gain works twice; "same-gain" does so with a
-shorter time constant tau', so that the gain is that of the causal filter without its delay:
+For the accelerometer as printed, a row also has the parameters from the stages: O of y and z, M, b, and S (mean of both
+sides). "zero-phase" runs the RC filter forwards and backwards, which squares its gain. "same-gain" does so with a
+shorter time constant tau', which gives the gain of the causal filter without its delay:
 
     |H|^2 = 1 - tau (dt + tau) omega^2,   2 tau' (dt + tau') = tau (dt + tau)      for small omega
 
-The estimates are those of the methods themselves; only their uncertainties are left out, which would take most of the
+The estimates are computed by the functions of the methods, without the uncertainties, which would take most of the
 time.
 
-Each seed draws new noise onto the same exact readings:
+Each seed adds new noise to the same exact readings:
 
     reading = round(c (exact + white + wander)) / c,   then a share of the samples is lost
 
-The motion of the precise table is the same for every seed, so its exact readings are simulated once. The home-made
-table errs anew each time, and is simulated anew.
+The motion of the precise table is the same for every seed, so that its exact readings are simulated once. The errors of
+the home-made table are drawn for each seed.
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ COLUMNS = ("set", "seed", "cause", "method", *FOUND, "error")
 TIME_CONSTANT_S = 0.12  # of campaign.yaml
 INTERVAL_S = 0.12  # of simulation.yaml
 SAME_GAIN_S = (np.sqrt(INTERVAL_S**2 + 2.0 * TIME_CONSTANT_S * (INTERVAL_S + TIME_CONSTANT_S)) - INTERVAL_S) / 2.0
-# Causes of disturbance; each includes those before it.
+# Causes of disturbance; each includes the causes before it.
 SHEET = "noise of the sensor file, up to half the sampling rate"
 WHOLE = "noise of the sensor's whole bandwidth, folded into the samples"
 LOST = "and samples lost on the radio link"
@@ -71,7 +73,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Set:
-    """One set of recordings of ``simulation.yaml``: its number there, and the seed of the campaign's motions."""
+    """One set of recordings of ``simulation.yaml``: its description, its number there, and the campaign's seed."""
 
     unit: UnitDescription
     number: int
@@ -79,13 +81,13 @@ class Set:
 
     @classmethod
     def named(cls, description: Description, name: str) -> Set:
-        """Return the set of a name."""
+        """Return the set with a name."""
         number = [u.unit for u in description.units].index(name)
         return cls(description.units[number], number, description.seed)
 
     @property
     def sensor(self) -> str:
-        """The sensor that the recordings are made for; the other one's readings are left out."""
+        """The sensor for which the recordings are made; readings of the other sensor are not used."""
         return "gyroscope" if "-gyro" in self.unit.unit else "accelerometer"
 
     @cached_property
@@ -95,7 +97,7 @@ class Set:
 
     @cached_property
     def shaken(self) -> list[Recording]:
-        """The same on a table that shakes."""
+        """The same on a vibrating table."""
         shaking = replace(self.unit, imperfections={**self.unit.imperfections, **SHAKING})
         return _exact(shaking, self.campaign_seed, self.number)
 
@@ -105,9 +107,9 @@ class Set:
         return parts_of(self.still, "accelerometer", read_config("table", self.unit.table), "the study")
 
     def drawn(self, seed: int, cause: str = LOST) -> list[tuple[Recording, Mask]]:
-        """Return the recordings of one seed, whole, and which of their samples arrive.
+        """Return the complete recordings of one seed, and which of their samples are received.
 
-        They are disturbed by ``cause`` and those before it in ``CAUSES``.
+        They are disturbed by ``cause`` and the causes before it in ``CAUSES``.
         """
         exact = self.still if self.unit.table == "acutronic" else _exact(self.unit, seed, self.number)
         if cause == SHAKEN:
@@ -126,8 +128,8 @@ class Set:
             reading = simulated.quantised(
                 np.asarray(recording.reading(self.sensor)) + white + sensor_config["bias_wander"] * slow
             )
-            own: dict[str, Any] = {s: reading if s == self.sensor else None for s in SENSORS}
-            out.append((replace(recording, **own), received(recording.samples, lost, link)))
+            readings: dict[str, Any] = {s: reading if s == self.sensor else None for s in SENSORS}
+            out.append((replace(recording, **readings), received(recording.samples, lost, link)))
         return out
 
 
@@ -143,14 +145,14 @@ def _exact(unit: UnitDescription, seed: int, number: int) -> list[Recording]:
 class Drawn:
     """The turns of one seed and the held-out motion of its device, with the same filter on both."""
 
-    own: Set
+    turns_set: Set
     seed: int
     held_out: Recording
     cause: str = LOST
     filter: str = "rc_low_pass"
 
     def filtered(self, recording: Recording) -> Recording:
-        """Return a recording behind the filter."""
+        """Filter a recording."""
         if self.filter == "unfiltered":
             return recording
         time_constant = SAME_GAIN_S if self.filter == "same-gain" else TIME_CONSTANT_S
@@ -159,11 +161,13 @@ class Drawn:
 
     def turns(self) -> list[Recording]:
         """Return the filtered turns."""
-        return [self.filtered(recording.select(kept)) for recording, kept in self.own.drawn(self.seed, self.cause)]
+        return [
+            self.filtered(recording.select(kept)) for recording, kept in self.turns_set.drawn(self.seed, self.cause)
+        ]
 
     def staged_accelerometer(self, *, as_printed: bool, judge: bool = True) -> Row:
-        """Return what the stages find, and the error that they leave."""
-        turns = self._seen(as_printed=as_printed)
+        """Return the parameters from the stages and, with ``judge``, the error after them."""
+        turns = self._accelerometer_turns(as_printed=as_printed)
         fitted = [[s.coefficients for s in fits] for fits in ([] if as_printed else sinusoids_of(turns))]
         extremes = extremes_of_samples(turns, 1.0) if as_printed else extremes_of_sinusoids(fitted, 1.0)
         found: dict[str, float] = {}
@@ -179,8 +183,8 @@ class Drawn:
         return row
 
     def least_squares_accelerometer(self) -> Row:
-        """Return the error that nonlinear least squares leaves."""
-        table, sensor = (read_config(group, getattr(self.own.unit, group)) for group in ("table", "sensor"))
+        """Return the error after nonlinear least squares."""
+        table, sensor = (read_config(group, getattr(self.turns_set.unit, group)) for group in ("table", "sensor"))
         settings = {"table": table, "sensor": sensor, "procedure": {"holdout_every": 0}}
         fitted = nonlinear_least_squares.fit(self.turns(), None, settings)
         return {"error": self._accelerometer_error(partial(linear_truth, fitted))}
@@ -190,11 +194,11 @@ class Drawn:
         reading = self.filtered(self.held_out).accelerometer
         return float(np.mean(np.abs(np.linalg.norm(correct(np.asarray(reading)), axis=1) - 1.0)))
 
-    def _seen(self, *, as_printed: bool) -> list[Turn]:
-        """Return what the staged method sees of the turns; their motion is the same for every seed."""
+    def _accelerometer_turns(self, *, as_printed: bool) -> list[Turn]:
+        """Return the turns as the staged method uses them; their motion is the same for every seed."""
         turns = []
-        drawn = self.own.drawn(self.seed, self.cause)
-        for part, (recording, kept) in zip(self.own.parts, drawn, strict=True):
+        drawn = self.turns_set.drawn(self.seed, self.cause)
+        for part, (recording, kept) in zip(self.turns_set.parts, drawn, strict=True):
             filtered = self.filtered(recording.select(kept))
             late = replace(part, recording=replace(part.recording, filter=filtered.filter))
             used = samples_of(late, as_printed=as_printed)
@@ -204,7 +208,7 @@ class Drawn:
 
     def gyroscope(self) -> Iterator[tuple[str, Row]]:
         """Yield method and error of the staged method, and of Cholesky and LU as printed and inverted."""
-        turns, table = self.turns(), read_config("table", self.own.unit.table)
+        turns, table = self.turns(), read_config("table", self.turns_set.unit.table)
         parts = parts_of(turns, "gyroscope", table, "the study")
         samples = gyroscope.samples_of(parts, turns)
         theta = gyroscope.weights_of(samples.rate, as_printed=False) @ samples.reading
@@ -227,26 +231,26 @@ class Drawn:
 def study_of(campaign: Path, seeds: Sequence[int], name: str) -> list[Row]:
     """Return the rows of a set of recordings of the campaign's ``simulation.yaml``."""
     description = read_description(campaign / "simulation.yaml")
-    own = Set.named(description, name)
-    held_out = Set.named(description, f"{device_of(name)}-held-out-{own.sensor}")
+    turns_set = Set.named(description, name)
+    held_out = Set.named(description, f"{device_of(name)}-held-out-{turns_set.sensor}")
     rows = []
     for seed in seeds:
         recording, kept = held_out.drawn(seed)[0]
-        for cause, method, row in _rows(Drawn(own, seed, recording.select(kept))):
+        for cause, method, row in _rows(Drawn(turns_set, seed, recording.select(kept))):
             rows.append({"set": name, "seed": seed, "cause": CAUSES.index(cause), "method": method, **row})
     return rows
 
 
 def _rows(drawn: Drawn) -> Iterator[tuple[str, str, Row]]:
     """Yield cause, method and row of one seed."""
-    name = drawn.own.unit.unit
-    if drawn.own.sensor == "gyroscope":
+    name = drawn.turns_set.unit.unit
+    if drawn.turns_set.sensor == "gyroscope":
         for method, row in drawn.gyroscope():
             yield LOST, method, row
         return
     yield LOST, "printed", drawn.staged_accelerometer(as_printed=True)
     yield LOST, "staged", _error_alone(drawn.staged_accelerometer(as_printed=False))
-    if drawn.own.unit.table == "acutronic":
+    if drawn.turns_set.unit.table == "acutronic":
         for cause in (c for c in CAUSES if c != LOST):
             yield cause, "printed", replace(drawn, cause=cause).staged_accelerometer(as_printed=True, judge=False)
     if "-continuous-" in name:
@@ -266,6 +270,6 @@ def device_of(name: str) -> str:
 
 
 def sets_of(campaign: Path) -> list[str]:
-    """Return the sets of recordings that calibrate a device of the thesis."""
+    """Return the names of the sets of recordings that calibrate a device of the thesis."""
     names = [u.unit for u in read_description(campaign / "simulation.yaml").units]
     return [n for n in names if "-held-out-" not in n and not n.startswith("gy-521")]

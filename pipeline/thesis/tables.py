@@ -1,9 +1,9 @@
-"""The tables of the thesis and of the conference paper: each printed value with the campaign's.
+"""Compare the tables of the thesis and of the conference paper with the campaign, value by value.
 
-All tables are one DataFrame with a row a cell: ``table`` (as printed; of the paper ``paper 1`` and so on), ``title``,
-``block`` (how ours was found), ``row``, ``column``, ``printed``, ``ours`` (NaN where a unit failed), ``digits``
-(decimals that were printed), ``difference``, and whether it is ``large``: beyond ``LARGE`` of the printed value, and
-beyond its rounding.
+All tables are one DataFrame with a row for each cell: ``table`` (as printed; ``paper 1`` and so on for the paper),
+``title``, ``block`` (how ours was computed), ``row``, ``column``, ``printed``, ``ours`` (NaN where a unit failed),
+``digits`` (printed decimals), ``difference``, and ``large``: whether the difference exceeds both ``LARGE`` of the
+printed value and its rounding.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Cells = Iterator[tuple[Any, ...]]
 
 COLUMNS = ("table", "title", "block", "row", "column", "printed", "ours", "digits")
-LARGE = 0.25  # of the printed value, from which the page explains a difference
+LARGE = 0.25  # of the printed value: the page explains a larger difference
 ACCELEROMETER = {
     "as printed: the largest and smallest samples": "printed",
     "errata corrected: fitted sinusoids": "staged",
@@ -40,7 +40,7 @@ METRICS = {
 }
 APPLIED = "by the printed parameters, applied to our held-out motion"
 STAGES = {"O": "orthogonality", "M": "misalignment", "b": "bias", "S": "scale_factor"}
-# Of the comparison of methods: what its two methods are, by reading of the thesis.
+# The comparison of methods: its two methods, for the thesis as printed and with errata corrected.
 COMPARED = {
     "accelerometer": {
         "by the staged method as printed": ("printed", "least-squares"),
@@ -59,8 +59,8 @@ PAPER = "gy-521"
 SEGMENT_DEG = 45.0  # the paper turns in steps of 45 deg
 
 
-# By sensor: file of the printed parameters, our methods, and rows: label, column of the file, stage, and the names of
-# the parameters whose mean is meant (of a factor, both sides).
+# By sensor: file of the printed parameters, our methods, and rows. A row: label, column of the file, stage, and the
+# parameters whose mean is compared (both sides of a factor).
 PARAMETERS: dict[str, tuple[str, dict[str, str], list[tuple[str, str, str, list[str]]]]] = {
     "accelerometer": ("accel_parameters", ACCELEROMETER, [
         (f"{q}{a}{', g' if q == 'b' else ''}", f"{q}_{a}{'_g' if q == 'b' else ''}", stage,
@@ -76,7 +76,7 @@ PARAMETERS: dict[str, tuple[str, dict[str, str], list[tuple[str, str, str, list[
 
 
 def all_tables(printed: Path, results: Results) -> pd.DataFrame:
-    """Return the cells of tables 5.1 to 5.26, then of those of the paper."""
+    """Return the cells of tables 5.1 to 5.26, then of the paper's tables."""
     tables = (_parameter_tables, _error_tables, _method_tables)
     cells = sorted((c for t in tables for c in t(printed, results)), key=lambda c: int(c[0].partition(".")[2]))
     return with_differences(pd.DataFrame([*cells, *_paper_tables(printed, results)], columns=list(COLUMNS)))
@@ -97,8 +97,8 @@ def _cells(
     digits: int = 3,
 ) -> Cells:
     """Yield the cells of one row; ``place``: table, title, block and row."""
-    for column, told, own in zip(columns, printed, ours, strict=True):
-        yield (*place, column, float(told), float(own), digits)
+    for column, printed_value, our_value in zip(columns, printed, ours, strict=True):
+        yield (*place, column, float(printed_value), float(our_value), digits)
 
 
 def _title(what: str, rows: pd.DataFrame) -> str:
@@ -142,15 +142,15 @@ def _method_tables(printed: Path, results: Results) -> Cells:
         sensor, unit = rows["sensor"].iloc[0], rows["bias_unit"].iloc[0]
         columns = [f"{DEVICES[d]}, {SHORT[m]}" for d, m in zip(rows["device"], rows["method"], strict=True)]
         head = f"{sensor.capitalize()}: {{}} by two methods"
-        own = "stop-1s" if sensor == "accelerometer" else "gyro-20dps"
-        # the STIM300's errors are those of continuous 0.5 deg/s (erratum 5)
+        procedure = "stop-1s" if sensor == "accelerometer" else "gyro-20dps"
+        # the STIM300's errors are from continuous 0.5 deg/s (erratum 5)
         other = {"stim300": "continuous-0.5dps"} if sensor == "accelerometer" else {}
         for block, (staged, method) in COMPARED[sensor].items():
             units = [
                 (d, staged if m == "staged" else method) for d, m in zip(rows["device"], rows["method"], strict=True)
             ]
-            fits = [results.calibration(f"{device}-{own}-{m}", sensor) for device, m in units]
-            # readings are row vectors in the thesis: its matrix is the transpose of ours
+            fits = [results.calibration(f"{device}-{procedure}-{m}", sensor) for device, m in units]
+            # readings are row vectors in the thesis, whose matrix is the transpose of ours
             found = {
                 f"R{i + 1}{j + 1}": (f"R{i + 1}{j + 1}", [matrix[j, i] for _, matrix in fits])
                 for i in range(3)
@@ -160,10 +160,10 @@ def _method_tables(printed: Path, results: Results) -> Cells:
             found |= {f"b{a}, {unit}": (f"b_{a}", [bias[k] for bias, _ in fits]) for k, a in enumerate(AXES)}
             for row, (column, ours) in found.items():
                 yield from _cells((table, head.format("parameters"), block, row), columns, rows[column], ours)
-            errors = [results.errors(f"{d}-{other.get(d, own)}-{m}", sensor) for d, m in units]
+            errors = [results.errors(f"{d}-{other.get(d, procedure)}-{m}", sensor) for d, m in units]
             names = (f"mean |e|, {unit}: before", f"mean |e|, {unit}: after", "mean |e|: change, %")
-            told = ("mean_error_before", "mean_error_after", "change_percent")
-            for row, column, ours in zip(names, told, np.transpose(errors), strict=True):
+            printed_values = ("mean_error_before", "mean_error_after", "change_percent")
+            for row, column, ours in zip(names, printed_values, np.transpose(errors), strict=True):
                 place = (rows["error_table"].iloc[0], head.format("held-out error"), block, row)
                 yield from _cells(place, columns, rows[column], ours)
 
@@ -178,11 +178,11 @@ def _paper_tables(printed: Path, results: Results) -> Cells:
         ("paper 2", f"{made}, judged in six positions", _paper_2(positions, results)),
         ("paper 3", "GY-521, gyroscope: Cholesky and LU", _paper_3(by_table["3"], results)),
     ):
-        for row, told, ours, digits in found:
-            yield from _cells((table, title, "", row), ["GY-521"], [told], [ours], digits)
+        for row, printed_values, ours, digits in found:
+            yield from _cells((table, title, "", row), ["GY-521"], [printed_values], [ours], digits)
     title = "GY-521, gyroscope: error of the integrated angle, row i in the turn about axis i"
-    for row, errors, own in _paper_4(by_table["4"], results):
-        yield from _cells(("paper 4", title, "", row), AXES, errors, own, 4)
+    for row, errors, our_values in _paper_4(by_table["4"], results):
+        yield from _cells(("paper 4", title, "", row), AXES, errors, our_values, 4)
 
 
 def _paper_1(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float, int]]:
@@ -204,7 +204,7 @@ def _paper_1(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float,
 
 
 def _paper_2(positions: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float, int]]:
-    """Yield the mean reading of the axis that points up or down, before and after the 24 orientations' calibration."""
+    """Yield the mean reading of the vertical axis, before and after calibration by the 24 orientations."""
     means = _rest_means(results.recordings(f"{PAPER}-six-positions", "rests"))
     bias, matrix = results.calibration(f"{PAPER}-orientations", "accelerometer")
     for row in positions.to_dict("records"):
