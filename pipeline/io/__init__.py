@@ -1,1 +1,1 @@
-"""Files to recordings: units and axes end here."""
+"""Read files to recordings in the units and the body axes of the package."""

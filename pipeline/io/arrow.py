@@ -1,14 +1,16 @@
-"""Recordings as Parquet and as canonical CSV, by pyarrow; ``pyarrow.array`` would import pandas, which takes 0.25 s.
+"""Write and read recordings as Parquet, and write canonical CSV, by pyarrow.
 
-**Parquet**: one file a unit, its recordings one after the other. ``time_ns`` is int64, ``flags`` uint16, every channel
-a double, null in the rows of recordings without it. The file is a member of a pack, whose checksum guards it
-(``pipeline.pack``). Writing the same recordings again gives the same bytes.
+**Parquet**: one file for each unit, with its recordings one after the other. ``time_ns`` is int64, ``flags`` uint16,
+every channel a double, null in the rows of recordings without it. The file is a member of a pack, which has a checksum
+(``pipeline.pack``). The same recordings give the same bytes.
 
-**CSV**: a number with fixed decimals is an integer with a point in it,
+**CSV**: a number with d decimals is written as a decimal,
 
     round(value * 10^d)  ->  decimal128(38, d)  ->  text
 
-so that the file holds the nearest decimal, and reading it gives ``round(value * 10^d) / 10^d`` to the last bit.
+so that the file contains the nearest decimal, and reading it gives ``round(value * 10^d) / 10^d`` to the last bit.
+
+``pyarrow.array`` is not used, because it imports pandas, which takes 0.25 s.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ def text_scalar(text: str) -> pa.Scalar:
 
 
 def columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
-    """Return the times, channels and flags that a recording holds, by name."""
+    """Return the times, channels and flags of a recording, by name."""
     columns: dict[str, NDArray[Any]] = {"time_ns": recording.time_ns}
     for name, channels in BLOCKS.items():
         block = getattr(recording, name)
@@ -74,10 +76,10 @@ def columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
 
 
 def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str, int] = MappingProxyType({})) -> None:
-    """Write a recording as canonical CSV; the file is replaced at once, never half written.
+    """Write a recording as canonical CSV; the file is replaced atomically.
 
-    Readings are written along the body axes. ``decimals``: header name (``accel_x_g`` ...) to digits after the point; a
-    column that is not named keeps every bit.
+    Readings are written along the body axes. ``decimals``: header name (``accel_x_g`` ...) to digits after the point;
+    other columns are written without loss.
     """
     unknown = [name for name in decimals if name not in CANONICAL.values()]
     if unknown:
@@ -101,12 +103,12 @@ def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str,
 
 
 def times_as_decimals(time_ns: Integers, digits: int = 9) -> pa.Array:
-    """Return times in s as decimals with ``digits`` after the point, which have to hold them exactly."""
+    """Return times in s as decimals with ``digits`` after the point, which must represent them exactly."""
     return _decimal(time_ns, 9).cast(pa.decimal128(38, digits))
 
 
 def _decimal(units: Integers, digits: int) -> pa.Array:
-    """Return integers as decimals: ``units / 10^digits``; both words of 128 bits, the high one the sign."""
+    """Return integers as decimals ``units / 10^digits``; the high word of the 128 bits is the sign."""
     words = np.empty((len(units), 2), np.int64)
     words[:, 0], words[:, 1] = units, units >> 63
     return pa.Array.from_buffers(pa.decimal128(38, digits), len(units), [None, pa.py_buffer(words)])
@@ -152,11 +154,11 @@ def to_parquet(recordings: Sequence[Recording]) -> bytes:
 
 
 def from_parquet(content: bytes, name: str) -> list[Recording]:
-    """Return the recordings of a unit, each bit as it was saved; errors have the name.
+    """Return the recordings of a unit, identical to the saved ones; ``name``: of the file, for errors.
 
-    The times are read at once, every other channel when it is used first: a stage decodes what it needs, once.
+    The times are read at once, every other channel when it is first used: a stage decodes only the channels it uses.
     """
-    # a file of some MB is read fastest by the thread that needs it
+    # a file of some MB is read fastest by a single thread
     file = parquet.ParquetFile(pa.BufferReader(content), pre_buffer=False)
     text = (file.schema_arrow.metadata or {}).get(KEY)
     if text is None:
@@ -188,7 +190,7 @@ def from_parquet(content: bytes, name: str) -> list[Recording]:
 
 
 class _StoredRecording(Recording):
-    """A recording whose channels, below, are decoded when they are used first."""
+    """A recording whose channels, below, are decoded when they are first used."""
 
     @classmethod
     def of(cls, entry: dict[str, Any], read: Callable[[Sequence[str]], list[NDArray[Any]]]) -> Recording:
@@ -203,7 +205,7 @@ class _StoredRecording(Recording):
         return recording
 
     def channels(self, names: Sequence[str]) -> NDArray[Any] | None:
-        """Return a channel, or a block of three or four; None if the file does not hold it."""
+        """Return a channel, or a block of three or four; None if the file does not have it."""
         columns = vars(self)["stored"](names)
         return None if columns is None else columns[0] if len(names) == 1 else np.column_stack(columns)
 

@@ -1,9 +1,9 @@
-"""What a reader of a file returns: channels in house units; and their rotation from the sensor's axes to the body's.
+"""The channels of one file in house units, and their rotation from the sensor's axes to the body's axes.
 
     body[m_i] = s_i * reading_i,   axis_map[i] = s_i m_i
 
-with reading axis i, the body axis m_i that it points along, and the sign s_i. Some chips have a left-handed
-accelerometer frame beside a right-handed gyroscope frame, so each sensor may have a map of its own.
+where axis i of the reading points along the body axis m_i with the sign s_i. Some chips have a left-handed
+accelerometer frame and a right-handed gyroscope frame, so that each sensor may have a separate map.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class ChannelTable:
     """The samples of one file.
 
     ``values`` are in house units, by channel (``pipeline.io.units.CHANNELS``). ``lines``: the line of each row, counted
-    from 1; None where a format has no lines. ``flags``: what the reader itself marks. ``count_sizes``: one count in the
-    house unit, of channels that came as counts.
+    from 1; None for a format without lines. ``flags``: quality flags from the reader. ``count_sizes``: one count in the
+    house unit, for channels that are logged as counts.
     """
 
     path: str
@@ -47,18 +47,18 @@ class ChannelTable:
     flags: NDArray[np.uint16] | None = None
 
     def place(self, row: int) -> str:
-        """Return ``path:line`` of a row, or the path where there are no lines."""
+        """Return ``path:line`` of a row, or the path for a format without lines."""
         return self.path if self.lines is None else f"{self.path}:{self.lines[row]}"
 
     def note(self, code: str, rows: Index, detail: str) -> Note:
-        """Return a note on some rows, with their first and last line and time."""
+        """Return a note on rows, with their first and last line and time."""
         first, last = int(rows[0]), int(rows[-1])
         start, end = float(self.time_ns[first]) / 1e9, float(self.time_ns[last]) / 1e9
         lines = (0, 0) if self.lines is None else (int(self.lines[first]), int(self.lines[last]))
         return Note(code, int(rows.size), *lines, detail, start, end)
 
     def select(self, rows: Index | slice, *notes: Note) -> ChannelTable:
-        """Return some rows, in their order, with further notes."""
+        """Select rows, and add notes."""
         return replace(
             self,
             time_ns=self.time_ns[rows],
@@ -70,7 +70,7 @@ class ChannelTable:
 
 
 def in_house_unit(source: ChannelSource, numbers: Values) -> Values:
-    """Return the numbers of a channel (not the time) in g, deg/s, deg or degC."""
+    """Convert the numbers of a channel (not the time) to g, deg/s, deg or degC."""
     if source.unit == COUNTS:
         return (numbers - source.offset) * (1.0 / source.counts_per_unit)
     return to_house_unit(source.channel, numbers, source.unit)
@@ -91,19 +91,19 @@ def axis_matrix(axis_map: Sequence[str]) -> Values:
 
 
 def axis_maps(sensor: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the axis map of each sensor by the section ``sensor``: its own, else that of the unit, else straight."""
+    """Return the axis map of each sensor from the section ``sensor``: the sensor's, else the unit's, else straight."""
     common = sensor.get("axis_map") or STRAIGHT
     return {s: tuple((sensor.get(s) or {}).get("axis_map") or common) for s in TRIADS}
 
 
 def maps_of_log(log: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the axis maps in the section ``log`` of a calibration: one a sensor, in older files one for both."""
+    """Return the axis maps in the section ``log`` of a calibration: one per sensor, in older files one for both."""
     stated = log.get("axis_map") or STRAIGHT
     return {s: tuple(stated[s] if isinstance(stated, dict) else stated) for s in TRIADS}
 
 
 def in_body_axes(axis_map: Sequence[str], readings: Values) -> Values:
-    """Return (n, 3) readings in the body's axes; the same array where the map is straight."""
+    """Rotate (n, 3) readings to the body's axes; return the same array if the map is straight."""
     if tuple(axis_map) == STRAIGHT:
         return readings
     matrix = axis_matrix(axis_map)

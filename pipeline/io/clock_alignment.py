@@ -1,23 +1,24 @@
-"""The clock of a table's log, aligned with the sensor's by the motion in both logs.
+"""Align the clock of a table's log with the sensor's clock, by the motion in both logs.
 
     tau  = t + d + k (t - t_m)
     w(t) = A r(tau) + a + noise,   f(t) = B u(tau) + b + noise
 
 with the sensor's and the table's clock t and tau, s; offset d and drift k of the table's clock, uncorrelated at t_m;
-readings w and f, and the signals r and u of the table's log that they follow (``pipeline.io.encoder_log``).
+readings w and f; and the signals r and u of the table's log to which they respond (``pipeline.io.encoder_log``).
 
-``d`` is first found by correlation on a grid. Steps of a table repeat, the directions of gravity at them do not: of the
-offsets with similar correlation, the one with the smallest residual of the whole model is taken. The table is assumed
-at rest before and after its log; where no offset fits so, only what both logs cover is compared. Then d and k are
-refined by Gauss-Newton, with A, B, a, b eliminated by projection.
+``d`` is first found by correlation on a grid. The steps of a table repeat, but the directions of gravity at the steps
+do not: of the offsets with similar correlation, the one with the smallest residual of the whole model is selected. The
+table is assumed at rest before and after its log. If no offset fits with this assumption, only the times that both logs
+cover are compared. Then d and k are refined by Gauss-Newton, with A, B, a, b eliminated by projection.
 
 The residuals are not white: they are largest where the rate changes, and there the offset is determined. So the
 covariance is a sandwich estimate from the scatter between blocks,
 
     C = H^-1 (sum_b s_b s_b') H^-1,   H = J'J,   s_b = J_b' e_b
 
-with the projected derivatives J and the residuals e, enlarged for the effective number of blocks; the larger one of
-blocks of 1 s and 4 s, at least that of white noise and 0.5 % of the table's interval, the error of the interpolation.
+with the projected derivatives J and the residuals e, enlarged for the effective number of blocks. It is computed with
+blocks of 1 s and of 4 s. The uncertainty is the largest of both and that of white noise, combined with the error of the
+interpolation, 0.5 % of the table's interval.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ if TYPE_CHECKING:
 
 
 SMALLEST_CORRELATION = 0.9  # at most 19 % of the variance of the rates is not explained, 1 - 0.9^2
-BLOCKS_S = (1.0, 4.0)  # about the length of a ramp of the rate, and longer than it
+BLOCKS_S = (1.0, 4.0)  # about the length of a ramp of the rate, and longer
 COARSE_S = 0.01  # step of the grid of offsets
 MOST_PLACES, WORTH_A_LOOK = 40, 0.3  # offsets refined, and their least correlation relative to the best
 SAMPLES_OF_A_LOOK = 20_000  # bounds the cost of up to 40 offsets
 AMBIGUOUS = 1.1  # ratio of the second-best mean squared residual to the best
-SHARED = 0.5  # share of the shorter log that both have to cover
+SHARED = 0.5  # share of the shorter log that both must cover
 STEPS, ROUNDING_S = 20, 1e-9  # Gauss-Newton stops below 1 ns, the resolution of the times
 FEWEST_BLOCKS = 3.0  # bounds the factor nu / (nu - 2), the variance of Student's t, for few blocks
 RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
@@ -63,7 +64,7 @@ class ClockFit:
     correlation: float
 
     def table_time(self, t: Values) -> Values:
-        """Return the table's time of times of the sensor, s."""
+        """Convert times of the sensor to the table's time, s."""
         return np.asarray(t + self.offset + self.drift * (t - self.middle))
 
 
@@ -82,10 +83,10 @@ class SensorSignals:
 
 
 def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
-    """Return offset and drift of the table's clock, both times counted from the first sample of each log.
+    """Return offset and drift of the table's clock; the times count from the first sample of each log.
 
-    Refused are a sensor without gyroscope, and logs that do not show the same motion, or show it at several times
-    alike.
+    Raises ``IngestError`` for a sensor without gyroscope, and for logs that do not show the same motion, or that fit
+    equally well at several offsets.
     """
     if "gyro_x" not in sensor.values:
         raise IngestError("a table's log with its own clock needs a gyroscope to be aligned", log.path, code="no_sync")
@@ -153,7 +154,7 @@ def _places(sensed: SensorSignals, signals: Signals) -> list[float]:
 def _left(sensed: SensorSignals, signals: Signals, offset: float, *, beyond: bool) -> float:
     """Return the mean squared residual of the whole model at an offset, relative to the noise.
 
-    Infinite where the two logs share less than half of what they could.
+    It is infinite where the logs overlap by less than half of the shorter one.
     """
     inside = signals.covers(sensed.time + offset)
     shared = float(np.mean(inside)) * sensed.time[-1]
@@ -169,7 +170,7 @@ def _left(sensed: SensorSignals, signals: Signals, offset: float, *, beyond: boo
 
 
 def _groups(sensed: SensorSignals, rates: Values, directions: Values) -> list[tuple[Values, Values, Values]]:
-    """Return columns, readings and noise of the rates and, where there are some, of the forces."""
+    """Return columns, readings and noise of the rates and, if there are any, of the forces."""
     ones = np.ones((len(sensed.time), 1))
     m = sensed.rates
     out = [(np.hstack([rates, ones]), sensed.readings[:, :m], sensed.noise[:m])]

@@ -1,13 +1,13 @@
-"""Motion of a table without encoders, from its commanded program and the moves in the data.
+"""Reconstruct the motion of a table without encoders from its commanded program and the moves in the data.
 
     A(t) = P(tau),   r(t) = P'(tau),   tau = m_j + (1 + k) (t - t_j) + d_j       near move j
 
-with the commanded angle P, deg, by the program's time; the middle m_j of move j, which is at the sensor's time t_j by
-offset and drift of the whole program (``pipeline.io.clock_alignment``); and the move's deviation d_j from that, s. The
-drift k during moves is separate, as pauses between moves would look like a drift.
+with the commanded angle P, deg, at the program's time tau. The middle m_j of move j is at the sensor's time t_j by
+offset and drift of the whole program (``pipeline.io.clock_alignment``); d_j is the deviation of the move from that, s.
+The drift k during moves is separate, because pauses between moves would bias it.
 
-``d_j`` and ``k`` are fitted to the readings w = a P'(tau) + b of the gyroscope about the move, so a table that pauses
-between moves is followed from rest to rest. Lost steps of the motors are not observable and belong to its accuracy.
+``d_j`` and ``k`` are fitted to the readings w = a P'(tau) + b of the gyroscope near the move, so that pauses between
+moves may have any length. Lost steps of the motors are not observable; they are part of the table's accuracy.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 STEP_S = 0.005  # grid of the program and of its derivative, half the interval of a log at 100 Hz
 BEFORE_S = 1.0  # rest that is added at both ends
 ROUNDS = 12  # iterations at most; they end where no move changes by 1 us
-FARTHEST = 0.5  # of the rest beside a move
+FARTHEST = 0.5  # of the rest before or after a move
 
 
 def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) -> ChannelTable:
-    """Return a log with the angle and rate of a table that was commanded so; the gyroscope must show the moves.
+    """Add the angle and rate of a table with this program to a log; the gyroscope must show the moves.
 
     ``program`` has rests ``{rest_s}``, turns ``{turn_deg, rate_dps, acceleration_dps2}`` and ``{repeat, steps}``.
     """
@@ -62,12 +62,12 @@ def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) ->
 
 
 class Program:
-    """One axis of a table over time, by its steps: rests and turns with trapezoidal rate; it rests before and after.
+    """Commanded motion of one axis of a table: rests, and turns with a trapezoidal rate.
 
         A(t) = A_k + W_k s + a_k s^2 / 2,   dA/dt = W_k + a_k s,   s = t - t_k
 
     A turn by the angle D at the rate r with acceleration a ramps for r/a, holds r and ramps down; where |D| < r^2/a it
-    never reaches r, and the ramps meet in the middle.
+    does not reach r, and the ramps meet in the middle. The table rests before and after the program.
 
     ``steps``: ``{rest_s}`` and ``{turn_deg, rate_dps, acceleration_dps2}``. ``knots``: (1 + 4 n, 4) array of time t_k
     (s), angle A_k (deg), rate W_k (deg/s) and acceleration a_k (deg/s^2), four rows for each of n moves. ``stops``:
@@ -97,7 +97,7 @@ class Program:
         self.stops: Values = self.knots[::4, 1]
 
     def at(self, time: Values) -> tuple[Values, Values, Values, Index]:
-        """Return angle, rate, acceleration and number of the move, at rest of the last one (-1: none yet), (n,)."""
+        """Return angle, rate, acceleration and index of the present or last move (-1: before the first), (n,) each."""
         k = np.clip(np.searchsorted(self.knots[:, 0], time, side="right") - 1, 0, None)
         s = np.clip(time - self.knots[k, 0], 0.0, None)
         _, angle, rate, acceleration = self.knots[k].T
@@ -105,22 +105,22 @@ class Program:
 
 
 def _flat(program: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-    """Yield the steps of a program, repeated ones as often as they are made."""
+    """Yield the steps of a program, with repetitions expanded."""
     for step in program:
         for _ in range(int(step.get("repeat", 1))):
             yield from _flat(step["steps"]) if "repeat" in step else [step]
 
 
 def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> tuple[Values, Values, float, float]:
-    """Place each move by the readings of the gyroscope about it.
+    """Fit the time of each move to the readings of the gyroscope near it.
 
-    Returns the program's time of times of the sensor, s; the deviation of each move, s; the drift; and the sensor's
-    time at which the program began, s. ``tau`` is the program's time by the clocks alone.
+    Returns the program's time at the sensor's times, s; the deviation of each move, s; the drift; and the sensor's time
+    at which the program began, s. ``tau`` is the program's time from offset and drift alone.
     """
     begin, end = program.knots[1::4, 0], program.knots[4::4, 0]
     gaps = begin[1:] - end[:-1]
     middle, n = (begin + end) / 2, len(begin)
-    near = np.searchsorted(end[:-1] + gaps / 2, tau)  # the move that each sample is near to
+    near = np.searchsorted(end[:-1] + gaps / 2, tau)  # the nearest move of each sample
     low, high = np.append(-np.inf, end[:-1])[near], np.append(begin[1:], np.inf)[near]  # between its neighbours
     at = np.interp(middle, tau, t)
     since = t - at[near]
@@ -145,7 +145,7 @@ def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> tup
 
 
 def _about_the_moves(table: ChannelTable, commanded: Values) -> Values:
-    """Return what the gyroscope reads about the axis of the moves, its scale and bias taken out: (n,) array, deg/s."""
+    """Return the rate about the axis of the moves by the gyroscope, corrected for scale and bias: (n,) array, deg/s."""
     rates = np.column_stack([table.values[c] for c in TRIADS["gyroscope"]])
     columns = np.column_stack([commanded, np.ones_like(commanded)])
     fitted = np.linalg.lstsq(columns, rates, rcond=None)[0]

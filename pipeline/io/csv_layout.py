@@ -1,7 +1,7 @@
-"""The columns of a text log: which holds which channel, its rows as numbers, and what is wrong with a row that is none.
+"""Find the columns of a text log, parse its rows to numbers, and find the faults of rows that are not numbers.
 
-Columns are found by their names. No type is inferred, and no text stands for a missing value. The fast parser says that
-a block of rows holds a bad cell, but not where: only the lines of such a block are checked one by one.
+Columns are found by their names. No type is inferred, and no text means a missing value. The fast parser reports that a
+block of rows has a bad cell, but not where; so only the lines of such a block are checked one by one.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ END_OF_NUMBER = re.compile(r"[\d.,eE+-]+")
 
 
 def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[int, str]) -> list[tuple[Column, int]]:
-    """Return the channels that a file holds, each with the index of its column.
+    """Return the channels of a file, each with the index of its column.
 
-    All columns of one sensor may be missing where those of the other are found and fewer than three columns are left
-    over that could hold them under other names: then the log is of one sensor. ``below`` are the next lines, by their
-    number, searched for a header that was not expected there.
+    All columns of one sensor may be missing if those of the other sensor are found, and fewer than three other columns
+    could contain them under other names: then the log has one sensor. ``below``: the next lines, by their number, which
+    are searched for a header at another place.
     """
     twice = sorted({n for n in names if n and names.count(n) > 1})
     others = [f"column name {', '.join(twice)} stands more than once in the header"] if twice else []
@@ -92,7 +92,7 @@ def column_notes(names: list[str], columns: list[tuple[Column, int]], line: int)
 
 
 def _channels_of_absent_sensor(missing: list[Column], found: list[tuple[Column, int]], columns: int) -> tuple[str, ...]:
-    """Return the channels of the sensor that a log of the other one does not hold; none where it may hold them."""
+    """Return the channels of a sensor that the log does not have; none if other columns could contain them."""
     lacking, known = {c.channel for c in missing}, {c.channel for c, _ in found}
     absent = [triad for triad in TRIADS.values() if set(triad) <= lacking]
     other = any(set(triad) <= known for triad in TRIADS.values())
@@ -100,7 +100,7 @@ def _channels_of_absent_sensor(missing: list[Column], found: list[tuple[Column, 
 
 
 def _contradiction(column: Column, name: str) -> list[str]:
-    """Return what is wrong where the header states another unit than the profile."""
+    """Return the message for a header that states another unit than the profile; empty for none."""
     stated = unit_in_brackets(name)
     if stated is None or stated == column.unit or stated not in UNITS[column.channel]:
         return []
@@ -109,7 +109,7 @@ def _contradiction(column: Column, name: str) -> list[str]:
 
 
 def other_separator(names: list[str]) -> str:
-    """Return a hint at the separators in a header that was read as one name; empty for none."""
+    """Return a hint on the separators in a header that was read as one name; empty for none."""
     separators = [repr(c) for c in ",;\t| " if c in names[0]] if len(names) == 1 else []
     return f"; is the separator {' or '.join(separators)}? Set ingest.csv.delimiter" if separators else ""
 
@@ -117,7 +117,7 @@ def other_separator(names: list[str]) -> str:
 def _what_to_do(
     missing: list[str], names: list[str], settings: CsvFormat, below: dict[int, str], *, numbers: bool
 ) -> str:
-    """Return the setting with which the columns would be found."""
+    """Return advice: the setting with which the columns would be found."""
     for number, line in below.items():
         if all(m in line for m in missing):
             return f"line {number} holds them: set ingest.csv.skip_lines to the lines before"
@@ -149,7 +149,7 @@ class Layout:
     decimal: str
 
     def parse(self, body: bytes, types: Mapping[int, Any]) -> Any:  # noqa: ANN401  (pyarrow has no types)
-        """Return columns of rows as a pyarrow table, by their index; ``ArrowInvalid`` where a row does not fit."""
+        """Parse columns of rows to a pyarrow table, by their index; raises ``ArrowInvalid`` if a row does not fit."""
         names = [str(i) for i in range(len(self.names))]
         return arrow_csv.read_csv(
             pa.py_buffer(body),
@@ -165,11 +165,11 @@ class Layout:
         )
 
     def numbers(self, body: bytes, rows: int) -> dict[int, Values] | None:
-        """Return the columns in use as numbers, by index; None where a cell is not a finite number."""
+        """Parse the used columns to numbers, by index; None if a cell is not a finite number."""
         wanted = sorted({index for _, index in self.columns})
         quoted = (line.decode("utf-8", "replace") for line in body.split(b"\n") if b'"' in line) if b'"' in body else ()
         if b"\0" in body or any(set(wanted) & set(_quoted(line, self.delimiter)) for line in quoted):
-            return None  # a comma in a number in quotes may separate thousands
+            return None  # a comma in a quoted number may separate thousands
         try:
             table = self.parse(body, dict.fromkeys(wanted, pa.float64()))
         except pa.ArrowInvalid:
@@ -184,8 +184,8 @@ class Layout:
 class Fault:
     """A line that is no row of numbers.
 
-    ``kind`` is a code of ``HINTS``. ``parted_before``: the line is a row, but the next line, of that number, may hold
-    the end of its last number.
+    ``kind`` is a code of ``HINTS``. ``parted_before``: the line is a row, but its last number may continue in the line
+    with this number.
     """
 
     line: int
@@ -197,9 +197,9 @@ class Fault:
 
 
 def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> IngestError:
-    """Return the error that names the first bad line of a log and how many there are (``more``: at least).
+    """Return the error with the first bad line of a log, the number of bad lines, and advice for each kind of fault.
 
-    It says what to do about each kind of fault.
+    ``more``: there may be further bad lines.
     """
     worst = next((f for f in faults if f.kind == "restarted"), faults[0])
     others = [str(f.line) for f in faults if f is not worst]
@@ -217,7 +217,7 @@ def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> I
 
 
 def find_faults(layout: Layout, body: bytes, lines: Integers, before: tuple[int, str] | None) -> Iterator[Fault]:
-    """Yield the faults of a block of rows; ``before`` is number and text of the valid row before it."""
+    """Yield the faults of a block of rows; ``before``: number and text of the preceding valid row."""
     for number, raw in zip(lines.tolist(), body.split(b"\n"), strict=False):
         text = raw.decode("utf-8", "replace")
         fault = _fault(layout, number, text)
@@ -233,7 +233,7 @@ def find_faults(layout: Layout, body: bytes, lines: Integers, before: tuple[int,
 
 
 def _fault(layout: Layout, line: int, text: str) -> Fault | None:
-    """Return what is wrong with a line, None where it is a row of numbers."""
+    """Return the fault of a line, None for a row of numbers."""
     if "\0" in text:
         nul = text.count("\0")
         return Fault(line, "nul", f"{nul} NUL bytes within the line: {text[:60]!r}", text)
@@ -257,7 +257,7 @@ def _fault(layout: Layout, line: int, text: str) -> Fault | None:
 
 
 def _quoted(line: str, delimiter: str) -> list[int]:
-    """Return which cells of a line stand in quotes."""
+    """Return the indices of the quoted cells of a line."""
     cells = re.findall(rf'\s*("(?:[^"]|"")*"|[^{re.escape(delimiter)}]*)\s*(?:{re.escape(delimiter)}|$)', line)
     return [index for index, cell in enumerate(cells) if cell.startswith('"')]
 
@@ -265,7 +265,7 @@ def _quoted(line: str, delimiter: str) -> list[int]:
 def _fault_of_cell(
     layout: Layout, where: tuple[Column, int], cells: list[str], quoted: Sequence[int]
 ) -> tuple[str, str]:
-    """Return the kind of fault of a cell, empty where it is a finite number, and what is wrong with it."""
+    """Return the kind and the message of a cell's fault; both empty for a finite number."""
     column, index = where
     name, channel = layout.names[index], column.channel
     label = f"column {name}" if not name.startswith("column ") else name

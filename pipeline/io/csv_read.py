@@ -1,4 +1,4 @@
-"""Text logs to channels in the units of the package.
+"""Read text logs to channels in the units of the package.
 
     value = (count - offset) / counts_per_unit
 
@@ -66,7 +66,7 @@ MOST_REFUSED = 10_000  # bad lines after which the rest of the file is not searc
 
 
 def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks | None = None) -> ChannelTable:
-    """Return the channels of a text log, or of the files of one recording."""
+    """Read the channels of a text log, or of all files of one recording."""
     tables = [_read_one(path, layout, checks or Checks()) for path, layout in zip(paths, formats, strict=True)]
     same = [t for t, layout in zip(tables, formats, strict=True) if not layout.own_clock]
     others = [t for t, layout in zip(tables, formats, strict=True) if layout.own_clock]
@@ -80,7 +80,7 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
 
 
 def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
-    """Return the channels of one file; an ``IngestError`` names the line."""
+    """Read the channels of one file; an ``IngestError`` names the line."""
     with unchanged(path), path.open("rb") as stream:
         log = TextLog(stream, str(path), settings)
         rows = Rows(log)
@@ -112,7 +112,7 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
 
 
 def also(first: IngestError, second: IngestError) -> IngestError:
-    """Return a refusal for two faults of one file."""
+    """Return one error for two faults of a file."""
     line = (second.file or "").rpartition(":")[2]
     place = f"line {line}: " if line.isdigit() else ""
     both = IngestError(f"{first.message}. Also {place}{second.message}", first.file, code=first.code)
@@ -146,13 +146,13 @@ class Rows:
 
     @property
     def layout(self) -> Layout:
-        """Which column holds which channel; refuses a log without rows."""
+        """The columns of the channels; raises ``IngestError`` for a log without rows."""
         if self._layout is None:
             raise self.log.no_rows()
         return self._layout
 
     def add(self, body: bytes, lines: Integers) -> None:
-        """Add a block of rows with these numbers of lines."""
+        """Add a block of rows; ``lines``: their line numbers."""
         layout = self._layout = self._layout or self._find_layout(body, lines)
         numbers = layout.numbers(body, len(lines))
         self._row_count += len(lines)
@@ -164,7 +164,7 @@ class Rows:
             self._blocks.append(numbers | {LINES: lines} | self._exact_times(layout, body, numbers))
 
     def finish(self, checks: Checks) -> None:
-        """Join the blocks, and leave out rows that may be dropped."""
+        """Join the blocks, and drop rows where the profile allows it."""
         layout, blocks = self.layout, self._blocks
         columns = {k: np.concatenate([b.pop(k) for b in blocks]) for k in list(blocks[0] if blocks else ())}
         parted = [f.line for f in self._faults if f.parted_before]
@@ -186,7 +186,7 @@ class Rows:
             self._drop_faults(layout, checks)
 
     def _find_layout(self, body: bytes, lines: Integers) -> Layout:
-        """Return which column holds which channel."""
+        """Find the columns of the channels, by the head and the first rows."""
         head, settings = self.log.head, self.settings
         assert head is not None  # noqa: S101  (rows follow it)
         text = body[:SEARCHED_BELOW].decode("utf-8", "replace").split("\n")[:LINES_BELOW]
@@ -198,7 +198,7 @@ class Rows:
         return Layout(self.path, head.names, columns, head.delimiter, settings.decimal)
 
     def _valid_rows(self, layout: Layout, body: bytes, lines: Integers) -> tuple[bytes, Integers, dict[int, Values]]:
-        """Return the valid rows of a block, and keep the faults of the others."""
+        """Return the valid rows of a block, and store the faults of the others."""
         found = []
         for fault in find_faults(layout, body, lines, self._last_row):
             found.append(fault)
@@ -218,7 +218,7 @@ class Rows:
         return body, lines, numbers
 
     def _exact_times(self, layout: Layout, body: bytes, numbers: dict[int, Values]) -> dict[int, Integers]:
-        """Return the times from their digits, from the first that a double does not hold to half a nanosecond."""
+        """Return the times from their digits, once a double does not resolve half a nanosecond."""
         if self.settings.rate_hz is not None or self.settings.tick_ns is not None:
             return {}
         column, index = time_column(layout)
@@ -232,7 +232,7 @@ class Rows:
         return {EXACT: np.zeros(len(numbers[index]), np.int64) if out_of_range else exact_times(layout, body)}
 
     def _drop_faults(self, layout: Layout, checks: Checks) -> None:
-        """Note the lines that are dropped and count those that are repaired, or keep the refusal."""
+        """Note the dropped lines and count the repaired ones, or store the refusal."""
         final = self._faults[-1]
         end = max(final.line, int(self.lines[-1]))
         cut = {final.line} if final.short and final.line == end else set()
@@ -264,7 +264,7 @@ class Rows:
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
-    """Join files row by row; refuse files that were not logged at the same times: their rows do not belong together."""
+    """Join files row by row; raise ``IngestError`` if they were not logged at the same times."""
     first, *others = tables
     same = "parts of one recording need the same times"
     for other in others:
@@ -291,7 +291,7 @@ def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
 
 
 def read_gcsv(path: Path, checks: Checks) -> ChannelTable:
-    """Return the channels of a ``.gcsv`` file in the sensor's axes; ``source`` states its orientation."""
+    """Read the channels of a ``.gcsv`` file in the sensor's axes; ``source`` states its orientation."""
     names, facts, line = _read_head(path)
     text = facts.get("orientation", "XYZ")
     if sorted(text.lower()) != ["x", "y", "z"]:
@@ -303,7 +303,7 @@ def read_gcsv(path: Path, checks: Checks) -> ChannelTable:
 
 
 def _read_head(path: Path) -> tuple[list[str], dict[str, str], int]:
-    """Return the names of the columns, all facts that the head states, and the number of its lines before the names."""
+    """Return the column names, all other facts of the head, and the number of lines before the column names."""
     with unchanged(path), path.open("rb") as stream:
         start = stream.read(LONGEST_HEADER)
     refuse_foreign(start[:16], str(path))

@@ -1,12 +1,12 @@
-"""The times of a text log's rows: integer nanoseconds, increasing.
+"""Compute the times of a text log's rows: integer nanoseconds, increasing.
 
-    time = round(t * 10^9), from the decimal digits themselves where doubles are too coarse (beyond 10^6 s)
+    time = round(t * 10^9), from the decimal digits where doubles are too coarse (beyond 10^6 s)
 
-A counter that overflows starts again at 0: a time that falls from within 2.5 intervals of M to within 2.5 intervals of
-0 continues at M, where M is 2^32 us or ms, or 2^16, 2^24 or 2^32 of the column's unit. A block of rows that directly
-follows an exact copy of it is dropped. Rows displaced by at most five are sorted and rows that repeat the one before
-them are dropped, within the limit of ``ingest.checks.repaired_rows``. Any other time that goes
-back belongs to another session of the logger.
+A counter that overflows restarts at 0: a time that falls from within 2.5 intervals of M to within 2.5 intervals of 0
+continues at M, where M is 2^32 us or ms, or 2^16, 2^24 or 2^32 of the column's unit. A block of rows that directly
+follows an exact copy of it is dropped. Rows displaced by at most five rows are sorted, and rows that repeat the row
+before them are dropped, within the limit of ``ingest.checks.repaired_rows``. Any other time that goes back begins
+another session of the logger.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ COARSEST = 0.01  # of the median interval
 NEAR = 2.5  # intervals
 LARGEST_DISPLACEMENT = 5  # rows
 MOST_LISTED = 5  # parts of a log, in a refusal
-SHORTEST_PART = 10  # rows; fewer are rows with a wrong time
-RESET_INTERVALS = 5  # a time that falls back by more begins another session
+SHORTEST_PART = 10  # rows; a shorter part is rows with a wrong time
+RESET_INTERVALS = 5  # a time that goes back by more begins another session
 
 
 def time_column(layout: Layout) -> tuple[Column, int]:
-    """Return the column of the time and its index, of a log that is not sampled at a stated rate."""
+    """Return the column of the time and its index; the log must have one."""
     return next((c, i) for c, i in layout.columns if c.channel == "time")
 
 
@@ -71,7 +71,7 @@ def exact_times(layout: Layout, body: bytes) -> Integers:
 
 
 def whole_times(values: Values, unit: str, tick_ns: Fraction | None = None) -> Integers:
-    """Return times in ns of numbers in a unit, or of counts of a tick."""
+    """Convert numbers in a unit, or counts of a tick, to times in ns."""
     if tick_ns is not None and tick_ns.denominator == 1 and bool(np.all(values == np.rint(values))):
         return np.asarray(values.astype(np.int64) * int(tick_ns))
     scale = UNITS["time"][unit][0] if tick_ns is None else float(tick_ns)
@@ -79,7 +79,7 @@ def whole_times(values: Values, unit: str, tick_ns: Fraction | None = None) -> I
 
 
 def times_of(rows: Rows) -> Integers:
-    """Return the time of each row, ns; refuse times out of range, or that have lost their digits."""
+    """Return the time of each row, ns; raise ``IngestError`` for times out of range or too coarse."""
     settings = rows.settings
     if settings.rate_hz is not None:
         return np.asarray(np.rint(np.arange(len(rows.lines)) * (1e9 / settings.rate_hz)).astype(np.int64))
@@ -97,9 +97,9 @@ def times_of(rows: Rows) -> Integers:
 
 
 def _refuse_coarse(values: Values, exact_ns: Integers, unit: str, name: str, path: str) -> None:
-    """Refuse times that were stored as doubles too coarse for them, as nanoseconds since 1970 are.
+    """Refuse times that were stored as doubles and lost digits by that, such as nanoseconds since 1970.
 
-    Such times are the doubles themselves, or end in zeros where the digits of a double end.
+    Such times are equal to doubles, or end in zeros where the digits of a double end.
     """
     scale = int(UNITS["time"][unit][0])
     spacing = float(np.spacing(np.abs(values).max())) * scale
@@ -117,10 +117,10 @@ def _refuse_coarse(values: Values, exact_ns: Integers, unit: str, name: str, pat
 
 
 def in_order(table: ChannelTable, rows: Rows, checks: Checks) -> ChannelTable:
-    """Return a log in the order of its times, each time once.
+    """Sort a log by its times, with each time once.
 
-    A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time
-    that differ, and more repairs than ``checks`` allows.
+    Raises ``IngestError`` for a time that goes back for another reason than an overflow or displaced rows, for two
+    different rows of one time, and for more repairs than ``checks`` allows.
     """
     tick_ns, restarts, session = _tick_ns(rows), rows.restarts, rows.settings.session
     if session is not None:
@@ -173,9 +173,9 @@ def in_order(table: ChannelTable, rows: Rows, checks: Checks) -> ChannelTable:
 
 
 def _refusal(table: ChannelTable, row: int, starts: list[int]) -> IngestError:
-    """Return the refusal of a row whose time does not increase, with the earlier rows that it and the next repeat.
+    """Return the error of a row whose time does not increase, with the earlier rows that are repeated from there.
 
-    Where the time falls back for good, the refusal names the parts of the log.
+    Where the time goes back permanently, the error lists the parts of the log.
     """
     time_ns = table.time_ns
     repeats = time_ns[row] == time_ns[row - 1]
@@ -204,9 +204,10 @@ def _refusal(table: ChannelTable, row: int, starts: list[int]) -> IngestError:
 
 
 def _repeats(table: ChannelTable) -> list[tuple[int, int, int]]:
-    """Return each row at which the time falls back to that of an earlier row, that row, and how many rows repeat it.
+    """Return each row where the time goes back to that of an earlier row, the earlier row, and the number of repeats.
 
-    Rows repeat others where the time and all columns in use do, not more than up to the row where the time falls back.
+    A row repeats another if its time and all used columns are equal; only rows before the one where the time goes back
+    are compared.
     """
     time_ns = table.time_ns
     order = np.argsort(time_ns, kind="stable")
@@ -224,7 +225,7 @@ def _repeats(table: ChannelTable) -> list[tuple[int, int, int]]:
 
 
 def _once(table: ChannelTable) -> ChannelTable:
-    """Drop blocks that were written twice, one copy directly after the other: no information is lost."""
+    """Drop exact copies of a block that directly follow it: no information is lost."""
     keep, notes = np.ones(len(table.time_ns), np.bool_), []
     for row, start, count in _repeats(table):
         if start + count == row and count > 0:
@@ -238,7 +239,7 @@ def _once(table: ChannelTable) -> ChannelTable:
 
 
 def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> IngestError:
-    """Return a refusal for more repairs than the profile allows."""
+    """Return the error for more repairs than the profile allows."""
     hint = (
         f"{touched} of {rows} rows would have to be repaired, more than the share of {checks.repaired_rows:g} that "
         "ingest.checks.repaired_rows allows"
@@ -258,7 +259,7 @@ def _counted_on(table: ChannelTable, tick_ns: float) -> ChannelTable:
 
 
 def _unwrap(time_ns: Integers, tick_ns: float) -> tuple[Integers, list[tuple[int, int]]]:
-    """Return times with the overflows of their counter undone, and the row after each overflow with its modulus, ns."""
+    """Undo overflows of the time counter; return the times, and the row after each overflow with its modulus, ns."""
     steps = np.diff(time_ns)
     back = np.flatnonzero(steps < 0)
     forward = steps[steps > 0]
@@ -277,7 +278,7 @@ def _unwrap(time_ns: Integers, tick_ns: float) -> tuple[Integers, list[tuple[int
 
 
 def _starts(time_ns: Integers, restarts: list[int], tick_ns: float) -> list[int]:
-    """Return the rows where a log was started: at a repeated header, or where time falls back for good."""
+    """Return the rows where the logger was started: at a repeated header, or where time goes back permanently."""
     steps = np.diff(time_ns)
     forward = steps[steps > 0]
     longest = RESET_INTERVALS * float(np.median(forward)) if forward.size else 0.0
@@ -292,7 +293,7 @@ def _tick_ns(rows: Rows) -> float:
 
 
 def rows_of_session(rows: Rows, time_ns: Integers) -> Index:
-    """Return the rows of the part that is read of a log that was restarted."""
+    """Return the rows of the selected session of a log that was restarted."""
     starts, session = _starts(time_ns, rows.restarts, _tick_ns(rows)), rows.settings.session or 1
     if session > len(starts):
         message = f"session is {session}, and the log was started {len(starts)} times"

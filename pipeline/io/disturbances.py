@@ -1,25 +1,25 @@
-"""Samples that neither noise nor the table's motion explains: bus glitches, shocks, and disturbed rests.
+"""Find samples that neither noise nor motion explains: bus glitches, shocks, and disturbed rests.
 
-**Disturbances.** What the log explains is removed from each channel by least squares: from a specific force a constant
+**Disturbances.** The motion by the log is removed from each channel by least squares: from a specific force a constant
 and gravity in the body (by attitude, or cosine and sine of the angle), from an angular rate a constant and the table's
-rate. A sample is disturbed where the residual x departs from the median m of the samples around it by
+rate. A sample is disturbed where the residual x differs from the median m of the samples around it by
 
     |x - m| > 10 s + 1.5 L
 
-where s is the larger of the noise of neighbours and of the scatter about m (at rest that of most rests), and L is the
-largest change by a delay, a clock error or a lever arm within half a second: for a gyroscope the variation of the
-table's rate; for an accelerometer g times the angle turned in 0.2 s, and the acceleration at a lever arm of 0.1 m. So
-effects that shift a reading in time are no disturbances. The samples around are those of the same rest, up to 2 s on
-either side, or half a second of motion. Without a table's log, the gyroscope gives the motion, and only rests are
-searched; of a static recording all of it.
+where s is the larger of the noise between neighbours and the scatter about m (at rest, the median scatter of the
+rests), and L is the largest change by a delay, a clock error or a lever arm within half a second: for a gyroscope the
+variation of the table's rate; for an accelerometer g times the angle turned in 0.2 s, and the acceleration at a lever
+arm of 0.1 m. So effects that shift a reading in time are no disturbances. The samples around are the same rest, up to 2
+s on either side, or half a second of motion. Without a table's log, the motion is taken from the gyroscope, and only
+rests are searched; a static recording is searched as a whole.
 
-**Disturbed rests.** A rest by the table's log, without its first and last 0.3 s, in which a late or early sensor reads
-the move, is cut into pieces of at most 2 s. A piece is left out as a whole where
+**Disturbed rests.** A rest by the table's log is cut into pieces of at most 2 s. Its first and last 0.3 s are not used,
+because a sensor with a delay reads the move there. A whole piece is left out where
 
     chi^2 = sum over its n samples and the 3 axes of (x - m)^2 / s^2 > 4 nu  and  > nu + 6 sqrt(2 nu) + 18
 
 with ``nu = 3 (n - 1)``, m the mean of the piece and s the median scatter of an axis over the pieces of the recording
-(half a count at least), without the sample that is farthest off, which may be a glitch. Rests by hand are tested in
+(at least half a count), without the most distant sample, which may be a glitch. Rests by hand are tested in
 ``pipeline.signal.rests``.
 """
 
@@ -57,7 +57,7 @@ LATE_S = 0.1  # a delay of a low-cost filter or of the log
 WINDOWS = 40  # of a recording, to find the usual scatter of its rests
 LEVER_M = 0.1  # of the accelerometer from the turn axis, a usual fixture
 STILL_DEG = 0.05  # turned within a window that is at rest
-STILL_BY_HAND_DEG = 0.5  # as a gyroscope with noise and bias adds it up
+STILL_BY_HAND_DEG = 0.5  # integral of a gyroscope's noise and bias
 SAME_EVENT = 5  # samples between two that belong to one event; an event of several is widened by 2
 
 PIECE_S, SETTLING_S = 2.0, 0.3  # as the module's description states
@@ -72,10 +72,10 @@ LARGEST_SHARE = 0.1  # of the pieces
 def leave_out_disturbances(
     recording: Recording, note: Callable[[str, Index, str], Note], largest_share: float
 ) -> Recording:
-    """Return a recording without its disturbed samples, each event noted by ``note``, that of its ``ChannelTable``.
+    """Remove the disturbed samples of a recording, and note them by ``note``, the method of its ``ChannelTable``.
 
-    Where more than ``largest_share`` of the samples would have to go, all are kept, and that is noted: it is how the
-    bench behaves.
+    If they are more than ``largest_share`` of the samples, none is removed, and that is noted: then the disturbance is
+    a property of the bench.
     """
     silent = recording.accelerometer is None and recording.gyroscope is None
     if silent or largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
@@ -105,7 +105,7 @@ def leave_out_disturbances(
 
 
 def without_rows(recording: Recording, rows: Index, note: Note) -> Recording:
-    """Return a recording without some samples, a gap before what follows them, and with the note that says so."""
+    """Remove samples from a recording, flag a gap before the following sample, and add the note."""
     undisturbed = np.ones(recording.samples, bool)
     undisturbed[rows] = False
     flags = np.zeros(recording.samples, np.uint16) if recording.flags is None else recording.flags.copy()
@@ -115,9 +115,9 @@ def without_rows(recording: Recording, rows: Index, note: Note) -> Recording:
 
 
 def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
-    """Return by how much each reading exceeds what is allowed, (n, c) array, and sensor and axis of the columns.
+    """Return the excess of each reading over its limit, (n, c) array, and sensor and axis of the columns.
 
-    Samples around an event of several have the excess of a rounding error, so that they go with it.
+    Samples next to an event of several samples are given the smallest positive excess, so that they are removed, too.
     """
     found = [(s, r) for s in SENSOR_UNITS if (r := recording.reading(s)) is not None]
     where = [(s, axis) for s, _ in found for axis in "xyz"]
@@ -150,7 +150,7 @@ def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
 
 
 def _noise(step: Values) -> Values:
-    """Return the noise by the differences of neighbours; where most are equal, one count: (c,) array."""
+    """Return the noise from the differences of neighbours; one count where most are equal: (c,) array."""
     noise = noise_of_steps(step)
     if np.all(noise > 0):
         return noise
@@ -171,7 +171,7 @@ def _widened(excess: Values) -> Values:
 
 
 class _Motion:
-    """What a recording says of its motion: by the table's log, by hand, or at rest."""
+    """The motion in a recording: by the table's log, by hand, or at rest."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
@@ -195,7 +195,7 @@ class _Motion:
         )
 
     def _rate(self) -> Values | None:
-        """Return the rate: (n, 1) or (n, 3) array, deg/s; None where nothing tells it."""
+        """Return the rate: (n, 1) or (n, 3) array, deg/s; None if it is unknown."""
         r = self.recording
         if r.table_attitude is not None and np.isfinite(r.table_attitude).all():
             q = continuous(r.table_attitude)
@@ -211,7 +211,7 @@ class _Motion:
         return None if r.gyroscope is None else r.gyroscope - median(r.gyroscope)
 
     def unexplained(self, sensor: str, reading: Values) -> Values:
-        """Return what the log does not explain of a sensor's readings: (n, 3) array."""
+        """Return the residual of a sensor's readings after the fit of the motion by the log: (n, 3) array."""
         r, columns = self.recording, [np.ones((self.recording.samples, 1))]
         if sensor == "gyroscope":
             columns += [] if self.by_hand or self.unknown else [self.rate]
@@ -226,7 +226,7 @@ class _Motion:
         return np.asarray(reading - A @ np.linalg.lstsq(A, reading, rcond=None)[0])
 
     def change(self, sensor: str) -> Values:
-        """Return by how much the motion can change what is unexplained: (n,) array, infinite where nothing is known."""
+        """Return the largest change of the residual by the motion: (n,) array, infinite if the motion is unknown."""
         n = np.arange(self.recording.samples)
         low, high = np.maximum(n - self.half, 0), np.minimum(n + self.half, len(n) - 1)
         if self.unknown or (self.by_hand and sensor == "gyroscope"):
@@ -241,7 +241,7 @@ class _Motion:
         return np.where(turned > STILL_BY_HAND_DEG, np.inf, change) if self.by_hand else change
 
     def around(self, n: int) -> tuple[slice, bool]:
-        """Return the samples of the same rest, or in motion the nearest ones, and whether they are at rest."""
+        """Return the samples around n, of the same rest or in motion the nearest, and whether they are at rest."""
         last = self.recording.samples - 1
         for far in (self.long, self.long // 2, self.half):
             a, b = max(n - far, 0), min(n + far, last)
@@ -254,14 +254,14 @@ class _Motion:
         return slice(max(n - self.half, 0), min(n + self.half, last) + 1), False
 
     def scatter_of_rests(self, values: Values) -> float | None:
-        """Return the scatter in most rests, by some windows over the recording; None where hardly any is at rest."""
+        """Return the median scatter of windows at rest; None if too few of the windows are at rest."""
         windows = [self.around(n) for n in np.linspace(0, len(values) - 1, WINDOWS).astype(int)]
         scatters = [_scatter(values[window]) for window, resting in windows if resting]
         return float(np.median(scatters)) if len(scatters) >= WINDOWS // 4 else None
 
 
 def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str], Note]) -> Recording:
-    """Return a recording of a table without the pieces of its rests that were shaken, noted as ``N-SHAKEN``."""
+    """Remove shaken pieces of rests from a recording on a table, and note them as ``N-SHAKEN``."""
     pieces = _pieces(recording)
     if len(pieces) < FEWEST_PIECES:
         return recording
@@ -284,7 +284,7 @@ def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str
 
 
 def _pieces(recording: Recording) -> Index:
-    """Return first sample and end of each piece of a rest, and of what goes with it: (p, 4) array."""
+    """Return start and stop of each piece of a rest, and of the samples to remove with it: (p, 4) array."""
     none = np.zeros((0, 4), np.intp)
     if recording.samples < FEWEST * FEWEST_PIECES or recording.role in ("rests", "static"):
         return none
@@ -312,7 +312,7 @@ def _pieces(recording: Recording) -> Index:
 
 
 def _excess(reading: Values, pieces: Index) -> tuple[Values, Values]:
-    """Return by how much the chi^2 of each piece exceeds its limit, and its scatter over the usual one: (p,) arrays."""
+    """Return the excess of each piece's chi^2 over its limit, and its scatter relative to the usual: (p,) arrays."""
     count = np.diff(pieces, axis=1)[:, 0].astype(float)
     bounds = pieces.ravel()
     centred = np.append(reading - reading.mean(axis=0), np.zeros((1, 3)), axis=0)

@@ -1,10 +1,10 @@
-"""The log of a table's encoders with a clock of its own: its signals at any time, and at the times of a sensor.
+"""Interpolate the log of a table's encoders that has a separate clock, and merge it with the log of a sensor.
 
-    rate r and angle A of the turn     the gyroscope reads along r, the accelerometer along (cos A, sin A)
-    attitude q                         the gyroscope reads along omega, the accelerometer along R(q)^T e_z
+    rate r and angle A of the turn     the gyroscope responds to r, the accelerometer to (cos A, sin A)
+    attitude q                         the gyroscope responds to omega, the accelerometer to R(q)^T e_z
 
-Between two samples the angle is the cubic through angle and rate at both ends, exact for constant acceleration; the
-rate is linear and bends once where the slopes on both sides require it; the attitude is the quintic spline of its
+Between two samples the angle is the cubic through angle and rate at both ends, exact for constant acceleration. The
+rate is linear, with one bend where the slopes on both sides require it. The attitude is the quintic spline of its
 components.
 """
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Values
 
 
-FEWEST_ROWS = 6  # the quintic spline needs them
+FEWEST_ROWS = 6  # for the quintic spline
 FINEST_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
 MOST_POINTS = 1 << 18  # bounds memory and the cost of correlation; a power of 2 for the transform
 BENT = 8.0  # times the median change of slope
@@ -37,12 +37,12 @@ SAME_SIGN = 0.9  # correlation of the logged rate with the slope of the angle
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals of a table's motion that sensors follow, on a regular grid of the log's time from its first sample."""
+    """Signals of a table's motion to which sensors respond, on a regular grid of time since the log's first sample."""
 
     step: float  # of the grid, s
-    rates: Values  # (n, m), deg/s, which angular rates follow
-    directions: Values  # (n, p), which specific forces follow; p is 0 where the log does not determine them
-    interval: float  # median of the log's own, s
+    rates: Values  # (n, m), deg/s, for angular rates
+    directions: Values  # (n, p), for specific forces; p is 0 where the log does not determine them
+    interval: float  # median of the log, s
     magnitude: bool = False  # whether only the magnitude of the rate is known
 
     @property
@@ -56,7 +56,7 @@ class Signals:
         return bool(np.ptp(self.rates, axis=0).max() < RESTING_DPS)
 
     def covers(self, tau: Values) -> Mask:
-        """Return which times lie within the log."""
+        """Return which times are within the log."""
         return np.asarray((tau >= 0) & (tau <= self.duration))
 
     def at(self, tau: Values) -> tuple[Values, Values, Values, Values]:
@@ -71,7 +71,7 @@ class Signals:
 
 
 def own_rows(table: ChannelTable) -> ChannelTable:
-    """Return the table's channels of a log whose rows hold a time of the table's own."""
+    """Return the table's channels of a log whose rows have a separate time of the table."""
     time = np.rint(table.values[TABLE_TIME]).astype(np.int64)
     new = np.concatenate([[True], time[1:] > np.maximum.accumulate(time)[:-1]])
     values = {c: table.values[c] for c in TABLE_CHANNELS if c in table.values}
@@ -79,9 +79,9 @@ def own_rows(table: ChannelTable) -> ChannelTable:
 
 
 def unwrapped(table: ChannelTable) -> ChannelTable:
-    """Return a log with a continuous table angle, where an encoder started again at 0 or 360 deg.
+    """Make the table's angle continuous where the encoder restarts at 0 or 360 deg.
 
-    A table turns by less than half a turn between two samples, so a larger step is one of the counter.
+    A table turns by less than half a turn between two samples, so that a larger step is a restart of the encoder.
     """
     angle = table.values.get("table_angle")
     if angle is None or len(angle) < 2:
@@ -95,10 +95,10 @@ def unwrapped(table: ChannelTable) -> ChannelTable:
 
 
 def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
-    """Return a sensor's log with the channels of a table's log at its own times; refuse logs of different motions.
+    """Add the channels of a table's log, interpolated at the sensor's times; refuse logs of different motions.
 
-    Rows that the table's log does not cover are left out. Where the table rests throughout, both logs are taken to
-    begin together, as nothing depends on it.
+    Rows that the table's log does not cover are dropped. If the table rests throughout, no result depends on the
+    alignment, and both logs are assumed to begin together.
     """
     from pipeline.io.clock_alignment import fit_clocks  # noqa: PLC0415  (it reads the signals of this module)
 
@@ -142,7 +142,7 @@ def _notes(sensor: ChannelTable, rows: slice, fit: ClockFit, offset_s: float) ->
 
 
 def _one_digit(value: float) -> str:
-    """Return a number to one digit, without a power of ten."""
+    """Format a number with one significant digit, without exponent."""
     return np.format_float_positional(float(f"{value:.1g}"), trim="-")
 
 
@@ -161,7 +161,7 @@ def _merged(  # noqa: PLR0917  (parts of one table)
 
 
 def signals_of(log: ChannelTable) -> Signals:
-    """Return the signals of a table's motion that sensors respond to; refuse a log without rate, angle and attitude."""
+    """Return the signals of a table's motion; raise ``IngestError`` for a log without rate, angle and attitude."""
     own = seconds_of(log)
     found = interpolators(log)
     step = max(FINEST_OF_ATTITUDE_S if ATTITUDE[0] in found else FINEST_S, own[-1] / MOST_POINTS)
@@ -188,7 +188,7 @@ def seconds_of(table: ChannelTable) -> Values:
 
 
 def interpolators(log: ChannelTable) -> dict[str, Callable[[Values], Values]]:
-    """Return functions of the table's own time, s, one for each channel."""
+    """Return an interpolating function of the table's time, s, for each channel."""
     own, values = seconds_of(log), log.values
     out: dict[str, Callable[[Values], Values]] = {}
     rate = values.get("table_rate")
@@ -217,7 +217,7 @@ def _unit(q: Values) -> Values:
 
 
 def _bent_line(own: Values, value: Values, tau: Values) -> Values:
-    """Return linear interpolation that bends within an interval where the lines of its neighbours meet in it.
+    """Interpolate linearly, with a bend within an interval where the lines of its two neighbours meet in it.
 
     At a bend the slope changes by far more than elsewhere.
     """
@@ -232,6 +232,6 @@ def _bent_line(own: Values, value: Values, tau: Values) -> Values:
     left = value[k] + before * (tau - own[k])
     right = value[k + 1] + after * (tau - own[k + 1])
     ahead, h = value[k + 1] - value[k], own[k + 1] - own[k]
-    meet = (before * h - ahead) * (after * h - ahead) <= 0  # the slope between lies between those on either side
+    meet = (before * h - ahead) * (after * h - ahead) <= 0  # the slope lies between the slopes on either side
     bent = meet & (change[k - 1] > BENT * np.median(change)) & (tau >= own[1]) & (tau <= own[-2])
     return np.where(bent, np.where(before > after, np.minimum(left, right), np.maximum(left, right)), plain)

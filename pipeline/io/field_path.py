@@ -1,8 +1,7 @@
-"""Paths to numbers within messages: ``linear_acceleration.x``, ``acc[0]``, ``samples[2].value``, ``position[table]``.
+"""Paths to numbers in messages: ``linear_acceleration.x``, ``acc[0]``, ``samples[2].value``, ``position[table]``.
 
-``[2]`` counts from 0. ``[table]`` is the element whose name, in the list ``name`` beside it, is ``table``
-(sensor_msgs/JointState); ``[*]`` is the only element. A path to a moment ends at a message with seconds and
-nanoseconds.
+``[2]`` counts from 0. ``[table]`` is the element whose name, in the field ``name`` of the same message, is ``table``
+(sensor_msgs/JointState); ``[*]`` is the only element. A path to a time ends at a message with seconds and nanoseconds.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class FieldPath:
 
     @classmethod
     def parse(cls, text: str) -> FieldPath:
-        """Cut a path; ``ValueError`` if it is none."""
+        """Parse a path; raise ``ValueError`` if it is invalid."""
         match = _LAST.fullmatch(text)
         base, last = match.groups() if match else ("", None)
         if not all(_STEP.fullmatch(part) for part in base.split(".")):
@@ -51,14 +50,14 @@ class FieldPath:
 
     @property
     def names(self) -> FieldPath:
-        """Path to the list of names beside the numbers."""
+        """Path to the list of names in the same message as the numbers."""
         parent = self.base.rpartition(".")[0]
         base = f"{parent}.{NAMES}" if parent else NAMES
         return FieldPath(base, base, None)
 
 
 def place_of(path: FieldPath, layout: MessageLayout) -> tuple[int, str] | None:
-    """Return the byte and the type of a number in a layout; None if it belongs to an empty list."""
+    """Return the byte offset and the type of a number in a layout; None for an element of an empty list."""
     place: Place | None = layout.places.get(path.base)
     if place is None:
         raise ValueError(f"it has no number {path.base}; it has {', '.join(layout.places)}")
@@ -78,7 +77,7 @@ def place_of(path: FieldPath, layout: MessageLayout) -> tuple[int, str] | None:
 
 
 def _named(path: FieldPath, count: int, names: object) -> int | None:
-    """Return which element bears a name; None for an empty list."""
+    """Return the index of the element with a name; None for an empty list."""
     if not isinstance(names, list):
         raise ValueError(f"{path.names.base} is no list of names, which {path.text} needs")  # noqa: TRY004
     if path.index == ONLY and len(names) != 1:
@@ -93,7 +92,7 @@ def _named(path: FieldPath, count: int, names: object) -> int | None:
 
 
 def look_up(path: FieldPath, message: object) -> Any:  # noqa: ANN401  (a number, or a message)
-    """Return what a path leads to in a decoded message; None if it is an element of an empty list."""
+    """Return the value at a path of a decoded message; None for an element of an empty list."""
     value: Any = message
     for step in path.steps:
         value = _step(value, step, path)
@@ -123,7 +122,7 @@ def _step(value: Any, step: str | int, path: FieldPath) -> Any:  # noqa: ANN401
 
 
 def number_at(path: FieldPath, message: object) -> float | None:
-    """Return a number of a decoded message; None if it is an element of an empty list."""
+    """Return the number at a path of a decoded message; None for an element of an empty list."""
     value = look_up(path, message)
     if value is None and path.index is not None:
         return None
@@ -133,7 +132,7 @@ def number_at(path: FieldPath, message: object) -> float | None:
 
 
 def stamp_at(path: FieldPath, message: object) -> tuple[int, int] | int | Decimal:
-    """Return the moment at a path of a decoded message: (seconds, nanoseconds), or one number."""
+    """Return the time at a path of a decoded message: (seconds, nanoseconds), or one number."""
     value = look_up(path, message)
     if isinstance(value, int | float | Decimal) and not isinstance(value, bool):
         return value if isinstance(value, int) else Decimal(value)

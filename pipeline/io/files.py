@@ -1,11 +1,10 @@
-"""Files of users: which ones hold a unit's recordings, what their names may be, and safe access to them.
+"""Find the files of a unit's recordings, check names, and read files safely.
 
-A procedure names a recording's file without suffix; the first kind of file that exists is taken, in the order of
-``SUFFIXES``. A name with a suffix is taken as it is. Where the ingest profile has ``parts`` (files of one
-logger, joined on time), these stand instead of the ``.csv``. Only regular files are opened: opening a FIFO would wait
-forever.
+A procedure names a recording's file without suffix; the first kind of file that exists is used, in the order of
+``SUFFIXES``. A name with a suffix is used unchanged. If the ingest profile has ``parts`` (files of one logger, joined
+on time), they replace the ``.csv``. Only regular files are opened: opening a FIFO would wait forever.
 
-Only the standard library is imported here: the Snakefile asks for the files of thousands of units while it is parsed.
+Only the standard library is imported here: the Snakefile looks up the files of thousands of units while it is parsed.
 """
 
 from __future__ import annotations
@@ -43,8 +42,8 @@ MESSAGE_FORMATS = {
 SUFFIXES = (".csv", ".gcsv", ".mcap", *MESSAGE_FORMATS, ".BIN")  # .BIN: as ArduPilot names its logs
 FILE = "{file}"
 UNIT_NAME = re.compile(r"[A-Za-z0-9._-]+")
-LONGEST_NAME = 200  # a file name has at most 255 bytes; the longest of a unit's adds 41 (_accelerometer_unknown.yaml)
-OF_STAGES = (".failed", ".noise", ".calibration")  # <unit>.failed.json and others lie beside <unit>.json
+LONGEST_NAME = 200  # a file name has at most 255 bytes; files of a unit add up to 41 (_accelerometer_unknown.yaml)
+OF_STAGES = (".failed", ".noise", ".calibration")  # <unit>.failed.json and others are in the folder of <unit>.json
 KINDS = {
     stat.S_IFDIR: "a directory",
     stat.S_IFIFO: "a FIFO",
@@ -86,7 +85,7 @@ def is_mat_5(path: Path) -> bool:
 def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], folder: Path) -> dict[str, list[Path]]:
     """Return the existing files of each recording of a procedure, in its order.
 
-    A recording without any file is absent, one with some of its parts missing has those that exist.
+    A recording without any file is not in the result; a recording with missing parts has its existing parts.
     """
     found = {}
     for name, candidates in candidate_files(procedure, ingest).items():
@@ -99,7 +98,7 @@ def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], fol
 
 
 def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> dict[str, list[list[str]]]:
-    """Return which files each recording may lie in: alternatives, most wanted first, each with all its files."""
+    """Return the possible files of each recording: alternatives in order of preference, each with all its files."""
     recordings: Mapping[str, Mapping[str, Any]] = procedure["recordings"]
     parts: Sequence[Mapping[str, Any]] = (ingest.get("csv") or {}).get("parts") or ()
     owner = _owner_of_parts(recordings, parts)
@@ -119,7 +118,7 @@ def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> 
 
 
 def _owner_of_parts(recordings: Mapping[str, Mapping[str, Any]], parts: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the one recording that parts with fixed names belong to, None where their names hold ``{file}``."""
+    """Return the recording to which parts with fixed names belong; None if their names contain ``{file}``."""
     fixed = [part["file"] for part in parts if FILE not in part["file"]]
     if not fixed:
         return None
@@ -133,7 +132,7 @@ def _owner_of_parts(recordings: Mapping[str, Mapping[str, Any]], parts: Sequence
 
 
 def wrong_name(name: str) -> str:
-    """Return what is wrong with the name of a unit; nothing for a good one."""
+    """Return what is wrong with the name of a unit; empty for a valid name."""
     if not UNIT_NAME.fullmatch(name) or name in (".", ".."):
         return "use letters, digits, '.', '_', '-'"
     if len(name) > LONGEST_NAME:
@@ -143,7 +142,10 @@ def wrong_name(name: str) -> str:
 
 
 def not_regular(path: Path) -> str:
-    """Return why a path cannot be read as a file; empty for a regular file or a link to one. ``OSError``: none."""
+    """Return why a path cannot be read as a file; empty for a regular file or a link to one.
+
+    Raises ``OSError`` if the path does not exist.
+    """
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
     except FileNotFoundError:
@@ -156,7 +158,7 @@ def not_regular(path: Path) -> str:
 
 
 def read_text(path: Path, largest: int, what: str) -> str:
-    """Return the text of a UTF-8 file of at most ``largest`` bytes; ``what`` it holds is named in refusals."""
+    """Read a UTF-8 text file of at most ``largest`` bytes; ``what`` it contains is named in errors."""
     try:
         other = not_regular(path)
         if other:
@@ -177,7 +179,7 @@ def read_text(path: Path, largest: int, what: str) -> str:
 
 @contextmanager
 def unchanged(path: Path) -> Iterator[None]:
-    """Refuse a log that is no regular file, cannot be opened, is empty, or changes while it is read."""
+    """Raise ``IngestError`` if a log is no regular file, cannot be opened, is empty, or changes while it is read."""
     try:
         other = not_regular(path)
         if other:
@@ -196,7 +198,7 @@ def unchanged(path: Path) -> Iterator[None]:
 
 
 def refuse_foreign(start: bytes, path: str) -> None:
-    """Refuse a file whose first bytes are those of another kind of file."""
+    """Raise ``IngestError`` for a file that begins like another kind of file."""
     for magic, what in FOREIGN.items():
         if start.startswith(magic):
             code = "utf16" if what == UTF_16 else "foreign"

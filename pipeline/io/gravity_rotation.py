@@ -1,12 +1,13 @@
-"""The unit of the angular rates, from the rotation of gravity between rests.
+"""Determine the unit of the angular rates from the rotation of gravity between rests.
 
 In the sensor's axes,
 
     du/dt = -(s w) x u
 
 with the direction u of the specific force, measured at rest before and after a move; the reading w of the gyroscope,
-minus its mean in these rests; and the unknown s, deg/s per unit of the gyroscope. The right s rotates u from rest to
-rest; the next possible unit (57.3 times, or another range of the sensor) misses by tens of degrees.
+minus its mean in these rests; and the unknown s, deg/s per unit of the gyroscope. With the right s, the integral from u
+before the move gives u after it. With any other possible unit (57.3 times, or another range of the sensor) the error is
+tens of degrees.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ LARGEST_DRIFT_DEG = 2.0  # between any two parts of a rest; more is slow motion
 LARGEST_STEP_DEG = 0.5  # from block to block of a rest; a turn at 2 deg/s
 BLOCK_NOISE = 5.0  # standard deviations between the means of two blocks; in 10^5 blocks noise exceeds it less than once
 BINS = 64  # a half turn rotates by less than 3 deg in each
-LONGEST_MOVE_S = 30.0  # a bias of 0.5 deg/s then adds 15 deg, what still fits
-SMALLEST_TURN_DEG = 20.0  # above what fits, so that no rotation at all fails
+LONGEST_MOVE_S = 30.0  # a bias of 0.5 deg/s then adds 15 deg, the limit FITS_DEG
+SMALLEST_TURN_DEG = 20.0  # above FITS_DEG, so that a prediction without rotation does not fit
 FEWEST_MOVES = 3  # for a median
 MOST_MOVES = 40  # bounds the cost
 MOST_SAMPLES = 200_000  # bounds the cost
-FITS_DEG, FAILS_DEG = 15.0, 30.0  # the next possible unit misses by tens of degrees
+FITS_DEG, FAILS_DEG = 15.0, 30.0  # the error of any other possible unit is tens of degrees
 
 
 @dataclass(frozen=True)
@@ -51,23 +52,23 @@ class Move:
 
     @property
     def angle_deg(self) -> float:
-        """Angle by which gravity turned in the sensor's axes, deg."""
+        """Angle of gravity's rotation in the sensor's axes, deg."""
         return float(np.degrees(np.arccos(np.clip(self.before @ self.after, -1.0, 1.0))))
 
     @property
     def way(self) -> float:
-        """Angle that the move turned through, by the gyroscope in its unit times s."""
+        """Total angle of the move by the gyroscope, in its unit times s."""
         return float(np.linalg.norm(self.turns, axis=1).sum())
 
 
 def interval_of(steps: Values) -> float:
-    """Return the usual interval of times by their steps; the mean step forward where most times are written twice."""
+    """Return the usual interval from the steps of time; the mean step forward where most times are written twice."""
     middle = float(np.median(steps))
     return middle if middle > 0 else float(np.mean(np.maximum(steps, 0.0)))
 
 
 def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
-    """Return start and stop of stretches of at least half a second at rest, by (n, 3) forces in any unit."""
+    """Return start and stop of stretches of at least half a second at rest, from (n, 3) forces in any unit."""
     width = max(SHORTEST_BLOCK, round(BLOCK_S / interval_s))
     count = len(force) // width
     if count < 4:
@@ -87,7 +88,7 @@ def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
 
 
 def moves_of(force: Values, rate: Values, time_s: Values) -> list[Move]:
-    """Return the moves between rests in which gravity turned by more than 20 degrees; (n, 3) readings in any unit."""
+    """Return the moves between rests in which gravity rotated by more than 20 degrees; (n, 3) readings in any unit."""
     steps = np.diff(time_s, append=2 * time_s[-1] - time_s[-2])
     rests = rests_of(force, interval_of(steps))
     found: list[Move] = []
@@ -113,9 +114,9 @@ def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> Values:
 
 
 def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> Values:
-    """Return the angle between the gravity that each scale predicts after a move and the one that was read.
+    """Return the angle between predicted and measured gravity after each move, for each scale: (moves, scales) array.
 
-    ``scales`` are candidates of ``s``, deg/s in one unit of the gyroscope.
+    ``scales``: candidates of ``s``, deg/s per unit of the gyroscope.
     """
     factors = np.radians(np.asarray(scales, float))[None, :, None]
     direction = np.repeat(np.stack([m.before for m in moves])[:, None, :], len(scales), axis=1)
@@ -132,7 +133,7 @@ def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> Values:
 
 
 def declared_scale(table: ChannelTable) -> tuple[float, str] | None:
-    """Return the factor by which the angular rates are off, and the evidence; None where none is found."""
+    """Return the factor by which the angular rates are wrong, and the evidence; None if they are right or undecided."""
     if not {"accel_x", "gyro_x"} <= table.values.keys():
         return None
     part = slice(0, MOST_SAMPLES)

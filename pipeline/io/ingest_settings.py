@@ -1,6 +1,6 @@
-"""The settings of an ingest profile; ``configs/ingest/canonical_csv.yaml`` explains every key.
+"""Read and check the settings of an ingest profile; ``configs/ingest/canonical_csv.yaml`` explains every key.
 
-A profile states what a file holds: names, units, separators and the order of columns are never guessed from the file.
+A profile describes a file: names, units, separators and the order of columns are never guessed from the file.
 ``ingest.mcap.topics`` maps the fields of any messages to channels:
 
     topics:
@@ -37,17 +37,17 @@ Duration = Annotated[float, Field(ge=0)]
 
 
 class Section(BaseModel):
-    """A section of an ingest profile. The description of a field says what a refused value should be."""
+    """A section of an ingest profile. The description of a field states the expected value in an error message."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class Checks(Section):
-    """Limits of what is repaired or tolerated (``ingest.checks``).
+    """Limits of repairs and faults (``ingest.checks``).
 
     ``repaired_rows``: share of a file's rows that may be dropped or sorted. ``missing_time``: share of the duration in
-    gaps. ``disturbed_rows``: share of samples left out as disturbances; 0 keeps all. ``rate_hz``: rate that the times
-    keep within 20 %; None: not known.
+    gaps. ``disturbed_rows``: share of samples that may be removed as disturbances; 0: remove none. ``rate_hz``:
+    expected sampling rate, within 20 %; None: unknown.
     """
 
     repaired_rows: Share = 1e-3
@@ -57,7 +57,7 @@ class Checks(Section):
 
 
 class ChannelSource(Section):
-    """Where a channel comes from: its unit, and the scale of counts."""
+    """The source of a channel: its unit, and the scale of counts."""
 
     channel: str
     unit: str = Field(default="", validate_default=True)
@@ -96,7 +96,7 @@ class ChannelSource(Section):
 
 
 class Column(ChannelSource):
-    """The column of a channel: its name, or its index from 0. A time may be in counts."""
+    """The column of a channel: its name, or its index from 0. A time may be in counts, too."""
 
     column: str | int = Field(default="", validate_default=True)
     optional: bool = Field(default=False, description="true or false")
@@ -124,9 +124,9 @@ class Column(ChannelSource):
 class CsvFormat(Section):
     """The layout of one text file (``ingest.csv``).
 
-    ``comment``: start of lines that are no data. ``header``: ``commented`` where the last comment names the columns.
-    ``rate_hz``: sampling rate of a file without a time column. ``session``: which part, from 1, of a log that was
-    restarted. ``own_clock``: the times are those of the table's clock.
+    ``comment``: start of lines that are no data. ``header``: ``commented`` if the last comment names the columns.
+    ``rate_hz``: sampling rate of a file without a time column. ``session``: which part, from 1, of a restarted log to
+    read. ``own_clock``: the times are of the table's clock.
     """
 
     delimiter: str = Field(default=",", description="a character")
@@ -171,7 +171,7 @@ class CsvFormat(Section):
 
 
 class _Part(Section):
-    """One file of a recording that a logger writes in several."""
+    """One of several files of a recording."""
 
     file: str = Field(min_length=1, description="the name of a file")
     own_clock: bool = Field(default=False, description="true or false")
@@ -183,9 +183,9 @@ C = TypeVar("C", bound=ChannelSource)
 
 
 def validated(model: type[S], section: Any, where: str, given: Mapping[str, Any] | None = None, **context: Any) -> S:  # noqa: ANN401
-    """Return a section as its model; a refusal names the key below ``where``, its value and what is allowed.
+    """Parse a section to its model; an error names the key below ``where``, its value and what is allowed.
 
-    ``given``: fields that are not the user's.
+    ``given``: fields that are not set by the user.
     """
     given = given or {}
     refuse_unknown(where, section, [k for k in model.model_fields if k not in given])
@@ -202,7 +202,7 @@ def validated(model: type[S], section: Any, where: str, given: Mapping[str, Any]
 
 
 def refuse_unknown(where: str, entries: object, allowed: Iterable[str]) -> None:
-    """Refuse what is no mapping, and an unknown key, with the nearest known one."""
+    """Raise ``ConfigurationError`` if ``entries`` is no mapping or has an unknown key, with the nearest known key."""
     known = tuple(allowed)
     if not isinstance(entries, Mapping):
         raise ConfigurationError(f"{where} is {entries!r}; it is a mapping with {', '.join(known)}")
@@ -214,14 +214,14 @@ def refuse_unknown(where: str, entries: object, allowed: Iterable[str]) -> None:
 
 
 def _channels(model: type[C], where: str, entries: Any, **context: Any) -> dict[str, C]:  # noqa: ANN401  (the user's)
-    """Return where the channels of a file or topic come from; null leaves one out."""
+    """Return the sources of the channels of a file or topic, without channels set to null."""
     refuse_unknown(where, entries, UNITS)
     stated = {channel: entry for channel, entry in entries.items() if entry is not None}
     return {c: validated(model, entry, f"{where}.{c}", {"channel": c}, **context) for c, entry in stated.items()}
 
 
 def _once(where: str, groups: Iterable[Iterable[str]], what: str) -> set[str]:
-    """Return the channels of all files or topics; refuse one that stands in two, but for the time."""
+    """Return the channels of all files or topics; raise ``ConfigurationError`` if one, except the time, is in two."""
     seen: set[str] = set()
     for channels in groups:
         twice = seen & set(channels) - {TIME}
@@ -232,12 +232,12 @@ def _once(where: str, groups: Iterable[Iterable[str]], what: str) -> set[str]:
 
 
 def checks_of(ingest: Mapping[str, Any]) -> Checks:
-    """Return the limits that an ingest profile sets (``ingest.checks``)."""
+    """Return the limits of an ingest profile (``ingest.checks``)."""
     return validated(Checks, ingest.get("checks") or {}, "ingest.checks")
 
 
 def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
-    """Return the layout of each text file of a recording: one, or one for each of the profile's ``parts``."""
+    """Return the layout of each text file of a recording: one, or one for each part in the profile's ``parts``."""
     csv: Mapping[str, Any] = ingest.get("csv") or {}
     refuse_unknown("ingest.csv", csv, [k for k in (*CsvFormat.model_fields, "parts") if k != "own_clock"])
     shared = {k: v for k, v in csv.items() if k not in ("parts", "columns")}
@@ -256,7 +256,7 @@ def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
 
 
 def _check_channels(formats: Sequence[CsvFormat]) -> None:
-    """Refuse a profile without time, without a sensor, or with an incomplete one."""
+    """Raise ``ConfigurationError`` for a profile without time, without a sensor, or with an incomplete sensor."""
     readings, channels = {*ACCELEROMETER, *GYROSCOPE}, [{c.channel for c in layout.columns} for layout in formats]
     for layout, own in zip(formats, channels, strict=True):
         if layout.own_clock and (own & readings or TIME not in own):
@@ -278,7 +278,7 @@ def _check_channels(formats: Sequence[CsvFormat]) -> None:
 
 
 def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None = None) -> None:
-    """Refuse an ingest profile that no file could be read with, or whose parts do not suit the procedure."""
+    """Raise ``ConfigurationError`` for an invalid ingest profile, or if its parts do not match the procedure."""
     mcap_format(ingest)
     checks_of(ingest)
     if ingest.get("csv"):
@@ -288,7 +288,7 @@ def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None 
 
 
 class MappedField(ChannelSource):
-    """The field of a message that holds a channel; a time is in ns by default."""
+    """The field of a message with the values of a channel; a time is in ns by default."""
 
     field: FieldPath = Field(description="a path, such as linear_acceleration.x or position[table]")
 
@@ -308,9 +308,9 @@ class McapFormat(Section):
 
     ``topics``: topic to channel (or ``time``) to field. ``time_source``: the stamps in the messages, or the recorder's
     times. ``table_clock``: ``shared`` if the table's messages have the stamps of the Imu messages, ``own`` if they are
-    aligned by the motion. ``sensor_clock``: ``own`` if the two sensors have stamps and rates of their own, of one
-    clock. ``clock_difference_s``: largest difference between stamps and recorder's times (None: any).
-    ``reorder_s``: how late a message may stand in the file.
+    to be aligned by the motion. ``sensor_clock``: ``own`` if the two sensors have different stamps and rates of one
+    clock. ``clock_difference_s``: largest difference between stamps and recorder's times (None: any). ``reorder_s``:
+    largest delay of a message in the file.
     """
 
     imu_topic: Name = None
