@@ -2,11 +2,11 @@
 
     value = (count - offset) / counts_per_unit
 
-The rows are read in blocks of whole lines. Lines that are no rows of numbers are refused by their number, or dropped
-with a note where the profile allows it. Files of one recording that were logged at the same times are joined row by
-row; the log of a table with a clock of its own is aligned with the sensor's (``pipeline.io.encoder_log``).
+The rows are read in blocks of whole lines. A line that is no row of numbers is refused with its number, or dropped with
+a note where the profile allows it. Files of one recording that were logged at the same times are joined row by row; the
+log of a table with a separate clock is aligned with the sensor's (``pipeline.io.encoder_log``).
 
-Gyroflow's ``.gcsv`` states scales, orientation and column names itself (versions 1.0 to 1.3;
+Gyroflow's ``.gcsv`` states scales, orientation and column names (versions 1.0 to 1.3;
 docs.gyroflow.xyz/app/technical-details/gcsv-format):
 
     GYROFLOW IMU LOG            (or CAMERA IMU LOG)

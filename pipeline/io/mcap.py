@@ -1,8 +1,8 @@
-"""Logs of messages to channels: MCAP files, and the formats of ``pipeline.io.message_logs``.
+"""Read logs of messages to channels: MCAP files, and the formats of ``pipeline.io.message_logs``.
 
 Times are the stamps in the messages' headers, integer ns: the sensor's clock, not the recorder's. The rows are the Imu
 messages, or the messages of the first topic of ``ingest.mcap.topics`` with an accelerometer or a gyroscope. Table
-messages belong to them by equal stamps, and a temperature with stamps of its own is interpolated.
+messages are matched by equal stamps. A temperature with other stamps is interpolated.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ if TYPE_CHECKING:
 
 
 def read_log(path: Path, settings: McapFormat) -> ChannelTable:
-    """Read a log of any format; refuse a damaged or incomplete one, no Imu topic or several, and impossible times."""
+    """Read a log of messages in any format.
+
+    Raises ``IngestError`` for a damaged or incomplete log, for no Imu topic or several, and for impossible times.
+    """
     with unchanged(path), open_reader(path, allow_truncated=settings.allow_truncated) as reader:
         return read_messages(reader, settings)
 
@@ -49,7 +52,7 @@ def read_messages(reader: MessageReader, settings: McapFormat) -> ChannelTable:
 
 @dataclass
 class _Topic:
-    """The messages of one topic as they come; an error in them matters only if the topic is used."""
+    """The messages of one topic; an error in them is raised only if the topic is used."""
 
     decoder: TopicDecoder
     error: IngestError | None = None
@@ -73,7 +76,7 @@ class _Topic:
             self.values.setdefault(name, []).append(column)
 
     def series(self, settings: McapFormat, notes: list[Note], *, recorder: bool) -> ChannelTable:
-        """Return all messages in the order of their times; ``recorder``: whether the logger has times of its own."""
+        """Return all messages in order of time; ``recorder``: whether the log has times of the recorder."""
         if self.error is not None:
             raise self.error
         topic, path = self.decoder.topic, self.decoder.path
@@ -104,13 +107,13 @@ class _Topic:
 
 
 class _Log:
-    """One file, and what of it becomes channels."""
+    """One file, whose topics are combined to a table of channels."""
 
     def __init__(self, reader: MessageReader, settings: McapFormat) -> None:
         self.reader, self.path, self.settings = reader, reader.path, settings
         self.topics: dict[str, _Topic] = {}
         self.notes: list[Note] = []
-        self.table_logs: list[ChannelTable] = []  # of a table with a clock of its own
+        self.table_logs: list[ChannelTable] = []  # of a table with a separate clock
         self.end_ns = np.iinfo(np.int64).max  # the topics of a truncated file end at different times
 
     def table(self) -> ChannelTable:
@@ -164,7 +167,7 @@ class _Log:
         return found
 
     def _chosen(self) -> list[_Topic]:
-        """Return the topic of the rows, and then the others that are read."""
+        """Return the used topics, first the topic of the rows."""
         topics = self.settings.topics
         if topics:
             empty = [t for t in topics if t not in self.topics]
@@ -186,7 +189,7 @@ class _Log:
         raise IngestError(f"{what}; the file has {listed}", self.path, code="missing_topic", hint=hint)
 
     def _slower_first(self, base: ChannelTable, others: list[ChannelTable]) -> tuple[ChannelTable, list[ChannelTable]]:
-        """Return the rows of the slower of two sensors with the averages of the faster one, and all else."""
+        """Return the rows of the slower of two sensors with averages of the faster one, and the other topics."""
         sensors = {triad[0] for triad in TRIADS.values()}
         other = next((s for s in others if sensors & set(s.values)), None)
         if other is None:
@@ -204,7 +207,7 @@ class _Log:
         return replace(slow.select(rows), values=values), others  # an average of counts is no count
 
     def _at_rows(self, series: ChannelTable, base: ChannelTable) -> Columns:
-        """Return the channels of a topic at the times of the rows; none of a table's with a clock of its own."""
+        """Return the channels of a topic at the times of the rows; none for a table with a separate clock."""
         channels = set(series.values)
         if self.settings.table_clock == OWN and channels <= set(TABLE_CHANNELS):  # aligned with the rows later
             self.table_logs.append(series)

@@ -1,15 +1,15 @@
-"""Records of an MCAP file by the official library, and chunks unpacked and cut into messages.
+"""Parse records of an MCAP file with the official library; unpack chunks and split them into messages.
 
-A run of records (a chunk, or the messages between chunks) is cut by following the lengths from record to record:
+A run of records (a chunk, or the messages between chunks) is split by following the lengths from record to record:
 
     start_0 = 0,   start_{i+1} = start_i + 9 + length_i,   and the last record ends where the run ends
 
-If all records have one length, the starts are an arithmetic series; if the file has an index, they are its offsets;
-else the lengths are followed one by one. numpy compares the first two with the rule, so that a wrong index has no
+If all records have one length, the starts are an arithmetic series. If the file has an index, they are its offsets.
+Else the lengths are followed one by one. numpy checks the first two with the rule above, so that a wrong index has no
 effect.
 
-The library returns short data where a length is too large, ignores contradicting lengths, does not compare the checksum
-of attachments, and reads an index entry by entry. Here such records are refused, and an index is an array.
+The library returns short data if a length is too large, ignores contradicting lengths, does not check the checksum of
+attachments, and reads an index entry by entry. Here such records are refused, and an index is read as an array.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ class Rows:
     channel: int
     data: NDArray[np.uint8]  # all records of the run
     heads: NDArray[np.void]  # ``HEAD`` of each message
-    starts: Integers  # where the payload of each message begins in ``data``
+    starts: Integers  # offset of each message's payload in ``data``
     sizes: Integers  # of the payloads, bytes
-    stride: int  # distance of the starts where it is the same for all, else 0
-    place: str  # the run, for messages: ``chunk 3``
+    stride: int  # distance between the starts if it is constant, else 0
+    place: str  # name of the run, for messages to the user: ``chunk 3``
     offset: int  # byte of the file at which the run begins
 
     def payload(self, row: int) -> bytes:
@@ -68,13 +68,13 @@ class Rows:
         return self.data[start : start + int(self.sizes[row])].tobytes()
 
     def select(self, rows: Index) -> Rows:
-        """Return some messages, by their indices in increasing order."""
+        """Select messages by their indices, in increasing order."""
         if len(rows) == len(self.starts):
             return self
         return replace(self, heads=self.heads[rows], starts=self.starts[rows], sizes=self.sizes[rows], stride=0)
 
     def table(self, layout: np.dtype[np.void]) -> NDArray[np.void]:
-        """Return all messages, each as one item of a type of their common size."""
+        """Return all messages as an array of a structured type; they must have the size of that type."""
         if self.stride:
             return np.ndarray(len(self.starts), layout, self.data.data, int(self.starts[0]), (self.stride,))
         windows = sliding_window_view(self.data, layout.itemsize)[self.starts]
@@ -83,10 +83,10 @@ class Rows:
 
 @dataclass
 class Run:
-    """Records of the data section up to and with the messages of one chunk, or messages between chunks.
+    """Records of the data section: up to and including the messages of one chunk, or messages between chunks.
 
-    ``index``: channel to the offsets of its messages in ``data`` by the file's index, which may be wrong. ``records``
-    (head, content) are as in the file, without messages outside chunks.
+    ``index``: channel to the offsets of its messages in ``data`` by the file's index, which may be wrong. ``records``:
+    (head, content) of each record as in the file, without messages outside chunks.
     """
 
     offset: int = 0  # byte of the file at which the chunk, or the first message outside chunks, begins
@@ -99,9 +99,9 @@ class Run:
 
 
 def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryview:
-    """Return the records of a chunk, ``expected`` bytes by its head; compression is empty, ``zstd`` or ``lz4``.
+    """Decompress the records of a chunk, ``expected`` bytes by its head; compression is empty, ``zstd`` or ``lz4``.
 
-    A size too large for any log is refused before memory is allocated.
+    Raises ``ValueError`` for a size that is too large for any log, before memory is allocated.
     """
     if expected > min(LARGEST_CHUNK, max(ALWAYS_ALLOWED, LARGEST_EXPANSION * len(content))):
         raise ValueError(f"a chunk claims to hold {expected} bytes, packed into {len(content)}: damaged, or no log")
@@ -128,7 +128,10 @@ def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryvie
 
 
 def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
-    """Return the other records (opcode, content) of a run, and its messages; ``ValueError``: records do not fill it."""
+    """Split a run into its messages; return the other records (opcode, content), and the messages by channel.
+
+    Raises ``ValueError`` if the records do not fill the run exactly.
+    """
     data = np.frombuffer(run.data, np.uint8)
     leading, others = _followed(run.data, 0, stop_at_message=True)
     if not leading.size:
@@ -153,7 +156,7 @@ def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
 def _followed(
     data: bytes | memoryview, start: int, *, stop_at_message: bool = False
 ) -> tuple[Integers, list[tuple[int, memoryview]]]:
-    """Follow the lengths from record to record: the starts of the messages, and the other records."""
+    """Follow the lengths from record to record; return the starts of the messages, and the other records."""
     view, end, starts, others = memoryview(data), len(data), [], []
     while start < end:
         if start + RECORD_HEAD > end:
@@ -173,7 +176,7 @@ def _followed(
 
 
 def _alike(run: Run, data: NDArray[np.uint8], first: int) -> Rows | None:
-    """Return the messages if from the first one on all are of one channel and one length."""
+    """Return the messages if all records from the first message on have one channel and one length, else None."""
     _, length, channel = _HEAD.unpack_from(run.data, first)
     stride = RECORD_HEAD + length
     count, rest = divmod(len(data) - first, stride)
@@ -187,7 +190,7 @@ def _alike(run: Run, data: NDArray[np.uint8], first: int) -> Rows | None:
 
 
 def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> Integers | None:
-    """Return the starts that the index gives if following the lengths gives the same."""
+    """Return the starts by the index if the lengths of the records confirm them, else None."""
     if not run.index:
         return None
     starts = np.sort(np.concatenate(list(run.index.values())))
@@ -204,7 +207,7 @@ def _heads(data: NDArray[np.uint8], starts: Integers) -> NDArray[np.void]:
 
 
 class _Content(ReadDataStream):
-    """The content of a record; the library's own stream returns less than asked for at its end."""
+    """The content of a record; the stream of the library returns short data at its end without an error."""
 
     def read(self, length: int) -> bytes:
         data = self._stream.read(length)
@@ -215,9 +218,9 @@ class _Content(ReadDataStream):
 
 
 def parsed(kind: Any, content: bytes | memoryview) -> Any:  # noqa: ANN401  (a class of the library, its record)
-    """Return the record in a content, which may be longer: later versions of the format append to it.
+    """Parse the content of a record; it may be longer, because later versions of the format append fields.
 
-    ``ValueError``: it is too short, a text is not UTF-8, or the lengths in it contradict each other.
+    Raises ``ValueError`` if it is too short, a text is not UTF-8, or its lengths contradict each other.
     """
     record = kind.read(_Content(BytesIO(content)))
     if kind is not Chunk and not bytes(content).startswith(bytes_of([record])[RECORD_HEAD:]):
@@ -226,7 +229,7 @@ def parsed(kind: Any, content: bytes | memoryview) -> Any:  # noqa: ANN401  (a c
 
 
 def attachment(content: bytes) -> Attachment:
-    """Return an attachment; ``ValueError`` if its checksum is neither right nor 0 (not computed)."""
+    """Parse an attachment; raise ``ValueError`` if its checksum is neither right nor 0 (not computed)."""
     record: Attachment = Attachment.read(_Content(BytesIO(content)))
     written = bytes_of([record])[RECORD_HEAD:]  # with the right checksum, in its last four bytes
     body, crc = content[: len(written) - 4], content[len(written) - 4 : len(written)]
@@ -236,7 +239,7 @@ def attachment(content: bytes) -> Attachment:
 
 
 def bytes_of(records: Iterable[McapRecord]) -> bytes:
-    """Return records as they stand in a file."""
+    """Return the bytes of records in a file."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -244,7 +247,10 @@ def bytes_of(records: Iterable[McapRecord]) -> bytes:
 
 
 def message_index(content: bytes) -> tuple[int, Integers]:
-    """Return a channel and the offsets of its messages in the chunk before; ``ValueError`` if it is not an index."""
+    """Parse a message index: a channel, and the offsets of its messages in the preceding chunk.
+
+    Raises ``ValueError`` if it is not an index.
+    """
     number, size = struct.unpack_from("<HI", content)
     body = content[6 : 6 + size]
     if len(body) < size or size % INDEX_ENTRY:

@@ -1,8 +1,8 @@
-"""A copy of an MCAP file, every record of its data section byte for byte, with messages added.
+"""Copy an MCAP file, every record of its data section byte for byte, and add messages.
 
-Chunks stay as they are compressed. Added messages form chunks of their own, each after the chunk that it belongs to.
-Messages outside chunks are put into one, because readers that use a file's index look into chunks only. The summary is
-written anew, as every record has a new place.
+Chunks are not decompressed. Added messages are written in separate chunks, each after the chunk to which it belongs.
+Messages outside chunks are written into a chunk, because readers that use the file's index read chunks only. The
+summary is computed again, because the records have new offsets.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class McapCopy:
             self._count(rows.channel, rows.heads["log_time"])
 
     def _record(self, head: bytes, content: bytes) -> None:
-        """Write a record of the data section and keep its place for the summary."""
+        """Write a record of the data section, and store its place for the summary."""
         opcode, place = head[0], {"offset": self.position, "length": len(head) + len(content)}
         if opcode == Opcode.CHUNK:
             chunk = parsed(Chunk, content)
@@ -108,7 +108,7 @@ class McapCopy:
         self.times = [min([*self.times, int(times.min())]), max([*self.times, int(times.max())])]
 
     def add(self, table: NDArray[np.uint8] | list[bytes], before: Iterable[McapRecord], channel: int) -> None:
-        """Add messages of one channel, whole records as rows of bytes or a list, after the definitions ``before``."""
+        """Add messages of one channel, as rows of bytes or a list of records, after the definitions ``before``."""
         head = bytes_of(before)
         if isinstance(table, np.ndarray):
             body: bytes | memoryview = table.data.cast("B")

@@ -1,12 +1,12 @@
-"""MCAP files, read once from the first byte to the last, with a proof that they are complete.
+"""Read MCAP files in one pass from the first byte to the last, and check that they are complete.
 
     file   = magic | data section | summary | magic
     record = opcode (1 byte) | length (8 bytes) | content (length bytes)
 
 Checked are the checksums of each chunk, each attachment, the data section and the summary (0: the recorder computed
-none); that records fill their chunks; and that the summary's counts are those found. No length is used before it is
-compared with the bytes that are left. Messages are returned chunk by chunk, so memory is bounded by the largest chunk.
-A file is known to be complete only when the iteration has ended without an error.
+none); that records fill their chunks; and that the counts in the summary are right. Every length is first compared with
+the number of remaining bytes. Messages are returned chunk by chunk, so that the largest chunk determines the memory. A
+file is known to be complete only after the iteration has ended without an error.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class _TruncatedError(Exception):
 class MessageReader:
     """One pass over a log of messages.
 
-    ``schemas``, ``channels`` and ``counts`` of messages are by number. ``notes``: what the format's own reader remarks.
-    ``has_recorder``: whether the messages have times of the logger. ``truncated``: what is missing at the end of a file
-    whose complete chunks are read on request. ``sha256``: of the whole file, once the iteration has ended.
+    ``schemas``, ``channels`` and ``counts`` of messages are by number. ``notes``: from the reader of the format.
+    ``has_recorder``: whether the messages have times of the logger. ``truncated``: description of the missing end of a
+    file whose complete chunks are read on request. ``sha256``: of the whole file, after the iteration has ended.
     """
 
     def __init__(self, path: str) -> None:
@@ -71,7 +71,7 @@ class MessageReader:
 
     @property
     def verified(self) -> bool:
-        """Whether a checksum covers every message; a file may be written without any."""
+        """Whether a checksum covers every message; a file may have no checksums."""
         return False
 
     def rows(self) -> Iterator[Rows]:
@@ -80,7 +80,7 @@ class MessageReader:
 
 
 class McapReader(MessageReader):
-    """One pass over an MCAP file; ``allow_truncated``: whether the complete chunks of a file without end are read."""
+    """One pass over an MCAP file; ``allow_truncated``: whether to read the complete chunks of a truncated file."""
 
     def __init__(self, stream: BinaryIO, path: str, *, allow_truncated: bool = False) -> None:
         super().__init__(path)
@@ -115,7 +115,7 @@ class McapReader(MessageReader):
             yield from run.rows
 
     def runs(self) -> Iterator[Run]:
-        """Yield the data section, run by run; damage, and a part that is missing, raise ``IngestError``."""
+        """Yield the data section, run by run; raise ``IngestError`` for damage and for a missing part."""
         try:
             self._take(len(MAGIC))
             try:
@@ -146,7 +146,7 @@ class McapReader(MessageReader):
         return data
 
     def _record(self) -> tuple[int, bytes, bytes]:
-        """Return the next record: its kind, its first nine bytes, its content."""
+        """Return the kind, the head (nine bytes) and the content of the next record."""
         self._start, left = self.position, self.size - self.position - RECORD_HEAD
         if left == -RECORD_HEAD:
             raise _TruncatedError("it ends after a complete record; the recorder did not close it")
@@ -160,7 +160,7 @@ class McapReader(MessageReader):
         return opcode, head, self._take(length)
 
     def _data(self) -> Iterator[Run]:
-        """Read up to the end of the data section."""
+        """Read to the end of the data section, and yield its runs."""
         while True:
             crc = self._crc
             opcode, head, content = self._record()
@@ -178,11 +178,11 @@ class McapReader(MessageReader):
                 if self._run.records:
                     yield self._run
                 return self._end_data(parsed(DataEnd, content).data_section_crc, crc)
-            self._take_in(opcode, content)
+            self._store_record(opcode, content)
             self._run.records.append((head, content))
 
-    def _take_in(self, opcode: int, content: bytes) -> None:
-        """Read a record of the data section other than a message."""
+    def _store_record(self, opcode: int, content: bytes) -> None:
+        """Parse a record of the data section other than a message, and store its content."""
         if (self.header is None) != (opcode == Opcode.HEADER):
             message = f"no Header record: the first is of kind {opcode}" if not self.header else "a second Header"
             raise ValueError(message)
@@ -215,7 +215,7 @@ class McapReader(MessageReader):
         self.chunks.append(self._start)
 
     def _finished_run(self) -> Iterator[Run]:
-        """Yield the current run if it has messages, and begin the next one."""
+        """Yield the current run if it has messages, and start the next run."""
         run = self._run
         if self._loose:
             run.name, run.data, run.loose = "the messages outside chunks", b"".join(self._loose), True
@@ -235,7 +235,7 @@ class McapReader(MessageReader):
         yield run
 
     def _define(self, opcode: int, content: bytes | memoryview) -> None:
-        """Add a message definition or a channel; a second one of the same number must be equal."""
+        """Store a message definition or a channel; a second one with the same number must be equal."""
         record = parsed(DEFINITIONS[Opcode(opcode)], content)
         known: dict[int, Any] = self.schemas if opcode == Opcode.SCHEMA else self.channels
         if known.setdefault(record.id, record) != record:
@@ -250,7 +250,7 @@ class McapReader(MessageReader):
         self._unknown_kinds &= not given
 
     def _summary(self) -> None:
-        """Read from the end of the data section to the end of the file."""
+        """Read and check the summary, to the end of the file."""
         start, self._crc, opcode = self.position, 0, 0
         while opcode != Opcode.FOOTER:
             crc = self._crc
@@ -266,7 +266,7 @@ class McapReader(MessageReader):
         self._check_footer(parsed(Footer, content), zlib.crc32(head + content[:16], crc), start)
 
     def _check_footer(self, footer: Footer, crc: int, start: int) -> None:
-        """Check the summary's checksum and place, and the last bytes of the file."""
+        """Check the checksum and the place of the summary, and the last bytes of the file."""
         if footer.summary_crc not in {0, crc}:
             raise ValueError("the checksum of the summary is wrong")
         if footer.summary_start not in {0, start}:
@@ -280,7 +280,7 @@ class McapReader(MessageReader):
             raise ValueError("records of an unknown kind, and no counts that tell whether messages are missing")
 
     def _accept_truncation(self, reason: str) -> None:
-        """Accept the complete chunks of a file without end, if that is allowed and a checksum covers each."""
+        """Accept the complete chunks of a truncated file, if that is allowed and a checksum covers each; else raise."""
         facts = f"truncated: {reason}; {self.count} messages in {len(self.chunks)} complete chunks are readable"
         unproven = "" if self.verified else "not every message lies in a chunk with a checksum"
         unproven = "records of an unknown kind" if self._unknown_kinds else unproven
@@ -295,7 +295,7 @@ class McapReader(MessageReader):
         raise IngestError(facts, self.path, code="truncated", offset=self.size, hint=hint)
 
     def _check_complete(self) -> None:
-        """Compare what was read with the summary; ``ValueError`` if a part is missing."""
+        """Compare chunks and counts with the summary; raise ``ValueError`` if a part is missing."""
         lost = set(self._chunk_index) - set(self.chunks)
         if lost or (self._chunk_index and not self.truncated and sorted(self._chunk_index) != self.chunks):
             what = f"the summary lists {len(self._chunk_index)} chunks, and the file holds {len(self.chunks)}"
@@ -317,7 +317,7 @@ class McapReader(MessageReader):
 
 
 def check_magic(start: bytes, path: str) -> None:
-    """Refuse a file that does not begin as an MCAP file does, and name what it is."""
+    """Raise ``IngestError`` for a file that does not begin like an MCAP file, with the kind of file."""
     if start.startswith(MAGIC):
         return
     if not start:

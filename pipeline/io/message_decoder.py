@@ -1,19 +1,19 @@
-"""Messages of one topic to channels in g, deg/s, deg and degC.
+"""Decode the messages of one topic to channels in g, deg/s, deg and degC.
 
     cdr with ros2msg definitions, ros1 with ros1msg   columns of a whole chunk at once, as views on its bytes
-    arrays (of other formats: ``message_logs``)       likewise
+    arrays (of other formats: ``message_logs``)       the same
     protobuf, json                                    message by message
 
-Where the ROS messages of a chunk differ in layout (a text or a list changes its length), those of one layout are read
-together. The official ROS decoders are not used: that of ROS 1 runs Python code that it writes from the
-definition, and a log from a stranger must not run code; that of ROS 2 accepts bytes that are left over.
+Where the ROS messages of a chunk differ in layout (a text or a list has another length), messages of one layout are
+read together. The official ROS decoders are not used: the decoder of ROS 1 generates and runs Python code from the
+definition, but a log from a stranger must not run code; the decoder of ROS 2 accepts excess bytes.
 
-The profile states which number of a message is which channel (``ingest.mcap.topics``). Four ROS types are known:
+The profile assigns fields of messages to channels (``ingest.mcap.topics``). Four ROS types are known:
 
     specific force [g]   = linear_acceleration [m/s^2] / 9.80665          sensor_msgs/Imu
     angular rate [deg/s] = angular_velocity [rad/s] * 180/pi
 
-A covariance whose first element is -1 says that the quantity is absent (sensor_msgs/Imu).
+A covariance whose first element is -1 means that the quantity is absent (sensor_msgs/Imu).
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ ARRAYS = "arrays"  # encoding of messages made of arrays; the definition is JSON
 MAPPED = "mapped"  # the kind of a topic whose fields the profile names; other kinds are ROS types
 KINDS = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
 STATED = "unit of "  # before a field's name in the metadata of a channel: the unit that the file states
-MOST_LAYOUTS = 32  # in a run; the messages after so many are read one by one, which bounds the cost
+MOST_LAYOUTS = 32  # in a run; messages of further layouts are read one by one, which bounds the cost
 FindLayout = Callable[[bytes], MessageLayout]
 Decode = Callable[[bytes], Any]
 
 
 def ros_layouts(channel: Channel, schema: Schema | None) -> FindLayout | None:
-    """Return the function that finds the layout of a channel's ROS messages, or arrays; None for other encodings."""
+    """Return a function that finds the layout of a channel's messages (ROS or arrays); None for other encodings."""
     if schema is not None and schema.encoding == ARRAYS:
         places = {name: Place(byte, code, count) for name, byte, code, count in json.loads(schema.data)}
         return lambda payload: MessageLayout(payload, places)
@@ -90,7 +90,7 @@ def object_decoder(channel: Channel, schema: Schema | None) -> Decode | None:
 
 
 def _stamp_places(path: FieldPath | None, layout: MessageLayout) -> dict[str, tuple[int, str]]:
-    """Return the places of the seconds and nanoseconds of a moment, or of its one number."""
+    """Return the places of the seconds and nanoseconds of a time, or of its single number."""
     if path is None:
         return {}
     for seconds, nanos in STAMPS:
@@ -104,13 +104,13 @@ def _stamp_places(path: FieldPath | None, layout: MessageLayout) -> dict[str, tu
 
 
 def topic_of(kind: str, settings: McapFormat) -> str | None:
-    """Return the topic that the profile names for a ROS type; None stands for the only one."""
+    """Return the topic that the profile names for a ROS type; None means the only topic of the type."""
     topics = (settings.imu_topic, settings.temperature_topic, settings.joint_topic, settings.attitude_topic)
     return dict(zip(KINDS.values(), topics, strict=True))[kind]
 
 
 def listed_topics(reader: MessageReader) -> list[tuple[str, str]]:
-    """Return all topics of a file, each with its type in words."""
+    """Return all topics of a file, each with a text that includes its type."""
     found = set()
     for number, channel in reader.channels.items():
         schema = reader.schemas.get(channel.schema_id)
@@ -121,18 +121,18 @@ def listed_topics(reader: MessageReader) -> list[tuple[str, str]]:
 
 
 class Batch(NamedTuple):
-    """Some messages of a topic: their moments, ns (None: the recorder's times are used), and values by channel."""
+    """Messages of a topic: their times, ns (None: the recorder's times are used), and values by channel."""
 
     time_ns: Integers | None
     values: dict[str, Values]
 
     def times(self, rows: Rows) -> Integers:
-        """Return the moments or, where none is read, the recorder's times, ns."""
+        """Return the times of the messages, or the recorder's times if none are read, ns."""
         return rows.heads["log_time"].astype(np.int64) if self.time_ns is None else self.time_ns
 
 
 def _together(parts: Sequence[Batch], groups: Sequence[tuple[Index, MessageLayout]]) -> Batch:
-    """Return the messages of all layouts in the order of the file."""
+    """Join the messages of all layouts in the order of the file."""
     if len(parts) == 1:
         return parts[0]
     order = np.argsort(np.concatenate([own for own, _ in groups]))
@@ -144,9 +144,9 @@ def _together(parts: Sequence[Batch], groups: Sequence[tuple[Index, MessageLayou
 class TopicDecoder:
     """Decoder of one topic; ``path`` names the file in messages.
 
-    ``fields``: channel to its field, unit and scale. ``count``: messages so far; ``varying``: those in runs with
-    several layouts. ``coarse_time``: whether moments are floating-point numbers. ``groups``: the ROS messages that were
-    read last, those of one layout together, by their indices.
+    ``fields``: channel to its field, unit and scale. ``count``: messages so far; ``varying``: messages in runs with
+    several layouts. ``coarse_time``: whether times are floating-point numbers. ``groups``: indices of the ROS messages
+    that were read last, grouped by layout.
     """
 
     def __init__(self, topic: str, kind: str, settings: McapFormat, path: str) -> None:
@@ -167,9 +167,9 @@ class TopicDecoder:
         self._absent: dict[str, bool] = {}  # columns, by the first message
 
     def read(self, rows: Rows, reader: MessageReader) -> Batch:
-        """Return time and channels of some messages; channels that are absent are left out.
+        """Return times and channels of messages, without absent channels.
 
-        A refusal names the first message that is not what its definition says.
+        An ``IngestError`` names the first message that contradicts its definition.
         """
         recorded = rows.heads["log_time"]
         if (recorded > LARGEST).any():
@@ -195,7 +195,7 @@ class TopicDecoder:
         return batch._replace(values=values)
 
     def _open(self, reader: MessageReader, number: int) -> tuple[str, FindLayout | None, Decode | None]:
-        """Return the type of a channel's messages and what reads one; refuse an encoding that is not supported."""
+        """Return the type of a channel's messages, and the functions that read one; refuse an unknown encoding."""
         channel = reader.channels[number]
         schema = reader.schemas.get(channel.schema_id)
         self._check_units(channel.metadata)
@@ -214,7 +214,7 @@ class TopicDecoder:
         return schema.name if schema else "json", find, decode
 
     def _by_layout(self, rows: Rows, find: FindLayout) -> Iterator[tuple[Index, MessageLayout]]:
-        """Yield the indices of the messages of each layout."""
+        """Yield the indices of the messages of each layout, and the layout."""
         left = np.arange(len(rows.starts))
         layout = self._layouts.get(rows.channel)
         for _ in range(MOST_LAYOUTS):
@@ -232,7 +232,7 @@ class TopicDecoder:
             yield np.array([row]), self._in_message(row, rows, find)
 
     def _columns(self, rows: Rows, own: Index, layout: MessageLayout) -> Batch:
-        """Return moments and columns of the messages of one layout; a column is NaN where the list is empty."""
+        """Return times and columns of the messages of one layout; a column is NaN where the list is empty."""
 
         def find(_: bytes) -> dict[str, tuple[int, str] | None]:
             places = {name: place_of(path, layout) for name, path in self._paths.items()}
@@ -255,7 +255,7 @@ class TopicDecoder:
         return Batch(time_ns, columns)
 
     def _decoded(self, rows: Rows, decode: Decode) -> Batch:
-        """Return moments and columns of messages that are decoded one by one."""
+        """Return times and columns of messages, decoded one by one."""
         numbers: dict[str, list[float | None]] = {name: [] for name in self._paths}
         moments: list[int] = []
 
@@ -289,7 +289,7 @@ class TopicDecoder:
             raise IngestError(message, self.path, code="bad_message", offset=rows.offset) from error
 
     def _check_units(self, stated: Mapping[str, str]) -> None:
-        """Refuse a unit of the profile that is not the one which the file states (``STATED``)."""
+        """Raise ``IngestError`` if the file states another unit than the profile (``STATED``)."""
         for channel, source in self.fields.items():
             text = stated.get(f"{STATED}{source.field.base}", "")
             unit = unit_spelt(text)
@@ -300,7 +300,7 @@ class TopicDecoder:
                 raise IngestError(message, self.path, code="other_unit", hint=f"write unit: {unit} for {channel}")
 
     def _note_absent(self, name: str, absent: Mask, own: Index) -> None:
-        """Refuse a quantity that some messages lack; ``own`` are their indices."""
+        """Raise ``IngestError`` if a quantity is absent in some messages only; ``own``: indices of the messages."""
         before = self._absent.setdefault(name, bool(absent[0]))
         changed = np.flatnonzero(absent != before)
         if changed.size:
@@ -311,14 +311,14 @@ class TopicDecoder:
 
 
 class Topics:
-    """The topics of a log that are read: those of the profile, or those of known types."""
+    """The topics of a log that are read: topics in the profile, and topics of known types."""
 
     def __init__(self, settings: McapFormat, path: str) -> None:
         self.settings, self.path = settings, path
         self.decoders: dict[str, TopicDecoder] = {}
 
     def decoder_of(self, rows: Rows, reader: MessageReader) -> TopicDecoder | None:
-        """Return the decoder of some messages; None if their topic is not read."""
+        """Return the decoder for messages; None if their topic is not read."""
         channel = reader.channels[rows.channel]
         name, schema = channel.topic, reader.schemas.get(channel.schema_id)
         if name not in self.decoders:

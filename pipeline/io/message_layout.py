@@ -1,15 +1,16 @@
-"""The layout of ROS messages: their definitions parsed, and where the numbers of a message lie.
+"""Find the layout of ROS messages: parse their definitions, and locate the numbers in a message.
 
-A definition is the text of the message's own type, then that of each type in it, each after a line of ``=`` signs and a
-line ``MSG: package/Type``. A line is ``type name``, with an optional default value, or ``type NAME=value`` (a constant,
-which is not sent); ``#`` begins a comment. ``type[3]`` is an array, ``type[]`` and ``type[<=3]`` are sequences.
+A definition is the text of the message's type, followed by the text of each type in it after a line of ``=`` signs and
+a line ``MSG: package/Type``. A line is ``type name``, with an optional default value, or ``type NAME=value`` (a
+constant, which is not sent); ``#`` begins a comment. ``type[3]`` is an array, ``type[]`` and ``type[<=3]`` are
+sequences.
 
-    CDR (ROS 2): 4 bytes of encapsulation; a number of size s lies at a multiple of s, counted from after them;
-                 a text is a 4-byte length with its closing zero
+    CDR (ROS 2): 4 bytes of encapsulation; a number of size s is at a multiple of s, counted after these bytes;
+                 a text is a 4-byte length and the text with a closing zero
     ROS 1      : no alignment, no encapsulation, no closing zero
 
-Only texts and sequences move the numbers after them, and each sends its length first. So another message of the same
-size that agrees in the encapsulation, every length and every text has its numbers in the same places.
+Only texts and sequences change the places of the numbers after them, and each is preceded by its length. So another
+message of the same size with equal encapsulation, lengths and texts has its numbers in the same places.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ ENCAPSULATION = 4  # bytes before the content: its representation and options
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 BIG_ENDIAN = b"\x00\x00"
 DEEPEST = 32  # types within types
-MOST_FIELDS = 100_000  # of one message; a definition of arrays of arrays of nothing would have no end
+MOST_FIELDS = 100_000  # of one message; nested arrays of empty messages would not end
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def short_name(name: str) -> str:
 
 
 def parse_definition(name: str, text: str, given: Definitions) -> Definitions:
-    """Return the definitions in the text of the message type ``name``, and those ``given`` that it may leave out."""
+    """Parse the definitions in the text of the message type ``name``; ``given``: definitions that it may omit."""
     sections = _SECTION.split(text)
     bodies = {short_name(name): sections[0]}
     for section in sections[1:]:
@@ -123,7 +124,7 @@ def _resolve(kind: str, owner: str, known: Definitions) -> str:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a number lies: byte of the message, numpy's type, and length of an array (None: a single number)."""
+    """The place of a number: byte of the message, numpy's type, and length of an array (None: a single number)."""
 
     offset: int
     code: str
@@ -135,7 +136,7 @@ class MessageLayout:
     """The layout of one message.
 
     ``places`` of the numbers and ``texts`` are by path, such as ``linear_acceleration.x``. ``fixed``: spans of bytes
-    that another message of this layout has in common with the sample.
+    that are equal in all messages of this layout.
     """
 
     sample: bytes
@@ -144,7 +145,7 @@ class MessageLayout:
     fixed: list[tuple[int, int]] = field(default_factory=list)
 
     def matching(self, rows: Rows) -> Index:
-        """Return which messages have their numbers where the sample has them."""
+        """Return the indices of the messages with this layout."""
         own = np.flatnonzero(rows.sizes == len(self.sample))
         if not own.size:
             return own
@@ -156,12 +157,12 @@ class MessageLayout:
         return own[same]
 
     def columns(self, rows: Rows, wanted: dict[str, tuple[int, str]]) -> dict[str, NDArray[np.generic]]:
-        """Return numbers of all messages: name to (offset, type) becomes name to column, a copy."""
+        """Return columns of all messages as copies; ``wanted``: name to (offset, type)."""
         table = rows.table(self._items(wanted))
         return {name: table[name].copy() for name in wanted}
 
     def elements(self, most: int) -> dict[str, tuple[int, str]]:
-        """Return (offset, type) of each number by its path, of arrays the first elements: ``samples[0]`` .."""
+        """Return (offset, type) of each number by its path, with at most ``most`` elements of an array."""
         found: dict[str, tuple[int, str]] = {}
         for name, place in self.places.items():
             indices = [""] if place.count is None else [f"[{i}]" for i in range(min(place.count, most))]
@@ -170,7 +171,7 @@ class MessageLayout:
         return found
 
     def _items(self, places: dict[str, tuple[int, str]]) -> np.dtype[np.void]:
-        """Return the type of a message of which some places are read."""
+        """Return the structured type of a message with fields at the given places."""
         offsets, codes = [p[0] for p in places.values()], [p[1] for p in places.values()]
         return np.dtype({"names": [*places], "formats": codes, "offsets": offsets, "itemsize": len(self.sample)})
 
@@ -186,7 +187,7 @@ def _words(start: int, end: int) -> Iterator[tuple[int, int]]:
 def find_layout(root: str, definitions: Definitions, sample: bytes, *, cdr: bool) -> MessageLayout:
     """Return the layout of one message of the type ``root``: CDR of either byte order, or ROS 1.
 
-    ``ValueError``: the message does not have exactly the bytes that its definition needs.
+    Raises ``ValueError`` if the message does not have exactly the size by its definition.
     """
     finder = _LayoutFinder(definitions, sample, cdr=cdr)
     finder.message(root, "", 0)
@@ -196,7 +197,7 @@ def find_layout(root: str, definitions: Definitions, sample: bytes, *, cdr: bool
 
 
 class _LayoutFinder:
-    """Follows a definition through one message; depth and number of fields are bounded, lest it never end."""
+    """Follows a definition through one message; depth and number of fields are limited, so that it ends."""
 
     def __init__(self, definitions: Definitions, sample: bytes, *, cdr: bool) -> None:
         self.definitions, self.sample, self.cdr = definitions, sample, cdr

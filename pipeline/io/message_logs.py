@@ -1,18 +1,19 @@
-"""Logs of other programs as messages: ROS bags by ``rosbags``, and logs of arrays.
+"""Read logs of other programs as messages: ROS bags by ``rosbags``, and logs of arrays.
 
     ULog       (pyulog)     each logged message is a topic; no units
     DataFlash  (pymavlink)  each message type is a topic, with the units of the messages FMTU, UNIT and MULT
     HDF5, MATLAB 7.3 (h5py), MATLAB 5 (scipy.io)
-                            a group (a struct) is a topic, its arrays are the fields; samples run along the longer
+                            a group (a struct) is a topic, its arrays are the fields; samples are along the longer
                             dimension; a unit is the attribute ``unit`` or ``units``
 
-Arrays become messages of one length, so that fields, units, clocks and checks are those of MCAP (``pipeline.io.mcap``):
+Arrays are converted to messages of one length. So ``pipeline.io.mcap`` reads them with the same fields, units, clocks
+and checks:
 
     message i = the bytes of row i of every array, little endian, one after the other
 
-A message of several sensors is ``IMU``, ``IMU[1]``, ``IMU[2]``. Where the arrays of a group differ in length, those of
-one length are a topic with the name of its first array. Times of ULog and DataFlash are microseconds since power-on.
-The readers' libraries are extras of the package, imported when a log of their format is read.
+Messages of several sensors are the topics ``IMU``, ``IMU[1]``, ``IMU[2]``. Where the arrays of a group differ in
+length, the arrays of each length are a topic with the name of its first array. Times of ULog and DataFlash are
+microseconds since power-on. The libraries are extras of the package, imported when a log of their format is read.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class LogReader(MessageReader):
             self.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
 
     def rows(self) -> Iterator[Rows]:
-        """Yield the messages; what the format's library refuses raises ``IngestError``."""
+        """Yield the messages; any error of the format's library is raised as ``IngestError``."""
         try:
             for rows in self.messages(self):
                 self.counts[rows.channel] += len(rows.starts)
@@ -92,10 +93,9 @@ class LogReader(MessageReader):
 def _of_columns(
     log: LogReader, name: str, columns: Columns, units: Mapping[str, str], recorded_ns: Integers | None = None
 ) -> Rows:
-    """Return the arrays of a topic, (n,) or (n, k) numbers by field, as messages.
+    """Convert the arrays of a topic, (n,) or (n, k) numbers by field, to messages.
 
-    ``units`` are those that the file states, ``recorded_ns`` the times of the logger. Where a log holds a topic several
-    times, its name is ``name[1]``, ``name[2]`` from the second one on.
+    ``units``: stated in the file, by field; ``recorded_ns``: times of the logger.
     """
     log.has_recorder &= recorded_ns is not None
     codes = {n: f"<{a.dtype.kind}{a.dtype.itemsize}" for n, a in columns.items()}
@@ -118,7 +118,7 @@ def _of_bag(log: LogReader) -> Iterator[Rows]:
         numbers = {}
         for connection in bag.connections:
             text = _definition(connection, version)
-            schema = (connection.msgtype, f"ros{version}msg" if text else "no", text.encode())  # no: it is not read
+            schema = (connection.msgtype, f"ros{version}msg" if text else "no", text.encode())  # no: not readable
             numbers[connection.id] = log.define(connection.topic, "ros1" if version == 1 else "cdr", schema, {})
         waiting: dict[int, list[tuple[int, bytes]]] = {c.id: [] for c in bag.connections}
         for connection, time, data in bag.messages(bag.connections):
@@ -137,7 +137,7 @@ def _run_of(channel: int, run: list[tuple[int, bytes]]) -> Rows:
 
 
 def _definition(connection: Any, version: int) -> str:  # noqa: ANN401  (rosbags.interfaces.Connection)
-    """Return the message definition; that of Humble by ``rosbags`` where the bag, before version Iron, holds none."""
+    """Return the message definition; bags before ROS 2 Iron have none, for them that of Humble by ``rosbags``."""
     if version == 1 or connection.msgdef.format.name == "MSG":
         return str(connection.msgdef.data)
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  (an extra)
@@ -147,7 +147,7 @@ def _definition(connection: Any, version: int) -> str:  # noqa: ANN401  (rosbags
 
 
 def _rows(channel: int, data: bytes | memoryview, sizes: Integers, times: NDArray[Any]) -> Rows:
-    """Return messages, one after the other in ``data``, as ``McapReader`` does; ``times`` are the recorder's, ns."""
+    """Return messages that follow each other in ``data``; ``times``: of the recorder, ns."""
     heads = np.zeros(len(sizes), HEAD)
     heads["channel"], heads["log_time"] = channel, times
     stride = int(sizes[0]) if len(sizes) and bool((sizes == sizes[0]).all()) else 0
@@ -157,7 +157,7 @@ def _rows(channel: int, data: bytes | memoryview, sizes: Integers, times: NDArra
 
 @contextlib.contextmanager
 def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[MessageReader]:
-    """Open a log of messages by its suffix, MCAP included; ``IngestError``: the package for it is not installed."""
+    """Open a log of messages by its suffix; raise ``IngestError`` if the package for the format is not installed."""
     known = MESSAGE_FORMATS.get(path.suffix.lower())
     if known is None:
         with path.open("rb") as stream:
@@ -206,7 +206,7 @@ def _instance(name: str, number: int) -> str:
 
 
 def _check_chain(content: bytes, log: LogReader) -> None:
-    """Refuse a log whose messages do not follow one another to its end; the lengths are those of its FMT messages."""
+    """Raise ``IngestError`` for a log with other bytes between messages; FMT messages state the lengths."""
     lengths, at = {FORMAT: LENGTH_OF_FORMAT}, 0
     while at + MARKED <= len(content):
         if content[at : at + 2] != MARKS or content[at + 2] not in lengths:
@@ -225,7 +225,7 @@ def _check_chain(content: bytes, log: LogReader) -> None:
 
 
 def _of_dataflash(log: LogReader) -> Iterator[Rows]:
-    """Yield the topics of a log; refuse one in which other bytes stand between messages."""
+    """Yield the topics of a log; raise ``IngestError`` if it has other bytes between messages."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT, DFReader_binary  # noqa: PLC0415  (an extra)
 
     content = log.file.read_bytes()
@@ -271,7 +271,7 @@ def _of_arrays(log: LogReader) -> Iterator[Rows]:
 
 
 def _tree(group: Any) -> dict[str, Any]:  # noqa: ANN401  (h5py.Group)
-    """Return the groups and arrays of an HDF5 file; an array with its unit is a pair."""
+    """Return the groups and arrays of an HDF5 file; an array is a pair with its unit."""
     found: dict[str, Any] = {}
     for name, item in group.items():
         if hasattr(item, "items"):
@@ -283,7 +283,7 @@ def _tree(group: Any) -> dict[str, Any]:  # noqa: ANN401  (h5py.Group)
 
 
 def _of_group(log: LogReader, place: str, tree: Mapping[str, Any]) -> Iterator[Rows]:
-    """Yield the topics of a group, and of those in it."""
+    """Yield the topics of a group and of the groups in it."""
     arrays: dict[str, NDArray[Any]] = {}
     units: dict[str, str] = {}
     for name, item in tree.items():
@@ -301,7 +301,7 @@ def _of_group(log: LogReader, place: str, tree: Mapping[str, Any]) -> Iterator[R
 
 
 def _by_length(log: LogReader, place: str, arrays: Columns, units: Mapping[str, str]) -> Iterator[Rows]:
-    """Yield the arrays of a group, those of one length together."""
+    """Yield the arrays of a group as topics, one for each length."""
     lengths = sorted({len(a) for a in arrays.values()})
     for length in lengths:
         own = {n: a for n, a in arrays.items() if len(a) == length}
@@ -310,7 +310,7 @@ def _by_length(log: LogReader, place: str, arrays: Columns, units: Mapping[str, 
 
 
 def _samples(array: NDArray[Any]) -> NDArray[Any] | None:
-    """Return an array of numbers with its samples along the first dimension; None if it holds no samples."""
+    """Return an array of numbers with its samples along the first dimension; None if it has no samples."""
     if array.dtype.kind not in "iufb" or array.dtype.itemsize > BYTES_OF_A_DOUBLE:
         return None
     array = np.squeeze(array)

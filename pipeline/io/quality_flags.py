@@ -1,13 +1,13 @@
-"""Quality of a recording: the impossible is refused; gaps, clipped and stuck readings are flagged for the fits.
+"""Check the quality of a recording: refuse impossible values; flag gaps, clipped and stuck readings for the fits.
 
-Refused are times that keep another rate than is known, specific force far from gravity, readings
-beyond the range, rates that contradict the table or the rotation of gravity, and an attitude that is no rotation: the
-cause is nearly always a wrong unit or column. ``pipeline.preprocessing.mounting`` checks the mounting.
+Refused are times at another rate than the stated one, a specific force far from gravity, readings beyond the range,
+rates that contradict the table or the rotation of gravity, and an attitude that is no rotation: the cause is nearly
+always a wrong unit or column. ``pipeline.preprocessing.mounting`` checks the mounting.
 
-A reading is *stuck* where it stays the same for longer than noise allows. The share ``p`` of equal neighbours in
-windows of 64 samples measures how noisy the channel is; a run of ``L`` equal values among ``n`` is expected ``n
-p^(L-1)`` times by chance, and flagged where that is below 10^-6. Where the 95th percentile of ``p`` exceeds one half,
-the noise is below the resolution and nothing can be decided.
+A reading is *stuck* where it is constant for longer than noise allows. The share ``p`` of equal neighbours in windows
+of 64 samples measures the noise of the channel. A run of ``L`` equal values among ``n`` is expected ``n p^(L-1)`` times
+by chance, and flagged if that is below 10^-6. If the 95th percentile of ``p`` exceeds one half, the noise is below the
+resolution, and no run is flagged.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ if TYPE_CHECKING:
 GAP, CLIPPED, STUCK, REPAIRED = np.uint16(1), np.uint16(2), np.uint16(4), np.uint16(8)  # bits of ``Recording.flags``
 GAP_INTERVALS = 1.5  # half way to one missing sample
 JITTER_NOTED, JITTER_TOO_LARGE = 0.2, 0.5  # rms, relative to the median interval; spectra need regular samples
-FULL_SCALE_MARGIN = 1.2  # sensors read up to a fifth past their nominal range
-RAIL = 1e-4  # relative; the top code of 16 bits lies 3e-5 below full scale
-BEYOND = 1e-3  # relative; with nominal counts per unit the top code lies up to so far above
+FULL_SCALE_MARGIN = 1.2  # sensors read up to a fifth beyond their nominal range
+RAIL = 1e-4  # relative; the largest code of 16 bits is 3e-5 below full scale
+BEYOND = 1e-3  # relative; with nominal counts per unit the largest code may be above full scale by this
 WINDOW = 64  # samples in which the share of equal neighbours is counted
 BY_CHANCE = 1e-6  # expected number of such runs in the recording
 SHORTEST_RUN = 20  # samples; the estimate of p from windows of 64 is too coarse for less
 QUIET = 0.5  # share of equal neighbours at which noise is below the resolution
 MOST_STRETCHES = 10  # of stuck rows that have a note each; more are one note: ``check`` lists 20 notes of a file
 DEAD_ROWS = 1000  # shorter recordings may be constant by their resolution
-FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is off by 9.8 or 1000
+FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is wrong by a factor of 9.8 or 1000
 QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
-RATE_TOLERANCE = 0.2  # another unit of time is off by 1000
+RATE_TOLERANCE = 0.2  # another unit of time is wrong by a factor of 1000
 ENOUGH = 200_000  # samples that a median is taken of
-TURNING_DPS = 5.0  # below, the bias of a low-cost gyroscope is of the same size
-# Factors by which intervals are wrong, and what the times are then.
+TURNING_DPS = 5.0  # a smaller rate is of the size of a low-cost gyroscope's bias
+# Factors by which intervals are wrong, and the kind of times that this indicates.
 _OTHER_FACTORS = {
     1e-3: "times of a unit a thousand times shorter", 1e3: "times of a unit a thousand times longer",
     1e-6: "times of a unit a million times shorter", 1e6: "times of a unit a million times longer", 1e-9: "ns",
@@ -55,7 +55,7 @@ _OTHER_FACTORS = {
 
 
 def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
-    """Flag gaps and note irregular intervals; refuse more missing time than ``checks.missing_time`` allows."""
+    """Flag gaps, and note irregular intervals; raise ``IngestError`` beyond ``checks.missing_time`` of missing time."""
     steps = np.diff(table.time_ns)
     usual = float(np.median(steps))
     limit = GAP_INTERVALS * usual
@@ -109,8 +109,8 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
                 f"ingest.csv.columns.{channel}.unit or sensor.{sensor}.full_scale"
             )
             raise IngestError(message, table.place(row), code="beyond_full_scale")
-        # Many sensors read on past their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth: a
-        # largest value beyond it that occurs more than once is a rail too.
+        # Many sensors read beyond their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth: a
+        # largest value beyond the range that occurs more than once is clipped, too.
         clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (size <= (1.0 + BEYOND) * full_scale)
         at_largest = size >= size.max() - 1.5 * count
         if size.max() > full_scale and at_largest.sum() > 1:
@@ -124,9 +124,10 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
 
 
 def find_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
-    """Return the rows, by channel, of readings that stay the same for longer than the channel's own noise allows.
+    """Return the rows, by channel, of readings that are constant for longer than the noise of the channel allows.
 
-    An axis that never changes, or stays for half of the rows while the others of its sensor change, is refused.
+    Raises ``IngestError`` for an axis that is constant in half of the rows or more, while the other axes of its sensor
+    change.
     """
     neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
     found = {}
@@ -152,7 +153,7 @@ def find_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> d
 
 
 def _common_rows(found: Mapping[str, Index]) -> dict[str, Index]:
-    """Return the rows without those by which a channel is equal longer, by chance, than others stuck with it."""
+    """Cut runs that are longer, by chance, than the runs of other channels that were stuck at the same time."""
     runs = {c: np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) for c, rows in found.items()}
     starts, stops = (np.array([run[end] for of in runs.values() for run in of]) for end in (0, -1))
 
@@ -165,7 +166,7 @@ def _common_rows(found: Mapping[str, Index]) -> dict[str, Index]:
 
 
 def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[np.uint16]) -> list[Note]:
-    """Flag stuck rows; return a note for each stretch of rows, one for all where there are many."""
+    """Flag stuck rows; return a note for each stretch of rows, or one note if there are many stretches."""
     if not found:
         return []
     found = _common_rows(found)
@@ -197,7 +198,7 @@ def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[n
 
 
 def equal_share(same: Mask) -> float:
-    """Return the 95th percentile, over windows that are not wholly equal, of the share of equal neighbours."""
+    """Return the 95th percentile of the share of equal neighbours, over windows that are not entirely equal."""
     whole = len(same) // WINDOW * WINDOW
     if whole == 0:
         return 1.0
@@ -205,12 +206,12 @@ def equal_share(same: Mask) -> float:
     partial = shares[shares < 1.0]
     if not partial.size:
         return 1.0
-    place = 0.95 * (partial.size - 1)  # np.quantile costs more than all the rest, for every channel of every file
+    place = 0.95 * (partial.size - 1)  # np.quantile costs more than the rest of this function
     return float(np.interp(place, np.arange(partial.size), np.sort(partial)))
 
 
 def _stuck_rows(same: Mask, share: float) -> Index:
-    """Return the rows in runs of equal values that are longer than chance allows."""
+    """Return the rows in runs of equal values that are too long for chance."""
     if share > QUIET:
         return np.zeros(0, np.intp)
     p = max(share, 1.0 / WINDOW)
@@ -224,7 +225,7 @@ def _stuck_rows(same: Mask, share: float) -> Index:
 
 
 def _in_a_row(same: Mask, count: int) -> bool:
-    """Return whether so many neighbours in a row are equal."""
+    """Return whether ``count`` successive neighbours are equal."""
     places, further = np.flatnonzero(same), count - 1
     return bool(np.any(places[further:] - places[: max(len(places) - further, 0)] == further))
 
@@ -232,9 +233,9 @@ def _in_a_row(same: Mask, count: int) -> bool:
 def examine(
     table: ChannelTable, sensor: Mapping[str, Any], checks: Checks
 ) -> tuple[NDArray[np.uint16] | None, list[Note]]:
-    """Return quality flags (None where none is set) and notes; refuse what cannot be valid.
+    """Return quality flags (None if none is set) and notes; raise ``IngestError`` for impossible values.
 
-    ``sensor`` is the section of the unit's configuration; its full scales may be absent.
+    ``sensor``: section of the unit's configuration; its full scales may be absent.
     """
     for channels in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in channels if c not in table.values]
@@ -315,7 +316,7 @@ def _check_attitude(table: ChannelTable) -> None:
 
 
 def _check_turn_rate(table: ChannelTable) -> None:
-    """Refuse rates that are a radian's number of degrees off those of the table, or of the way gravity turns."""
+    """Raise ``IngestError`` if rates differ by a factor of 180/pi from the table's, or from gravity's rotation."""
     if "gyro_x" not in table.values:
         return
     stride = -(-len(table.time_ns) // ENOUGH)

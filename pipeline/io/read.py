@@ -1,9 +1,9 @@
-"""All recordings of one unit: files found, read, checked, turned into body axes, their clocks compared.
+"""Read all recordings of one unit: find and read files, check them, rotate to body axes, and compare the clocks.
 
-Times of a unit count from power-on. Where the times of two files overlap they cannot be of one clock (each file starts
-at 0), and the time between the recordings is unknown, as where some count from 1970 and others from power-on. Times
-since 1970 are counted from the first sample instead, as a double resolves 1.7*10^9 s to 2*10^-7 s only, too coarse to
-differentiate.
+Times of a unit count from power-on. If the times of two files overlap, they are not of one clock (each file starts at
+0), and the time between the recordings is unknown; likewise if some count from 1970 and others from power-on. Times
+since 1970 are converted to times since the first sample, because a double resolves 1.7*10^9 s to 2*10^-7 s only, too
+coarse to differentiate.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 
-MOST_NAMED = 5  # files in the refusal of another
+MOST_NAMED = 5  # further files that an error lists
 
 
 def read_recordings(
     procedure: Mapping[str, Any], ingest: Mapping[str, Any], sensor: Mapping[str, Any], folder: Path
 ) -> list[Recording]:
-    """Read all recordings of a unit, in the order of the procedure; optional ones that do not exist are left out.
+    """Read all existing recordings of a unit, in the order of the procedure.
 
     ``procedure``, ``ingest`` and ``sensor`` are sections of the unit's configuration. Raises ``MissingInputError`` if
-    files that are not optional do not exist, ``InputError`` if files cannot be used; one error names all.
+    files that are not optional do not exist, ``InputError`` if files cannot be used; one error lists all such files.
     """
     checks, layouts = checks_of(ingest), csv_formats(ingest) if ingest.get("csv") else None
     found, missing = set[str](), list[str]()
@@ -113,7 +113,7 @@ def read_table(
 
 
 def _tried(candidates: Sequence[Sequence[str]]) -> str:
-    """Return the names that a recording may have; of names that differ in the suffix alone, the first in full."""
+    """List the possible file names of a recording; names that differ in the suffix only are shortened to it."""
     stems: set[str] = set()
     texts = []
     for names in candidates:
@@ -124,7 +124,7 @@ def _tried(candidates: Sequence[Sequence[str]]) -> str:
 
 
 def _of_one_sensor(procedure: Mapping[str, Any], files: Collection[str]) -> str:
-    """Return how a unit with one sensor is described, where all recordings of one sensor are missing."""
+    """Return advice for a unit with one sensor, if all recordings of one sensor are missing; else empty."""
     entries = procedure["recordings"].items()
     there = {sensor: [n in files for n, e in entries if e["role"] == sensor] for sensor in TRIADS}
     lacking = [sensor for sensor, found in there.items() if found and not any(found)]
@@ -135,10 +135,10 @@ def _of_one_sensor(procedure: Mapping[str, Any], files: Collection[str]) -> str:
 def to_recording(
     name: str, entry: Mapping[str, Any], table: ChannelTable, sensor: Mapping[str, Any], checks: Checks
 ) -> Recording:
-    """Return a table's samples as a recording in body axes, examined and marked; its channels are taken out of it.
+    """Convert a table of channels to a recording in body axes, with quality flags; removes the channels from ``table``.
 
-    ``entry`` is what the procedure says of the recording: ``role``, ``axis``, and ``program`` where the table logs
-    nothing. ``sensor`` is the section of the unit's configuration.
+    ``entry``: the procedure's entry of the recording: ``role``, ``axis``, and ``program`` for a table without a log.
+    ``sensor``: section of the unit's configuration.
     """
     if entry.get("program") and not set(TABLE_CHANNELS) & table.values.keys():
         from pipeline.io.commanded_motion import follow_program  # noqa: PLC0415  (few tables need it)
@@ -155,7 +155,7 @@ def to_recording(
             raise IngestError(message, table.path, code="gcsv", hint=hint)
         maps = dict.fromkeys(TRIADS, map_of_orientation(stated))
     left = [s for s, m in maps.items() if np.linalg.det(axis_matrix(m)) < 0 and TRIADS[s][0] in values]
-    if left:  # no rotation does that, only a sensor with such axes: the map is used as it stands
+    if left:  # not a rotation: some sensors have left-handed axes, so that the map is used
         detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left)
         notes.insert(0, Note("N-LEFTHANDED", len(left), 0, 0, f"left-handed axis map: {detail}"))
     readings: dict[str, Values | None] = dict.fromkeys(TRIADS)
@@ -195,9 +195,9 @@ def _stack(values: dict[str, Values], channels: Sequence[str]) -> Values | None:
 
 
 def _check_different(recordings: Sequence[Recording]) -> None:
-    """Refuse one file under two names: held-out data would not be held out, or one axis would stand for another.
+    """Raise ``IngestError`` for one file under two names: held-out data would not be held out, or an axis be wrong.
 
-    The parts of a log that was restarted differ in their ``session``. Recordings may share the log of a table.
+    The parts of a restarted log differ in their ``session``. Recordings may share the log of a table.
     """
     seen: dict[tuple[str, int | None], tuple[str, str]] = {}
     for recording in recordings:
@@ -213,7 +213,7 @@ def _check_different(recordings: Sequence[Recording]) -> None:
 
 
 def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
-    """Count times from power-on where they count from 1970, and say whether the recordings share a clock."""
+    """Convert times since 1970 to times since the first sample, and set whether the recordings share a clock."""
     since_1970 = [r for r in recordings if r.time_ns[0] > SINCE_1970_NS]
     if since_1970:
         origin = min(int(r.time_ns[0]) for r in since_1970)

@@ -1,9 +1,9 @@
-"""The ROS 2 messages of a calibration log: their definitions, recordings as MCAP files, and calibrated Imu messages.
+"""Write the ROS 2 messages of a calibration log: recordings as MCAP files, and calibrated Imu messages.
 
     linear_acceleration [m/s^2] = specific force [g] * 9.80665
     angular_velocity [rad/s]    = angular rate [deg/s] * pi/180
 
-All messages of a topic have one length: a table of bytes is filled column by column, and its rows are the messages.
+All messages of a topic have one length: they are the rows of a table of bytes, which is filled column by column.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ VECTORS = {
     "linear_acceleration": ("accelerometer", "m/s^2", STANDARD_GRAVITY),
     "angular_velocity": ("gyroscope", "rad/s", np.pi / 180.0),
 }
-CHANNEL_AT = 9  # byte of a record where the channel's number stands
+CHANNEL_AT = 9  # byte offset of the channel's number in a record
 
 
 def _count(value: int) -> bytes:
@@ -111,7 +111,7 @@ def _text(value: str) -> bytes:
 
 
 def as_messages(time_ns: Integers, frame: str, *parts: bytes | Values) -> NDArray[np.uint8]:
-    """Return CDR messages with a header, rows of bytes, of (n,) times; ``parts`` are constants and (n, k) numbers."""
+    """Return CDR messages with a header at (n,) times, as rows of bytes; ``parts``: constants and (n, k) numbers."""
     constant = (len(time_ns), 1)
     stamps = np.stack([time_ns // SECOND_NS, time_ns % SECOND_NS], axis=1).astype("<u4").view(np.uint8)
     columns = [np.tile(np.frombuffer(LITTLE_ENDIAN, np.uint8), constant), stamps]
@@ -126,7 +126,7 @@ def as_messages(time_ns: Integers, frame: str, *parts: bytes | Values) -> NDArra
 
 
 def write_mcap(path: Path, recording: Recording) -> None:
-    """Write a recording as ROS 2 messages; the file is replaced at once, never half written."""
+    """Write a recording as ROS 2 messages; the file is replaced atomically."""
     time = recording.time_ns
     if len(time) and not (time.min() >= 0 and time.max() < 2**31 * SECOND_NS):
         raise InputError("times of a ROS 2 stamp lie between 0 and 2^31 s", str(path))
@@ -147,7 +147,7 @@ def write_mcap(path: Path, recording: Recording) -> None:
 
 
 def _streams(recording: Recording) -> dict[str, NDArray[np.uint8]]:
-    """Return the messages of each type, a row of bytes for each sample."""
+    """Return the messages of each type, as one row of bytes for each sample."""
     time = recording.time_ns
     readings = {s: r for s in SENSORS if (r := recording.reading(s)) is not None}
     streams = {IMU: imu_table(time, readings)}
@@ -166,10 +166,10 @@ def _streams(recording: Recording) -> dict[str, NDArray[np.uint8]]:
 
 
 def imu_table(time_ns: Integers, readings: Readings, covariances: Readings | None = None) -> NDArray[np.uint8]:
-    """Return Imu messages, rows of bytes, of (n,) times and (n, 3) readings in g and deg/s.
+    """Return Imu messages with (n,) times and (n, 3) readings in g and deg/s, as rows of bytes.
 
-    Orientation, angular rate and acceleration each have a covariance, whose first element is -1 for what is absent;
-    zeros stand for an unknown one. ``covariances``: sensor to (3, 3), g^2 or (deg/s)^2.
+    Orientation, angular rate and acceleration each have a covariance. Its first element is -1 for an absent quantity;
+    an unknown covariance is zeros. ``covariances``: sensor to (3, 3), g^2 or (deg/s)^2.
     """
     numbers = np.zeros((len(time_ns), 37))
     numbers[:, 3] = 1.0  # the identity
@@ -185,11 +185,11 @@ def imu_table(time_ns: Integers, readings: Readings, covariances: Readings | Non
 def replaced(
     rows: Rows, groups: Sequence[tuple[Index, MessageLayout]], truths: Readings, channel: int, covariances: Readings
 ) -> NDArray[np.uint8] | list[bytes]:
-    """Return copies of Imu messages, whole records, in which the readings of some sensors are replaced.
+    """Return copies of Imu messages, as whole records, with calibrated readings.
 
-    ``groups`` are the messages of each layout, by their indices; ``truths`` are (n, 3) calibrated readings, g or deg/s;
-    ``channel`` is the number of the channel of the copies; ``covariances`` are those of a sample, (3, 3), g^2 or
-    (deg/s)^2, of some sensors: where there is none, that of the message stays.
+    ``groups``: indices and layout of the messages of each layout; ``truths``: sensor to (n, 3) calibrated readings, g
+    or deg/s; ``channel``: number of the copies' channel; ``covariances``: sensor to the covariance of a sample, (3, 3),
+    g^2 or (deg/s)^2; without one, the covariance in the message is not changed.
     """
     numbers = _in_ros_units(truths, covariances)
     copies: dict[int, bytes] = {}
@@ -214,7 +214,7 @@ def _in_ros_units(readings: Readings, covariances: Readings) -> dict[str, Values
 
 
 def _all_at_once(rows: Rows, layout: MessageLayout, numbers: dict[str, Values], channel: int) -> NDArray[np.uint8]:
-    """Copy all records at once, and replace their numbers."""
+    """Copy all records of one layout, and replace their numbers."""
     size = HEAD.itemsize + len(layout.sample)
     places = {path: layout.places[path] for path in numbers}
     items = np.dtype(
@@ -238,7 +238,7 @@ def _all_at_once(rows: Rows, layout: MessageLayout, numbers: dict[str, Values], 
 
 
 def new_imu(rows: Rows, truths: Readings, channel: int, time_ns: Integers, covariances: Readings) -> NDArray[np.uint8]:
-    """Return records of new ROS 2 Imu messages with the times and numbers of the originals' records."""
+    """Return records of new ROS 2 Imu messages, with the log times and sequence numbers of the original records."""
     messages = imu_table(time_ns, truths, covariances)
     count, size = messages.shape
     heads = np.zeros(count, HEAD)

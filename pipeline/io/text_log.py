@@ -1,7 +1,7 @@
-"""A text log as blocks of whole lines: bytes checked, head found, comments and empty lines left out.
+"""Read a text log in blocks of whole lines: check the bytes, find the head, skip comments and empty lines.
 
-The parser of numbers is strict, but it cannot know that a file ends inside a number (``9.81`` cut to ``9.`` still
-parses), that a memory card wrote zeros, or that the file is no text. These checks of the bytes cost less than reading
+The parser of numbers is strict, but it does not detect that a file ends inside a number (``9.81`` cut to ``9.`` is a
+number), that a memory card wrote zeros, or that the file is no text. These checks of the bytes cost less than reading
 the file.
 """
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from pipeline.io.ingest_settings import CsvFormat
     from pipeline.records import Integers
 
-BLOCK_BYTES = 1 << 20  # stays in the cache of the processor while it is hashed, checked and parsed
+BLOCK_BYTES = 1 << 20  # fits in the cache of the processor
 LONGEST = 1 << 24  # bytes of a line (one of 16 MB is no row of a table), and of the lines before the first row
 NEWLINE = ord("\n")
 BOM = b"\xef\xbb\xbf"
-# A line, a carriage return that no newline follows, and (looked ahead only) the line after it.
+# A line, a carriage return without a newline, and (only as look-ahead) the line after it.
 BROKEN = re.compile(rb"([^\r\n]+)\r(?!\n)(?=([^\r\n]+))")
 DELIMITERS = ",;\t|"
 ANY_DELIMITER = re.compile(rb"[,;\t|]| +")
@@ -39,9 +39,9 @@ ANY_DELIMITER = re.compile(rb"[,;\t|]| +")
 
 @dataclass(frozen=True)
 class Head:
-    """What stands before the rows: ``lines`` above the header, the header (None: there is none), names of the columns.
+    """The text before the rows: ``lines`` above the header, the header (None: no header), and names of the columns.
 
-    ``names`` are ``column 0`` ... without a header. ``line`` is the number of the header, or of the first row.
+    Without a header, ``names`` are ``column 0`` ... ``line``: number of the header's line, or of the first row.
     """
 
     lines: list[str]
@@ -51,7 +51,7 @@ class Head:
     line: int
 
     def text(self, names: list[str]) -> str:
-        """Return the lines before the rows, with other names where they differ."""
+        """Return the lines before the rows, with other column names if they differ."""
         header = self.header
         if header is not None and names != self.names:
             mark = header[: len(header) - len(header.lstrip("#%/;! "))]
@@ -61,10 +61,10 @@ class Head:
 
 
 class TextLog:
-    """The rows of a text log, block by block, each block with the numbers of its lines, counted from 1.
+    """The rows of a text log, block by block, with their line numbers, counted from 1.
 
     ``keep_open_line``: a last line without a newline is a row; else it is dropped with a note, as it may be cut.
-    ``head`` is None until the header, or the first row of a log without one, was read.
+    ``head`` is None until the header, or the first row of a log without header, was read.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class TextLog:
 
     @property
     def notes(self) -> list[Note]:
-        """What was repaired or left out, complete once all rows were read."""
+        """Notes on repairs and dropped lines; complete after all rows were read."""
         notes = [*self.first_notes]
         if self.ends["CRLF"] or self.ends["CR"]:
             listed = ", ".join(f"{count} {name}" for name, count in self.ends.items() if count)
@@ -100,7 +100,7 @@ class TextLog:
         return notes
 
     def __iter__(self) -> Iterator[tuple[bytes, Integers]]:
-        """Yield the rows, each with a newline after it; a block has at least one."""
+        """Yield blocks of at least one row, each row with a newline at its end."""
         before = b""
         for block, numbers in self._blocks():
             data = block
@@ -129,7 +129,7 @@ class TextLog:
         return self.settings.comment is not None and line.lstrip().startswith(self.settings.comment.encode())
 
     def _find_head(self, text: bytes) -> int:
-        """Find the head in the first lines; return where the rows begin."""
+        """Find the head in the first lines; return the offset of the first row."""
         settings, start, lines = self.settings, 0, list[str]()
         self.comments = []
         while (end := text.find(b"\n", start)) >= 0:
@@ -163,7 +163,7 @@ class TextLog:
         return start
 
     def _rows(self, data: bytes, numbers: range) -> tuple[bytes, Integers]:
-        """Return lines without comments and empty ones, and their numbers."""
+        """Remove comments and empty lines; return the other lines and their numbers."""
         lines = np.arange(numbers.start, numbers.stop)
         comment, empty = self.settings.comment, b"\n\n" in data or data.startswith(b"\n")
         if self.settings.delimiter == WHITESPACE:
@@ -179,7 +179,7 @@ class TextLog:
         return data, lines
 
     def _blocks(self) -> Iterator[tuple[bytes, range]]:
-        """Yield blocks of whole lines in UTF-8, a newline after each, with the numbers of the lines."""
+        """Yield blocks of whole lines in UTF-8, each with a newline at its end, and the numbers of the lines."""
         rest = b""
         for chunk in self._chunks():
             end = chunk.rfind(b"\n") + 1
@@ -223,7 +223,7 @@ class TextLog:
             position += len(chunk)
 
     def _without_nul(self, data: bytes, position: int) -> bytes:
-        """Return data, to the end of the file, without the NUL bytes at their end."""
+        """Remove NUL bytes at the end of the file; raise ``IngestError`` for others that are not allowed."""
         kept = data.rstrip(b"\0")
         first = max(kept.find(b"\0"), 0)
         inside = b"\0" in kept
@@ -244,7 +244,7 @@ class TextLog:
         return kept
 
     def _lines(self, data: bytes) -> tuple[bytes, range]:
-        """Return lines with uniform ends, and their numbers."""
+        """Return lines with newlines as line ends, and their numbers."""
         if not data.isascii():
             self._check_utf8(data)
         self.offset += len(data)
@@ -273,10 +273,10 @@ class TextLog:
             ) from error
 
     def _refuse_broken_line(self, data: bytes) -> None:
-        r"""Refuse a carriage return inside a line: ``0\r.025`` was one number, and ``0`` is another.
+        r"""Raise ``IngestError`` for a carriage return inside a line: ``0\r.025`` was one number, ``0`` is another.
 
-        Beside newlines, a lone carriage return is accepted as a line end where the lines on both sides have the same
-        number of separators.
+        In a file with newlines, a single carriage return is accepted as a line end if the lines on both sides have the
+        same number of separators.
         """
         for found in BROKEN.finditer(data):
             left, right = found.group(1), found.group(2)
@@ -287,7 +287,7 @@ class TextLog:
                 raise IngestError(message, place, code="bad_row", hint=hint)
 
     def _whole_lines(self, data: bytes) -> bytes:
-        """Return lines with the last one, which no newline ends, completed or dropped."""
+        """Complete or drop a last line without a newline."""
         if self.keep_open_line:
             return data + b"\n"
         end = data.rfind(b"\n") + 1
@@ -298,7 +298,7 @@ class TextLog:
 
 
 def find_delimiter(settings: CsvFormat, line: str) -> str:
-    """Return the separator; ``auto`` takes the one that occurs most often in a line."""
+    """Return the separator; for ``auto``, the one that occurs most often in a line."""
     if settings.delimiter == WHITESPACE:
         return " "
     if settings.delimiter != AUTO:
@@ -309,7 +309,7 @@ def find_delimiter(settings: CsvFormat, line: str) -> str:
 
 
 def _single_blanks(body: bytes) -> bytes:
-    """Replace every run of blanks and tabs by one blank, and none at the ends of lines."""
+    """Replace every run of blanks and tabs by one blank, and remove them at the ends of lines."""
     body = body.replace(b"\t", b" ")
     while b"  " in body:
         body = body.replace(b"  ", b" ")

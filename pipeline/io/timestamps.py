@@ -1,15 +1,15 @@
-"""Timestamps of messages as integer nanoseconds, and the checks of their values and order.
+"""Convert timestamps of messages to integer nanoseconds, and check their values and order.
 
-A double resolves a time since 1970 to 238 ns only. So no timestamp passes through one, unless the log itself stores it
-as one; then whole seconds and fraction are converted separately, which loses nothing more.
+A double resolves a time since 1970 to 238 ns only. So timestamps are not converted to doubles. If the log stores
+doubles, whole seconds and fraction are converted separately, without further loss.
 
-Accelerometer and gyroscope may come in messages of their own, at times and rates of their own, of one clock. The rows
-are then the messages of the slower sensor, at t_k. The faster one is averaged over the interval about each row:
+Accelerometer and gyroscope may be in separate messages, with different times and rates of one clock. The rows are then
+the messages of the slower sensor, at t_k. The faster sensor is averaged over the interval about each row:
 
     mean_k = (A(e_{k+1}) - A(e_k)) / (e_{k+1} - e_k),   A = integral of the reading,   e_k = (t_{k-1} + t_k) / 2
 
-A reading is a straight line between two messages. An average keeps the integral and the density of white noise,
-which interpolation does not. It is a low-pass filter over the slower sensor's interval.
+The reading is interpolated linearly between two messages. Unlike interpolation, an average preserves the integral and
+the density of white noise. It is a low-pass filter over the slower sensor's interval.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ LARGEST = np.iinfo(np.int64).max
 YEAR_2000, YEAR_2100 = 946_684_800 * SECOND_NS, 4_102_444_800 * SECOND_NS
 FEWEST = 3  # messages of a sensor: a row has a neighbour on both sides
 LONGEST_GAP = 1.5  # times the median interval, as of a recording's rows
-IN_BLOCK = 0.5  # of the mean interval, which the median one does not reach where rows come in blocks
-SAME_SIZE = 0.8  # share of the blocks that have the usual size but for one row, as a readout may wait for one
-COARSEST = 0.01  # of the median interval, the resolution of a moment that is sent as a floating-point number
+IN_BLOCK = 0.5  # of the mean interval: the median interval is below it where rows come in blocks
+SAME_SIZE = 0.8  # share of the blocks whose size differs from the usual one by at most one row
+COARSEST = 0.01  # of the median interval: coarsest resolution of a time in floating-point numbers
 
 
 def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
-    """Return one moment in ns: (seconds, nanoseconds), or a number in a unit."""
+    """Convert one time to ns, from (seconds, nanoseconds) or from a number in a unit."""
     if isinstance(moment, tuple):
         if not 0 <= moment[1] < SECOND_NS:
             raise ValueError(f"its stamp has {moment[1]} nanoseconds; 0 to 999999999 are possible")
@@ -56,7 +56,7 @@ def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
 
 
 def of_pair(seconds: NDArray[Any], nanos: NDArray[Any]) -> Integers:
-    """Return moments in ns of seconds and nanoseconds."""
+    """Convert times in seconds and nanoseconds to ns."""
     parts = nanos.astype(np.int64)
     wrong = np.flatnonzero((parts < 0) | (parts >= SECOND_NS))
     if wrong.size:
@@ -67,7 +67,7 @@ def of_pair(seconds: NDArray[Any], nanos: NDArray[Any]) -> Integers:
 
 
 def of_number(values: NDArray[Any], unit: str) -> Integers:
-    """Return moments in ns of numbers in a unit."""
+    """Convert times in a unit to ns."""
     scale = int(UNITS["time"][unit][0])
     if values.dtype.kind in "iu":
         if values.size and int(max(values.max(), -int(values.min()))) > LARGEST // scale:
@@ -83,9 +83,10 @@ def of_number(values: NDArray[Any], unit: str) -> Integers:
 
 
 def check_plausible(topic: str, time: Integers, log_time: Integers, difference_s: float | None, path: str) -> None:
-    """Refuse stamps ``time`` that no clock gave; ``log_time`` are the recorder's.
+    """Raise ``IngestError`` for impossible stamps ``time``; ``log_time``: times of the recorder.
 
-    ``difference_s``: how far both may be apart, beyond a constant where the stamps do not count from 1970; None: any.
+    ``difference_s``: largest allowed difference of both (None: any); if the stamps do not count from 1970, without a
+    constant offset.
     """
     absolute = bool((np.abs(time) > SINCE_1970_NS).any())
     strange = np.flatnonzero((time < YEAR_2000) | (time > YEAR_2100)) if absolute else np.flatnonzero(time < 0)
@@ -114,7 +115,7 @@ def check_plausible(topic: str, time: Integers, log_time: Integers, difference_s
 
 
 def sorted_once(time: Integers, columns: Iterable[NDArray[Any]]) -> tuple[Index, Index, Mask]:
-    """Return the order in which times increase, the places in it that repeat a time, and which repeat the numbers too.
+    """Return the order by time, the places in it that repeat a time, and which of these repeat all numbers, too.
 
     NaN is equal to NaN.
     """
@@ -131,10 +132,10 @@ def sorted_once(time: Integers, columns: Iterable[NDArray[Any]]) -> tuple[Index,
 def in_order(
     topic: str, time: Integers, columns: Sequence[NDArray[Any]], reorder_s: float, path: str
 ) -> tuple[Index | None, list[Note]]:
-    """Return the order in which times increase, without messages that stand there twice; None where all is in order.
+    """Return the order by time, without repeated messages; None if the messages are in order.
 
-    ``columns`` are all that is read of the messages, for comparison: two messages of one stamp that differ are refused.
-    So are messages that stand more than ``reorder_s`` after later ones.
+    ``columns``: all numbers that are read. Raises ``IngestError`` for two different messages of one stamp, and for a
+    message that is more than ``reorder_s`` late.
     """
     steps = np.diff(time)
     if (steps > 0).all():
@@ -170,7 +171,7 @@ def in_order(
 
 
 def check_fine(topic: str, time: Integers, path: str) -> None:
-    """Refuse times in floating-point numbers that are too coarse to differentiate."""
+    """Raise ``IngestError`` for times in floating-point numbers that are too coarse to differentiate."""
     if len(time) < 2:
         return
     resolution = float(np.spacing(np.abs(time).max() / 1e9)) * 1e9
@@ -184,9 +185,9 @@ def check_fine(topic: str, time: Integers, path: str) -> None:
 
 
 def blocks_error(table: ChannelTable, code: str) -> IngestError | None:
-    """Return the refusal of rows that come in blocks of one size with almost one time each; None where they do not.
+    """Return the error for rows in blocks of one size, each block with almost one time; None for other rows.
 
-    Such times are those of the readout of a sensor's FIFO. None as well where a block is missing.
+    Such times are the times at which a sensor's FIFO was read. None also where a block is missing.
     """
     steps = np.diff(table.time_ns)
     first = np.flatnonzero(steps > steps.mean()) + 1
@@ -211,9 +212,9 @@ def blocks_error(table: ChannelTable, code: str) -> IngestError | None:
 
 
 def rows_covered(slow: Integers, fast: Integers, topic: str, path: str) -> Index:
-    """Return the messages of the slower sensor whose whole interval the faster one, on ``topic``, covers without a gap.
+    """Return the messages of the slower sensor whose interval the faster one, on ``topic``, covers without a gap.
 
-    ``IngestError``: there are none.
+    Raises ``IngestError`` if there are none.
     """
     found = np.zeros(0, np.intp)
     if len(slow) >= FEWEST and len(fast) >= FEWEST:
@@ -230,7 +231,7 @@ def rows_covered(slow: Integers, fast: Integers, topic: str, path: str) -> Index
 
 
 def averaged(slow: Integers, rows: Index, fast: Integers, values: Values) -> Values:
-    """Return the mean of a channel of the faster sensor over the interval about each of some rows of the slower one."""
+    """Return the mean of a channel of the faster sensor over the interval about each of the slower ``rows``."""
     edges = (_edges(slow) - slow[0]) / 1e9
     time = (fast - slow[0]) / 1e9
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
@@ -242,6 +243,6 @@ def averaged(slow: Integers, rows: Index, fast: Integers, values: Values) -> Val
 
 
 def _edges(slow: Integers) -> Integers:
-    """Return the middles between messages: the beginning and end of each but the first and last."""
+    """Return the middles between messages: start and end of the interval of each message but the first and last."""
     edges: Integers = slow[:-1] + np.diff(slow) // 2
     return edges

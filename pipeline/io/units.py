@@ -1,8 +1,8 @@
-"""Channels of a recording and the units that they may come in.
+"""Define the channels of a recording and the units in which they may be logged.
 
     value in house unit = value * multiplier / divisor,   value = (count - offset) / counts_per_unit
 
-House units are g, deg/s, deg, degC and integer ns. Nothing is guessed: a column's unit stands in the ingest profile.
+House units are g, deg/s, deg, degC and integer ns. The ingest profile states the unit of a column; it is never guessed.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 SECOND_NS = 1_000_000_000
-SINCE_1970_NS = 100_000_000 * SECOND_NS  # 3 years: a later time does not count from power-on
+SINCE_1970_NS = 100_000_000 * SECOND_NS  # 3 years: a larger time does not count from power-on
 DEGREES = 180.0 / math.pi
 COUNTS = "counts"
-TABLE_TIME = "table_time"  # the time of a table's own clock, in the rows of the sensor
+TABLE_TIME = "table_time"  # the time of the table's clock, in the rows of the sensor
 
 ACCELEROMETER = ("accel_x", "accel_y", "accel_z")
 GYROSCOPE = ("gyro_x", "gyro_y", "gyro_z")
@@ -72,18 +72,18 @@ BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
 
 def unit_spelt(text: str) -> str | None:
-    """Return the unit that a text spells, None for any other text."""
+    """Return the unit that a text spells; None for any other text."""
     return SPELLINGS.get(text.strip().lower().replace(" ", ""))
 
 
 def unit_in_brackets(name: str) -> str | None:
-    """Return the unit that a column's name states in brackets at its end, None where it states none."""
+    """Return the unit in brackets at the end of a column's name; None if there is none."""
     found = BRACKETS.search(name)
     return unit_spelt(found.group(1)) if found else None
 
 
 def to_house_unit(channel: str, values: Values, unit: str) -> Values:
-    """Convert values of a channel to its house unit (g, deg/s, deg, degC); counts are none of its business."""
+    """Convert values of a channel, not in counts, to its house unit (g, deg/s, deg, degC)."""
     multiplier, divisor = UNITS[channel][unit]
     if multiplier != 1.0:
         values = values * multiplier

@@ -1,7 +1,7 @@
-"""YAML files of users, read within limits of time and memory.
+"""Read YAML files of users within limits of time and memory.
 
-An alias (``*name``) stands for everything that its anchor holds, so a few lines of nested aliases can stand for 10^9
-values. Before anything is built, the events of the parser are counted:
+An alias (``*name``) repeats everything in its anchor, so that a few lines of nested aliases can represent 10^9 values.
+Before any value is built, the events of the parser are counted:
 
     size = number of scalars, lists and mappings, each alias counted with the size of its anchor
 
@@ -41,7 +41,7 @@ _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_Base):  # type: ignore[misc]
-    """A safe loader that reads scalars as Hydra does, and refuses keys that stand twice."""
+    """A safe loader that reads scalars as Hydra does, and refuses repeated keys."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012  (PyYAML's own attribute)
         first: [(tag, how) for tag, how in resolvers if tag not in NOT_AS_YAML]
@@ -64,13 +64,13 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+01234567
 def read_yaml(path: Path, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401  (whatever the file holds)
     """Read a YAML file of plain values, of at most the size ``largest``.
 
-    ``ConfigurationError``: it is no regular file, cannot be read, is no YAML, or is beyond the limits.
+    Raises ``ConfigurationError`` if it is no regular file, cannot be read, is no YAML, or exceeds the limits.
     """
     return load_yaml(read_text(path, LARGEST_BYTES, "settings"), str(path), largest)
 
 
 def load_yaml(text: str, where: str, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401
-    """Return what a YAML text holds; refusals as of ``read_yaml``."""
+    """Parse a YAML text; errors as of ``read_yaml``."""
     try:
         _check_size(yaml.parse(text, Loader=_Loader), where, largest)
         return yaml.load(text, _Loader)  # noqa: S506  (a safe loader)
@@ -84,9 +84,9 @@ def load_yaml(text: str, where: str, largest: int = LARGEST_SIZE) -> Any:  # noq
 
 
 def _check_size(events: Iterable[yaml.Event], where: str, largest: int) -> None:
-    """Refuse a text whose aliases stand for too much, stand within themselves, or that is nested too deeply."""
+    """Raise ``ConfigurationError`` for aliases of too many values or within their anchor, and for too deep nesting."""
     known: dict[str, tuple[int, int]] = {}  # size and depth of each anchor that is complete
-    above: list[tuple[str | None, int, int]] = []  # anchor, size before it, and depth of what stands beside it
+    above: list[tuple[str | None, int, int]] = []  # anchor, size before it, and depth of its siblings
     size = deepest = 0
     for event in events:
         line = event.start_mark.line + 1 if event.start_mark else 1
