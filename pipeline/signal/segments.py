@@ -334,8 +334,8 @@ def turns_by_hand(recording: Recording, rests: Sequence[Rest], turns: Mapping[st
 def held_out_windows(recording: Recording, turns: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the windows that make every k-th turn about each axis a recording of the role ``validation``.
 
-    ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none). The windows are for ``cut``, from the middle of the rest
-    before a turn to the middle of the rest after it; there are none where nothing is held out.
+    ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none). The windows, for ``cut``, are from the middle of the
+    rest before a turn to the middle of the rest after it; there are none where nothing is held out.
     """
     edges = [0.0]
     for turn in turns_by_hand(recording, find_rests(recording), turns):
