@@ -1,4 +1,4 @@
-"""How a chip sits on its board, as ``calibrations/<unit>.json`` holds it: values, uncertainties, checks."""
+"""Compose the mounting of a chip on its board for ``calibrations/<unit>.json``: values, uncertainties, checks."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ UNITS = {"rotation": "deg", "lever_arm": "m", "time_offset": "s"}
 
 
 def chip_document(reference: Chip, other: Chip) -> dict[str, Any]:
-    """Return how a chip sits to the reference chip of its board.
+    """Return the mounting of a chip relative to the reference chip of its board.
 
     Raises ``NotObservableError`` if the chips share no calibrated sensor, or too little time.
     """
@@ -48,7 +48,7 @@ def chip_document(reference: Chip, other: Chip) -> dict[str, Any]:
 
 
 def _checks(found: Found) -> dict[str, Any]:
-    """Return what the fits leave, and what is in doubt."""
+    """Return the residuals of the fits, and doubts about them."""
     doubts, residual, left, agree = [], {}, {}, found.estimate.agreement
     if agree and agree["p_value"] < DOUBTFUL:
         doubts.append(
@@ -125,7 +125,7 @@ def _estimated(R: Values, estimate: Estimate, chips: Sequence[Chip]) -> dict[str
 
 
 def _of_vector(R: Values) -> Values:
-    """Return what a small turn before R, ``R exp([phi x])``, does to the vector of R: (3, 3) array."""
+    """Return the derivative of the rotation vector of ``R exp([phi x])`` with respect to phi: (3, 3) array."""
     step, columns = 1e-6, []
     for phi in step * np.eye(3):
         v, w = vector_of(R @ turn_by_vector(-phi)), vector_of(R @ turn_by_vector(phi))

@@ -1,16 +1,16 @@
-"""Base and effects as columns of a linear problem in the measurement direction.
+"""Build the design matrix of base and effects, a linear problem in the measurement direction.
 
     y_c = b_c + K_c . u + sum over effects z_c(p) + noise,    c = x, y, z
 
-where b is the bias, K_c row c of the inverse of the calibration matrix, u the truth by the table. The columns of one
-axis and those that the axes share differ by effect (``Layout``); each is built once:
+where b is the bias, K_c row c of the inverse of the calibration matrix, u the truth by the table. The layout of an
+effect (``Layout``) states which columns are for one axis and which all axes share; each column is built once:
 
-    A = [1, u, every-axis regressors | y_x, its own and shared | y_y, ... | y_z, ...]
+    A = [1, u, every-axis regressors | y_x, its columns and shared ones | y_y, ... | y_z, ...]
 
-so that all products of the 3 n rows are found in ``A^T A``.
+so that ``A^T A`` contains all products of the 3 n rows.
 
-Errors e of the angle at the stops of the table (``pipeline.estimation.table_errors``) are further parameters, of
-``N(0, u^2)``. With their columns T, scaled by u, they are eliminated from all products:
+The errors e of the angle at the stops of the table (``pipeline.estimation.table_errors``) are additional parameters
+with the prior ``N(0, u^2)``. With their columns T, scaled by u, they are eliminated from all products:
 
     A^T C^-1 A - A^T C^-1 T (1 + T^T C^-1 T)^-1 T^T C^-1 A
 """
@@ -45,7 +45,7 @@ BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """What is known of an effect's p parameters before the readings: ``N(mean, precision^-1)``."""
+    """The normal prior of an effect's p parameters: ``N(mean, precision^-1)``."""
 
     mean: Values  # (p,)
     precision: Values  # (p, p)
@@ -53,7 +53,7 @@ class NormalPrior:
 
 @dataclass(frozen=True)
 class Term:
-    """An effect at given values of its parameters, as columns."""
+    """The columns of an effect at given values of its parameters."""
 
     effect: Effect
     values: Values  # (p,); where its derivative is taken
@@ -61,11 +61,11 @@ class Term:
     prior: NormalPrior | None = None  # of the parameters; None: flat
 
     def layout(self) -> Layout:
-        """Return how its columns act on the axes."""
+        """Return the layout of the effect's columns."""
         return Layout.SHARED if self.full else self.effect.layout
 
     def regressors(self, sensor: str, motion: Motion, K: Values, everything: Motion | None = None) -> Values:
-        """Return its columns in the shape of its layout; ``everything`` is the motion after all effects of timing."""
+        """Return the columns in the shape of the layout; ``everything``: the motion after all effects of timing."""
         if everything is not None and self.effect.moves and np.any(self.values):
             slope = self.effect.slope(sensor, everything)
             if slope is not None:
@@ -75,20 +75,20 @@ class Term:
 
 
 def placed(terms: Sequence[Term], base: int = BASE) -> dict[str, tuple[Term, slice]]:
-    """Return each term and where its parameters lie after so many of the base, by the name of its effect."""
+    """Return each term and the slice of its parameters, which follow ``base`` parameters, by the effect's name."""
     edges = np.cumsum([base, *(len(term.values) for term in terms)]).tolist()
     return {t.effect.name: (t, slice(*edge)) for t, edge in zip(terms, pairwise(edges), strict=True)}
 
 
 def stepped(terms: Sequence[Term], step: Values) -> tuple[list[Term], Values]:
-    """Return terms after a step of their parameters, and the part of it that was taken: effects may refuse some."""
+    """Return terms after a step of their parameters, and the step taken, which effects may limit."""
     moved = [replace(t, values=t.effect.stepped(t.values, step[at])) for t, at in placed(terms, 0).values()]
     taken = [new.values - old.values for new, old in zip(moved, terms, strict=True)]
     return moved, np.concatenate([np.zeros(0), *taken])
 
 
 def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion:
-    """Return the true motion of the sensor at the time stamps, by all effects of timing but one."""
+    """Return the true motion of the sensor at the time stamps, with all effects of timing except ``but``."""
     movers = [term for term in terms if term.effect.moves and term.effect is not but and np.any(term.values)]
     if not movers:
         return part.motion
@@ -104,10 +104,7 @@ def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) ->
 
 
 def without_unknown_motion(observations: Observations, terms: Sequence[Term]) -> Observations:
-    """Return observations without the rows that effects of timing move to times at which the motion is not known.
-
-    The same object where there is no such row.
-    """
+    """Remove the rows that effects of timing move to times with unknown motion; return the same object if none are."""
     known = [true_motion(part, terms).reference_valid for part in observations.parts]
     if all(mask is None or mask.all() for mask in known):
         return observations
@@ -116,7 +113,7 @@ def without_unknown_motion(observations: Observations, terms: Sequence[Term]) ->
 
 
 def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
-    """Return the motion that each term acts on, and last that of the base."""
+    """Return the motion on which each term acts, and last the motion of the base."""
     everything = true_motion(part, terms)
     moves = [term.effect.moves and bool(np.any(term.values)) for term in terms]
     acted = [
@@ -127,7 +124,7 @@ def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit starts: the base by ordinary least squares, or another fit."""
+    """The start of a fit: the base by ordinary least squares, or another fit."""
 
     bias: Values  # (3,)
     K: Values  # (3, 3)
@@ -168,9 +165,8 @@ def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
 class Design:
     """Products of base, terms and readings under noise settings.
 
-    ``scale``: (3,). ``target``: (n, 3), what is to be explained; None: the readings. ``project``: take the base out of
-    the other columns first, so that products keep their digits. ``base``: (n, 3), regressors of K instead of the
-    truth.
+    ``scale``: (3,). ``target``: (n, 3), values to explain; None: the readings. ``project``: project the base out of the
+    other columns first, so that products lose no digits. ``base``: (n, 3), regressors of K instead of the truth.
     """
 
     def __init__(
@@ -212,7 +208,7 @@ class Design:
         self._to = [np.add.outer(index * count, index).ravel() for index in self._total]
 
     def _add_stops(self, observations: Observations, terms: Sequence[Term], K: Values) -> None:
-        """Add the errors of the angle, as parameters after the readings; each axis has columns of its own."""
+        """Add the errors of the angle, as parameters after the readings, with separate columns for each axis."""
         motions = [true_motion(part, terms) for part in observations.parts]
         before, after, group, last = errors_of_stops(observations.sensor, motions, K)
         self.stops = last + 1
@@ -226,7 +222,7 @@ class Design:
             self._at[c] = np.arange(len(self._total[c]))
 
     def _place(self, sensor: str, terms: Sequence[Term]) -> None:
-        """Lay out the columns: where each lies in A, and which of all parameters it belongs to, for each axis."""
+        """Assign to each axis its columns of A, and the parameter of each column."""
         local: list[list[int]] = [[0, 1, 2, 3] for _ in range(3)]
         total: list[list[int]] = [[c, 3 + 3 * c, 4 + 3 * c, 5 + 3 * c] for c in range(3)]
         self.slices: list[slice] = []
@@ -275,13 +271,13 @@ class Design:
         return self.columns.columns[:, self._local[c]]
 
     def places(self, c: int) -> tuple[Index, Index]:
-        """Return where the columns of one axis lie, and to which parameters they belong, the readings last."""
+        """Return the indices of the columns of one axis in A, and their parameters; the readings last."""
         return self._local[c], self._total[c][: len(self._local[c])]
 
     def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return all products of parameters' columns and, last, the readings, (g, p + 1, p + 1); and log det C, (g,).
 
-        Those of the priors are added, errors of the angle eliminated. The determinant is known up to a constant.
+        The priors are added, and errors of the angle are eliminated. The determinant has an unknown constant factor.
         """
         whole, logarithms = self._with_stops(settings)
         if not self.stops:
@@ -292,7 +288,7 @@ class Design:
         return left, logarithms + np.linalg.slogdet(inner)[1]
 
     def _with_stops(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
-        """Return the same with the errors of the angle as the last parameters."""
+        """Return ``products`` with the errors of the angle as the last parameters."""
         count = self.count + 1 + self.stops
         total = np.zeros((len(settings), count**2))
         distinct = {id(own): own for own in self._own}  # without stops, one for all axes
@@ -315,7 +311,7 @@ class Design:
         return square, np.sum([of_settings[id(own)][1] for own in self._own], axis=0)
 
     def linear_map(self, setting: Setting) -> LinearMap:
-        """Return what small changes of the readings do to the parameters, solved under a noise setting."""
+        """Return the linear map from small changes of the readings to the parameters, under a noise setting."""
         inverse, distinct = self._inverse(setting), {id(own): own for own in self._own}
         influence = {key: own.influence(setting) for key, own in distinct.items()}
         weights, back = [], []
@@ -326,17 +322,17 @@ class Design:
         return LinearMap((weights[0], weights[1], weights[2]), (back[0], back[1], back[2]))
 
     def prior_covariances(self, setting: Setting) -> dict[str, Values]:
-        """Return what the prior of each effect contributes to the covariance of the parameters: (p, p) arrays."""
+        """Return the contribution of each effect's prior to the covariance of the parameters: (p, p) arrays."""
         inverse = self._inverse(setting)[: self.count, : self.count]
         return {t.effect.name: inverse[:, at] @ t.prior.precision @ inverse[at] for at, t in self._priors if t.prior}
 
     def _inverse(self, setting: Setting) -> Values:
-        """Return the inverse of the products of the parameters' columns and those of the stops: (q, q) array."""
+        """Return the inverse of the products of the columns of parameters and stops: (q, q) array."""
         gram = self._with_stops([setting])[0][0]
         return scaled_inverse(np.delete(np.delete(gram, self.count, 0), self.count, 1))
 
     def sizes(self) -> Values:
-        """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""
+        """Return the norm of each parameter's column before the projection: (p + 1,) array."""
         squares = np.zeros(self.count + 1)
         for c in range(3):
             local, total = self.places(c)

@@ -1,4 +1,4 @@
-"""The last stage of a fit, for both sensors: base and effects together, the list configured or selected."""
+"""Fit base and effects together, the last stage of a fit for both sensors; the effects are configured or selected."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def fit(
     """Fit the effects of ``settings["effects"][sensor]`` together with bias and matrix, whatever the method was.
 
     ``settings``: sections ``effects``, ``sensor`` and ``table``; ``procedure`` for recordings by hand. Returns
-    ``previous`` unchanged where there is nothing to add.
+    ``previous`` unchanged if there are no effects to add.
     """
     before = previous or SensorCalibration(sensor)
     by_hand = is_multi_position(sensor, recordings)
@@ -50,10 +50,11 @@ def fit(
 
 
 def mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
-    """Return the accelerometer with the mountings of its turns; None where the recordings do not determine them.
+    """Fit the accelerometer with the mountings of its turns; None if the recordings do not determine them.
 
-    What its readings show beside the listed effects is fitted with them: otherwise it would be taken for mountings.
-    Errors of the table's angle that are not listed are left out, as one that is named wrongly turns the mountings.
+    Effects that are selected in addition to the listed ones are fitted together with the mountings, which would be
+    biased otherwise. Errors of the table's angle are fitted only if they are listed, because a wrongly selected one
+    would bias the mountings.
     """
     listed = settings["effects"]["accelerometer"]
     within = (MOUNTING, *effect(MOUNTING).contains)

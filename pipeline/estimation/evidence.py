@@ -1,4 +1,4 @@
-"""The evidence of sets of effects: a linear problem with conjugate priors, under several hypotheses about the noise.
+"""Compute the evidence of sets of effects: a linear problem with conjugate priors, under hypotheses about the noise.
 
     log E(S, s, theta) = log pi(theta) - 1/2 log|C| - 1/2 log|X^T C^-1 X| - 1/2 log|I + D G D| - nu/2 log RSS
 
@@ -38,7 +38,7 @@ RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
 
 @dataclass(frozen=True)
 class Version:
-    """The columns of an effect at one value of what is not linear in it."""
+    """The columns of an effect at one value of its nonlinear parameters."""
 
     columns: Index  # (k,), places among the products
     log_weight: float  # of its prior
@@ -46,7 +46,7 @@ class Version:
 
 @dataclass(frozen=True)
 class Problem:
-    """Candidates beside a base, which is projected out, under t hypotheses about the noise."""
+    """Candidates in addition to a base, which is projected out, under t hypotheses about the noise."""
 
     products: Values  # (t, p + 1, p + 1); of columns over the limits of their parameters, and last the readings
     prior: Values  # (t,); log pi(theta) - 1/2 log|C| - 1/2 log|X^T C^-1 X|
@@ -71,7 +71,7 @@ class Problem:
         return np.asarray(-0.5 * (self.free * np.log(variance) + total / variance))
 
     def variance(self, total: Values) -> Values:
-        """Return sigma^2 by sums of squares of all."""
+        """Return the estimate of sigma^2 from total sums of squares."""
         return np.maximum(total / self.free, self.least)
 
     def under(self, kept: Values | slice) -> Problem:
@@ -80,10 +80,10 @@ class Problem:
 
 
 def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
-    """Return the change of columns to those of parameters over their limits, in the directions that are excited.
+    """Return the linear map of columns to columns per limit of the parameters, in the directions that are excited.
 
-    ``products``: (k, k), with the base projected out. ``size``: (k,), norm of the columns with it. ``least``: share of
-    it that must be left.
+    ``products``: (k, k), with the base projected out. ``size``: (k,), norm of the columns before the projection.
+    ``least``: smallest share of that norm after the projection.
     """
     values, vectors = np.linalg.eigh(products / np.outer(size, size))
     kept = vectors[:, values > least**2]
@@ -135,7 +135,7 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
 
 
 class Given:
-    """A problem beside s sets of effects, each at chosen versions and scales."""
+    """A problem given s sets of effects, each at chosen versions and scales."""
 
     def __init__(self, problem: Problem, sets: Sequence[Mapping[str, Pick]]) -> None:
         self.problem, products = problem, problem.padded
@@ -170,9 +170,9 @@ class Given:
         return found
 
     def mixtures(self, names: Sequence[str]) -> dict[str, tuple[Values, Values, Values]]:
-        """Return log weight, (m,), mean and standard deviation, (m, k), of effects' parameters over their limits.
+        """Return log weight, (m,), mean and standard deviation, (m, k), of parameters over their limits.
 
-        They are those beside the first set.
+        They are for each effect, given the first set.
         """
         found = {}
         for block in self.blocks(names):
@@ -193,7 +193,7 @@ class Given:
         return found
 
     def blocks(self, names: Sequence[str]) -> list[Block]:
-        """Return some further effects, those with as many columns together."""
+        """Return further effects, grouped by their number of columns."""
         sizes: dict[int, list[str]] = {}
         for name in names:
             sizes.setdefault(len(self.problem.versions[name][0].columns), []).append(name)
@@ -216,7 +216,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Block:
-    """Effects with as many columns beside s sets, their m versions one after the other."""
+    """Effects with equal numbers of columns, given s sets; their m versions follow each other."""
 
     names: list[str]
     starts: Index  # of each effect's versions

@@ -1,4 +1,4 @@
-"""Free curves: physics outside the catalogue, so that the posterior need not call it an effect of the catalogue.
+"""Free curves, with which the posterior represents physics that is not in the catalogue.
 
     other_temperature : sum over n = 1 to 5 of c_n P_n(x), x the temperature over its span
     other_rate        : the same of |omega|, and d_x omega_x^2 + d_y omega_y^2, which differ with the axis of the turn
@@ -6,10 +6,12 @@
     other_angle       : sum over n = 1 to 8 of a_n cos(n A) + b_n sin(n A), A the table's angle
 
 with Legendre polynomials P_n and coefficients for each axis. A curve has no limit by the sensor file: its coefficients
-have the size of the noise, times the scales of ``pipeline.estimation.evidence``. That many coefficients cost evidence,
-so that a curve is more probable than an effect only where that effect leaves more than noise. An effect that follows
-the time looks like a bend of the temperature. So ``other_temperature`` has a second form beside slow effects, with one
-coefficient for each axis, ``c exp(-x / w)`` or ``c (1 - tanh(x / w))``, x the share of the span from one of its ends.
+have the size of the noise, times the scales of ``pipeline.estimation.evidence``. The many coefficients lower the
+evidence, so that a curve is more probable than an effect only if the residual of that effect is larger than noise.
+
+An effect that depends on time has a similar signal to a bend in the dependence on temperature. So, where slow effects
+are in question, ``other_temperature`` has a second form with one coefficient for each axis, ``c exp(-x / w)`` or
+``c (1 - tanh(x / w))``, x the share of the span from one of its ends.
 """
 
 from __future__ import annotations
@@ -74,7 +76,7 @@ class FreeCurve(Effect):
 
 
 class Bend(Effect):
-    """A bend of the temperature, from its lowest value (or its highest) on, with a coefficient for each axis."""
+    """A bend in the dependence on temperature, from one end of the span, with a coefficient for each axis."""
 
     name, owner, layout, needs = f"{OTHER}temperature{BEND}", Owner.RECORDING, Layout.EVERY_AXIS, ("temperature",)
     meaning, excitation, experiment, source = "Physics outside the catalogue.", "", "", ""
@@ -96,7 +98,7 @@ class Bend(Effect):
 
 
 def free_curves(sensor: str, motions: Sequence[Motion], *, bent: bool) -> list[Effect]:
-    """Return the free curves of what changes in some motions; ``bent``: with bends of the temperature."""
+    """Return the free curves of the covariates that vary in motions; ``bent``: also bends of the temperature."""
     spans: dict[str, list[Values | None]] = {
         "temperature": [m.temperature for m in motions],
         "rate": [length(m.angular_rate) for m in motions],

@@ -1,17 +1,17 @@
-"""Bias, matrix and effects together, by generalized least squares in the measurement direction.
+"""Fit bias, matrix and effects together, by generalized least squares in the measurement direction.
 
     y = b + K u(t') + sum over effects z(t'; p) + noise,    beta = (b, K, p)
     step = (J^T C^-1 J)^-1 J^T C^-1 r
 
 where
 
-    u  : truth by the table, at the time t' that effects of timing lead to
+    u  : truth by the table, at the time t' after effects of timing
     J  : derivative of the model with respect to beta; r: readings minus the model
     C  : white noise plus a Gauss-Markov bias, ``pipeline.estimation.gauss_markov``
 
-Nearly everything is linear; time offsets, lags and time constants take a few Gauss-Newton rounds. The weights of the
-estimate are those of the noise under which the readings are most likely. Its uncertainty is that of
-``pipeline.estimation.engine``: all hypotheses about the noise, by their restricted likelihood.
+Most parameters are linear; time offsets, lags and time constants need a few Gauss-Newton rounds. The estimate has the
+weights of the most likely noise. Its uncertainty, by ``pipeline.estimation.engine``, is averaged over all hypotheses
+about the noise, weighted by their restricted likelihood.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(Start):
-    """Base and effects that explain the readings best."""
+    """The best fit of base and effects to the readings."""
 
     # (12 + p, 12 + p); of bias, K (row by row) and the effects' parameters, as the noise settings of the fit weight it
     covariance: Values
@@ -82,10 +82,10 @@ class Fit(Start):
 
 
 def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
-    """Fit base and effects from given values.
+    """Fit base and effects from a start.
 
-    ``terms``: effects and where their nonlinear parameters start. ``settings``: noises over which the likelihood is
-    maximised.
+    ``terms``: effects, at the start of their nonlinear parameters. ``settings``: noise settings over which the
+    likelihood is maximised.
     """
     linear = not any(term.effect.nonlinear or term.effect.layout == Layout.SHARED for term in terms)
     rounds, converged, state = 0, False, _with_all_columns(start, terms)
@@ -125,20 +125,20 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
 
 
 def _with_all_columns(start: Start, terms: Sequence[Term]) -> Start:
-    """Return a base with effects of which all parameters are fitted."""
+    """Return a base with terms that have the columns of all their parameters."""
     full = (replace(term, values=np.array(term.values, float), full=True) for term in terms)
     return Start(start.bias, start.K, start.scale, tuple(full))
 
 
 def design_at(observations: Observations, at: Start, beside: Sequence[Term] | None = None) -> Design:
-    """Return the derivative of a model at some parameters, or the columns of terms ``beside`` it; and its residual."""
+    """Return the design of a model at given parameters, or of additional terms ``beside``; and the residual."""
     residual, base = _residual(observations, at)
     terms, project = (at.terms, False) if beside is None else (beside, True)
     return Design(observations, terms, at.K, np.maximum(at.scale, 1e-300), target=residual, base=base, project=project)
 
 
 def _residual(observations: Observations, at: Start) -> tuple[Values, Values]:
-    """Return the readings minus the model, and what K acts on: the truth and the effects that the axes share."""
+    """Return the readings minus the model, and the vectors on which K acts: truth and effects added to it."""
     sensor, K = observations.sensor, at.K
     predicted, base = [], []
     for part in observations.parts:
@@ -176,7 +176,7 @@ class _Solved:
 
 
 def _solve(design: Design, observations: Observations, settings: Sequence[Setting]) -> _Solved:
-    """Solve for the step under each noise setting and take the most likely one."""
+    """Solve for the step under each noise setting, and return the most likely one."""
     n = 3.0 * observations.samples
     within = float(np.sum(observations.scatter / design.scale**2))
     size = design.sizes()[:-1]
@@ -215,7 +215,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
 def _residual_noise(
     design: Design, observations: Observations, settings: Sequence[Setting], reference: Reference
 ) -> ResidualNoise:
-    """Weight hypotheses about the noise by their restricted likelihood, given a design at its solution."""
+    """Weight the hypotheses about the noise by their restricted likelihood, for a design at its solution."""
     weight, blocks, white = observations.weight, observations.long_blocks, design.scale
     disturbed = disturbance(reference, observations.reading, blocks, weight, white)
     if disturbed is not None:
@@ -235,10 +235,10 @@ def _residual_noise(
 def fit_best(
     observations: Observations, combinations: Sequence[Sequence[Term]], start: Start, settings: Sequence[Setting]
 ) -> Fit:
-    """Fit from the combination of starts under which the readings are most likely after one linear step.
+    """Fit from the combination of starts with the largest likelihood after one linear step.
 
-    Effects of timing are fitted to the base alone first: far from their values, where a linear step is of no use, other
-    effects would take their signal.
+    Effects of timing are first fitted with the base alone: far from their values, where a linear step is inaccurate,
+    other effects would absorb their signal.
     """
     chosen = combinations[0]
     if len(combinations) > 1:
@@ -256,10 +256,7 @@ def fit_best(
 
 
 def require_observable(observations: Observations, fit: Fit) -> None:
-    """Refuse a fit that the recordings do not determine.
-
-    Raises ``NotObservableError`` naming the parameters.
-    """
+    """Raise ``NotObservableError``, with the parameters, if the recordings do not determine a fit."""
     design = design_at(observations, fit)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
     free = np.ones(len(names), bool)  # a prior determines the others
@@ -298,11 +295,11 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
 ) -> SensorCalibration:
     """Fit bias, matrix and effects together.
 
-    ``recordings``: all of a unit; those held out are left aside. ``effects``: in the order in which they are reported.
-    ``noise``: pins the bias wander where it comes from a static recording. ``start``: the calibration so far: its
-    stages are kept, its effects are starts. ``accelerometer``, for the gyroscope: its mountings. Raises
+    ``recordings``: all of a unit; held-out ones are not used. ``effects``: in the order of the report. ``noise``: from
+    a static recording, it determines the bias wander. ``start``: the calibration so far, with its stages and the
+    starting values of effects. ``accelerometer``: for the gyroscope, the fit with the mountings. Raises
     ``NotObservableError`` if the recordings do not determine a parameter; ``ConfigurationError`` if an effect is
-    unknown or not one of this sensor.
+    unknown or not of this sensor.
     """
     observations = weighted(observe(sensor, recordings, settings["table"]), noise)
     combinations = starts_of(effects, observations, start, accelerometer)
@@ -325,9 +322,9 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     settings: Mapping[str, Any] | None = None,
     noise: Noise | None = None,
 ) -> SensorCalibration:
-    """Return a fit as a calibration: ``matrix = K^-1``, with ``d matrix = -matrix dK matrix``.
+    """Convert a fit to a calibration: ``matrix = K^-1``, with ``d matrix = -matrix dK matrix``.
 
-    With ``settings``, the accuracies of their table are in the uncertainties, but for those that an effect of the fit
+    With ``settings``, the uncertainties include the accuracies of the table, except those that an effect of the fit
     estimates.
     """
     fit, turned = fit_in_mean_frame(fit)
@@ -388,7 +385,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
 
 
 def fit_in_mean_frame(fit: Fit) -> tuple[Fit, Values]:
-    """Return a fit in the frame of the mean of the mountings, and the map of its errors to those there."""
+    """Return a fit in the frame of the mean mounting, and the map of its errors to that frame."""
     found = next((each for each in placed(fit.terms).values() if isinstance(each[0].effect, Mounting)), None)
     if found is None:
         return fit, np.eye(len(fit.covariance))

@@ -1,4 +1,4 @@
-"""Least squares, linear and nonlinear, with a certificate of the minimum.
+"""Solve linear and nonlinear least squares, with a certificate of the minimum.
 
     x = argmin |r(x)|^2,    covariance = sigma^2 (J^T J)^-1
 
@@ -9,9 +9,9 @@ where
     sigma : standard deviation of one residual: given, or sqrt(|r|^2 / (n - p))
 
 Columns are scaled to unit norm d, so that units do not matter, and factorised as ``A = Q U diag(s) V^T diag(d)``; the
-singular values s show what the data determine. The nonlinear problem is solved by Gauss-Newton steps, halved while they
-do not help. A success flag proves nothing; the largest cosine between the residual and a column of the Jacobian does:
-it is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
+singular values s show which combinations the data determine. The nonlinear problem is solved by Gauss-Newton steps,
+halved while they do not lower ``|r|``. The certificate of a minimum is the largest cosine between the residual and a
+column of the Jacobian, which is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class ScaledColumns:
 
     @property
     def rank(self) -> int:
-        """Number of parameters, or combinations of them, that are determined."""
+        """Number of determined combinations of parameters."""
         return int(np.sum(self.singular > self.tolerance * self.singular[0]))
 
     @property
@@ -71,7 +71,7 @@ class ScaledColumns:
         return float(self.singular[0] / self.singular[-1]) if self.singular[-1] > 0 else float("inf")
 
     def solve(self, y: Values) -> Values:
-        """Return x that minimises ``|y - A x|``, of least norm where several do: (n,) or (n, m) to (p,) or (p, m)."""
+        """Return the x of least norm that minimises ``|y - A x|``: (n,) or (n, m) to (p,) or (p, m)."""
         keep = slice(self.rank)
         x: Values = ((self.Vt[keep].T / self.singular[keep]) @ (self.basis.T @ y)[keep]).T / self.scale
         return x.T
@@ -81,13 +81,13 @@ class ScaledColumns:
         return (self.Vt.T / self.singular / self.scale[:, None]) @ self.basis.T
 
     def covariance(self) -> Values:
-        """Return ``(A^T A)^-1``, of what is determined: (p, p) array."""
+        """Return ``(A^T A)^-1`` of the determined combinations: (p, p) array."""
         keep = slice(self.rank)
         half: Values = self.Vt[keep].T / self.singular[keep] / self.scale[:, None]
         return half @ half.T
 
     def undetermined(self, names: Sequence[str], share: float = PART_OF_NULL_SPACE) -> list[str]:
-        """Return the names of the parameters with at least a share in combinations that are not determined."""
+        """Return the names of the parameters with at least ``share`` in undetermined combinations."""
         parts = np.linalg.norm(self.Vt[self.rank :], axis=0)
         return [name for name, part in zip(names, parts, strict=True) if part > share]
 
@@ -111,10 +111,10 @@ def gauss_newton(  # noqa: PLR0917  (what an iteration is)
 ) -> tuple[State, tuple[Values, Values], int]:
     """Minimise ``|r|`` by Gauss-Newton steps, each halved while it does not lower ``|r|``.
 
-    ``at``: state to its residuals (n,) and their derivative (n, p). ``moved``: state and step (p,) to the state there,
-    and what was taken of the step. ``small``: whether a step, with the factors of the derivative, is the last; by
-    default one that changes nothing but rounding. ``tolerance``: as of ``ScaledColumns``. Returns the state, residuals
-    and derivative there, and the number of steps. Raises ``NotObservableError`` where the start is not finite.
+    ``at``: state to its residuals (n,) and their derivative (n, p). ``moved``: state and step (p,) to the new state,
+    and the step taken. ``small``: whether a step, with the factors of the derivative, is the last; by default a step of
+    the size of rounding. ``tolerance``: as of ``ScaledColumns``. Returns the final state, its residuals and derivative,
+    and the number of steps. Raises ``NotObservableError`` if the start is not finite.
     """
     state, (r, J), size = start, at(start), np.inf
     if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
@@ -142,7 +142,7 @@ def gauss_newton(  # noqa: PLR0917  (what an iteration is)
 
 
 def certificate(A: Values, residual: Values, condition: float, rank: int) -> dict[str, Any]:
-    """Return what shows that a linear estimate is a minimum, as ``SensorCalibration.convergence`` holds it.
+    """Return the certificate that a linear estimate is a minimum, for ``SensorCalibration.convergence``.
 
     ``A``: (n, p), columns, the same for each channel. ``residual``: (n,) or (n, m), of m channels. ``condition``: of
     the scaled columns.
@@ -154,7 +154,7 @@ def certificate(A: Values, residual: Values, condition: float, rank: int) -> dic
 
 
 def certified(cosine: float, condition: float, rank: int, parameters: int) -> dict[str, Any]:
-    """Return the certificate of a fit as ``SensorCalibration.convergence`` holds it."""
+    """Return the certificate of a fit, for ``SensorCalibration.convergence``."""
     return {
         "cosine": cosine,
         "cosine_at_minimum": COSINE_AT_MINIMUM,

@@ -1,18 +1,19 @@
-"""Propagation of distributions by a Monte Carlo method, beside the law of propagation (JCGM 101:2008).
+"""Propagate distributions by a Monte Carlo method, in addition to the law of propagation (JCGM 101:2008).
 
     parameters_r = f(z + e_r),    e_r = e_noise + sum over sources of type B e_s,    r = 1 .. M
 
 where
 
-    z       : what a fit first makes of the readings by a linear map (a sinusoid's coefficients, a response to the rate,
-              the lengths of gravity at the rests, the directions of moves), so that nothing is lost by drawing it
-    f       : all that follows, without linearising
-    e_noise : normal under each hypothesis of the noise, which are drawn by their weight
-    e_s     : normal; rounding errors are many, so that their sum is
+    z       : the linear functions of the readings that a fit first computes (coefficients of a sinusoid, response to
+    the
+              rate, lengths of gravity at the rests, directions of moves); to draw them instead of readings is exact
+    f       : all further computation, without linearisation
+    e_noise : normal under each hypothesis of the noise; the hypotheses are drawn by their weight
+    e_s     : normal; also the sum of many rounding errors is normal
 
-The law of propagation holds where both ends of its interval ``y +- U`` lie within ``delta = 10^l / 2`` of those of the
-Monte Carlo interval, with ``u = c 10^l`` and c an integer of the digits stated (8.1): one digit below a million trials,
-two from there on, as the ends of a Monte Carlo interval scatter by 2.7 u / sqrt(M).
+The law of propagation is confirmed if both ends of its interval ``y +- U`` are within ``delta = 10^l / 2`` of the ends
+of the Monte Carlo interval, with ``u = c 10^l`` and c an integer of the stated digits (8.1): one digit below a million
+trials, else two, because the ends of a Monte Carlo interval scatter by 2.7 u / sqrt(M).
 """
 
 from __future__ import annotations
@@ -98,12 +99,12 @@ def compare(
 
 
 def trials_of(settings: Mapping[str, Any]) -> int:
-    """Return how many trials ``uncertainty.monte_carlo`` asks for; 0: none."""
+    """Return the number of trials by ``uncertainty.monte_carlo``; 0: none."""
     return int((settings.get("uncertainty") or {}).get(KEY) or 0)
 
 
 def through(posterior: Posterior, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
-    """Return how parameters are drawn: errors of noise and of (q, q) stated covariances, through (t, q) to (t, p)."""
+    """Return a function that draws parameters: errors by noise and (q, q) stated covariances, (t, q), to (t, p)."""
 
     def draw(rng: np.random.Generator, count: int) -> Values:
         errors = posterior.draw(rng, count)
@@ -117,7 +118,7 @@ def through(posterior: Posterior, stated: Sequence[Values], results: Callable[[V
 def beside_trials(
     calibration: SensorCalibration, draw: Draw, trials: int, direct: Sequence[Contribution] = ()
 ) -> SensorCalibration:
-    """Return a calibration whose budget also holds the Monte Carlo run, and how it compares.
+    """Return a calibration whose budget also has the Monte Carlo run and its comparison.
 
     ``calibration``: with its budget. ``draw``: generator and t to (t, p) parameters. ``trials``: M. ``direct``: sources
     of type B that act on the parameters themselves.

@@ -1,24 +1,24 @@
-"""The noise of a sensor, estimated from its recordings.
+"""Estimate the noise of a sensor from its recordings.
 
     noise[n] = white * w[n] + wander * m[n]        (``pipeline.records.Noise``)
 
 with unit white noise w and a unit first-order Gauss-Markov process m. The first of these sources that exists determines
 the noise:
 
-1. ``static``: a long rest. Temperature and warm-up, which would count as wander, are regressed out. The scatter within
-   the rests of the other recordings also counts for the white noise, where it agrees.
-2. ``rests``: the rests of the other recordings, each with a mean of its own. In recordings by hand the unit creeps
-   (``pipeline.signal.quiet_motion``), which moves gravity from one axis to another and is not wander of a bias. The
-   accelerometer's wander is then that of the component along gravity, and its white noise the scatter about a parabola
-   in time.
-3. ``residual``: scatter of windows of 16 samples in turns about a local polynomial: white noise alone. With P the
+1. ``static``: a long rest. Temperature and warm-up, which would look like wander, are regressed out. The scatter within
+   the rests of the other recordings is also used for the white noise, if it agrees.
+2. ``rests``: the rests of the other recordings, each with a separate mean. In recordings by hand the unit creeps
+   (``pipeline.signal.quiet_motion``): gravity moves from one axis to another, which is not wander of a bias. The
+   accelerometer's wander is then estimated from the component along gravity, and its white noise from the scatter about
+   a parabola in time.
+3. ``residual``: scatter of windows of 16 samples in turns about a local polynomial: white noise only. With P the
    projection that removes the polynomial and R the autocovariance of the filter, ``median(|P y|^2) = white^2 tr(P R)
-   (1 - 2/(9 nu))^3``, where ``nu = tr(P R)^2 / tr(P R P R)`` (Satterthwaite 1946; by the median, windows over a ramp do
-   not count).
+   (1 - 2/(9 nu))^3``, where ``nu = tr(P R)^2 / tr(P R P R)`` (Satterthwaite 1946; the median is robust against windows
+   over a ramp).
 4. ``sensor_file``: the figures of the sensor file, ``white = noise_density sqrt(1 / (2 dt))``.
 
-``white`` is that of a raw sample: the effect of a filter is removed by its exact autocovariance, from its impulse
-response. Where the recordings do not show wander, it is that of the sensor file if they allow it, else 0
+``white`` is the noise of a raw sample: the effect of a filter is removed by its exact autocovariance, from its impulse
+response. If the recordings do not show wander, it is the sensor file's figure if they allow it, else 0
 (``Noise.wander_source``). A recording held out for validation is not used.
 
 Rests are cut into blocks. The restricted likelihood of the block means and of the scatter within the blocks follows
@@ -32,7 +32,7 @@ where
     white, q, tau, B : the noise model of ``pipeline.estimation.gauss_markov``; sqrt(q) is the ratio wander / white
     e_b  : unit white noise; m_b: the average of m over block b; n_b: its samples
     r    : autocovariance of the filter's output for white noise of variance 1; v_b: variance of its mean over a block
-    d_b  : a constant for each rest, and what a rest cannot separate from the bias: temperature and warm-up
+    d_b  : a constant for each rest, and functions that a rest cannot separate from the bias: temperature and warm-up
     beta : nuisance parameters, projected out, so that they do not bias the estimate of the noise
 
     -2 log L = log det C + log det(d^T C^-1 d) + nu log(E S) + (N - p + nu) log white^2
@@ -103,7 +103,7 @@ def estimate_noise(sensor: str, recordings: list[Recording], sensor_file: dict[s
 
 
 def _rests_of(recordings: Sequence[Recording], sensor: str, *, whole_recording: bool) -> list[Rest]:
-    """Return the rests of recordings; those of recordings that share a clock share their time."""
+    """Return the rests of recordings; recordings with a shared clock have a common time."""
     return [
         Rest(time, reading, 0 if recording.clock_shared else number)
         for number, recording in enumerate(recordings, start=1)
@@ -117,7 +117,7 @@ def _by_hand(recordings: list[Recording]) -> bool:
 
 
 def _noise_along_gravity(rests: list[Rest], recordings: list[Recording], sensor_file: dict[str, Any]) -> Noise:
-    """Return the noise of an accelerometer that may creep: see the module, 2."""
+    """Return the noise of an accelerometer in a unit that may creep: see the module, 2."""
     components = [component_along_gravity(rest.time, rest.reading) for rest in rests]
     along = [replace(rest, reading=values[:, None]) for rest, (values, _) in zip(rests, components, strict=True)]
     creeping = [k for k, (_, creeps) in enumerate(components) if creeps]
@@ -141,7 +141,7 @@ def _noise_of_rests(
     other_rests: Sequence[Rest] = (),
     creeping: Sequence[int] = (),
 ) -> Noise:
-    """Return the noise of ``rests``; the scatter within ``other_rests`` counts for the white noise."""
+    """Return the noise of ``rests``; the scatter within ``other_rests`` is used for the white noise only."""
     covariance = filter_autocovariance(recordings[0])
     memory = int(np.searchsorted(-np.abs(covariance), -0.01 * covariance[0]))
     shortest = max(SHORTEST_BLOCK, 4 * memory)
@@ -157,7 +157,7 @@ def _noise_of_rests(
 
 
 def _nuisance(blocks: _RestBlocks, recordings: list[Recording], source: str, creeping: Sequence[int] = ()) -> Values:
-    """Return a constant for each rest, and a line where the unit creeps; for a static one temperature and warm-up."""
+    """Return the nuisance columns: a constant for each rest, a line for creep; temperature and warm-up if static."""
     rest, centre = blocks.rest[blocks.cut], (blocks.start + blocks.length / 2.0)[blocks.cut]
     columns = [(rest == r).astype(float) for r in np.unique(rest)]
     if source != "static":
@@ -211,7 +211,7 @@ def _peak(gain: Values) -> float:
 
 
 def _without_detected_wander(gain: Values, white: Values, sensor_file: dict[str, Any], source: str) -> Noise:
-    """Return the sensor file's wander where the likelihood allows it, else none; ``gain`` is by ratio and axis."""
+    """Return the sensor file's wander if the likelihood allows it, else 0; ``gain``: by ratio and axis."""
     noise = _with_stated_wander(white, sensor_file, source)
     column = np.argmin(np.abs(RATIOS[:, None] - noise.wander / noise.white), axis=0)
     loss = -float(np.take_along_axis(gain, column[None], axis=0).sum())
@@ -229,7 +229,7 @@ def _with_stated_wander(white: Values, sensor_file: dict[str, Any], source: str)
 
 
 def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
-    """Return the white noise of short windows about a local polynomial, or None where there are too few."""
+    """Return the white noise from short windows about a local polynomial, or None if there are too few."""
     squares, trace, nu = [], 0.0, 1.0
     x = np.linspace(-1.0, 1.0, WINDOW)
     basis, _ = np.linalg.qr(np.vander(x, WINDOW_DEGREE + 1))
@@ -318,9 +318,9 @@ def _blocks_of(rests: Sequence[Rest], shortest: int) -> _RestBlocks:
 
 
 def _with_scatter(blocks: _RestBlocks, others: _RestBlocks) -> _RestBlocks:
-    """Return the blocks with the scatter of others added where it agrees with theirs; their means are not used.
+    """Add the scatter of other blocks, without their means, if it agrees.
 
-    Scatters agree where the estimates of white noise differ by less than 3 standard deviations on every axis.
+    Scatters agree if the estimates of white noise differ by less than 3 standard deviations on every axis.
     """
     nu = np.array([np.sum(b.count - 1) for b in (blocks, others)], float)
     if np.any(nu < 1) or np.any(blocks.scatter == 0) or np.any(others.scatter == 0):

@@ -1,4 +1,4 @@
-"""What is known of the noise of a sensor before a fit: by an earlier stage, a static recording and the sensor file."""
+"""Prior of a sensor's noise before a fit: from an earlier stage, a static recording and the sensor file."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Noise | None:
-    """Return the noise that an earlier stage has estimated, else the estimate; None where it cannot be estimated.
+    """Return the noise from an earlier stage, else estimate it; None if it cannot be estimated.
 
-    ``settings``: ``noise`` by sensor, where an earlier stage has estimated it; ``sensor``, the sensor file.
+    ``settings``: ``noise`` by sensor, if an earlier stage has estimated it; ``sensor``, the sensor file.
     """
     if "noise" in settings:
         noise: Noise | None = settings["noise"][sensor]
@@ -31,16 +31,16 @@ def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
 
 
 def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Prior:
-    """Return what the sensor file and a static recording say about the bias wander.
+    """Return the prior of the bias wander from the sensor file and a static recording.
 
-    The prior is that of the sensor file times the likelihood of the static recording at each wander and correlation
-    time. A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative
-    uncertainty ``sqrt(tau / T)``. Where that is below ``SHARPEST_WIDTH``, the likelihood counts as that of a shorter
-    rest: no sensor is a Gauss-Markov process that well. Above the likeliest wander, the likelihood is at least
-    ``exp(-FARTHEST**2)`` of its maximum: the residuals of turns can show more wander than the rest (lack of fit).
-    Noise that is correlated over seconds (a filter in the sensor, values held between samples, chance in a short rest)
-    says nothing of a slow wander, and counts as white noise in the means of the blocks of a fit: then the prior is that
-    of the sensor file.
+    It is the prior of the sensor file times the likelihood of the static recording at each wander and correlation time.
+    A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative uncertainty
+    ``sqrt(tau / T)``. If that is below ``SHARPEST_WIDTH``, the likelihood is widened to that of a shorter rest, because
+    no sensor is exactly a Gauss-Markov process. Above the likeliest wander, the likelihood is at least
+    ``exp(-FARTHEST**2)`` of its maximum: the residuals of turns can show more wander than the rest (lack of fit). Noise
+    that is correlated over seconds (a filter in the sensor, values repeated between samples, chance in a short rest)
+    does not determine a slow wander, and is white noise in the means of the blocks of a fit: then the prior is that of
+    the sensor file.
 
     ``settings``: section ``sensor``.
     """

@@ -1,10 +1,10 @@
-"""Deterministic parts of readings at rest, fitted together with the noise: ramp, temperature, sinusoids.
+"""Fit the deterministic parts of readings at rest together with the noise: ramp, temperature, sinusoids.
 
     reading = c + R t + k temperature + sum_i (a_i cos(2 pi f_i t) + b_i sin(2 pi f_i t)) + noise
 
-Ramp and temperature are part of the model where they lower its BIC (``noise_search``). A sinusoid is a line of the
-periodogram with a Hann window, whose power is ``LINE_POWER ln(n)`` times the level around it. A column with its
-derivative by f refines f and gives its uncertainty. The sinusoid is kept where it raises twice the log-likelihood by
+Ramp and temperature are part of the model if they lower its BIC (``noise_search``). A sinusoid is found as a line of
+the periodogram with a Hann window and a power of ``LINE_POWER ln(n)`` times the level around it. A column of its
+derivative by f refines f and gives its uncertainty. The sinusoid is retained if it raises twice the log-likelihood by
 ``3 ln(n)``, the penalty of its three parameters.
 """
 
@@ -81,7 +81,7 @@ class Regression:
                 break
 
     def _warms(self) -> bool:
-        """Return whether the temperature changes, and not in proportion to the time, as a ramp does."""
+        """Return whether the temperature changes, and not in proportion to time like a ramp."""
         if any(s.temperature is None for s in self.stretches):
             return False
         warm = np.concatenate([s.temperature for s in self.stretches if s.temperature is not None])
@@ -207,7 +207,7 @@ class Regression:
 
 
 def _level(power: Values) -> Values:
-    """Return the level around each line of a periodogram from ``FEWEST_PERIODS`` on, by medians of bins."""
+    """Return the level around each line of a periodogram, from ``FEWEST_PERIODS`` on, by medians of bins."""
     number = np.floor(
         np.log(np.arange(FEWEST_PERIODS, FEWEST_PERIODS + len(power)) / FEWEST_PERIODS) / np.log(BIN_RATIO)
     ).astype(int)

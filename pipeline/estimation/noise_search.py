@@ -1,12 +1,12 @@
-"""Selection of the terms that make up the noise of an axis at rest, and their sizes.
+"""Select the terms of the noise of an axis at rest, and estimate their sizes.
 
 Compositions (sets of the terms of ``noise_terms``) are compared by
 
     BIC = -2 log L + p ln(n),    probability proportional to exp(-BIC / 2)
 
 with p parameters and n coefficients (``noise_likelihood``). The search begins with white noise and adds, drops or swaps
-one term at a time until no step lowers the BIC. A term whose gain is certain is not dropped. Terms are added only where
-their score, the derivative of the likelihood at zero, promises a gain, so that a recording of white noise needs one
+one term at a time until no step lowers the BIC. A term whose gain is certain is not dropped. Terms are tried only if
+their score, the derivative of the likelihood at zero, predicts a gain, so that a recording of white noise needs one
 fit. A ramp, sinusoids and a dependence on temperature are deterministic columns (``noise_regression``).
 
 Intervals are those of the profile likelihood (of a ramp and a sinusoid: of generalised least squares). The upper limit
@@ -60,7 +60,7 @@ def count_of(kinds: Composition, columns: Iterable[int]) -> int:
 
 
 class Search:
-    """The compositions of one axis that have been fitted."""
+    """The fitted compositions of one axis."""
 
     def __init__(self, spectrum: Spectrum, axis: int) -> None:
         self.spectrum, self.axis = spectrum, axis
@@ -68,9 +68,9 @@ class Search:
         self.found: dict[tuple[Composition, tuple[int, ...]], Candidate] = {}
 
     def run(self, columns: tuple[int, ...], start: Candidate | None = None) -> Work[Candidate]:
-        """Return the best composition beside these deterministic columns.
+        """Return the best composition with these deterministic columns.
 
-        ``start``: a composition beside other columns, with which the search begins where it is better than white noise.
+        ``start``: a composition with other columns, from which the search begins if it is better than white noise.
         """
         power = self.spectrum.products[self.axis, :, 0, 0].sum() / self.spectrum.size
         white = np.array([np.log(max(power * self.spectrum.interval, 1e-300)), 0.0])
@@ -90,16 +90,16 @@ class Search:
             best = new
 
     def _dispensable(self, candidate: Candidate) -> list[int]:
-        """Return the terms that are not certainly there: their gain is at least ``(coefficient^2 / spread)^2``."""
+        """Return the terms without a certain gain; the gain is at least ``(coefficient^2 / spread)^2``."""
         spread = np.sqrt(np.diag(candidate.fit.covariance(self.spectrum.count)[0])[: len(candidate.kinds)])
         return np.flatnonzero(spread**-2 < CERTAIN_GAIN * self.penalty).tolist()
 
     def _best(self, columns: tuple[int, ...]) -> Candidate:
-        """Return the best composition so far beside these columns."""
+        """Return the best composition so far with these columns."""
         return min((c for c in self.found.values() if c.columns == columns), key=lambda c: c.bic)
 
     def fit(self, tries: Sequence[tuple[Composition, Values]], columns: tuple[int, ...]) -> Work[None]:
-        """Fit compositions from their starts; each is kept at its best."""
+        """Fit compositions from their starts, and store the best fit of each."""
         trials = [Trial(self.axis, k, columns, p) for k, p in tries if (k, columns) not in self.found]
         if not trials:
             return
@@ -113,7 +113,7 @@ class Search:
         self.found |= {(c.kinds, columns): c for c in out.values()}
 
     def _added(self, candidate: Candidate) -> list[tuple[Composition, Values]]:
-        """Return the compositions of one term more whose score promises a lower criterion, and their starts."""
+        """Return compositions with one additional term whose score predicts a lower criterion, and their starts."""
         spectrum = self.spectrum
         absent = [k for k in SINGLE if k not in candidate.kinds]
         longest = np.log(LONGEST_TIME * spectrum.length / 1.5)
@@ -142,7 +142,7 @@ def _without(candidate: Candidate, index: int) -> tuple[Composition, Values]:
 
 
 def _with_term(candidate: Candidate, kind: int, size: float, log_time: float) -> tuple[Composition, Values]:
-    """Return a composition with one term more, and its start."""
+    """Return a composition with one additional term, and its start."""
     kinds = candidate.kinds
     at = sum(k <= kind for k in kinds)
     start = np.insert(candidate.parameters, [at, len(kinds) + at], [np.log(size), log_time])
@@ -150,7 +150,7 @@ def _with_term(candidate: Candidate, kind: int, size: float, log_time: float) ->
 
 
 def _scores(spectrum: Spectrum, fit: Fits, shapes: Values) -> tuple[Values, Values, Values]:
-    """Return the gain of -2 log L that terms promise, their squared coefficients by one step, and the spread of these.
+    """Return for terms the predicted gain of -2 log L, the squared coefficients after one step, and their spread.
 
     ``fit``: of one row. ``shapes``: (l, b), spectra of the terms.
     """
@@ -168,9 +168,9 @@ def _scores(spectrum: Spectrum, fit: Fits, shapes: Values) -> tuple[Values, Valu
 
 
 def limits(spectrum: Spectrum, best: Candidate) -> Work[tuple[Values, dict[int, float]]]:
-    """Return the 95 % intervals of the parameters, and the upper limits of the single terms that are absent.
+    """Return the 95 % intervals of the parameters, and the upper limits of single terms that are not selected.
 
-    The intervals are a (2, 2 k) array, NaN where there is no parameter; the limits those of squared coefficients.
+    The intervals are a (2, 2 k) array, NaN where there is no parameter; the limits are for squared coefficients.
     """
     trial = Trial(int(best.fit.axis[0]), best.kinds, best.columns, best.parameters)
     spread = np.sqrt(np.diag(best.fit.covariance(spectrum.count)[0]))
@@ -196,7 +196,7 @@ def limits(spectrum: Spectrum, best: Candidate) -> Work[tuple[Values, dict[int, 
 
 
 def _crossing(best: Candidate, trial: Trial, at: int, step: float, *, one_sided: bool = False) -> Work[float]:
-    """Return by how much a parameter departs from its start where the profile loses a given square of -2 log L.
+    """Return the change of a parameter at which -2 log L of the profile has risen by a given square.
 
     ``step``: a first guess.
     """
@@ -235,7 +235,7 @@ def ranked(search: Search) -> list[tuple[Candidate, float]]:
 def best_of(search: Search, required: tuple[int, ...], optional: Sequence[int]) -> Work[Candidate]:
     """Return the best composition over all choices of the optional deterministic columns.
 
-    Beside white noise alone, a column is left out where it gains less than ``SLIGHT_GAIN`` of -2 log L.
+    With white noise only, a column that gains less than ``SLIGHT_GAIN`` of -2 log L is not used.
     """
     best = yield from search.run(required)
     if optional and len(best.kinds) == 1:

@@ -1,4 +1,4 @@
-"""The terms of the noise of a sensor at rest: their spectra and Allan variances, with the coefficients of IEEE Std 952.
+"""Spectra and Allan variances of the noise terms of a sensor at rest, with the coefficients of IEEE Std 952.
 
 With ``w = 2 pi f dt`` and ``s = 2 sin(w / 2)``, each term adds to the variance of a coefficient of the cosine transform
 (first column) and to the Allan variance at the averaging time t (second column):
@@ -17,8 +17,8 @@ is ``sqrt(2) N``. The overlapping Allan deviation of N readings with the integra
 
     sigma^2(tau) = sum_i (theta[i + 2m] - 2 theta[i + m] + theta[i])^2 / (2 tau^2 (N - 2m + 1)),   tau = m dt
 
-Of long averages every (m / ``PER_AVERAGE``)th term is summed: terms so close together are nearly the same. Sources:
-IEEE Std 952-1997, annex C; Riley, NIST SP 1065, section 5.2.4.
+For long averages only every (m / ``PER_AVERAGE``)th term is summed, because neighbouring terms are nearly equal.
+Sources: IEEE Std 952-1997, annex C; Riley, NIST SP 1065, section 5.2.4.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def unit_of(term: str, unit: str) -> str:
 
 
 def fixed_shapes(omega: Values, interval: float) -> Values:
-    """Return the spectra of Q, N, B and K of unit coefficients: (4, b) array. ``omega``: w, rad a sample."""
+    """Return the spectra of Q, N, B and K with unit coefficients: (4, b) array. ``omega``: w, rad per sample."""
     s = 2.0 * np.sin(omega / 2.0)
     dt = interval
     return np.stack([s**2 / dt**2, np.full_like(s, 1.0 / dt), 1.0 / s, dt / s**2])
@@ -88,7 +88,7 @@ def allan_variance(name: str, term: Mapping[str, Any], tau: Values) -> Values:
 
 
 def each_term(terms: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return name and content of each term that has a value, of an axis as published; not what is regressed out."""
+    """Return name and content of each published term of an axis with a value, without terms that are regressed out."""
     listed = [(name, part) for name, parts in terms.items() for part in (parts if isinstance(parts, list) else [parts])]
     return [(name, part) for name, part in listed if part["value"] is not None and name in UNITS]
 

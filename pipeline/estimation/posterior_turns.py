@@ -1,8 +1,8 @@
-"""The posterior over effects in turns on a table: the linear problem at a fit, and one for each set of timing effects.
+"""Posterior over effects in turns on a table: a linear problem at a fit, for each relevant set of timing effects.
 
-Columns are taken at the fit of what was selected. What its equations hold beyond the first order is taken out of the
-readings, ``y = r + Z p`` with the residual r, the columns Z and the values p of the selected effects. An effect of
-timing moves the motion for all columns; where a set with other ones has weight, the fit is repeated with it.
+Columns are computed at the fit of the selected effects. The readings are linearised there: ``y = r + Z p`` with the
+residual r, the columns Z and the values p of the selected effects. An effect of timing moves the motion for all
+columns; if a set with other timing effects has weight, the fit is repeated with them.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
 
 
 def _worth_a_fit(search: Search, moving: frozenset[str], own: frozenset[str]) -> list[frozenset[str]]:
-    """Return the sets of timing effects, other than those of the fit, whose sets have weight; the likeliest first."""
+    """Return the sets of timing effects, other than those of the fit, with significant weight; the likeliest first."""
     pool = search.pool
     total = float(np.logaddexp.reduce([found.score for found in pool.values()]))
     shares: dict[frozenset[str], float] = {}

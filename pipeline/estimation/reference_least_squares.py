@@ -1,4 +1,4 @@
-"""Bias and full 3x3 matrix of a sensor by least squares against the table's motion.
+"""Fit bias and full 3x3 matrix of a sensor by least squares against the table's motion.
 
 In the measurement direction, with regressors that have no noise,
 
@@ -11,15 +11,15 @@ where
     b : (3,) bias
     K : (3, 3)
 
-each channel is a linear problem with the same columns (1, u_x, u_y, u_z). A reading that was filtered is compared with
-``b + K F u``, F the same filter: exact for any linear filter, where shifting u by the filter's delay would be wrong by
-its attenuation and in every ramp. A filter that this cannot rebuild leaves the shift, ``u(t - delay)``.
+each channel is a linear problem with the same columns (1, u_x, u_y, u_z). A filtered reading is compared with
+``b + K F u``, F the same filter. This is exact for any linear filter; a shift of u by the filter's delay would ignore
+its attenuation and be wrong in every ramp. If the filter cannot be reproduced, the shift ``u(t - delay)`` is used.
 
-The accelerometer of a table that stops and goes is fitted to its settled rests, otherwise to all samples; the gyroscope
-to all samples, but where the table's rate is only the derivative of its logged angle the ramps are left out.
+With stop-and-go turns the accelerometer is fitted to the settled rests, otherwise to all samples. The gyroscope is
+fitted to all samples; if the table's rate is only the derivative of its logged angle, the ramps are not used.
 
-The covariance allows for a bias wander (``pipeline.estimation.engine``) and for the table's stated accuracies
-(``pipeline.estimation.table_errors``); that of the matrix follows from ``dM = -M dK M``.
+The covariance includes bias wander (``pipeline.estimation.engine``) and the table's stated accuracies
+(``pipeline.estimation.table_errors``); the covariance of the matrix follows from ``dM = -M dK M``.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def fit(
 
 
 def of_channels(values: Values) -> Values:
-    """Return bias and K, (t, 12), of bias and row of K of each channel, (t, 12)."""
+    """Reorder (t, 12) values from (bias, row of K) for each channel to bias and K."""
     channels = values.reshape(len(values), 3, 4)
     return np.concatenate([channels[:, :, 0], channels[:, :, 1:].reshape(-1, 9)], axis=1)
 
@@ -134,7 +134,7 @@ def _select(sensor: str, part: Part) -> Part:
 
 
 def _reference(sensor: str, part: Part) -> Values:
-    """Return what an ideal sensor would read behind the recording's filter: (n, 3) array."""
+    """Return the reading of an ideal sensor after the recording's filter: (n, 3) array."""
     recording, motion = part.recording, part.motion
     try:
         return filtered(truth(sensor, motion), recording)

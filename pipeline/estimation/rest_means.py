@@ -1,9 +1,9 @@
-"""The rests that a calibration without a table uses, those that are held out of it, and their mean readings.
+"""Select the rests for a calibration without a table, and the held-out rests; compute their mean readings.
 
-A rest is one orientation: its mean reading is one equation, ``|matrix @ (mean - bias)| = G``. Where a unit has no
-recording for validation, every ``holdout_every``-th rest is kept out of the fit, and the fit is judged by it. The
-gyroscope is fitted to the rests of the accelerometer's method. ``Orientations`` are the rows of a fit by gravity's
-length alone, also of a table: dwells of stop-and-go turns, single samples of continuous ones.
+A rest is one orientation: its mean reading is one equation, ``|matrix @ (mean - bias)| = G``. If a unit has no
+recording for validation, every ``holdout_every``-th rest is held out of the fit for validation. The gyroscope is fitted
+to the rests of the accelerometer's method. ``Orientations`` are the rows of a fit by gravity's length alone, also on a
+table: dwells of stop-and-go turns, or single samples of continuous turns.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class RestSplit:
 
 
 def holdout_interval(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> int:
-    """Return k where every k-th rest is held out; 0 where none is.
+    """Return k if every k-th rest is held out; 0 if none is held out.
 
-    ``settings``: section ``procedure``: ``holdout_every``, and ``holdout_from``, the number of rests below which none
-    is held out. None is with a recording for validation either.
+    None is with a recording for validation, or with fewer rests than ``holdout_from``. ``settings``: section
+    ``procedure``: ``holdout_every`` and ``holdout_from``.
     """
     procedure = settings["procedure"]
     every, fewest = (int(procedure.get(key) or 0) for key in ("holdout_every", "holdout_from"))
@@ -56,11 +56,10 @@ def count_of_rests(recordings: Sequence[Recording]) -> int:
 
 
 def split_rests(recording: Recording, every: int) -> RestSplit:
-    """Find the rests of a recording and hold out every ``every``-th of those that are sound; 0 holds out none.
+    """Find the rests of a recording, by the table's log or else by its readings, and hold out some.
 
-    The middle one of each group of ``every`` is held out: the first and the last rest stay in the fit.
-
-    ``recording``: by the table's log where it has one, else by its readings.
+    The middle one of each ``every`` accepted rests is held out, so that the first and the last rest are in the fit; 0
+    holds out none.
     """
     if "rests" not in recording.cache:
         recording.cache["rests"] = rests_from_table(recording) or find_rests(recording)
@@ -75,11 +74,10 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
 
 
 def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[Rest]]:
-    """Return the rests that no fit uses, by the name of their recording.
+    """Return the held-out rests, by the name of their recording; empty with a recording for validation.
 
-    ``recordings``: those of role ``rests`` count. ``settings``: ``procedure.holdout_every``. Empty where there is a
-    recording for validation. The move before a rest ends with it: it begins where the rest before, held out or not,
-    stops.
+    ``recordings``: those of role ``rests`` are used. ``settings``: ``procedure.holdout_every``. The move before a
+    held-out rest is held out, too.
     """
     every = holdout_interval(recordings, settings)
     if not every:
@@ -88,7 +86,7 @@ def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any])
 
 
 def advice_on_held_out(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> str:
-    """Return how a fit gets the rests that are held out of it, as a clause; empty where none is."""
+    """Return advice, as a clause, on how to use the held-out rests in the fit; empty if none are held out."""
     held = sum(map(len, held_out_rests(recordings, settings).values()))
     if not held:
         return ""
@@ -99,10 +97,10 @@ def advice_on_held_out(recordings: Sequence[Recording], settings: Mapping[str, A
 
 
 def rests_by_use(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Return the rests of the recordings of role ``rests``: which a fit would use, and which not, with the reason.
+    """Return which rests of the recordings of role ``rests`` a fit would use, and which not, with the reason.
 
     ``settings``: ``procedure.holdout_every``. The keys are ``rests_used``, ``rests_held_out`` and ``rests_left_out``,
-    the values as of ``describe_rests``; what a fit itself leaves out counts as used here.
+    the values as of ``describe_rests``. Rests that the fit later excludes are listed as used here.
     """
     every = holdout_interval(recordings, settings)
     found: dict[str, list[dict[str, Any]]] = {"rests_used": [], "rests_held_out": [], "rests_left_out": []}
@@ -114,7 +112,7 @@ def rests_by_use(recordings: Sequence[Recording], settings: Mapping[str, Any]) -
 
 
 def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, Any]]:
-    """Return each rest's recording, start and duration in s, and why it is refused (empty where it is not)."""
+    """Return each rest's recording, start and duration in s, and the reason why it is refused (empty if accepted)."""
     return [
         {
             "recording": recording.name,
@@ -132,7 +130,7 @@ def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, An
 def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer") -> tuple[Values, Integers]:
     """Return the mean reading of each rest, without clipped, stuck or missing samples.
 
-    By hand a unit may creep: the mean over its directions is too short, and is made longer by that (see
+    By hand a unit may creep: the mean over its directions is too short, which is corrected (see
     ``pipeline.signal.quiet_motion``).
 
     Returns ``means`` (m, 3), g or deg/s: NaN where a rest has no sound sample; ``counts`` (m,): number of samples

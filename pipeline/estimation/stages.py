@@ -1,12 +1,12 @@
-"""Which function runs a stage of a fit, and the correction of the readings that a stage leaves.
+"""Find and run the function of a fit's stage, and apply the correction of readings by the stages.
 
 A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``: a new
 stage needs only such a module and its name in a method's list. The stages of the staged method are functions of one
 module for each sensor, and some stages are the same for both sensors.
 
-The stage ``given`` (``method=given``) is no fit, but bias, matrix and effects of an existing calibration, which the
-recordings judge by validation and diagnosis. Its uncertainty is what its file states. Where that states none, the
-covariance is zero, the budget says so, and what noise cannot explain on held-out motion is a departure of it.
+The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effects of an existing calibration, for
+validation and diagnosis with the recordings. Its uncertainty is taken from its file. If the file states none, the
+covariance is zero, which the budget states; any held-out error beyond noise is then a departure of the calibration.
 
 The correction by the stages so far is ``{"steps": [...]}``; each step acts on the output of the step before, on row
 vectors v:
@@ -44,7 +44,7 @@ KINDS = "subtract, matrix, two_sided"
 
 
 def stage_module(sensor: str, stage: str) -> str:
-    """Return the module that holds a stage."""
+    """Return the module of a stage."""
     if stage in STAGED[sensor]:
         return f"pipeline.estimation.{sensor}.staged"
     if stage in (NOT_WANTED, GIVEN):
@@ -74,10 +74,10 @@ def fit_stage(
 
 
 def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibration:
-    """Return the given calibration of a sensor, as its configuration holds it (``method.given``).
+    """Return the given calibration of a sensor from the configuration (``method.given``).
 
-    Effects of mounting, place, table and timing belong to the bench of the file's own recordings: they are left out,
-    and the stage names them. Raises ``CannotCalibrateError`` where the file holds nothing of the sensor.
+    Effects of mounting, place, table and timing belong to the bench on which the file was made: they are not used, and
+    the stage names them. Raises ``CannotCalibrateError`` if the file has no calibration of the sensor.
     """
     from pipeline.estimation.uncertainty_budget import base_parameters, combined  # noqa: PLC0415  (0.1 s of Snakemake)
 
@@ -133,7 +133,7 @@ def staged_result(  # noqa: PLR0917  (what a stage of the staged method tells)
 
 
 def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mapping[str, Any]) -> list[str]:
-    """Return the names of the stages so far; refuse what is no stage of the staged method."""
+    """Return the names of the stages so far; raise ``ConfigurationError`` for a stage of another method."""
     done = () if previous is None else previous.stages
     unknown = [stage.name for stage in done if stage.name not in stages or stage.correction is None]
     if unknown:

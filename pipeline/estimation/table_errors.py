@@ -1,10 +1,11 @@
-"""What the stated accuracies of a table do to the parameters of a fit, through its linear map.
+"""Propagate the stated accuracies of a table to the parameters of a fit, through its linear map.
 
-The true motion is the logged one plus an error, ``u + du``; the fit takes ``K du`` for readings. Each accuracy is the
-standard uncertainty of independent errors:
+The true motion is the logged motion plus an error, ``u + du``, which changes the readings by ``K du``. Each accuracy is
+the standard uncertainty of independent errors:
 
     angle          each stop of the table, and in a turn between two stops e_k + (e_k+1 - e_k) (A - A_k) / (A_k+1 - A_k)
-    rate           each turn axis, relative; an accelerometer in continuous turns feels the angle that it sums up to
+    rate           each turn axis, relative; for an accelerometer in continuous turns its integral, an error of the
+    angle
     orthogonality  lean of each turn axis toward both others (``table_axis_nonorthogonality``)
     wobble         once a turn, each axis about both others: cosine and sine of the table angle
     levelling      tilt of the table about level x and y (``table_tilt``)
@@ -54,7 +55,7 @@ CLOCK_OF_TABLE = (
 
 @dataclass(frozen=True)
 class Reference:
-    """The motion at the rows of a fit, recording by recording, by a table of stated accuracies."""
+    """The motion at the rows of a fit, recording by recording, by a table with stated accuracies."""
 
     sensor: str
     motions: Sequence[Motion]  # their samples, one after the other, are the columns of a fit's weights
@@ -62,9 +63,9 @@ class Reference:
     table: Mapping[str, Any]
 
     def summed(self, fit: LinearMap, change: Callable[[Motion], Values | None], inputs: int) -> Values:
-        """Return what inputs do to the parameters, each by a change of the truth: (p, inputs) array.
+        """Return the change of the parameters by inputs that change the truth: (p, inputs) array.
 
-        ``change``: motion to (n, 3, inputs), or None where they do nothing.
+        ``change``: motion to (n, 3, inputs), or None if they change nothing.
         """
         total, row = np.zeros((fit.parameters, inputs)), 0
         for motion in self.motions:
@@ -90,9 +91,9 @@ def type_b(  # noqa: PLR0917  (the columns of a budget's line)
 def table_errors(
     reference: Reference, fit: LinearMap, estimated: Sequence[str] = ()
 ) -> tuple[list[Contribution], dict[str, str]]:
-    """Return each stated accuracy with its effect on the parameters of a fit, and why the others are not included.
+    """Return the contribution of each stated accuracy to the parameters of a fit, and reasons for those not included.
 
-    ``estimated``: effects of the fit: what one of them estimates is no input any more.
+    ``estimated``: effects of the fit; an error that one of them estimates is not an input any more.
     """
     found, missing = [], {}
     for source, key, unit, sensors, replaced_by, inputs, change in ACCURACIES:
@@ -114,11 +115,10 @@ def table_errors(
 def disturbance(
     reference: Reference, residuals: Values, blocks: Blocks, weight: Values | None = None, white: Values | None = None
 ) -> Values | None:
-    """Return the covariance that the stated accuracies give the sums over blocks, or None where noise hides it.
+    """Return the covariance of sums over blocks by the stated accuracies, or None if it is small against the noise.
 
-    ``residuals``: (n, 3). ``weight``: (n,), samples of each row; None: rows
-    are samples. ``white``: (3,), noise of a sample; None: as the residuals show it. The covariance is (3 b, 3 b),
-    channel by channel.
+    ``residuals``: (n, 3). ``weight``: (n,), samples of each row; None: rows are samples. ``white``: (3,), noise of a
+    sample; None: from the residuals. The covariance is (3 b, 3 b), channel by channel.
     """
     if white is None:
         white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
@@ -138,7 +138,7 @@ def noise_on_table(
 
 
 def _largest(reference: Reference) -> float:
-    """Return about the largest error of the truth that the stated accuracies make, g or deg/s."""
+    """Return the approximate largest error of the truth by the stated accuracies, g or deg/s."""
     table, size = reference.table, 0.0
     tilt = np.radians(max(float(table.get(key) or 0.0) for key in TILTS))
     for motion in reference.motions:
@@ -152,7 +152,7 @@ def _largest(reference: Reference) -> float:
 
 
 def _without(source: str, key: str, reference: Reference) -> str:
-    """Return why a source is not included; empty where it is, or where its accuracy is stated as 0."""
+    """Return why a source is not included; empty if it is included, or its accuracy is stated as 0."""
     table, clocks = reference.table, {motion.timed_by for motion in reference.motions}
     placed = table.get("latitude_deg") is not None and table.get("azimuth_deg") is not None
     if source == "Earth's rotation" and not placed:
@@ -167,7 +167,7 @@ def _without(source: str, key: str, reference: Reference) -> str:
 
 
 def _angle(reference: Reference, fit: LinearMap) -> Values:
-    """Return what an error of each stop's angle does: (p, stops) array."""
+    """Return the change of the parameters by an error of each stop's angle: (p, stops) array."""
     left, right, group, count = errors_of_stops(reference.sensor, reference.motions, reference.K)
     at_stops = fit.of_groups(left, group, count + 1)
     at_stops += fit.of_groups(right, group + 1, count + 1)
@@ -178,9 +178,10 @@ def _angle(reference: Reference, fit: LinearMap) -> Values:
 
 
 def errors_of_stops(sensor: str, motions: Sequence[Motion], K: Values) -> tuple[Values, Values, Index, int]:
-    """Return what an error of the angle at the stop before and after each sample adds to its reading, per deg.
+    """Return the change of each reading by errors of the angle at the stop before and the stop after it, per deg.
 
-    Returns two (n, 3) arrays, the number of the stop before, (n,), that after being the next, and the number of stops.
+    Returns two (n, 3) arrays; the index of the stop before, (n,), where the stop after is the next; and the number of
+    stops.
     """
     left, right, groups, count = [], [], [], 0
     for motion in motions:
@@ -206,9 +207,9 @@ def errors_of_stops(sensor: str, motions: Sequence[Motion], K: Values) -> tuple[
 
 
 def between_stops(angle: Values, rate: Values) -> tuple[Index, Values, Values, int]:
-    """Return the stop at or before each sample, its share of the way to the next, and the slope of that, 1/deg.
+    """Return the stop at or before each sample, the share of the way to the next, and its derivative, 1/deg.
 
-    Where a recording does not begin or end with a rest, its first or last sample stands in for one.
+    If a recording does not begin or end with a rest, its first or last sample is used as a stop.
     """
     still = np.abs(rate) <= RATE_AT_REST_DPS
     before = np.concatenate([[False], still[:-1]])
@@ -224,7 +225,7 @@ def between_stops(angle: Values, rate: Values) -> tuple[Index, Values, Values, i
 
 
 def _turned(reference: Reference, fit: LinearMap, motion: Motion) -> Values:
-    """Return what a turn of one recording about each body axis does, per deg: (p, 3) array."""
+    """Return the change of the parameters by a rotation of one recording about each axis, per deg: (p, 3) array."""
 
     def change(other: Motion) -> Values | None:
         if other is not motion:
@@ -236,7 +237,7 @@ def _turned(reference: Reference, fit: LinearMap, motion: Motion) -> Values:
 
 
 def _rate(reference: Reference, motion: Motion) -> Values | None:
-    """Return a relative error of the rate about each axis."""
+    """Return the change of the truth by a relative error of the rate about each axis."""
     if motion.axis is None or motion.rate is None or motion.angle is None:
         return None
     du = np.zeros((len(motion.time), 3, 3))
@@ -249,13 +250,13 @@ def _rate(reference: Reference, motion: Motion) -> Values | None:
 
 
 def _orthogonality(reference: Reference, motion: Motion) -> Values | None:
-    """Return a lean of each axis, per deg."""
+    """Return the change of the truth by a lean of each axis, per deg."""
     lean = effect("table_axis_nonorthogonality")
     return None if motion.axis is None else lean.regressors(reference.sensor, motion, np.eye(3), np.zeros(6))
 
 
 def _wobble(reference: Reference, motion: Motion) -> Values | None:
-    """Return cosine and sine of a wobble about both other axes, per deg."""
+    """Return the change of the truth by cosine and sine of a wobble about both other axes, per deg."""
     if motion.axis is None or motion.angle is None or motion.rate is None:
         return None
     a, angle = motion.axis, np.radians(motion.angle)
@@ -271,18 +272,18 @@ def _wobble(reference: Reference, motion: Motion) -> Values | None:
 
 
 def _levelling(reference: Reference, motion: Motion) -> Values | None:
-    """Return a tilt about level x and y, per deg."""
+    """Return the change of the truth by a tilt about level x and y, per deg."""
     tilt = effect("table_tilt")
     return None if motion.level is None else tilt.regressors(reference.sensor, motion, np.eye(3), np.zeros(2))
 
 
 def _gravity(reference: Reference, motion: Motion) -> Values:
-    """Return a g more of gravity."""
+    """Return the change of the truth by gravity, per g."""
     return motion.specific_force[:, :, None] / float(reference.table.get("gravity_g") or 1.0)
 
 
 def _azimuth(reference: Reference, motion: Motion) -> Values | None:
-    """Return a turn of the table about the vertical, per deg, by its effect on Earth's rotation."""
+    """Return the change of Earth's rotation by a turn of the table about the vertical, per deg."""
     if motion.level is None:
         return None
     earth = earth_rate(float(reference.table["latitude_deg"]), float(reference.table["azimuth_deg"]))
@@ -291,7 +292,7 @@ def _azimuth(reference: Reference, motion: Motion) -> Values | None:
 
 
 def _clock(reference: Reference, motion: Motion) -> Values | None:
-    """Return an error of the sensor's clock, per ppm, where rates follow from it."""
+    """Return the change of rates by an error of the sensor's clock, per ppm, if they are computed by that clock."""
     del reference
     return 1e-6 * motion.angular_rate[:, :, None] if motion.timed_by == "sensor" else None
 

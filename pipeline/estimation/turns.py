@@ -1,6 +1,6 @@
-"""The turns of a table: which samples a fit uses, their means at rest, and the sinusoid that a channel draws in a turn.
+"""Select the samples of a table's turns for a fit, average them at rest, and fit the sinusoid of a channel in a turn.
 
-While the table turns about body axis i by the angle A, gravity G draws in a channel whose axis lies across
+While the table turns about body axis i by the angle A, gravity G causes in a channel with its axis across
 
     y = z + a cos(A - phi) + c |cos(A - phi)|
 
@@ -11,12 +11,12 @@ where
     a, c : half sum and half difference of the two sides, g: the largest reading is ``z + a + c``, the smallest
            ``z - a + c``; c is zero where a sensor has one scale factor for both sides
 
-and in the channel whose axis is turned about ``y = z + h cos(A - phi)`` with a small h, the misalignment. Given phi the
-rest is linear; phi is the phase of the linear fit's own first harmonic, found by a few rounds since |cos| has even
-harmonics only. So all samples of a turn say where its extremes are, not the few at its flat peaks.
+and in the channel along the turn axis ``y = z + h cos(A - phi)`` with a small h, the misalignment. For a given phi the
+other parameters are linear. phi is the phase of the first harmonic of the linear fit, found in a few rounds because
+|cos| has even harmonics only. So all samples of a turn determine its extremes, not only the few at its flat peaks.
 
-A filter turns phi by rate x delay and shrinks a, but only while the table turns: a rest at either end is read as it is,
-and no one sinusoid holds both.
+A filter shifts phi by rate x delay and reduces a, but only while the table turns: the readings of a rest at either end
+are not changed, and one sinusoid does not describe both.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Part:
 
 
 def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, Any], method: str) -> list[Part]:
-    """Return the recordings made for a sensor that hold its readings and the table's motion, without bad samples.
+    """Return the recordings made for a sensor with its readings and the table's motion, without invalid samples.
 
     ``method``: name of the method, for the message. Raises ``CannotCalibrateError`` if there is none.
     """
@@ -92,7 +92,7 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
 
 
 def stop_and_go(motion: Motion) -> bool:
-    """Return whether a motion rests at four or more attitudes, so that its rests say it all."""
+    """Return whether a motion has rests at four or more attitudes, so that the rests suffice for a fit."""
     rests = runs(motion.still)
     if len(rests) < 4:
         return False
@@ -108,10 +108,10 @@ def settled(part: Part) -> Mask:
 
 
 def steady_turns(part: Part, memory: float) -> Mask:
-    """Return the samples in the steady parts of a turn about one axis, without a filter's memory of what was before.
+    """Return the samples in the steady parts of a turn about one axis, without the settling of a filter.
 
-    A turn that is shorter than the memory (s) keeps its middle: what the filter still lacks there is a small share of
-    the turn, where the rest beside it would lack all.
+    Of a turn that is shorter than the settling time ``memory``, s, the middle is used: the filter's error there is a
+    small share of the rate.
     """
     motion = part.motion
     if motion.axis is None or motion.rate is None:
@@ -129,10 +129,10 @@ def steady_turns(part: Part, memory: float) -> Mask:
 
 
 def filtered_alike(part: Part) -> Mask:
-    """Return the samples of ``settled`` that a filter changes alike.
+    """Return the samples of ``settled`` that a filter changes equally.
 
-    Without a filter, and of rests, these are all. In a continuous turn behind a filter they are those in which the
-    table turns steadily and the filter follows.
+    Without a filter, and for rests, these are all. In a continuous turn with a filter they are the samples in which the
+    table turns steadily and the filter has settled.
     """
     keep, applied = settled(part), part.recording.filter
     if applied["name"] == "none" or part.motion.rate is None or stop_and_go(part.motion):
@@ -190,7 +190,7 @@ def _factors(columns: Values, where: str) -> ScaledColumns:
 
 
 def blocks_of_samples(parts: Sequence[tuple[Recording, Mask]]) -> Blocks:
-    """Cut the chosen samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
+    """Divide the used samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
 
     ``parts``: each recording and which of its samples are used.
     """
@@ -214,7 +214,7 @@ def blocks_of_samples(parts: Sequence[tuple[Recording, Mask]]) -> Blocks:
 
 
 def _clock(recording: Recording, number: int, known: dict[str, tuple[int, float]]) -> int:
-    """Return the clock of a recording: its own, or that of its session's recording before; ``known`` holds those."""
+    """Return the clock of a recording: its own, or that of an earlier recording of the session, from ``known``."""
     before, end = known.get(recording.setup, (number, np.inf))
     clock = before if recording.setup and recording.time[0] > end else number
     known[recording.setup] = clock, float(recording.time[-1])
@@ -231,9 +231,9 @@ class Rows:
     total: int  # samples of the recording
 
     def settled(self, reading: Values) -> Rows:
-        """Return rows in which groups that scatter too much are taken apart into their samples.
+        """Split groups that scatter too much into single samples.
 
-        By the table's log they are at rest; where the sensor's clock is off, it still moves at their edge.
+        They are at rest by the table's log; with an error of the sensor's clock, the sensor still moves at their edges.
 
         ``reading``: (n, 3), g or deg/s.
         """
@@ -265,7 +265,7 @@ class Rows:
         return np.add.reduceat(kept, self.first, axis=0) / self.count.reshape(shape)
 
     def all(self, mask: Mask | None) -> Mask | None:
-        """Return at which groups an (n,) mask holds throughout: (m,) array; None for none."""
+        """Return for which groups an (n,) mask is true at all samples: (m,) array; None for None."""
         return None if mask is None else np.logical_and.reduceat(mask[self.kept], self.first)
 
     def motion(self, motion: Motion) -> Motion:
@@ -283,7 +283,7 @@ class Rows:
         )
 
     def _at(self, trajectory: Callable[..., Motion | None], offset: float | Values = 0.0, **lag: float) -> Motion:
-        """Return the motion at the rows' samples shifted in time; ``offset`` is that of the rows."""
+        """Return the motion at the rows' samples shifted in time; ``offset``: of the rows."""
         if isinstance(offset, np.ndarray):
             samples = np.zeros(self.total)
             samples[self.kept] = np.repeat(offset, self.count.astype(int))
@@ -294,9 +294,9 @@ class Rows:
 
 
 def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> Rows:
-    """Choose the samples of a fit and group those of a rest.
+    """Select the samples of a fit, and group the samples of each rest.
 
-    ``valid``: (n,), samples whose readings can be used. ``together``: whether the samples of a rest are alike; after a
+    ``valid``: (n,), samples with valid readings. ``together``: whether the samples of a rest are equivalent; after a
     filter they are not.
     """
     moving = np.linalg.norm(motion.angular_rate, axis=1) > RATE_AT_REST_DPS
@@ -316,10 +316,10 @@ def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> Rows:
 
 
 def reference_valid(motion: Motion) -> Mask:
-    """Return at which samples the log follows the table: (n,) array of bool.
+    """Return at which samples the log describes the motion of the table: (n,) array of bool.
 
-    Both intervals beside a sample of a turn must be explained; with an attitude log, the rate must be the cubic through
-    its four neighbours, and theirs too, to 0.05 deg/s and 0.1 %.
+    Both intervals next to a sample of a turn must be explained. With an attitude log, the rate at the sample and at its
+    neighbours must agree with the cubic through the four nearest samples, to 0.05 deg/s and 0.1 %.
     """
     if motion.reference_valid is not None:
         return motion.reference_valid

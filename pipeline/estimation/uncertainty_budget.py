@@ -1,17 +1,18 @@
-"""The uncertainty budget of a fit (JCGM 100:2008, GUM, 5, 8 and annex G).
+"""Compute the uncertainty budget of a fit (JCGM 100:2008, GUM, 5, 8 and annex G).
 
     U = sum over sources of U_s,    nu_eff = u^4 / sum_s (u_s^4 / nu_s),    expanded uncertainty = k(nu_eff) u
 
-The noise of the readings is of type A, as the residuals show it (``pipeline.estimation.engine``); slow errors and lack
-of fit are part of it. Its parts are told apart: white noise, the bias instability that the static recording or the
-sensor file lets expect, and lack of fit beyond both. Everything else is of type B, with infinite degrees of freedom:
+The noise of the readings is of type A, from the residuals (``pipeline.estimation.engine``), including slow errors and
+lack of fit. Its parts are stated separately: white noise, the bias instability that is expected by the static recording
+or the sensor file, and lack of fit beyond both. All other contributions are of type B, with infinite degrees of
+freedom:
 
     limits        : misalignments that rests do not determine (``limit_contribution``)
     bench         : the table's stated accuracies (``pipeline.estimation.table_errors``), local gravity
     quantisation  : where white noise does not make the rounding errors of the samples independent
     others        : temperature, repeatability, a time that was counted (``pipeline.estimation.stated_lines``)
 
-Sources without a stated accuracy are named and left out.
+Sources without a stated accuracy are listed as not included.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: A
 
 
 def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: Prior) -> Contribution:
-    """Return what white noise, bias instability and lack of fit contribute."""
+    """Return the contribution of white noise, bias instability and lack of fit."""
     covariance, freedom = noise.posterior(fit).averaged()
     total = np.diag(covariance)
     white, wander = noise.variances(fit, prior)
@@ -89,13 +90,13 @@ def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: Prior) -> Co
 def scatter_contribution(
     covariance: Values, degrees_of_freedom: float, parts: Mapping[str, Values] | None = None, remark: str = ""
 ) -> Contribution:
-    """Return the contribution of the readings' scatter where a fit gives its covariance at once."""
+    """Return the contribution of the readings' scatter for a fit that computes its covariance directly."""
     freedom = np.full(len(covariance), float(degrees_of_freedom))
     return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
 
 
 def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
-    """Return what rounding to whole counts contributes, or why it has no line of its own.
+    """Return the contribution of rounding to whole counts, or why it has no separate line.
 
     With white noise of half a count and more, the rounding errors of the samples are independent, of variance 1/12
     count^2, and part of the noise that the residuals show. With less, each block of samples has one error.
@@ -112,7 +113,7 @@ def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float |
 
 
 def gravity_line(calibration: SensorCalibration, table: Mapping[str, Any]) -> tuple[list[Contribution], dict[str, str]]:
-    """Return what an error of local gravity does to a matrix that is scaled by it, ``dM = M dG / G``; or why not."""
+    """Return the contribution of local gravity to a matrix that is scaled by it, ``dM = M dG / G``, or why not."""
     u = table.get("gravity_accuracy_g")
     if not u:
         return [], {GRAVITY: "table.gravity_accuracy_g is not stated"} if u is None else {}
@@ -124,7 +125,7 @@ def gravity_line(calibration: SensorCalibration, table: Mapping[str, Any]) -> tu
 def clock_contribution(
     calibration: SensorCalibration, ppm: float, distribution: str = NORMAL, remark: str = ""
 ) -> Contribution:
-    """Return what an error of the sensor's clock does where a rate is an angle over a time by it: ``dM = M de``."""
+    """Return the contribution of the sensor's clock, for rates that are an angle over its time: ``dM = M de``."""
     effect = np.zeros((len(calibration.parameter_names()), 1))
     effect[3:12, 0] = 1e-6 * calibration.matrix.ravel()
     return type_b(TIME_BASE, distribution, ppm, "ppm", effect, remark)
@@ -133,15 +134,16 @@ def clock_contribution(
 def limit_contribution(
     gain: Values, names: Sequence[str], curvature: Values, covariance: Values, place: Values
 ) -> tuple[Contribution, Values]:
-    """Return what misalignments known by the sensor file's limit contribute, and the covariance to first order.
+    """Return the contribution of misalignments that are limited by the sensor file, and the first-order covariance.
 
-    A limit is so wide that the square of a misalignment matters, as in six positions, where the readings depend on it
-    to second order alone. With the curvature H_i of equation i and the covariance C of a fit, ``d^T H_i d / 2`` of a
-    normal error d has the mean ``tr(H_i C) / 2`` and the covariances ``tr(H_i C H_j C) / 2`` (JCGM 100, 5.1.2, note).
+    A limit is so wide that the square of a misalignment is significant, for example in six positions, where the
+    readings depend on it only to second order. With the curvature H_i of equation i and the covariance C of a fit,
+    ``d^T H_i d / 2`` of a normal error d has the mean ``tr(H_i C) / 2`` and the covariances ``tr(H_i C H_j C) / 2``
+    (JCGM 100, 5.1.2, note).
 
-    ``gain``: (p, n), of the equations, over their standard deviations, in the fitted parameters; the last are the
-    pseudo-observations of the ``names``. ``curvature``: (n, p, p), likewise. ``covariance``: (p, p), C. ``place``: (12,
-    p).
+    ``gain``: (p, n), of the equations over their standard deviations, on the fitted parameters; the last equations are
+    the pseudo-observations of the ``names``. ``curvature``: (n, p, p), of the same equations. ``covariance``: (p, p),
+    C. ``place``: (12, p).
     """
     own = gain[:, gain.shape[1] - len(names) :]
     HC = curvature @ covariance
@@ -157,7 +159,7 @@ def combined(
 ) -> SensorCalibration:
     """Return a calibration with the covariance and the degrees of freedom of all contributions together.
 
-    ``contributions``: of all of its parameters. ``not_included``: source to the reason why it is not among them.
+    ``contributions``: to all of its parameters. ``not_included``: source to the reason why it is not included.
     """
     size = len(calibration.parameter_names())
     covariance, freedom = np.zeros((size, size)), np.full(size, np.inf)
@@ -190,12 +192,12 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     results: Callable[[Values], Values],
     estimated: Sequence[str] = (),
 ) -> SensorCalibration:
-    """Return a calibration on a table with its budget, and a Monte Carlo run beside it where that is asked for.
+    """Return a calibration on a table with its budget and, if configured, a Monte Carlo run.
 
-    ``contributions``: the first that of the noise; the others act on the parameters themselves. ``settings``: sections
-    ``sensor``, for the size of a count, and ``uncertainty``. ``results``: (t, q) errors of what the fit's map makes of
-    the channels, one after the other, to (t, p) parameters. ``estimated``: effects of the fit: what one of them
-    estimates is no input any more.
+    ``contributions``: first that of the noise; the others act on the parameters directly. ``settings``: sections
+    ``sensor``, for the size of a count, and ``uncertainty``. ``results``: function of (t, q) errors of the fit's linear
+    map, channel after channel, to (t, p) parameters. ``estimated``: effects of the fit; an error that one of them
+    estimates is not an input any more.
     """
     sensor = calibration.sensor
     counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
@@ -224,9 +226,9 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
 
 
 def covariance_beside_reference(calibration: SensorCalibration) -> Values:
-    """Return the covariance without the scale that calibration and held-out reference share: local gravity, time base.
+    """Return the covariance without errors that calibration and held-out reference share: local gravity, time base.
 
-    Both scale the whole matrix, ``dM = M e``, and the reference alike, so no held-out error shows them.
+    Both scale the whole matrix, ``dM = M e``, and the reference equally, so that no held-out error shows them.
     """
     size = len(calibration.parameter_names())
     out = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance.copy()
@@ -239,9 +241,9 @@ def covariance_beside_reference(calibration: SensorCalibration) -> Values:
 
 
 def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Values, Values]:
-    """Return the covariance of a calibration by its own readings, and that by the bench; together the published one.
+    """Divide the covariance of a calibration into the parts from its readings and from the bench.
 
-    ``shared``: a part of the readings' contribution that counts as of the bench, too.
+    ``shared``: a part of the readings' contribution that is also counted for the bench.
     """
     size = len(calibration.parameter_names())
     C = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance
@@ -274,7 +276,7 @@ def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Value
 def effect_parameters(
     sensor: str, terms: Sequence[Term], covariance: Values
 ) -> tuple[tuple[FittedEffect, ...], dict[str, dict[str, Any]]]:
-    """Return effects as fitted, and their parameters as those of a stage; they follow bias and matrix."""
+    """Return the fitted effects, and their parameters as a stage states them; they follow bias and matrix."""
     u = iter(np.sqrt(np.clip(np.diag(covariance)[BASE:], 0.0, None)).tolist())
     effects, parameters = [], {}
     for term in terms:
@@ -293,7 +295,7 @@ def with_uncertainty(
     budget: Mapping[str, Any],
     not_included: Sequence[Mapping[str, Any]],
 ) -> SensorCalibration:
-    """Return a calibration with a covariance and all that follows from it: of its effects and its budget, too."""
+    """Return a calibration with a new covariance, and the values that follow from it in its effects and budget."""
     u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     factors = coverage_factor(freedom)
     known = freedom[u > 0.0]

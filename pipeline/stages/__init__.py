@@ -1,7 +1,7 @@
-"""The stages of a run: a function each, which reads the files of a unit, calls the library, and returns files."""
+"""The stages of a run: one function for each, which reads the files of a unit, calls the library, and returns files."""
 
-# Stage: the module of its function ``<stage>_unit`` or ``<stage>_batch``, in the order of a run. A change of the code
-# that a module imports repeats its stages, so that a change of pages does not repeat calibrations.
+# Stage to the module of its function ``<stage>_unit`` or ``<stage>_batch``, in the order of a run. A stage is repeated
+# when the code that its module imports changes: a change of pages does not repeat calibrations.
 MODULES = {
     "collect": "ingest",
     "ingest": "ingest",

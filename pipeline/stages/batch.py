@@ -1,7 +1,7 @@
-"""Runs a stage on a batch of units, one after the other; a unit that fails does not stop the others.
+"""Run a stage on a batch of units, one after the other; a unit that fails does not stop the others.
 
-A job reads and writes one file for each stage, a ``pipeline.pack``. A failed unit has ``<unit>.failed.json`` in it. The
-stages after it copy that, and ``verdict`` turns it into the exit code.
+A job reads and writes one file for each stage, a ``pipeline.pack``. It contains ``<unit>.failed.json`` for a failed
+unit. Later stages copy this member, and ``verdict`` sets the exit code from it.
 """
 
 from __future__ import annotations
@@ -44,28 +44,28 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "gather": (),
 }
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last", "code"), "diagnose": ("code",)}
-INPUTS_OF = ".inputs"  # member of a pack: what the files of a unit were computed from, and their names
-BY_INPUTS = ("fit", "diagnose")  # stages that take longest: a unit with unchanged inputs is taken from the last run
+INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
+BY_INPUTS = ("fit", "diagnose")  # the longest stages: a unit with unchanged inputs is copied from the last run
 
 
 @dataclass(frozen=True)
 class Job:
-    """A stage on a batch."""
+    """One stage for one batch."""
 
     stage: str
     units: dict[str, dict[str, Any]]  # unit to its settings
-    run: dict[str, Any]  # settings that are not a unit's, and the options of the command line
-    inputs: dict[str, Pack]  # stage to the files that it wrote
+    run: dict[str, Any]  # settings of the run, and the options of the command line
+    inputs: dict[str, Pack]  # stage to its output
     output: Path  # file to write
-    results: Path  # of the campaign
+    results: Path  # folder of the campaign's results
 
 
 def main(stage: str, argv: Sequence[str]) -> int:
     """Run the function ``<stage>_unit(job, unit, settings)`` for each unit, or ``<stage>_batch(job)`` for all.
 
-    ``<stage>_unit`` returns the files of the unit, ``<stage>_failed(job, unit, settings, failure)``, where it exists,
-    those of a unit that failed, here or in a stage before.
-    Returns 0 even if units have failed: their failures are part of the output.
+    ``<stage>_unit`` returns the files of the unit. ``<stage>_failed(job, unit, settings, failure)``, if it exists,
+    returns the files of a unit that failed in this stage or before. The exit code is 0 even if units have failed: their
+    failures are part of the output.
     """
     if stage == "verdict":
         return verdict(argv)
@@ -89,18 +89,18 @@ def main(stage: str, argv: Sequence[str]) -> int:
             if inputs and unit + FAILED not in files:
                 add({unit + INPUTS_OF: as_bytes({"sha256": inputs, "files": [*files]})})
     if stage in BY_INPUTS:
-        _keep(job.output)
+        _link_output(job.output)
     record_output(job, job.output)
     return 0
 
 
 def last_output(output: Path) -> Path:
-    """Return a link to what a job wrote last: Snakemake deletes the output before it starts the job again."""
+    """Return the path of a link to the last output of a job; Snakemake deletes the output before it repeats the job."""
     return output.with_name(f".{output.name}.last")
 
 
-def _keep(output: Path) -> None:
-    """Link what a job wrote; where the disk has no links, the next run computes every unit."""
+def _link_output(output: Path) -> None:
+    """Link the output of a job; on a disk without links, the next run computes every unit."""
     last = last_output(output)
     last.unlink(missing_ok=True)
     with suppress(OSError):
@@ -108,13 +108,13 @@ def _keep(output: Path) -> None:
 
 
 def forget_last_outputs(results: Path) -> None:
-    """Delete the links to what jobs wrote last, so that every unit is computed again."""
+    """Delete the links to the last outputs of jobs, so that every unit is computed again."""
     for last in (results / "batches").rglob(".*.last"):
         last.unlink()
 
 
 def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:
-    """Return a digest of settings, code and files of earlier stages that a unit depends on, "" where one is damaged."""
+    """Return a digest of a unit's settings, code and files of earlier stages; empty if a file is damaged."""
     packs = [*job.inputs.values(), *([Pack(Path(job.run["previous"]))] if job.run.get("previous") else [])]
     run = {key: value for key, value in job.run.items() if key not in {"previous", "again"}}
     found = hashlib.sha256(json.dumps([run, settings], sort_keys=True).encode())
@@ -129,7 +129,7 @@ def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:
 
 
 def _unchanged(last: Path, unit: str, inputs: str) -> dict[str, bytes]:
-    """Return the files of a unit as the last run wrote them, none where what they depend on has changed."""
+    """Return the files of a unit from the last run; empty if its inputs have changed."""
     name, pack = unit + INPUTS_OF, Pack(last)
     try:
         found = pack.json(name) if last.is_file() and name in pack else {}
@@ -139,7 +139,7 @@ def _unchanged(last: Path, unit: str, inputs: str) -> dict[str, bytes]:
 
 
 def parse_job(stage: str, argv: Sequence[str]) -> Job:
-    """Read a stage's command line: ``--config SETTINGS --output FILE``, a pack for each input, and options."""
+    """Parse a stage's command line: ``--config SETTINGS --output FILE``, a pack for each input, and options."""
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=f"The stage {stage} on a batch.")
     parser.add_argument("--config", type=Path, required=True, help="the stage's settings (JSON)")
     parser.add_argument("--output", type=Path, required=True, help="file to write")
@@ -164,7 +164,7 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
 
 
 def merge_common(content: dict[str, Any]) -> dict[str, Any]:
-    """Merge the common settings into each unit's."""
+    """Merge the common settings into the settings of each unit."""
     content["units"] = {unit: _merged(content.get("common", {}), own) for unit, own in content.get("units", {}).items()}
     content.pop("common", None)
     return content
@@ -176,22 +176,22 @@ def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def record_output(job: Job, output: Path, names: Sequence[str] = ("",)) -> None:
-    """Record what a job wrote, so that the next run detects edited files."""
+    """Record the output of a job, so that the next run detects edited files."""
     if output.is_relative_to(job.results):
         record_written(job.results, _below(job, output), job.run.get("again", 0), names)
 
 
 def _below(job: Job, output: Path) -> str:
-    """Return an output's path below the results, empty for these and outside of them."""
+    """Return an output's path below the results; empty for the results themselves and outside of them."""
     return output.relative_to(job.results).as_posix().removeprefix(".") if output.is_relative_to(job.results) else ""
 
 
 def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
-    """Return the record of a unit's failure; an exception that is no user error is a bug, its traceback is printed."""
+    """Return the record of a unit's failure; print the traceback of an exception that is a bug."""
     code, message, file = "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)", None
     if isinstance(error, DamagedFileError):
         with suppress(OSError), Path(str(error.file)).open("ab") as stream:
-            stream.write(b"\0")  # another size: the next run sees that the file is not as it was written
+            stream.write(b"\0")  # changes the size: the next run detects that the file was changed
     if isinstance(error, PipelineError):
         code, message, file = error.code, error.message, error.file
     elif isinstance(error, OSError) and error.filename is not None:
@@ -202,7 +202,7 @@ def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
 
 
 def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> dict[str, bytes]:
-    """Return the files of a unit; one that failed, here or in a stage before, has the record of its failure."""
+    """Return the files of a unit; for a unit that failed here or before, with the record of its failure."""
     name = unit + FAILED
     try:
         earlier = next((pack for pack in job.inputs.values() if name in pack), None)
@@ -211,7 +211,7 @@ def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any])
         failure = earlier.json(name)
     except Exception as error:
         if isinstance(error, OSError) and error.filename is None:
-            raise  # a full disk concerns the run, not the unit
+            raise  # an error of the run, not of the unit: a full disk
         stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
         failure = failure_of(error, unit, stage)
         print(f"{stage}: {unit} FAILED: {failure['message']}", file=sys.stderr, flush=True)
@@ -224,9 +224,9 @@ def _encoded(files: Files) -> dict[str, bytes]:
 
 
 def verdict(argv: Sequence[str]) -> int:
-    """Report the failed units, and set the exit code of the run.
+    """Report the failed units, and return the exit code of the run.
 
-    Without a failed unit it is 0, and the mark of a complete campaign is written.
+    Without a failed unit it is 0, and the file that marks a complete campaign is written.
     """
     parser = argparse.ArgumentParser(prog="python -m pipeline verdict", description="Report the failed units.")
     parser.add_argument("--failures", type=Path, required=True, help="the failures that gather found")

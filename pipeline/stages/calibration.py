@@ -1,7 +1,7 @@
-"""Stage calibration: the published calibration of a unit.
+"""Stage calibration: compose the published calibration of a unit.
 
-A fit that makes held-out motion significantly worse than the raw readings is null in it, with the reason. A unit
-without any calibrated sensor has failed.
+A sensor whose fit has a significantly larger held-out error than the raw readings is null in it, with the reason. A
+unit without any calibrated sensor has failed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
 def calibration_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Write fits, noise at rest, inputs and software as one document.
+    """Return one document with the fits, noise at rest, inputs and software.
 
     Raises ``CannotCalibrateError`` if no sensor is calibrated.
     """
@@ -62,7 +62,7 @@ def calibration_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
 
 
 def _fits(job: Job, unit: str, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the fit of each sensor of a unit, and why some are not its calibration."""
+    """Return the fit of each sensor of a unit, and the reasons for sensors that are not calibrated."""
     fits = {sensor: job.inputs[sensor].json(f"{unit}.json") for sensor in SENSORS}
     reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
     if not settings["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
@@ -73,7 +73,7 @@ def _fits(job: Job, unit: str, settings: dict[str, Any]) -> tuple[dict[str, Any]
 
 
 def _on_board(job: Job, unit: str, board: dict[str, Any]) -> dict[str, Any]:
-    """Return the board of a unit; of its reference chip with how all other chips sit to it."""
+    """Return the board of a unit; for its reference chip, with the mounting of all other chips relative to it."""
     reference, *others = board["chips"]
     chips: dict[str, Any] = {}
     for other in others if unit == reference else ():
@@ -89,16 +89,16 @@ def _on_board(job: Job, unit: str, board: dict[str, Any]) -> dict[str, Any]:
 
 
 def _chip(job: Job, unit: str) -> Chip:
-    """Return a chip of a board with the recordings and calibrations of its unit."""
+    """Return a chip of a board, with the recordings and calibrations of its unit."""
     fits, reasons = _fits(job, unit, job.units[unit])
     found = {s: None if s in reasons else SensorCalibration.from_json(s, fit) for s, fit in fits.items()}
     return Chip(unit, recordings_of({"ingest": job.inputs["ingest"]}, unit), found, job.units[unit]["sensor"])
 
 
 def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return how far the recordings of the fits reach: largest magnitude of a reading (g, deg/s), temperatures (degC).
+    """Return the range of the recordings in the fits: largest magnitude of a reading (g, deg/s), temperatures (degC).
 
-    Magnitudes are of the readings as logged. What no recording contains is left out.
+    Magnitudes are of the readings as logged. A quantity that no recording contains is absent.
     """
     found: dict[str, Any] = {}
     for sensor, key in (("accelerometer", "specific_force_g"), ("gyroscope", "angular_rate_dps")):
@@ -113,7 +113,7 @@ def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def judged(sensor: str, fit: dict[str, Any], sensor_config: dict[str, Any]) -> dict[str, Any]:
-    """Return a sensor's fit with what in it is beyond the sensor file's limits, and what is known by them alone."""
+    """Add to a fit the parameters beyond the sensor file's limits, and those that only the limits determine."""
     found = implausible(sensor, fit, sensor_config)
     accepted = sensor_config["accept_implausible"]
     lists = {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
@@ -136,7 +136,7 @@ def header(unit: str, settings: dict[str, Any]) -> dict[str, Any]:
 
 @cache
 def _software() -> dict[str, str]:
-    """Return the versions that run; looking for one reads the package's files."""
+    """Return the versions of the software; cached, because each lookup reads files."""
     libraries = {library: version(library) for library in LIBRARIES}
     return {"imu-calibration": __version__, "python": platform.python_version(), **libraries}
 
@@ -151,7 +151,7 @@ def _missing_s(recording: Recording) -> float:
 def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
     """Return file, hash, rows and notes of each recording of a unit.
 
-    ``joined``: the files that were joined with it. ``program``: the table's program, where that is the reference.
+    ``joined``: the files that were joined with it. ``program``: the table's program, if it is the reference.
     """
     return [
         {

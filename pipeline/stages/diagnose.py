@@ -1,4 +1,4 @@
-"""Stage diagnose: the effects that each sensor's model lacks."""
+"""Stage diagnose: find the effects that the model of each sensor lacks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def diagnose_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     """Diagnose which physical effects the models of both sensors lack.
 
-    A suggested formula is a file of its own.
+    A suggested formula is written as a separate file.
     """
     recordings = recordings_of(job.inputs, unit)
     fits = load_fits(job.inputs, unit)

@@ -1,4 +1,4 @@
-"""Stage export: the calibration in the formats of other tools."""
+"""Stage export: write the calibration in the formats of other tools."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Stage filter: the readings of every recording through the configured filter, and their noise.
+"""Stage filter: filter the readings of every recording as configured, and estimate their noise.
 
-The noise is estimated once, of the filtered readings, for all stages after it (``<unit>.noise.json``). Without a filter
-the readings are those of ingest (``unit_files.recordings_of``).
+The noise of the filtered readings is estimated once for all later stages (``<unit>.noise.json``). Without a filter,
+later stages read the recordings of ingest (``unit_files.recordings_of``).
 """
 
 from __future__ import annotations

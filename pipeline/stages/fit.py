@@ -1,4 +1,4 @@
-"""Stage fit: ``pipeline.estimation.stages`` finds the module that fits a stage of a method."""
+"""Stage fit: fit one stage of a method, by the module that ``pipeline.estimation.stages`` finds."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def fit_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     noises = load_noises(job.inputs["filter"], unit)
     try:
         found = fit_stage(sensor, stage, recordings, fitted, settings | {"noise": noises})
-        # not before the last stage, which would take it over and count it twice; a given calibration states its own
+        # only after the last stage, or it would be counted twice; a given calibration states its own uncertainty
         if job.run["last"] != NOT_LAST and stage != "given":
             found = with_stated(found, recordings, settings)
         return {file: found.to_json()}

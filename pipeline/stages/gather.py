@@ -1,8 +1,7 @@
-"""Stage gather: every unit's files under their stable paths, the summary and the page of the campaign.
+"""Stage gather: publish the files of all units, the summary and the page of the campaign.
 
-It joins the files that the stage ``summary`` has written, one a batch, and reads no other document of a unit. The whole
-set is made in a folder of its own and replaces the published one when it is complete, so that the published files are
-always those of one run.
+It joins the files of the stage ``summary``, one for each batch, and reads no other document of a unit. The complete set
+is written to a new folder, which then replaces the published one: the published files are always from one run.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ def gather_batch(job: Job) -> None:
 
 
 def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
-    """Publish the files of a unit and return its summary; one whose files cannot be gathered has failed."""
+    """Publish the files of a unit and return its summary; a unit whose files cannot be read has failed."""
     found: JSON = {}
     document: JSON | None = None
     try:
@@ -84,7 +83,7 @@ def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
         failure = failure_of(error, unit, "gather")
         document, page = failed_files(batch.packs["calibration"], unit, failure).values()
         files = {f"calibrations/{unit}.json": as_bytes(document), f"reports/{unit}.html": as_bytes(page)}
-    if failure and failure != found.get("failure"):  # it fails after its summary was made
+    if failure and failure != found.get("failure"):  # it failed after its summary was written
         document = document or failed_files(batch.packs["calibration"], unit, failure)[f"{unit}.calibration.json"]
         found = failed_summary(found, failure, document)
     for name, content in files.items():
@@ -93,7 +92,7 @@ def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
 
 
 def _shared(value: Any) -> Any:  # noqa: ANN401  (a JSON value)
-    """Return a value whose texts are stored once, however many units have them."""
+    """Return a JSON value in which equal texts share their memory, also with other units."""
     if isinstance(value, str):
         return sys.intern(value)
     if isinstance(value, list):
@@ -102,7 +101,7 @@ def _shared(value: Any) -> Any:  # noqa: ANN401  (a JSON value)
 
 
 def _figures(job: Job, units: Mapping[str, JSON]) -> list[JSON]:
-    """Return what is compared of the units, also against the truth of simulated recordings."""
+    """Return the figures of the units for comparisons; for simulated recordings, with their errors."""
     found = []
     for unit, path in job.run["truths"].items():
         truth = read_json(Path(path)) if Path(path).is_file() else {}
@@ -119,9 +118,9 @@ def _statistics(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, n
     rows = [u["row"] for u in units.values()]
     statistics = fleet_statistics(rows, parameters)
     if job.run["combine"] == "lot":
-        from pipeline.stages.prior import TOLD  # noqa: PLC0415  (only where a lot is the prior)
+        from pipeline.stages.prior import LOTS  # noqa: PLC0415  (only where a lot is the prior)
 
-        statistics["combined"] = Pack(job.output.parent / "lots.zip").json(TOLD)
+        statistics["combined"] = Pack(job.output.parent / "lots.zip").json(LOTS)
     if job.run["combine"] == "serial":
         from pipeline.report.combined import combined_calibrations  # noqa: PLC0415  (only for joint estimates)
 
@@ -135,7 +134,7 @@ def _statistics(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, n
 
 
 def _write_campaign(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, new: Path, *, packed: bool) -> None:
-    """Write the files about all units."""
+    """Write the files that summarise all units."""
     run, rows = job.run, [u["row"] for u in units.values()]
     failures, statistics = (
         [u["failure"] for u in units.values() if u["failure"]],
@@ -165,7 +164,7 @@ def _write_campaign(job: Job, units: Mapping[str, JSON], parameters: pd.DataFram
 
 
 def publish_histories(new: Path, entries: Sequence[JSON], units: Iterable[str]) -> None:
-    """Add to the page of each unit that several runs have changed what they changed."""
+    """Add the history to the page of each unit that several runs have changed."""
     times = times_of(entries)
     states = of_units(entries)
     for unit in units:
@@ -175,10 +174,9 @@ def publish_histories(new: Path, entries: Sequence[JSON], units: Iterable[str]) 
 
 
 def same_files(recordings: Mapping[str, Mapping[str, str]]) -> list[tuple[list[str], list[list[str]]]]:
-    """Return the units that have files with the same content under different names, and these files.
+    """Return groups of units that have files with the same content under different names, and these files.
 
-    ``recordings``: unit to its files, each with a digest. One file that several units are calibrated from is not
-    reported.
+    ``recordings``: unit to its files, each with a digest. A file that several units use under one name is not reported.
     """
     first: dict[str, tuple[str, str]] = {}
     same: dict[str, dict[str, str]] = {}
@@ -194,7 +192,7 @@ def same_files(recordings: Mapping[str, Mapping[str, str]]) -> list[tuple[list[s
 
 
 def _link(source: Path, target: Path) -> None:
-    """Publish a pack: a hard link, or a copy where the file system has none."""
+    """Publish a pack by a hard link, or by a copy if the file system has no links."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)

@@ -1,4 +1,4 @@
-"""Stages collect and ingest: a unit's files become one Parquet file with its recordings."""
+"""Stages collect and ingest: read a unit's files, and write its recordings as one Parquet file."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 
 def collect_batch(job: Job) -> None:
-    """Write the raw recordings of all units into one file, for a machine without this disk.
+    """Write the raw recordings of all units into one file, for a machine without access to this disk.
 
-    A member is named by the absolute path of its file without the first slash. A recording of several units is stored
-    once. A unit of which one cannot be read has failed, as in ``ingest``.
+    The name of a member is the absolute path of its file without the first slash. A recording of several units is
+    stored once. A unit with an unreadable recording has failed, as in ``ingest``.
     """
     files: dict[str, bytes] = {}
     folders = {unit: Path(job.run["directory"], s["procedure"]["folder"]) for unit, s in job.units.items()}
@@ -43,14 +43,14 @@ def collect_batch(job: Job) -> None:
                         done.add(_member(path))
             except IngestError as error:
                 add({unit + FAILED: as_bytes(failure_of(error, unit, "ingest"))})
-            # Ingest reports whether a folder exists, and files that it did not read.
+            # Empty members, because ingest reports missing folders, and files that it did not read.
             files |= {f"{_member(folders[unit])}/": b""} if folders[unit].is_dir() else {}
             files |= {_member(path): b"" for path in _candidates(settings, folders[unit]) if path.exists()}
         add({name: content for name, content in files.items() if name not in done})
 
 
 def _extract(recordings: Pack, settings: Mapping[str, Any], folder: Path, root: str) -> None:
-    """Write the recordings of a unit below ``root``, which stands for the root of the file system."""
+    """Write the recordings of a unit below ``root``, which replaces the root of the file system."""
     if f"{_member(folder)}/" in recordings:
         Path(f"{root}{folder}").mkdir(parents=True)
     for path in _candidates(settings, folder):
@@ -72,7 +72,7 @@ def _member(path: Path) -> str:
 def ingest_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     """Read, cut and check the recordings of a unit.
 
-    Files are named by their path below the campaign's directory.
+    Files inside the campaign's directory are named by their path relative to it.
     """
     directory = Path(job.run["directory"])
     folder = directory / settings["procedure"]["folder"]
@@ -108,6 +108,6 @@ def _ingested(directory: Path, folder: Path, settings: dict[str, Any]) -> list[R
 
 
 def _named(source: Mapping[str, Any], name: Callable[[str], str]) -> dict[str, Any]:
-    """Return the source of a recording with other names of its file and of those joined with it."""
+    """Rename the file of a recording's source, and the files joined with it, by the function ``name``."""
     joined = {"joined": [_named(other, name) for other in source["joined"]]} if "joined" in source else {}
     return {**source, "file": name(source["file"]), **joined}

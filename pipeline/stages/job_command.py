@@ -1,7 +1,7 @@
-"""The command of a job: ``job_command.py STAGE ...`` runs a stage in a copy of the job server, else by itself.
+"""The command of a job: ``job_command.py STAGE ...`` runs a stage in a process of the job server, else in a new one.
 
-It imports two modules in C and nothing of the package, as it is started for every job: it takes 15 ms instead of 38 of
-``python -m pipeline``, which follows it where there is no server (a job on another machine, or not on Linux).
+It is started for every job and imports only two modules in C, nothing of the package. So it takes 15 ms instead of the
+38 ms of ``python -m pipeline``, which it runs where there is no server (a job on another machine, or not on Linux).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ KILLED = 137  # exit code of a process that was killed, as shells return it
 
 
 def run_on_server(argv: list[str]) -> int | None:
-    """Run a stage on the server and return its exit code; None where no server answers."""
+    """Run a stage on the server and return its exit code; None if no server answers."""
     import _socket  # noqa: PLC0415  (absent from some systems; ``socket`` imports a dozen modules)
     from array import array  # noqa: PLC0415
 

@@ -1,7 +1,7 @@
-"""Runs the jobs of a run in processes forked from one that has already imported the stages (0.2 to 0.6 s a process).
+"""Run the jobs of a run in forks of one process that has imported the stages; this saves 0.2 to 0.6 s per job.
 
-The command ``job_command.py`` passes its arguments, folder and standard streams through a Unix socket, and waits for
-the exit code.
+The command ``job_command.py`` sends its arguments, folder and standard streams through a Unix socket, and waits for the
+exit code.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 COMMAND = [sys.executable, "-PS", str(Path(__file__).with_name("job_command.py"))]  # imports no package
-# glibc returns freed memory to the system by default, and clearing it anew is 8 % of the time of the stages.
+# glibc returns freed memory to the system by default, which clears it when it is used again: 8 % of the stages' time.
 KEEP_FREED_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "500000000", "MALLOC_MMAP_THRESHOLD_": "500000000"}
 
 
@@ -44,13 +44,13 @@ def start_server() -> Callable[[], None]:
 
     def end() -> None:
         os.environ.pop(ADDRESS, None)
-        server.communicate()  # closes its standard input, at which it ends
+        server.communicate()  # closes its standard input, which ends the server
 
     return end
 
 
 def serve(listener: socket.socket, run_command: Callable[[list[str]], int]) -> int:
-    """Serve until the standard input is closed, also by a killed run; run a command in each forked process."""
+    """Serve until the standard input is closed, also by a killed run; run one command in each forked process."""
     import gc  # noqa: PLC0415
     import shutil  # noqa: PLC0415
     import signal  # noqa: PLC0415
@@ -68,13 +68,13 @@ def serve(listener: socket.socket, run_command: Callable[[list[str]], int]) -> i
 
 
 def _prepare() -> None:
-    """Import what the stages use, read the built-in effects and compile the templates."""
+    """Import the modules of the stages, read the built-in effects and compile the templates."""
     from importlib import import_module  # noqa: PLC0415
 
     for module in {*MODULES.values()} - {"gather"}:  # runs once, and imports pandas
         import_module(f"pipeline.stages.{module}")
     for module in ("scipy.interpolate", "scipy.spatial.transform", "imufusion", "pipeline.io.csv_read"):
-        import_module(module)  # stages import them where they need them
+        import_module(module)  # stages import them inside functions
 
     from pipeline.diagnosis import words  # noqa: PLC0415
     from pipeline.exports import formats  # noqa: PLC0415
@@ -89,7 +89,7 @@ def _prepare() -> None:
 
 
 def _next_job(listener: socket.socket) -> tuple[socket.socket, bytes, list[int]] | None:
-    """Fork a process for each request; return the request in that process, None at the end of the run."""
+    """Fork a process for each request; return the request in the new process, None in the server at its end."""
     import select  # noqa: PLC0415
 
     jobs: set[int] = set()
@@ -136,5 +136,5 @@ def _run_job(
 
 
 def _end_with_command(connection: socket.socket) -> None:
-    connection.recv(1)  # returns when the command that asked has ended
+    connection.recv(1)  # returns when the command of this job has ended
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Stages lots and prior (``combine=lot``): the priors of all units, and the files of a unit that its prior changes."""
+"""Stages lots and prior (``combine=lot``): compute the priors of all units, and apply them to each unit's files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pipeline.pack import Files
     from pipeline.stages.batch import Job
 
-TOLD = "told.json"  # what ``fleet.json`` tells of the lots
+LOTS = "told.json"  # description of the lots for ``fleet.json``
 
 
 def lots_batch(job: Job) -> None:
@@ -29,14 +29,14 @@ def lots_batch(job: Job) -> None:
     for name, units in batches.items():
         summaries = Pack(job.output.parent / name / "summary.zip")
         for unit in units:
-            with suppress(DamagedFileError):  # ``gather`` finds that the unit has failed
+            with suppress(DamagedFileError):  # ``gather`` records the failure of the unit
                 found += [Estimate.read(e) for e in summaries.json(f"{unit}.json").get("estimates", ())]
-    priors, told = priors_of(found)
+    priors, lots = priors_of(found)
     with new_pack(job.output) as add:
-        add({TOLD: as_bytes(told)})
+        add({LOTS: as_bytes(lots)})
         for name, units in batches.items():
-            own = {u: {s: priors[u, s]._asdict() for s in SENSORS if (u, s) in priors} for u in units}
-            add({f"{name}.json": as_bytes(own)})
+            priors_of_batch = {u: {s: priors[u, s]._asdict() for s in SENSORS if (u, s) in priors} for u in units}
+            add({f"{name}.json": as_bytes(priors_of_batch)})
     record_output(job, job.output)
 
 
@@ -46,7 +46,7 @@ def _of_batch(lots: Pack, batch: str) -> Any:  # noqa: ANN401  (a JSON document)
 
 
 def prior_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Return the files that the priors of a unit add or change, by their paths below the results."""
+    """Return the files that the priors of a unit add or change, by paths relative to the results."""
     given = _of_batch(job.inputs["lots"], job.output.parent.name)[unit]
     if not given:
         return {}
@@ -72,6 +72,6 @@ def prior_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
 
 
 def prior_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:  # noqa: ARG001
-    """Return the document and the page of a unit that fails here."""
+    """Return the document and the page of a unit that fails in this stage."""
     earlier = f"{unit}.calibration.json" in job.inputs["report"]
     return {} if earlier else failed_files(job.inputs["calibration"], unit, failure)

@@ -1,4 +1,4 @@
-"""Stage report: the page of each unit, those that failed included, and the calibration report of the others."""
+"""Stage report: render the page of each unit, also of failed units, and the calibration report of the others."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def report_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[s
 
 
 def _page_of_failed(job: Job, document: dict[str, Any], settings: dict[str, Any]) -> str:
-    """Add what was ingested before the failure to a unit's document, and return its page."""
+    """Add the recordings that were read before the failure to a unit's document, and return its page."""
     unit = document["unit"]
     recordings = recordings_of(job.inputs, unit) if f"{unit}.noise.json" in job.inputs["filter"] else []
     if recordings:

@@ -1,6 +1,6 @@
-"""Stage summary: what each unit of a batch adds to the files about all units.
+"""Stage summary: compute the part of each unit in the files that summarise all units.
 
-``gather`` joins these files of the batches, and reads no calibration, validation or diagnosis.
+``gather`` joins the outputs of this stage, and reads no calibration, validation or diagnosis.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ KEPT = ("schema_version", "sensor", "table", "procedure", "method", "config_sha2
 
 
 def summary_unit(job: Job, unit: str, settings: JSON) -> Files:
-    """Return what a calibrated unit adds to the campaign."""
+    """Return the summary of a calibrated unit."""
     documents = [job.inputs[stage].json(f"{unit}.json") for stage in ("calibration", "validate", "diagnose")]
     calibration, _, diagnosis = documents
     found = summary(settings, None, *documents)
@@ -37,7 +37,7 @@ def summary_unit(job: Job, unit: str, settings: JSON) -> Files:
 
 
 def summary_failed(job: Job, unit: str, settings: JSON, failure: JSON) -> Files:
-    """Return what a failed unit adds to the campaign; of one that fails here also its document and its page."""
+    """Return the summary of a failed unit; for one that fails in this stage, with its document and its page."""
     name, report, files = f"{unit}.calibration.json", job.inputs["report"], {}
     try:
         calibration = report.json(name)
@@ -54,7 +54,7 @@ def summary(
     validation: JSON | None = None,
     diagnosis: JSON | None = None,
 ) -> JSON:
-    """Return the part of a summary that failed units have too.
+    """Return the part of a summary that failed units also have.
 
     ``settings``: ``row`` of ``units.csv``, ``overrides`` and ``config``, the digest of each section.
     """
@@ -79,7 +79,7 @@ def failed_files(calibrations: Pack, unit: str, failure: JSON) -> Files:
 
 
 def failed_summary(found: JSON, failure: JSON, document: JSON) -> JSON:
-    """Return the summary of a unit that fails after it was made."""
+    """Return the summary of a unit that fails after its first summary, ``found``."""
     state = found.get("state", {})
     settings = {"row": sheet_columns(found.get("row", {})), **{k: state.get(k, {}) for k in ("overrides", "config")}}
     return summary(settings, failure, document)

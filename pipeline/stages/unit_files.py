@@ -1,4 +1,4 @@
-"""Files of a unit that several stages read: its recordings, the fit of each sensor and its noise."""
+"""Read the files of a unit that several stages use: its recordings, the fit of each sensor and its noise."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ if TYPE_CHECKING:
 
 
 def recordings_of(packs: Mapping[str, Pack], unit: str) -> list[Recording]:
-    """Return the filtered recordings of a unit; those of ingest where there is no filter, or it has not run yet."""
+    """Return the filtered recordings of a unit, or those of ingest without a filter or before the stage filter."""
     name = f"{unit}.parquet"
     pack = packs["filter"] if "filter" in packs and name in packs["filter"] else packs["ingest"]
     return from_parquet(pack.read(name), str(pack.path))
 
 
 def load_fits(packs: Mapping[str, Pack], unit: str) -> dict[str, SensorCalibration | None]:
-    """Return each sensor's calibration, None for one that could not be calibrated."""
+    """Return the calibration of each sensor; None for a sensor that could not be calibrated."""
     found = {sensor: packs[sensor].json(f"{unit}.json") for sensor in SENSORS}
     return {s: None if "not_calibrated" in data else SensorCalibration.from_json(s, data) for s, data in found.items()}
 
 
 def noise_file(unit: str, recordings: list[Recording], settings: dict[str, Any]) -> Files:
-    """Return the file with the noise of each sensor, null where neither recordings nor data sheet determine it."""
+    """Return the file with the noise of each sensor; null if neither recordings nor data sheet determine it."""
     found = {sensor: noise_of(sensor, recordings, settings) for sensor in SENSORS}
     return {f"{unit}.noise.json": {sensor: noise and noise.to_json() for sensor, noise in found.items()}}
 
 
 def load_noises(pack: Pack, unit: str) -> dict[str, Noise | None]:
-    """Read the noise of each sensor, as ``noise_file`` returned it."""
+    """Read the noise of each sensor from the file of ``noise_file``."""
     found = pack.json(f"{unit}.noise.json")
     return {sensor: data and Noise.from_json(data) for sensor, data in found.items()}
 
@@ -49,7 +49,7 @@ def require_noises(
 ) -> dict[str, Noise]:
     """Read the noise of each calibrated sensor.
 
-    Raises ``ConfigurationError`` if nothing determines it; ``estimate_noise`` names what is missing.
+    Raises ``ConfigurationError`` if nothing determines it; its message states what is missing.
     """
     found = load_noises(pack, unit)
     return {

@@ -1,4 +1,4 @@
-"""Stage validate: the errors on held-out motion, and the noise floors."""
+"""Stage validate: compute the errors on held-out motion, and the noise floors."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def held_out(
     noises: Mapping[str, Noise],
     settings: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return the part of each sensor in ``validations/<unit>.json``, None where it has no fit."""
+    """Return the part of each sensor in ``validations/<unit>.json``; None for a sensor without a fit."""
     found = {}
     for sensor, fit in fits.items():
         other = next(f for s, f in fits.items() if s != sensor)

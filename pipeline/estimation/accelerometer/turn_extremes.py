@@ -1,14 +1,14 @@
-"""The extremes that the staged method works with (Sudsanguan 2019, eqs 3.15-3.25).
+"""Compute the extremes of the readings in turns, for the staged method (Sudsanguan 2019, eqs 3.15-3.25).
 
 In a turn about body axis i the axes j = i + 1 and k = i + 2 (cyclic: *first* and *second*) each point up and down once.
 The method uses, for each turn, the table angles of these four extremes, and for each axis its largest and smallest
-readings, its readings where it is level, and what it reads while the table turns about it:
+readings, its readings where it is level, and its readings while the table turns about it:
 
     a_max = mean of the largest, a_min = mean of the smallest, a_zero = mean of the level readings  (3.23-3.25)
 
-By default they are those of sinusoids fitted to the turns (``pipeline.estimation.turns``): the opposite extreme is then
-180 deg away, and all samples count that a filter changes alike. ``as_printed`` takes the largest and the smallest
-sample and their angles of all there are, in motion between two rests and at rest beside a turn too.
+By default they are extremes of sinusoids fitted to the turns (``pipeline.estimation.turns``). Opposite extremes are
+then 180 deg apart, and all samples that a filter changes equally are used. ``as_printed`` uses the largest and the
+smallest of all samples and their angles, also samples in motion between two rests and at rest before or after a turn.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y,
 
 @dataclass(frozen=True)
 class Extremes:
-    """What the staged method knows of the turns."""
+    """The extremes of the turns that the staged method uses."""
 
     # each (3, 2), deg; table angle where the first and the second axis of the turn about x, y, z read most and least
     angle_high: Values
@@ -91,7 +91,7 @@ class Extremes:
 
 @dataclass(frozen=True)
 class Turn:
-    """The samples that are used of all recordings of turns about one axis."""
+    """The used samples of all recordings of turns about one axis."""
 
     angle: Values  # (n,), deg
     reading: Values  # (n, 3), g
@@ -183,7 +183,7 @@ def extremes_of_samples(turns: Sequence[Turn], gravity_g: float) -> Extremes:
 
 
 def by_turn(sinusoids: Sequence[Sequence[Sinusoid]], values: Values) -> list[list[Values]]:
-    """Return coefficients ``[turn][channel]`` of a vector in which they come channel by channel."""
+    """Return coefficients ``[turn][channel]`` from a vector in which the channels follow each other."""
     sizes = [len(turn[channel].coefficients) for channel in range(3) for turn in sinusoids]
     pieces = np.split(values, np.cumsum(sizes)[:-1])
     return [[pieces[channel * len(sinusoids) + turn] for channel in range(3)] for turn in range(len(sinusoids))]

@@ -1,4 +1,4 @@
-"""The gyroscope's matrix by the Cholesky and LU factors of integrated turns (paper eqs 2 and 5-12).
+"""Fit the gyroscope's matrix by the Cholesky and LU factors of integrated turns (paper eqs 2 and 5-12).
 
     y - b = A u,   A = S T M
 
@@ -8,7 +8,7 @@ where
     u    : angular rate by the table, deg/s
     S    : diagonal scale factors
     T    : unit lower triangular, the non-orthogonality of the sensor's axes
-    M    : orthonormal, how the sensor is mounted
+    M    : orthonormal, the mounting of the sensor
 
 Readings and reference are integrated over each turn, from rest to rest; the angles are the columns of Y and U (deg),
 and
@@ -19,14 +19,14 @@ Several turns about an axis, at several rates and in both directions, make A a l
 matrix is ``A^-1``. As printed it is A: in Sudsanguan 2019, tables 5.25 and 5.26, the forward matrix is applied as if it
 were the correction.
 
-Y is linear in the readings, so the covariance of A under white noise and bias wander follows from that of
-``pipeline.estimation.engine``, and that of S, T, M and ``A^-1`` from their derivatives with respect to A.
+Y is linear in the readings. So ``pipeline.estimation.engine`` gives the covariance of A under white noise and bias
+wander, and the derivatives with respect to A give the covariance of S, T, M and ``A^-1``. The integrals
 
     Y = integral (y - b) dt,   U = integral u dt
 
-by the trapezoidal rule on the time stamps, for both alike, so that neither noise nor a delay of one against the other
-matters much. A turn lasts while the table's rate is above a threshold, in one direction, and as long as a filter's
-output still follows it.
+are by the trapezoidal rule on the time stamps, so that noise and a delay between reading and reference have little
+effect. A turn is the time in which the table's rate is above a threshold, in one direction, plus the time in which the
+output of a filter still changes.
 """
 
 from __future__ import annotations
@@ -150,9 +150,9 @@ def _matrix(A: Values, *, as_printed: bool) -> Values:
 
 
 def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_printed: bool) -> tuple[LinearMap, Values]:
-    """Return the map from readings to bias, matrix, S, T and M (12 + 15), and what a bias that is given adds to them.
+    """Return the map from readings to bias, matrix, S, T and M (12 + 15), and their covariance from a given bias.
 
-    Without a rest in the turns' recordings the bias is that of another recording, with a covariance of its own.
+    Without a rest in the turns' recordings the bias is from another recording, with a separate covariance.
     """
     inverse = ScaledColumns.of(turns.integral(turns.rate)).weights()
     inside = turns.turn >= 0
@@ -177,7 +177,7 @@ def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_prin
 
 
 def _values(factors: _Factors) -> dict[str, tuple[float, str]]:
-    """Return S, T below its diagonal and M, with their unit."""
+    """Return S, the elements of T below its diagonal, and M, with their units."""
     below = list(zip(*np.tril_indices(3, -1), strict=True))
     values = {f"S_{axis}": (float(s), "1") for axis, s in zip(AXES, factors.S, strict=True)}
     values |= {f"T_{AXES[i]}{AXES[j]}": (float(factors.T[i, j]), "1") for i, j in below}
@@ -185,7 +185,7 @@ def _values(factors: _Factors) -> dict[str, tuple[float, str]]:
 
 
 def _angle_errors(Y: Values, U: Values, matrix: Values) -> list[list[float | None]]:
-    """Return the rms error of the integrated angles, deg: a row a turn axis, a column a sensor axis."""
+    """Return the rms error of the integrated angles, deg: rows are turn axes, columns are sensor axes."""
     error, about = Y @ matrix.T - U, np.argmax(np.abs(U), axis=1)
     return [
         [float(np.sqrt(np.mean(error[about == i, j] ** 2))) if np.any(about == i) else None for j in range(3)]
@@ -195,7 +195,7 @@ def _angle_errors(Y: Values, U: Values, matrix: Values) -> list[list[float | Non
 
 @dataclass(frozen=True)
 class Turns:
-    """Samples at rest and in turns of all recordings, stacked, and what they integrate to."""
+    """Samples at rest and in turns of all recordings, stacked, with their weights in the integrals."""
 
     reading: Values  # (n, 3), deg/s
     rate: Values  # (n, 3), deg/s; by the table, Earth's rotation included where it is known
@@ -215,7 +215,7 @@ class Turns:
 
 
 def turns_of(parts: Sequence[Part]) -> Turns:
-    """Stack the samples at rest and in turns of some recordings."""
+    """Stack the samples at rest and in turns of recordings."""
     columns, chosen, motions, found, left_out = [], [], [], 0, 0
     for part in parts:
         weight, turn = np.zeros(part.recording.samples), np.full(part.recording.samples, -1, np.intp)
@@ -237,7 +237,7 @@ def turns_of(parts: Sequence[Part]) -> Turns:
 
 
 def _moves(part: Part) -> list[tuple[int, int]]:
-    """Return the stretches in which the table turns in one direction, and the filtered reading follows it."""
+    """Return the stretches in which the table turns in one direction, until the filtered reading has settled."""
     motion = part.motion
     rate = motion.rate if motion.rate is not None else np.linalg.norm(motion.angular_rate, axis=1)
     threshold = max(SLOWEST_DPS, MOTION_SHARE * float(np.max(np.abs(rate))))
@@ -255,9 +255,9 @@ def _moves(part: Part) -> list[tuple[int, int]]:
 
 
 def require_turns(U: Values) -> None:
-    """Raise where the turns do not span all three axes.
+    """Raise ``NotObservableError`` if the turns do not span all three axes.
 
-    ``U``: (t, 3), deg, angle of each turn about each axis. Raises ``NotObservableError``.
+    ``U``: (t, 3), deg, angle of each turn about each axis.
     """
     total = np.sqrt(np.sum(U**2, axis=0))
     largest = float(total.max(initial=0.0))

@@ -1,9 +1,9 @@
-"""Bias and matrix of the gyroscope from hand-held rests and moves (Tedaldi, Pretto & Menegatti, ICRA 2014).
+"""Fit bias and matrix of the gyroscope to hand-held rests and moves (Tedaldi, Pretto & Menegatti, ICRA 2014).
 
-At rest the reading is the bias; in a move, the integrated reading must turn the direction of gravity before it into
-that after it. The accelerometer is calibrated on the way, and gives the frame. The equations are those of
-``estimation.multi_position.gyroscope``; both kinds are weighted by their own scatter, and moves that contradict
-the others have less weight (``pipeline.estimation.multi_position.fit``).
+At rest the reading is the bias. In a move, the integrated reading must rotate gravity before it to gravity after it.
+The accelerometer is calibrated, too, and defines the frame. ``pipeline.estimation.multi_position.gyroscope`` has the
+equations. Rests and moves are weighted by their scatter, and moves that contradict the others have less weight
+(``pipeline.estimation.multi_position.fit``).
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def fit(
 
 
 def _require_known(covariance: Values, moves: int, advice: str) -> None:
-    """Refuse a matrix of which only the noise of the readings says something: no sensor is so far off."""
+    """Raise ``NotObservableError`` if an uncertainty of the matrix is larger than any sensor's error."""
     u = np.sqrt(np.diag(covariance))
     weak = [name for name, one in zip(BASE_NAMES[3:], u[3:], strict=True) if one > UNKNOWN]
     if weak:

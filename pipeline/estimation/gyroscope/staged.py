@@ -1,7 +1,7 @@
-"""The staged method of the gyroscope, equation by equation (Sudsanguan 2019, eqs 3.44-3.53).
+"""Fit the gyroscope by the staged method, equation by equation (Sudsanguan 2019, eqs 3.44-3.53).
 
-The readings are reduced to the means b at rest and the slopes R of steady turns. Each stage works on the response in
-the output of the stage before it:
+The readings are reduced to the means b at rest and the slopes R of steady turns. The input of each stage is the output
+of the stage before:
 
     bias -> orthogonality_and_misalignment -> scale_factor
 
@@ -14,9 +14,9 @@ one axis, or neither. The first two give, for each channel c,
     b_c = mean of y_c at rest
     R_ic = sum rate (y_c - b_c) / sum rate^2   over the steady parts of the turns about axis i
 
-where y is the reading, deg/s, and the rate is signed, so that turns at several rates and in both directions count as
-one regression; Earth's rotation is subtracted from y first where the table's place and azimuth are set. Without a rest
-in these recordings the bias is that of the static recording. As printed, row i is the mean reading over the mean rate.
+where y is the reading, deg/s, and the rate is signed, so that turns at several rates and in both directions are one
+regression. If the table's place and azimuth are set, Earth's rotation is first subtracted from y. Without a rest in
+these recordings the bias is from the static recording. As printed, row i is the mean reading over the mean rate.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alon
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one stage found: its step of the correction, and value and unit of each of its parameters."""
+    """The result of one stage: its step of the correction, and value and unit of each of its parameters."""
 
     step: dict[str, Any]
     values: dict[str, tuple[float, str]]
@@ -128,7 +128,7 @@ class Corrected:
 def follow(response: Response, names: Sequence[str], start: Sequence[Mapping[str, Any]] = ()) -> Corrected:
     """Run stages one after the other, each on the output of the one before.
 
-    ``start``: the correction by the stages before the first.
+    ``start``: the correction by the stages before the first of ``names``.
     """
     found = Corrected([dict(step) for step in start])
     for step in start:
@@ -205,7 +205,7 @@ def fit(
 
 @dataclass(frozen=True)
 class Response:
-    """What the readings of rests and steady turns say."""
+    """Mean readings at rest, and responses to the rate in steady turns."""
 
     rest: Values  # (3,), deg/s; mean reading at rest
     slope: Values  # (3, 3); row i: reading of x, y, z per deg/s about axis i
@@ -231,7 +231,7 @@ class Response:
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples that are used, stacked."""
+    """The used samples, stacked."""
 
     reading: Values  # (n, 3), deg/s; less Earth's rotation where it is known
     # (n, 3), deg/s; signed rate of the table about its turn axis, in that axis's column; 0 at rest
@@ -248,7 +248,7 @@ class Samples:
 
 
 def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Samples:
-    """Return the samples at rest and in steady turns, and a static recording's where there is no other rest."""
+    """Return the samples at rest and in steady turns; without a rest, also the samples of a static recording."""
     chosen, readings, rates, motions = [], [], [], []
     for part in parts:
         memory = _memory(part.recording)
@@ -275,7 +275,7 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
 
 
 def _memory(recording: Recording) -> float:
-    """Return for how long the recording's filter remembers a change, s."""
+    """Return the settling time of the recording's filter, s."""
     applied = recording.filter
     if applied["name"] == "none":
         return 0.0
@@ -289,7 +289,7 @@ def _memory(recording: Recording) -> float:
 
 
 def _without_tails(part: Part, memory: float) -> Mask:
-    """Return the settled samples of the rests, without what a filter still holds of the turns before or after."""
+    """Return the samples of the rests in which a filter has settled after a turn, and before the next turn."""
     still, time = part.motion.still.copy(), part.motion.time
     before = memory if part.recording.filter.get("zero_phase") else 0.0
     for start, stop in runs(part.motion.still) if memory > 0 else []:

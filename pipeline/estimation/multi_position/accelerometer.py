@@ -1,4 +1,4 @@
-"""The accelerometer at rest: its specific force has the magnitude of gravity.
+"""Equations of the accelerometer at rest: its specific force has the magnitude of gravity.
 
     r = (G' - |f|) / s_e,   f = M v,   v = y - b - z(f),   G'^2 = G^2 + 2 s^2 w
     d|f|/db = -n^T M,   d|f|/dM_ij = n_i v_j,   d|f|/dp = -n^T M dz/dp,   n = f / |f|
@@ -6,17 +6,17 @@
 where
 
     y   : (3,) mean reading of a rest, g; w its share of a sample's variance s^2
-    b, M: bias, g, and matrix ``M = Q L``: |f| determines the lower triangular L, and not the rotation Q, which is kept
+    b, M: bias, g, and matrix ``M = Q L``: |f| determines the lower triangular L, but not the rotation Q, which is fixed
     z   : effects, at the force of the magnitude of gravity; p their parameters
     s_e : standard deviation of |f| by white noise: ``s_e^2 = w sum_c (M^T n)_c^2 s_c^2``
 
-Where the procedure states faces, their equations follow (``faces_and_turns``), and the matrix is full. Otherwise a
-misalignment that the rests do not determine has an equation of its own, a pseudo-observation of 0 with the standard
-uncertainty u of the sensor file's limit c of the cross-axis sensitivity:
+If the procedure states faces, their equations are added (``faces_and_turns``), and the full matrix is fitted. Otherwise
+a misalignment that the rests do not determine has a separate equation, a pseudo-observation of 0 with the standard
+uncertainty u from the sensor file's limit c of the cross-axis sensitivity:
 
     r = (0 - L_ij) / u,   u = sqrt(2 / 3) c
 
-since L_ij is the angle between two axes, the sum of what each reads of the other, both uniform within c.
+because L_ij is the angle between two axes, the sum of their two cross-axis sensitivities, both uniform within c.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ COLUMN = {"misalignment_yx": 4, "misalignment_zx": 6, "misalignment_zy": 7}  # o
 class AccelerometerModel:
     """Equations of the accelerometer's rests.
 
-    ``rests``: those of the fit. ``directions``: (12, b), change of bias and matrix by each base parameter. ``held``:
-    rests that no fit sees. ``faces``: of ``rests``, where they are stated: bias and matrix are free then.
-    ``known_by_limit``: misalignments with a pseudo-observation, each with its u. ``wander``: whether the equations hold
-    the errors by a Gauss-Markov bias.
+    ``rests``: rests of the fit. ``directions``: (12, b), change of bias and matrix by each base parameter. ``held``:
+    held-out rests. ``faces``: of ``rests``, if they are stated: the full matrix is then free. ``known_by_limit``:
+    misalignments with a pseudo-observation, each with its u. ``wander``: whether the equations include the errors by a
+    Gauss-Markov bias.
     """
 
     sensor = "accelerometer"
@@ -75,7 +75,7 @@ class AccelerometerModel:
         self.stretches = len(rests.time) if wander else 0
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
-        """Return the linear form at some parameters."""
+        """Return the linearised equations at given parameters."""
         rests, K = self.rests, state.K
         force, v = self.specific_force(state, rests)
         length = np.linalg.norm(force, axis=1)
@@ -144,11 +144,11 @@ class AccelerometerModel:
         return force, v
 
     def samples(self) -> float:
-        """Return how many samples are behind the equations."""
+        """Return the number of samples in the equations."""
         return float(self.rests.count.sum())
 
     def held_out_error(self, state: State) -> float | None:
-        """Return the rms error of |f| at rests that no fit sees, g; None where there are none."""
+        """Return the rms error of |f| at held-out rests, g; None if there are none."""
         if self.held is None or len(self.held.time) == 0:
             return None
         force, _ = self.specific_force(state, self.held)
@@ -185,7 +185,7 @@ def limit_of_misalignment(sensor_config: Mapping[str, Any]) -> float:
 
 
 def _directions(calibration: SensorCalibration) -> Values:
-    """Return what b and the lower triangle of L do to bias and matrix: (12, 9) array."""
+    """Return the derivative of bias and matrix with respect to b and the lower triangle of L: (12, 9) array."""
     flipped, _ = np.linalg.qr(calibration.matrix[:, ::-1])
     Q = flipped[:, ::-1]
     Q = Q * np.sign(np.diag(Q.T @ calibration.matrix))
@@ -199,9 +199,9 @@ def _directions(calibration: SensorCalibration) -> Values:
 def model_of(
     recordings: Sequence[Recording], calibration: SensorCalibration, noise: Noise | None, settings: Mapping[str, Any]
 ) -> AccelerometerModel | None:
-    """Return the model of the recordings' rests, or None where they hold none.
+    """Return the model of the recordings' rests, or None if there are none.
 
-    ``calibration`` is that of the accelerometer's method; ``settings`` hold the sections ``table`` and ``procedure``.
+    ``calibration``: of the accelerometer's method; ``settings``: sections ``table`` and ``procedure``.
     """
     rests = rests_of("accelerometer", recordings, settings, calibration)
     if rests is None:

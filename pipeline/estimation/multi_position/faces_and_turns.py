@@ -1,4 +1,4 @@
-"""Faces and turns by hand as a procedure states them, as equations beside those of rests and moves.
+"""Equations of stated faces and turns by hand, in addition to the equations of rests and moves.
 
     face f      E_f^T mean_k(f_k) / G = 0 +- s_f
     turn k      e_a^T Phi_k = A_k +- s_t
@@ -9,9 +9,9 @@ where
     f_k   : specific force of the rests with face f up; E_f: two directions across the axis of the face
     Phi_k : integral of the calibrated rate over a turn, in the body's axes; A_k its stated total angle, about axis a
     s     : standard uncertainties: of a face's mean rest, of a turn's angle, and of the mean direction of the turns
-            about an axis: an error that rests on one face, or turns about one axis, share is not averaged out
+            about an axis. An error that is common to all rests on a face, or turns about an axis, is not averaged out
 
-For a turn about a fixed axis Phi is angle times axis; an axis that wobbles by w rad changes its length by w^2 / 2. Both
+For a turn about a fixed axis Phi is angle times axis; a wobble of the axis by w rad changes its length by w^2 / 2. Both
 sensors refer to the case. Source: F. Ferraris, U. Grimaldi & M. Parvis, Procedure for effortless in-field calibration
 of three-axial rate gyro and accelerometers, Sensors and Materials 7 (1995), 311-330.
 """
@@ -53,7 +53,7 @@ class Faces:
         return replace(self, face=self.face[index])
 
     def weights(self) -> Values:
-        """Return the weights of the rests' forces in the equations: (r, m, 3) array, two rows a face."""
+        """Return the weights of the rests' forces in the equations: (r, m, 3) array, two rows for each face."""
         rows = []
         for face in np.unique(self.face[self.face >= 0]):
             own = self.face == face
@@ -62,7 +62,7 @@ class Faces:
 
 
 def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces | None:
-    """Return on which face each rest is, by its specific force (m, 3); None where the procedure states no faces.
+    """Return the face of each rest, by its specific force (m, 3); None if the procedure states no faces.
 
     Raises ``NotObservableError`` if there is no rest on a face.
     """
@@ -82,7 +82,7 @@ def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces 
 
 
 def face_of(force: Values) -> tuple[Index, Index, Values, Values]:
-    """Return the face of each force (m, 3), -1 for none; its nearest axis, component along it, and tilt, deg."""
+    """Return for each force (m, 3) its face (-1: none), nearest axis, component along that axis, and tilt, deg."""
     u = force / np.linalg.norm(force, axis=1, keepdims=True)
     axis = np.argmax(np.abs(u), axis=1)
     along = u[np.arange(len(u)), axis]
@@ -140,7 +140,7 @@ class Turns:
         ]
 
     def departures(self, state: State) -> list[str]:
-        """Return in words where a calibrated turn is farther from what is stated than its uncertainty allows."""
+        """Describe the calibrated turns whose difference to the stated angle is beyond its uncertainty."""
         angles = np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T
         off = np.abs(np.einsum("rti,ti->r", self.rows, angles) - self.value)
         count = len(self.name)
@@ -176,12 +176,12 @@ def turns_of(
 ) -> tuple[Turns | None, list[tuple[Recording, float, Values]]]:
     """Return the moves that are turns by a multiple of the stated angle, and all moves.
 
-    A move goes from one rest to the next of its recording. A recording that the procedure calls a turn about an axis is
-    one move as a whole where two rests bound none.
+    A move is from one rest to the next of its recording. A recording that the procedure states as a turn about an axis
+    is one move if it has no move between two rests.
 
-    ``rests``: all of the gyroscope. A move that ends at one that is held out is left out. ``turns``: section
-    ``procedure.turns``. ``role``: of the recordings that may be a turn as a whole; empty for none. Of each move:
-    recording, start in s and integrated readings in deg.
+    ``rests``: all rests of the gyroscope; a move that ends at a held-out rest is not used. ``turns``: section
+    ``procedure.turns``. ``role``: of the recordings that may be one turn; empty for none. A move is its recording,
+    start in s and integrated readings in deg.
     """
     spans = [
         (int(rests.recording[j]), slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1))
@@ -242,10 +242,7 @@ def turns_of(
 def require_turns(
     found: Turns | None, moves: Sequence[tuple[Recording, float, Values]], turns: Mapping[str, Any]
 ) -> None:
-    """Raise where an axis has no stated turn, or a recording that is a turn about an axis holds another one.
-
-    Raises ``NotObservableError``.
-    """
+    """Raise ``NotObservableError`` if an axis has no stated turn, or a recording of a turn has another turn."""
     expected = f"a multiple of {float(turns['angle_deg']):g} deg, within a tenth of it and a quarter of that angle"
     advice = (
         "turn the unit from rest to rest about each body axis, and state the angle in procedure.turns.angle_deg; an "

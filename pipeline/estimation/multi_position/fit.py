@@ -1,4 +1,4 @@
-"""Base and effects fitted to rests and moves by generalised least squares: Gauss-Newton, robust against single moves.
+"""Fit base and effects to rests and moves by generalised least squares: Gauss-Newton, robust against single moves.
 
     step = (N + k P)^-1 (X^T C^-1 r - k P p),    covariance = k (N + k P)^-1,   N = X^T C^-1 X
 
@@ -7,19 +7,19 @@ restricted likelihood (``pipeline.estimation.engine``),
 
     -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
-where k = 1 if the scatter within the rests tells the white noise and a scatter of the hypotheses reaches the residuals
-(``NoiseHypothesis.known``).
+where k = 1 if the scatter within the rests determines the white noise, and the scatter of a hypothesis explains the
+residuals (``NoiseHypothesis.known``).
 
-A few rests leave some combinations of parameters open: two of the nine cross-axis terms of an accelerometer at rest, or
-the amplitude of a warm-up far from its end. So the last fit of plausible effects has the sensor file's limits of their
-parameters p, taken for two standard deviations, as prior with the precision P; it is zero for bias, matrix and time
-constants, and where there is no limit.
+A few rests do not determine some combinations of parameters: two of the nine cross-axis terms of an accelerometer at
+rest, or the amplitude of a warm-up far from its end. So the last fit of plausible effects has a prior with the
+precision P: the sensor file's limits of their parameters p are two standard deviations. P is zero for bias, matrix,
+time constants and parameters without a limit.
 
-A move is outlying where, with its two whitened residuals r_k and the scale s of the median move,
+A move is an outlier if, with its two whitened residuals r_k and the scale s of the median move,
 
     t_k = |r_k| / s,   s = median |r_k| / sqrt(2 log 2),   t_k^2 > 2 log(k / p)
 
-which one of k sound moves exceeds with the probability p. Where one is, all moves get the weights
+which one of k valid moves exceeds with the probability p. If there is an outlier, all moves have the weights
 ``min(1, (v + 2) / (v + t^2))`` of Student's t with v = 4 degrees of freedom: a move of weight w has 1/w times its
 variance. Source: Lange, Little & Taylor, JASA 84 (1989), 881-896.
 """
@@ -65,7 +65,7 @@ ROBUST_ROUNDS, SETTLED = 6, 0.05  # weights that change by less are final
 
 @dataclass(frozen=True)
 class Fit:
-    """The parameters that explain rests and moves best."""
+    """The best fit to rests and moves."""
 
     state: State
     covariance: Values  # (b + p, b + p); of the base parameters along the model's directions, and of the effects'
@@ -108,7 +108,7 @@ def fit(
 ) -> Fit:
     """Fit bias, matrix and effects from given values.
 
-    ``freedom``: degrees of freedom of the noise's scale, where other readings tell it; by default of the residuals.
+    ``freedom``: degrees of freedom of the noise's scale, if other readings determine it; by default of the residuals.
     """
     state, rounds, best, scale = start, 0, -1, 0.0
     seen: list[tuple[State, Equations]] = []
@@ -182,12 +182,12 @@ def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
 def refined(
     equations: Equations, hypotheses: Sequence[NoiseHypothesis], prior: tuple[Values, Values]
 ) -> tuple[list[NoiseHypothesis], float]:
-    """Return the hypotheses worth averaging, and the largest log likelihood over the given ones.
+    """Return the hypotheses with significant weight, and the largest log likelihood over the given ones.
 
-    Many moves tell their scatter to a tenth or so; a grid of factors of 3 or 4 would make the covariance wrong by up to
-    as much. So each scatter is led to the maximum of the restricted likelihood by ever smaller factors. Where its
-    logarithm has a standard deviation s there that is less than half a step of the grid, its levels are
-    ``exp(0, +-s, +-2 s)`` times the maximum; otherwise they are those of the grid that have weight.
+    Many moves determine their scatter to about a tenth; a grid with factors of 3 or 4 would make the covariance wrong
+    by up to such factors. So each scatter is moved to the maximum of the restricted likelihood by decreasing factors.
+    If the standard deviation s of its logarithm is then less than half a step of the grid, its levels are ``exp(0, +-s,
+    +-2 s)`` times the maximum; otherwise they are the levels of the grid with weight.
     """
     scores = project_out(equations, hypotheses).scores()
     if len(hypotheses) == 1:
@@ -254,7 +254,7 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
 
 
 def plausible(model: Model, found: Fit, limits: Limits) -> bool:
-    """Return whether every effect is within its limits or its uncertainty reaches them."""
+    """Return whether every effect is within its limits, or exceeds them by less than its uncertainty."""
     uncertainty = np.sqrt(np.diag(found.covariance))
     return all(
         bool(np.all(np.abs(term.values) - 2.0 * uncertainty[own] <= limits.get(name, np.inf)))
@@ -263,7 +263,7 @@ def plausible(model: Model, found: Fit, limits: Limits) -> bool:
 
 
 def require_observable(model: Model, found: Fit, limits: Limits) -> None:
-    """Raise ``NotObservableError`` that names effects or parameters that rests and moves do not determine."""
+    """Raise ``NotObservableError``, with the effects or parameters, if rests and moves do not determine them."""
     equations = model.equations(found.state)
     limited = _prior(model, found.state, limits)[0] > 0.0
     names = parameter_names(model.sensor, [term.effect for term in found.state.terms])
@@ -292,9 +292,9 @@ def _explained(base: Values, Z: Values) -> bool:
 def fit_robustly(
     model: GyroscopeModel, fitted: Callable[[GyroscopeModel], Fit], recordings: Sequence[Recording]
 ) -> tuple[GyroscopeModel, Fit, list[dict[str, Any]]]:
-    """Fit rests and moves with weights of Student's t where a move is outlying.
+    """Fit rests and moves, with weights of Student's t if a move is an outlier.
 
-    ``fitted``: fits a model. Returns model and fit with the variance that the weights add, and the outlying moves:
+    ``fitted``: function that fits a model. Returns model and fit with the variance by the weights, and the outliers:
     ``recording, time_s, error_deg, over_noise, weight``.
     """
     found, moves = fitted(model), model.moves

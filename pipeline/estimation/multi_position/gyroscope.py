@@ -1,4 +1,4 @@
-"""The gyroscope: at rest the rate is zero; the integrated rate of a move rotates gravity before it onto that after it.
+"""Equations of the gyroscope: zero rate at rest, and moves whose integrated rate rotates gravity to its new direction.
 
     at rest:  r = (y - b - z - K w) / s_e,     dr/db = -1/s_e,   dr/dp = -dz/dp / s_e
     a move:   r = W E^T (u_after - A_0 u_before),   omega = M (y - b - z)
@@ -6,17 +6,18 @@
 where
 
     y, b, M : reading and bias, deg/s, and matrix
-    z, p    : effects and their parameters, with the accelerometer's specific force, at rest and rotated along a move
-    w       : rate at which a unit creeps in a rest, across gravity by the accelerometer (K = M^-1); the rate about
-              gravity is unknown and as large (``pipeline.signal.quiet_motion.posterior_creep_rates``)
+    z, p    : effects and their parameters; in a move with the specific force of the rest, rotated along the move
+    w       : creep rate of the unit in a rest, across gravity by the accelerometer (K = M^-1); the rate about gravity
+              is unknown and of the same size (``pipeline.signal.quiet_motion.posterior_creep_rates``)
     u       : direction of gravity by the calibrated accelerometer (``gravity``); A_0 as in ``moves``
     E       : two directions across u_after; W whitens the integrated noise of the gyroscope, the uncertainty of the
               rate between samples, and the noise of the accelerometer
 
-Two moves share the error of a rest's direction, and all share those of the accelerometer's calibration:
-``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. The frame is that of the accelerometer's matrix. One move does
-not show a turn about the vertical; other moves do, as the vertical is elsewhere in the body. Where the procedure states
-the total angle of turns, their equations follow (``faces_and_turns``).
+Two moves share the error of the direction at the rest between them, and all moves share the errors of the
+accelerometer's calibration: ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. The frame is that of the
+accelerometer's matrix. One move does not show a turn about the vertical; other moves do, because the vertical has
+another direction in the body. If the procedure states the total angle of turns, their equations are added
+(``faces_and_turns``).
 
 Source: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12.
 """
@@ -56,8 +57,8 @@ DRAWS, TAIL = 4000, 0.005  # as of the 99 % interval of other held-out errors: 2
 class GyroscopeModel:
     """Equations of the gyroscope's rests and moves.
 
-    ``rests``: all, also those held out: a move may begin at one. ``gravity``: at each rest, by the accelerometer.
-    ``fewest``: moves, below which none is looked at. ``turns``: of a stated total angle.
+    ``rests``: all, also held-out ones, at which a move may begin. ``gravity``: at each rest, by the accelerometer.
+    ``fewest``: smallest number of moves that are used. ``turns``: of a stated total angle.
     """
 
     sensor = "gyroscope"
@@ -96,7 +97,7 @@ class GyroscopeModel:
         self.known: dict[str, Any] = {"gravity": gravity, "noise": noise, "fewest": fewest, "turns": turns}
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
-        """Return the linear form at some parameters."""
+        """Return the linearised equations at given parameters."""
         blocks = [self._at_rest(state)]
         if self.moves is not None:
             blocks.append(self._of_moves(state))
@@ -105,11 +106,11 @@ class GyroscopeModel:
         return stacked(blocks, self, state, candidates)
 
     def samples(self) -> float:
-        """Return how many samples are behind the equations."""
+        """Return the number of samples in the equations."""
         return float(self.rests.count.sum()) + (0.0 if self.moves is None else float(np.sum(self.moves.weight > 0)))
 
     def held_out_error(self, state: State) -> float | None:
-        """Return the rms of the rate at rests that no fit sees, deg/s; None where there are none."""
+        """Return the rms of the rate at held-out rests, deg/s; None if there are none."""
         if len(self.held.time) == 0:
             return None
         nothing = np.zeros_like(self.held_force)
@@ -119,13 +120,13 @@ class GyroscopeModel:
         return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
 
     def with_excess(self, variance: Values) -> GyroscopeModel:
-        """Return the model with an error of its own for each move, of a variance in deg^2: (k,) array."""
+        """Return the model with an additional independent error of each move; ``variance``: (k,), deg^2."""
         out = copy(self)
         out.excess = variance
         return out
 
     def without(self, held: Mask) -> GyroscopeModel:
-        """Return the model with ``held`` of its own rests, and the moves that end at them, held out."""
+        """Return the model with the rests ``held``, and the moves that end at them, held out."""
         out = self.every.held_out.copy()
         out[~self.every.held_out] = held
         moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
@@ -147,10 +148,10 @@ class GyroscopeModel:
     def largest_direction_error(
         self, state: State, covariance: Values, freedom: Values, scatter: Mapping[str, Any], ratio: float
     ) -> float:
-        """Return what the rms of ``direction_errors`` exceeds with a probability of 0.5 %, deg, by simulation.
+        """Return the bound that the rms of ``direction_errors`` exceeds with a probability of 0.5 %, deg; simulated.
 
-        Errors of the accelerometer's calibration count for the directions and in the covariance, as if these were
-        independent; so the result is on the large side.
+        Errors of the accelerometer's calibration are drawn both for the directions and in the covariance, as if these
+        were independent; so the bound is too large rather than too small.
 
         ``covariance``: (p, p), of bias and matrix first. ``freedom``: (p,), degrees of freedom. ``scatter``: of moves
         and of directions over the noise, as the fit found it. ``ratio``: of the bias wander to the white noise.
@@ -199,7 +200,7 @@ class GyroscopeModel:
         )
 
     def _of_creep(self, K: Values, error: Values) -> Values | None:
-        """Return the covariance of the rests' equations by what is not known of their creep: (3 m, 3 m) array."""
+        """Return the covariance of the rests' equations by the uncertainty of their creep: (3 m, 3 m) array."""
         across, about = self.rests.creep_error, self.rests.creep_about
         if not about.any():
             return None
@@ -258,7 +259,7 @@ class GyroscopeModel:
         )
 
     def _directions(self, E: Values, A: Values) -> Values:
-        """Return what an error of each rest's direction does to each move: (k, 2, m, 3) array."""
+        """Return the derivative of each move's equations with respect to each rest's direction: (k, 2, m, 3) array."""
         assert self.moves is not None  # noqa: S101
         out = np.zeros((self.moves.count, 2, len(self.every.time), 3))
         rows = np.arange(self.moves.count)
@@ -267,7 +268,7 @@ class GyroscopeModel:
         return out
 
     def _common(self, W: Values, directions: Values) -> Values:
-        """Return what the errors of the rests' means have in common for different moves: (2 k, 2 k) array."""
+        """Return the covariance of the moves' equations by errors of the rests' means: (2 k, 2 k) array."""
         n = 2 * len(W)
         directions = np.einsum("kij,kjmc->kimc", W, directions)
         means = np.einsum("kimc,mcd->kimd", directions, self.spread).reshape(n, -1)
@@ -275,7 +276,7 @@ class GyroscopeModel:
         return np.where(apart, means @ means.T, 0.0)
 
     def accelerometer_errors(self, found: Fit) -> Values:
-        """Return the errors of the accelerometer's bias and matrix, as the moves tell them: (12,) array."""
+        """Return the estimate of the accelerometer's errors of bias and matrix from the moves: (12,) array."""
         equations = self.equations(found.state)
         shared = np.zeros((len(equations.residual), 12))
         shared[self.of_moves] = self._of_moves(found.state).shared
@@ -320,11 +321,11 @@ def model_of(
     *,
     moved: Values | None = None,
 ) -> GyroscopeModel | None:
-    """Return the model of the recordings' rests and moves, or None where they hold no rest.
+    """Return the model of the recordings' rests and moves, or None if there is no rest.
 
-    ``calibration``: of the gyroscope: moves that its method found outlying are left out. ``settings``: sections
-    ``table`` and ``procedure``. ``accelerometer``: without it, the accelerometer is calibrated here;
-    ``CannotCalibrateError`` where that fails. ``moved``: (12,), as of ``gravity.observed_rests``; without it, as
+    ``calibration``: of the gyroscope; its outlying moves are not used. ``settings``: sections ``table`` and
+    ``procedure``. ``accelerometer``: without it, the accelerometer is calibrated here, which raises
+    ``CannotCalibrateError`` if it fails. ``moved``: (12,), as of ``gravity.observed_rests``; without it, as
     ``calibration`` states.
     """
     if accelerometer is None:

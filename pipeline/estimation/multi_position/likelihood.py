@@ -1,4 +1,4 @@
-"""Likelihoods of models of rests and moves, over a grid of noise hypotheses.
+"""Compute likelihoods of models of rests and moves, over a grid of noise hypotheses.
 
     -2 log L = rss / k + n log k + log det C,    rss = min_d (r - X d)^T C^-1 (r - X d),    k = max(1, rss / n)
 
@@ -39,7 +39,7 @@ SELECTION_SCATTER = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and o
 
 @dataclass(frozen=True)
 class NoiseHypothesis:
-    """One noise."""
+    """One hypothesis about the noise."""
 
     bias: Setting  # q, bias over white noise, and its time
     scatter: tuple[float, ...]  # the a_j: of rests, and of moves
@@ -59,7 +59,7 @@ class NoiseHypothesis:
 
     @property
     def free_scale(self) -> bool:
-        """Whether C is scaled up to the residuals."""
+        """Whether C is scaled to the residuals."""
         return not self.known or max(self.scatter) >= SCATTER[-1]
 
     def at(self, levels: Sequence[float]) -> NoiseHypothesis:
@@ -72,9 +72,10 @@ class NoiseHypothesis:
 
 
 def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesis]:
-    """Return the hypotheses over which models are compared: every bias instability with every scatter.
+    """Return the hypotheses for the comparison of models: every bias instability with every scatter.
 
-    ``noise``: A static recording pins the bias instability. ``kinds``: of scatter: that of rests, and that of moves.
+    ``noise``: from a static recording, it determines the bias instability. ``kinds``: number of kinds of scatter: of
+    rests, and of moves.
     """
     settings = selection_grid(noise)
     if kinds > 1:  # two kinds of scatter say nothing about a bias far from that of a static recording
@@ -88,7 +89,8 @@ def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesi
 def prior_hypotheses(prior: Prior, white: float, kinds: int) -> list[NoiseHypothesis]:
     """Return the hypotheses over which a covariance is averaged.
 
-    ``prior``: of the bias instability. ``white``: unit of the sensor, white noise of a sample. ``kinds``: of scatter.
+    ``prior``: of the bias instability. ``white``: white noise of a sample, unit of the sensor. ``kinds``: number of
+    kinds of scatter.
     """
     bias = np.append(0.0, prior.wander * FACTORS if prior.wander > 0.0 else white * np.array(RATIOS))
     pairs = zip((bias / white).tolist(), prior.log_belief(bias).tolist(), strict=True)
@@ -139,7 +141,7 @@ class ProjectedCandidates:
         return float(scores.max()), int(np.argmax(scores))
 
     def count(self, j: int, at: int) -> int:
-        """Return how many directions candidate j has under a hypothesis."""
+        """Return the number of directions of candidate j under a hypothesis."""
         return int(np.any(self.orthonormal[j][at], axis=0).sum())
 
     def shown(self, j: int, at: int) -> Values:
@@ -147,7 +149,7 @@ class ProjectedCandidates:
         return np.asarray(self.raw[j][at] @ self.orthonormal[j][at])
 
     def correction(self, j: int, at: int, added: int, kinds: Values) -> float:
-        """Return the factor on the gain by candidate j; 0 where fewer than two equations are left to judge it.
+        """Return the factor on the gain by candidate j; 0 if fewer than two equations show it.
 
         ``j``, ``at``: candidate and hypothesis. ``added``: parameters, also those whose column is zero at their start.
         ``kinds``: (s, n), positive where an equation is of a kind.

@@ -1,4 +1,4 @@
-"""Moves between rests: how the gyroscope's readings rotate the direction of gravity, and gravity at both ends.
+"""Compute the rotation of gravity in moves between rests from the gyroscope's readings, and gravity at both ends.
 
     dR/dt = R [omega]x,   R[k+1] = R[k] exp [phi_k]x,   phi_k = (omega_k + omega_k+1) dt/2 + omega_k x omega_k+1 dt^2/12
     u_end = A_0 u_start,   A_k = R_end^T R_k,   du_end = u_end x sum_k A_k domega_k w_k
@@ -98,9 +98,9 @@ class Moves:
 
 
 def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
-    """Return the moves that end at a rest of the fit, or None where there is none; ``rests`` are all of the gyroscope.
+    """Return the moves that end at a rest of the fit, or None if there are none; ``rests``: all of the gyroscope.
 
-    Left out are those with clipped, stuck or missing readings, with a gap, or longer than a minute.
+    Moves with clipped, stuck or missing readings, with a gap, or longer than a minute are not used.
     """
     found = []
     for i, j in zip(range(len(rests.time) - 1), range(1, len(rests.time)), strict=True):
@@ -173,10 +173,10 @@ def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Value
 
 
 def _regular_stamps(time: Values) -> Values | None:
-    """Return the stamps that a regular clock gives the samples: (s,) array; None where one was dropped.
+    """Return the stamps of a regular clock for the samples: (s,) array; None if a sample was dropped.
 
-    Stamps by arrival are late, each by an amount of its own. A dropped sample makes all that follow late: then the
-    lower envelope of the stamps, minus a straight line, has a step.
+    Stamps by arrival have random delays. A dropped sample delays all that follow: the lower envelope of the stamps,
+    minus a straight line, then has a step.
     """
     n = np.arange(len(time)) - 0.5 * (len(time) - 1)
     line = time.mean() + n * float(n @ time) / float(n @ n)
@@ -185,19 +185,19 @@ def _regular_stamps(time: Values) -> Values | None:
 
 
 def _roughness(time: Values, rate: Values, white: Values) -> float:
-    """Return the squares by which each reading departs from a line between its neighbours, over white noise."""
+    """Return the squared deviation of each reading from the line between its neighbours, over white noise."""
     share = ((time[1:-1] - time[:-2]) / np.maximum(time[2:] - time[:-2], 1e-9))[:, None]
     apart = rate[1:-1] - (1.0 - share) * rate[:-2] - share * rate[2:]
     return float(np.nansum(apart**2 / (white**2 * (1.0 + share**2 + (1.0 - share) ** 2))))
 
 
 def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values) -> list[Values]:
-    """Return the time of each move's samples: as stamped, or regular where the readings are much smoother with that.
+    """Return the times of each move's samples: the stamps, or a regular clock if it makes the readings much smoother.
 
-    The regular clock is that of the whole recording, or of each move where that one drifts or a sample was dropped.
-    Stamps that depart from it by a file's digits alone are regular unless the readings contradict: a file that keeps
-    six digits of a clock that ticks every 9.999 ms holds steps of 10 ms and now and then one of 9 ms, over which 200
-    deg/s would be integrated wrongly by 0.2 deg.
+    The regular clock is of the whole recording; if that drifts or a sample was dropped, of each move. If the stamps
+    differ from it only by the rounding of the file, it is used unless the readings contradict: with six digits, a clock
+    with an interval of 9.999 ms has steps of 10 ms and sometimes one of 9 ms, over which the integral of 200 deg/s
+    would be wrong by 0.2 deg.
 
     ``time``: (n,), s. ``rate``: (n, 3), deg/s. ``white``: (3,), deg/s, white noise of a sample.
     """
