@@ -29,10 +29,15 @@ Columns, units, counts and axes of the log are those of the recordings with whic
 the gyroscope in the other), name one or all of them; the output is a CSV as of other formats. CSV and MCAP are read in
 a stream; logs of other formats and joined files are held in memory.
 
+The bias of a gyroscope changes from one power-on to the next. Where the log holds some seconds in which the unit lies
+still, name them: --rest 0:10 subtracts the mean rate of the longest rest from 0 to 10 s, from the first sample of the
+log. It is stated, with its uncertainty.
+
 examples:
   python -m pipeline apply --calibration results/demo/calibrations/U1.json drive.csv -o drive_calibrated.csv
   python -m pipeline apply --calibration U1.json drive.mcap -o drive_calibrated.mcap
   python -m pipeline apply --calibration U1.json drive/accelerometer.txt drive/gyroscope.txt -o drive.csv
+  python -m pipeline apply --calibration U1.json drive.csv --rest 0:10 -o drive_calibrated.csv
   python -m pipeline apply --calibration U1.json counts.csv --ingest arduino_counts -o out.csv
   python -m pipeline apply --calibration U1.json log.csv --ingest my_bench/configs/ingest/my_logger.yaml -o out.csv
 """
@@ -58,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
     countdown = Countdown(log.stat().st_size if log.is_file() else 0)
     result = compensate_log(
         compensation, log, arguments.output, profile,
-        joined=joined, topic=arguments.topic, smoothing=arguments.smoothing,
+        joined=joined, topic=arguments.topic, smoothing=arguments.smoothing, rest=arguments.rest,
         progress=lambda rows, read: countdown(read, f"{rows} samples"),
     )  # fmt: skip
     countdown.end()
@@ -89,9 +94,23 @@ def _parser() -> argparse.ArgumentParser:
     add("--topic", metavar="TOPIC", help=words)
     words = "time constant of the causal smoothing of the temperature, s; 0: none (default: %(default)g)"
     add("--temperature-smoothing", type=float, default=SMOOTHING_S, metavar="S", dest="smoothing", help=words)
+    words = "s from the first sample in which the unit lies still: the gyroscope's bias is measured again there"
+    add("--rest", type=_seconds, metavar="FROM:TO", help=words)
     words = "file of an effect in Python with which the calibration was made; the file is run; may be repeated"
     add("--python-effect", action="append", default=[], metavar="FILE", dest="python_effects", help=words)
     return parser
+
+
+def _seconds(text: str) -> tuple[float, float]:
+    """Return the first and the last second of a stretch ``FROM:TO``."""
+    first, _, last = text.partition(":")
+    try:
+        found = float(first), float(last)
+    except ValueError:
+        found = 0.0, 0.0
+    if not 0.0 <= found[0] < found[1] < float("inf"):
+        raise ConfigurationError(f"--rest is {text}; expected FROM:TO in s, for example 0:10")
+    return found
 
 
 def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:

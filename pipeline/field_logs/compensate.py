@@ -3,6 +3,9 @@
 Each format of a log reads and writes its blocks (``pipeline.field_logs.text_output``, ``mcap_log``); all else is
 the same for all formats. Memory is bounded by the largest block; logs of other programs, and files that the profile
 joins, are held as a whole.
+
+Where the user names a stretch in which the unit rests, the log is read twice: first for the gyroscope's bias by that
+rest (``pipeline.field_logs.bias_of_rest``).
 """
 
 from __future__ import annotations
@@ -13,9 +16,11 @@ import shutil
 import sys
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError
+from pipeline.field_logs.bias_of_rest import Stretch, with_bias_changed
 from pipeline.field_logs.log_checks import LogChecks
 from pipeline.io.channel_table import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
 from pipeline.io.files import MESSAGE_FORMATS, not_regular
@@ -25,7 +30,6 @@ from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -101,6 +105,7 @@ def compensate_log(
     joined: Sequence[Path] = (),
     topic: str | None = None,
     smoothing: float = SMOOTHING_S,
+    rest: tuple[float, float] | None = None,
     block_bytes: int = BLOCK_BYTES,
     progress: Callable[[int, int], None] | None = None,
 ) -> Result:
@@ -109,36 +114,69 @@ def compensate_log(
     ``profile``: by default the canonical CSV, or the only Imu topic. ``joined``: further files of a recording
     whose profile joins several with readings, in its order. ``topic``: of the calibrated messages in an MCAP
     log; that of the readings and ``_calibrated`` by default. ``smoothing``: memory of the line through the
-    temperature's past, s; 0 takes the temperature as it is. ``progress`` is called with the samples done and the bytes
-    read. ``InputError``: the log is damaged, cannot be read as the profile says, or would be overwritten; no output is
-    left.
+    temperature's past, s; 0 takes the temperature as it is. ``rest``: first and last second of a rest, from the first
+    sample of the log; the mean rate there is subtracted from the gyroscope. ``progress`` is called with the samples
+    done and the bytes read. ``InputError``: the log is damaged, cannot be read as the profile says, does not rest where
+    ``rest`` says, or would be overwritten; no output is left.
     """
-    for file in (source, *joined):
+    files, profile = [source, *joined], profile or LogProfile()
+    for file in files:
         require_apart(file, target)
-    profile, suffix = profile or LogProfile(), source.suffix.lower()
-    with replacing(target) as out:
-        if suffix == ".mcap":
-            from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of both)
+    smoothed = 0.0 if source.suffix.lower() == ".mcap" else smoothing  # of MCAP, ``Temperatures`` smooths
 
-            stream = LogStream(compensation, 0.0, progress)  # ``Temperatures`` smooths
-            return McapLog(source, out, profile, stream, topic, smoothing).compensate()
-        from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
+    def write(stream: LogStream, file: Path) -> Result:
+        with replacing(file) as out:
+            return _write_log(files, out, profile, stream, topic, smoothing, block_bytes)
 
-        stream = LogStream(compensation, smoothing, progress)
-        wanted = 1 if suffix in MESSAGE_FORMATS else len(sensor_parts(profile.ingest))
-        if 1 + len(joined) != wanted:
-            raise InputError(f"the profile reads a recording from {wanted} files; got {1 + len(joined)}", str(source))
-        if joined or suffix in MESSAGE_FORMATS:
-            return compensate_whole([source, *joined], out, profile, stream)
-        return CsvLog(source, out, profile, stream).compensate(block_bytes)
+    notes = []
+    if rest is not None:
+        if compensation.gyroscope is None:
+            raise ConfigurationError("the calibration holds no gyroscope: leave out --rest", str(source))
+        stretch = Stretch(*rest)
+        write(LogStream(compensation, smoothed, progress, stretch), Path(os.devnull))
+        rate, note = stretch.mean_rate(str(source))
+        compensation, notes = with_bias_changed(compensation, rate), [note]
+    result = write(LogStream(compensation, smoothed, progress), target)
+    result.notes = notes + result.notes
+    return result
+
+
+def _write_log(  # noqa: PLR0917  (the arguments of ``compensate_log``)
+    files: Sequence[Path],
+    out: Output,
+    profile: LogProfile,
+    stream: LogStream,
+    topic: str | None,
+    smoothing: float,
+    block_bytes: int,
+) -> Result:
+    """Write a log of any format, compensated, to ``out``."""
+    source, suffix = files[0], files[0].suffix.lower()
+    if suffix == ".mcap":
+        from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of both)
+
+        return McapLog(source, out, profile, stream, topic, smoothing).compensate()
+    from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
+
+    wanted = 1 if suffix in MESSAGE_FORMATS else len(sensor_parts(profile.ingest))
+    if len(files) != wanted:
+        raise InputError(f"the profile reads a recording from {wanted} files; got {len(files)}", str(source))
+    if len(files) > 1 or suffix in MESSAGE_FORMATS:
+        return compensate_whole(files, out, profile, stream)
+    return CsvLog(source, out, profile, stream).compensate(block_bytes)
 
 
 class LogStream:
-    """The samples of a log as they come: compensated, checked and counted."""
+    """The samples of a log as they come: compensated, checked and counted. ``stretch`` collects those within it."""
 
     def __init__(
-        self, compensation: Compensation, smoothing: float, progress: Callable[[int, int], None] | None
+        self,
+        compensation: Compensation,
+        smoothing: float,
+        progress: Callable[[int, int], None] | None,
+        stretch: Stretch | None = None,
     ) -> None:
+        self.stretch = stretch
         self.compensation, self.stream, self.progress = compensation, compensation.stream(smoothing), progress
         self.calibrated = {s for s in SENSORS if compensation.calibration(s) is not None}
         self.checks, self.result = LogChecks(compensation.calibrated_range), Result(compensation.unit)
@@ -157,6 +195,8 @@ class LogStream:
             raise type(error)(error.message + place, file) from None
         readings = {s: getattr(found, s) for s in given}
         self.checks.add(given, readings, signals.get("time"), signals.get("temperature"))
+        if self.stretch is not None:
+            self.stretch.add(readings, signals.get("time"), file)
         self.result.samples += len(next(iter(given.values())))
         self.result.sensors = [s for s in SENSORS if s in {*self.result.sensors, *given}]
         if self.progress is not None:

@@ -95,6 +95,51 @@ def test_a_log_is_compensated_as_its_arrays_are(calibration: Path, log: Path, tm
     assert vectors(after, "gyroscope") == pytest.approx(expected.gyroscope, abs=1e-10)
 
 
+def resting_log(file: Path, still_s: float) -> Path:
+    """Write a log at 100 Hz: at rest up to ``still_s`` after 1 s of motion, then 30 deg/s about z for 5 s."""
+    rng = np.random.default_rng(3)
+    time = np.arange(0.0, still_s + 5.0, 0.01)
+    rate = np.where(time > still_s, 30.0, np.where(time < 1.0, 20.0 * np.sin(9.0 * time), 0.0))
+    gyroscope = np.outer(rate, [0.0, 0.0, 1.0]) + 0.1 * rng.standard_normal((len(time), 3)) + [1.3, -2.2, 0.6]
+    force = [0.0, 0.0, 1.0] + 2e-3 * rng.standard_normal((len(time), 3)) * (1.0 + 50.0 * (time < 1.0))[:, None]
+    table = np.column_stack([100.0 + time, force, gyroscope])
+    names = ["time_s", *VALUES]
+    lines = [",".join(names), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    file.write_text("\n".join(lines), encoding="utf-8")
+    return file
+
+
+def without_effects(calibration: Path) -> None:
+    data = json.loads(calibration.read_text(encoding="utf-8"))
+    for sensor in ("accelerometer", "gyroscope"):
+        data[sensor]["effects"] = []
+    calibration.write_text(json.dumps(data), encoding="utf-8")
+
+
+@pytest.mark.parametrize("block_bytes", [1000, 1 << 20])
+def test_a_rest_of_the_log_renews_the_bias(calibration: Path, tmp_path: Path, block_bytes: int) -> None:
+    without_effects(calibration)
+    log, out = resting_log(tmp_path / "rest.csv", 12.0), tmp_path / "out.csv"
+    result = compensate_log(load(calibration), log, out, rest=(0.0, 12.0), block_bytes=block_bytes)
+    table = columns(out)
+    time, rate = np.array(table["time_s"], float) - 100.0, vectors(table, "gyroscope")
+    matrix = np.eye(3) + 0.01  # of the calibration; its bias is 0.2 to 0.4 deg/s off that of the log
+    within = 5.0 * 0.1 / np.sqrt(1000)
+    assert rate[(time > 2.0) & (time < 11.0)].mean(axis=0) == pytest.approx(np.zeros(3), abs=within)
+    assert rate[time > 12.5].mean(axis=0) == pytest.approx(matrix @ [0.0, 0.0, 30.0], abs=2 * within)
+    assert "mean rate of the rest from 1." in result.notes[0]
+
+
+def test_a_log_that_moves_where_a_rest_is_named_is_refused(calibration: Path, tmp_path: Path) -> None:
+    without_effects(calibration)
+    log, out = resting_log(tmp_path / "rest.csv", 12.0), tmp_path / "out.csv"
+    with pytest.raises(InputError, match=r"no rest of 1 s or more from 0 to 1\.2 s"):
+        main(["--calibration", str(calibration), str(log), "-o", str(out), "--rest", "0:1.2"])
+    assert not out.exists()
+    with pytest.raises(ConfigurationError, match="expected FROM:TO"):
+        main(["--calibration", str(calibration), str(log), "-o", str(out), "--rest", "10:0"])
+
+
 def test_other_columns_are_kept_to_the_letter(calibration: Path, log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
     main(["--calibration", str(calibration), str(log), "-o", str(out)])

@@ -1,0 +1,79 @@
+"""The gyroscope's bias by a rest of the log itself, for ``apply --rest``.
+
+    b' = b + K m,    K = matrix^-1
+
+where m is the mean rate, calibrated with b, of the longest rest within a stretch of the log. Rests are found as in
+recordings by hand (``pipeline.signal.rests``). The bias b' is that of the log's own power-on. It contains Earth's
+rotation, at most 0.0042 deg/s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.records import Recording
+from pipeline.signal.rests import find_rests
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.model.compensation import Compensation
+    from pipeline.records import Values
+
+PARTS, K95 = 10, 2.262  # of a rest; Student's t for 95 %, two-sided, with 9 degrees of freedom
+
+
+@dataclass
+class Stretch:
+    """The calibrated readings of a log between two times, s from its first sample, collected block by block."""
+
+    first: float
+    last: float
+    begin: float = float("nan")  # time of the log's first sample, s
+    blocks: list[tuple[Values, Values, Values]] = field(default_factory=list)  # time, specific force, rate
+
+    def add(self, readings: Mapping[str, Values], time: Values | None, file: str) -> None:
+        """Add a block: (n, 3) calibrated readings of each sensor, (n,) times in s."""
+        if time is None or not {"accelerometer", "gyroscope"} <= set(readings):
+            message = "a rest is found by the time and the readings of both sensors; the log lacks some of these"
+            raise InputError(f"{message}: leave out --rest", file)
+        if not self.blocks:
+            self.begin = float(time[0])
+            self.blocks.append((time[:0], readings["accelerometer"][:0], readings["gyroscope"][:0]))
+        inside = (time - self.begin >= self.first) & (time - self.begin <= self.last)
+        if inside.any():
+            self.blocks.append((time[inside], readings["accelerometer"][inside], readings["gyroscope"][inside]))
+
+    def mean_rate(self, file: str) -> tuple[Values, str]:
+        """Return the mean rate of the longest rest, deg/s, (3,) array, and a note that states it."""
+        time, force, rate = (np.concatenate(column) for column in zip(*self.blocks, strict=True))
+        log = Recording("log", "rests", None, np.round(time * 1e9).astype(np.int64), force, rate)
+        rests = [r for r in find_rests(log) if r.accepted]
+        if not rests:
+            message = f"no rest of 1 s or more from {self.first:g} to {self.last:g} s of the log"
+            raise InputError(
+                f"{message}; --rest names seconds, from its first sample, in which the unit lies still", file
+            )
+        longest = max(rests, key=lambda r: r.stop - r.start)
+        still = rate[longest.start : longest.stop]
+        mean = still.mean(axis=0)
+        parts = np.array([part.mean(axis=0) for part in np.array_split(still, PARTS)])
+        error = parts.std(axis=0, ddof=1) / np.sqrt(PARTS)  # of the mean, where noise is correlated within a part too
+        words = ", ".join(f"{m:.4f} +- {K95 * e:.4f}" for m, e in zip(mean, error, strict=True))
+        at = time[[longest.start, longest.stop - 1]] - self.begin
+        return mean, (
+            f"mean rate of the rest from {at[0]:.1f} to {at[1]:.1f} s of the log, subtracted from all rates: {words} "
+            f"deg/s (x, y, z; +- is the 95 % interval by the scatter of {PARTS} parts of the rest)"
+        )
+
+
+def with_bias_changed(compensation: Compensation, rate: Values) -> Compensation:
+    """Return the compensation with the gyroscope's bias of which ``rate``, deg/s, is left at rest: (3,) array."""
+    gyroscope = compensation.gyroscope
+    assert gyroscope is not None  # noqa: S101  (``apply`` refuses it before)
+    bias = gyroscope.bias + np.linalg.solve(gyroscope.matrix, rate)
+    return replace(compensation, gyroscope=replace(gyroscope, bias=bias))
