@@ -95,8 +95,8 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
     look = sensed.part(slice(None, None, max(1, len(sensed.time) // SAMPLES_OF_A_LOOK)))
     places = _places(look, signals)
     for resting in (True, False):
-        left = np.array([_left(look, signals, place, beyond=resting) for place in places])
-        order = np.argsort(left)
+        residuals = np.array([_left(look, signals, place, beyond=resting) for place in places])
+        order = np.argsort(residuals)
         best = places[int(order[0])]
         fit = _refine(sensed if resting else sensed.part(signals.covers(sensed.time + best)), signals, best)
         if fit.correlation > SMALLEST_CORRELATION:
@@ -108,7 +108,7 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
         )
         hint = "do both logs belong to one recording, and are their units right?"
         raise IngestError(message, log.path, code="no_sync", hint=hint)
-    if len(order) > 1 and left[order[1]] < AMBIGUOUS * left[order[0]]:
+    if len(order) > 1 and residuals[order[1]] < AMBIGUOUS * residuals[order[0]]:
         message = (
             f"the motion repeats itself: the table's log fits at {best:.3f} and {places[int(order[1])]:.3f} s alike"
         )
@@ -162,11 +162,11 @@ def _left(sensed: SensorSignals, signals: Signals, offset: float, *, beyond: boo
         return np.inf
     covered = sensed if beyond else sensed.part(inside)
     rates, directions, *_ = signals.at(covered.time + offset)
-    left = 0.0
+    total = 0.0
     for columns, readings, noise in _groups(covered, rates, directions):
         Q = np.linalg.qr(columns)[0]
-        left += float(np.sum(((readings - Q @ (Q.T @ readings)) / noise) ** 2))
-    return left / len(covered.time)
+        total += float(np.sum(((readings - Q @ (Q.T @ readings)) / noise) ** 2))
+    return total / len(covered.time)
 
 
 def _groups(sensed: SensorSignals, rates: Values, directions: Values) -> list[tuple[Values, Values, Values]]:

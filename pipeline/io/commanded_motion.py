@@ -42,10 +42,10 @@ def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) ->
     """
     pause = {"rest_s": BEFORE_S}
     commanded = Program([pause, *_flat(program), pause])
-    own = np.arange(0.0, commanded.duration, STEP_S)
-    angle, rate, *_ = commanded.at(own)
+    times = np.arange(0.0, commanded.duration, STEP_S)
+    angle, rate, *_ = commanded.at(times)
     log = {"table_angle": angle, "table_rate": rate}
-    fit = fit_clocks(table, ChannelTable(table.path, np.rint(own * 1e9).astype(np.int64), log, table.source))
+    fit = fit_clocks(table, ChannelTable(table.path, np.rint(times * 1e9).astype(np.int64), log, table.source))
     t = seconds_of(table)
     tau, shifts, drift, begun = _place(table, commanded, t, fit.table_time(t))
     angle, rate, *_ = commanded.at(tau)

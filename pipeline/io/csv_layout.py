@@ -203,17 +203,17 @@ def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> I
     """
     worst = next((f for f in faults if f.kind == "restarted"), faults[0])
     others = [str(f.line) for f in faults if f is not worst]
-    said = ""
+    others_text = ""
     if others:
         count = f"at least {len(others)}" if more else str(len(others))
         kinds = sorted({f.kind for f in faults} - {worst.kind})
         other = f", {', '.join(kinds)} among them" if kinds else ""
-        said = f" ({count} more {'such' if not kinds else 'bad'} lines{other}, up to line {faults[-1].line}"
+        others_text = f" ({count} more {'such' if not kinds else 'bad'} lines{other}, up to line {faults[-1].line}"
         if len(others) > 1:
-            said += f": {', '.join(others[: LISTED - 1])}{' ..' if len(others) >= LISTED else ''}"
-        said += ")"
+            others_text += f": {', '.join(others[: LISTED - 1])}{' ..' if len(others) >= LISTED else ''}"
+        others_text += ")"
     hint = "; ".join(dict.fromkeys(HINTS[f.kind] for f in (worst, *faults)))
-    return IngestError(worst.message + said, f"{layout.path}:{worst.line}", code=worst.kind, hint=hint)
+    return IngestError(worst.message + others_text, f"{layout.path}:{worst.line}", code=worst.kind, hint=hint)
 
 
 def find_faults(layout: Layout, body: bytes, lines: Integers, before: tuple[int, str] | None) -> Iterator[Fault]:

@@ -103,17 +103,17 @@ def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
     from pipeline.io.clock_alignment import fit_clocks  # noqa: PLC0415  (it reads the signals of this module)
 
     log = unwrapped(log)
-    t, own = seconds_of(sensor), seconds_of(log)
-    if len(own) < FEWEST_ROWS:
-        message = f"the table's log has {len(own)} rows; at least {FEWEST_ROWS} are needed"
+    t, log_time = seconds_of(sensor), seconds_of(log)
+    if len(log_time) < FEWEST_ROWS:
+        message = f"the table's log has {len(log_time)} rows; at least {FEWEST_ROWS} are needed"
         raise IngestError(message, log.path, code="no_sync")
     if signals_of(log).resting:
-        tau = np.clip(t, 0.0, own[-1])
+        tau = np.clip(t, 0.0, log_time[-1])
         note = Note("N-SYNC", len(t), 0, 0, "the table rests throughout its log: there is no motion to align by")
         return _merged(sensor, log, slice(0, len(t)), tau, {}, [note])
     fit = fit_clocks(sensor, log)
     tau = fit.table_time(t)
-    inside = np.flatnonzero((tau >= 0) & (tau <= own[-1]))
+    inside = np.flatnonzero((tau >= 0) & (tau <= log_time[-1]))
     if inside.size < 2:
         raise IngestError("no time is covered by both logs", log.path, code="no_sync")
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
@@ -152,21 +152,21 @@ def _merged(  # noqa: PLR0917  (parts of one table)
     same, found = log.source is sensor.source, interpolators(log)
     part = sensor.select(rows, *(() if same else log.notes), *notes)
     joined = {} if same else {"joined": [*sensor.source.get("joined", []), log.source]}
-    own = {c: v for c, v in part.values.items() if c not in log.values and c != TABLE_TIME}
+    sensor_channels = {c: v for c, v in part.values.items() if c not in log.values and c != TABLE_TIME}
     return replace(
         part,
-        values=own | {channel: at(tau) for channel, at in found.items()},
+        values=sensor_channels | {channel: at(tau) for channel, at in found.items()},
         source=sensor.source | ({"table_clock": clock} if clock else {}) | joined,
     )
 
 
 def signals_of(log: ChannelTable) -> Signals:
     """Return the signals of a table's motion; raise ``IngestError`` for a log without rate, angle and attitude."""
-    own = seconds_of(log)
+    log_time = seconds_of(log)
     found = interpolators(log)
-    step = max(FINEST_OF_ATTITUDE_S if ATTITUDE[0] in found else FINEST_S, own[-1] / MOST_POINTS)
-    grid = step * np.arange(int(own[-1] / step) + 1)
-    interval = float(np.median(np.diff(own)))
+    step = max(FINEST_OF_ATTITUDE_S if ATTITUDE[0] in found else FINEST_S, log_time[-1] / MOST_POINTS)
+    grid = step * np.arange(int(log_time[-1] / step) + 1)
+    interval = float(np.median(np.diff(log_time)))
     if ATTITUDE[0] in found:
         q = np.column_stack([found[c](grid) for c in ATTITUDE])
         rates = np.degrees(2.0 * conjugate_product(q, np.gradient(q, step, axis=0)))  # 2 vec(conj(q) dq/dt)
@@ -189,26 +189,26 @@ def seconds_of(table: ChannelTable) -> Values:
 
 def interpolators(log: ChannelTable) -> dict[str, Callable[[Values], Values]]:
     """Return an interpolating function of the table's time, s, for each channel."""
-    own, values = seconds_of(log), log.values
+    log_time, values = seconds_of(log), log.values
     out: dict[str, Callable[[Values], Values]] = {}
     rate = values.get("table_rate")
     if rate is not None:
-        out["table_rate"] = lambda tau: _bent_line(own, rate, tau)
+        out["table_rate"] = lambda tau: _bent_line(log_time, rate, tau)
     if "table_angle" in values:
         angle = values["table_angle"]
-        slope = np.gradient(angle, own)
+        slope = np.gradient(angle, log_time)
         if rate is not None and np.ptp(rate) > 0 and np.ptp(slope) > 0 and np.corrcoef(slope, rate)[0, 1] > SAME_SIGN:
             slope = rate  # it holds the sign as well
         from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (0.3 s, needed by tables' logs alone)
 
-        cubic = CubicHermiteSpline(own, angle, slope)
-        out["table_angle"] = lambda tau: cubic(np.clip(tau, own[0], own[-1]))
+        cubic = CubicHermiteSpline(log_time, angle, slope)
+        out["table_angle"] = lambda tau: cubic(np.clip(tau, log_time[0], log_time[-1]))
     if ATTITUDE[0] in values:
         from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs alone)
 
-        spline = make_interp_spline(own, continuous(np.column_stack([values[c] for c in ATTITUDE])), k=5)
+        spline = make_interp_spline(log_time, continuous(np.column_stack([values[c] for c in ATTITUDE])), k=5)
         for index, channel in enumerate(ATTITUDE):
-            out[channel] = lambda tau, i=index: _unit(spline(np.clip(tau, 0.0, own[-1])))[:, i]  # type: ignore[misc]
+            out[channel] = lambda tau, i=index: _unit(spline(np.clip(tau, 0.0, log_time[-1])))[:, i]  # type: ignore[misc]
     return out
 
 
@@ -216,22 +216,22 @@ def _unit(q: Values) -> Values:
     return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
 
 
-def _bent_line(own: Values, value: Values, tau: Values) -> Values:
+def _bent_line(log_time: Values, value: Values, tau: Values) -> Values:
     """Interpolate linearly, with a bend within an interval where the lines of its two neighbours meet in it.
 
     At a bend the slope changes by far more than elsewhere.
     """
-    tau = np.clip(tau, own[0], own[-1])
-    plain: Values = np.interp(tau, own, value)
-    slope = np.diff(value) / np.diff(own)
+    tau = np.clip(tau, log_time[0], log_time[-1])
+    plain: Values = np.interp(tau, log_time, value)
+    slope = np.diff(value) / np.diff(log_time)
     if len(slope) < 3:
         return plain
     change = np.abs(slope[2:] - slope[:-2])
-    k = np.clip(np.searchsorted(own, tau, side="right") - 1, 1, len(own) - 3)
+    k = np.clip(np.searchsorted(log_time, tau, side="right") - 1, 1, len(log_time) - 3)
     before, after = slope[k - 1], slope[k + 1]
-    left = value[k] + before * (tau - own[k])
-    right = value[k + 1] + after * (tau - own[k + 1])
-    ahead, h = value[k + 1] - value[k], own[k + 1] - own[k]
+    left = value[k] + before * (tau - log_time[k])
+    right = value[k + 1] + after * (tau - log_time[k + 1])
+    ahead, h = value[k + 1] - value[k], log_time[k + 1] - log_time[k]
     meet = (before * h - ahead) * (after * h - ahead) <= 0  # the slope lies between the slopes on either side
-    bent = meet & (change[k - 1] > BENT * np.median(change)) & (tau >= own[1]) & (tau <= own[-2])
+    bent = meet & (change[k - 1] > BENT * np.median(change)) & (tau >= log_time[1]) & (tau <= log_time[-2])
     return np.where(bent, np.where(before > after, np.minimum(left, right), np.maximum(left, right)), plain)

@@ -143,11 +143,11 @@ def declared_scale(table: ChannelTable) -> tuple[float, str] | None:
     if len(moves) < FEWEST_MOVES:
         return None
     scales = (1.0, DEGREES, 1 / DEGREES)
-    left = misfit_deg(moves, scales)
-    best = int(np.argmin(left))
-    if left[0] < FAILS_DEG or left[best] > FITS_DEG:
+    misfits = misfit_deg(moves, scales)
+    best = int(np.argmin(misfits))
+    if misfits[0] < FAILS_DEG or misfits[best] > FITS_DEG:
         return None
     return 1 / scales[best], (
         f"in {len(moves)} moves between rests gravity turns as the rates do if they are multiplied by "
-        f"{scales[best]:.4g} ({left[best]:.1f} deg are left, {left[0]:.0f} deg as declared)"
+        f"{scales[best]:.4g} ({misfits[best]:.1f} deg are left, {misfits[0]:.0f} deg as declared)"
     )

@@ -194,10 +194,10 @@ def validated(model: type[S], section: Any, where: str, given: Mapping[str, Any]
     except ValidationError as error:
         first = error.errors()[0]
     key = str(first["loc"][0]) if first["loc"] else ""
-    said = str(first["ctx"]["error"]) if first["type"] == "value_error" else ""
+    reason = str(first["ctx"]["error"]) if first["type"] == "value_error" else ""
     if not key:
-        raise ConfigurationError(f"{where}.{said}")
-    expected = said or f"it is {model.model_fields[key].description or 'required'}"
+        raise ConfigurationError(f"{where}.{reason}")
+    expected = reason or f"it is {model.model_fields[key].description or 'required'}"
     raise ConfigurationError(f"{where}.{key} is {section.get(key)!r}; {expected}")
 
 
@@ -258,13 +258,13 @@ def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
 def _check_channels(formats: Sequence[CsvFormat]) -> None:
     """Raise ``ConfigurationError`` for a profile without time, without a sensor, or with an incomplete sensor."""
     readings, channels = {*ACCELEROMETER, *GYROSCOPE}, [{c.channel for c in layout.columns} for layout in formats]
-    for layout, own in zip(formats, channels, strict=True):
-        if layout.own_clock and (own & readings or TIME not in own):
+    for layout, in_part in zip(formats, channels, strict=True):
+        if layout.own_clock and (in_part & readings or TIME not in in_part):
             raise ConfigurationError(
                 "ingest.csv.parts: a part with own_clock is a table's log with its time; it holds "
-                f"{', '.join(sorted(own & readings)) or 'no time'}"
+                f"{', '.join(sorted(in_part & readings)) or 'no time'}"
             )
-        if (TIME in own) == (layout.rate_hz is not None):
+        if (TIME in in_part) == (layout.rate_hz is not None):
             raise ConfigurationError(
                 "ingest.csv needs either a time column (columns.time) or the sampling rate (rate_hz), in every part"
             )

@@ -151,7 +151,7 @@ class _Log:
             from pipeline.io.encoder_log import align  # noqa: PLC0415  (few logs need it)
 
             for log in self.table_logs:
-                table = align(table, log)
+                table = align(table, replace(log, source=table.source))  # of the same file
         return table
 
     def _only(self, kind: str, *, required: bool) -> list[_Topic]:

@@ -147,9 +147,9 @@ def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
     heads = _heads(data, starts)
     rows = []
     for channel in np.unique(heads["channel"]).tolist():
-        own = heads["channel"] == channel
-        sizes = heads["length"][own].astype(np.int64) - MESSAGE_HEAD
-        rows.append(Rows(channel, data, heads[own], starts[own] + HEAD.itemsize, sizes, 0, run.name, run.offset))
+        mask = heads["channel"] == channel
+        sizes = heads["length"][mask].astype(np.int64) - MESSAGE_HEAD
+        rows.append(Rows(channel, data, heads[mask], starts[mask] + HEAD.itemsize, sizes, 0, run.name, run.offset))
     return others, rows
 
 

@@ -147,13 +147,13 @@ class McapReader(MessageReader):
 
     def _record(self) -> tuple[int, bytes, bytes]:
         """Return the kind, the head (nine bytes) and the content of the next record."""
-        self._start, left = self.position, self.size - self.position - RECORD_HEAD
-        if left == -RECORD_HEAD:
+        self._start, available = self.position, self.size - self.position - RECORD_HEAD
+        if available == -RECORD_HEAD:
             raise _TruncatedError("it ends after a complete record; the recorder did not close it")
         head = self._take(RECORD_HEAD)
         opcode, length = _RECORD.unpack(head)
-        if length > left:
-            what = f"a record of kind {opcode} claims {length} bytes where {left} are left"
+        if length > available:
+            what = f"a record of kind {opcode} claims {length} bytes where {available} are left"
             raise _TruncatedError(what) if opcode in _KINDS else ValueError(what)
         if opcode == 0:
             raise ValueError("a record has the kind 0, which none has")

@@ -215,23 +215,23 @@ class TopicDecoder:
 
     def _by_layout(self, rows: Rows, find: FindLayout) -> Iterator[tuple[Index, MessageLayout]]:
         """Yield the indices of the messages of each layout, and the layout."""
-        left = np.arange(len(rows.starts))
+        remaining = np.arange(len(rows.starts))
         layout = self._layouts.get(rows.channel)
         for _ in range(MOST_LAYOUTS):
-            rest = rows.select(left)
-            own = np.zeros(0, np.intp) if layout is None else layout.matching(rest)
-            if not own.size or own[0]:
-                layout = self._layouts[rows.channel] = self._in_message(int(left[0]), rows, find)
-                own = layout.matching(rest)
+            rest = rows.select(remaining)
+            matching = np.zeros(0, np.intp) if layout is None else layout.matching(rest)
+            if not matching.size or matching[0]:
+                layout = self._layouts[rows.channel] = self._in_message(int(remaining[0]), rows, find)
+                matching = layout.matching(rest)
             assert layout is not None  # noqa: S101  (found above)
-            yield left[own], layout
-            if len(own) == len(left):
+            yield remaining[matching], layout
+            if len(matching) == len(remaining):
                 return
-            left = np.delete(left, own)
-        for row in left.tolist():
+            remaining = np.delete(remaining, matching)
+        for row in remaining.tolist():
             yield np.array([row]), self._in_message(row, rows, find)
 
-    def _columns(self, rows: Rows, own: Index, layout: MessageLayout) -> Batch:
+    def _columns(self, rows: Rows, indices: Index, layout: MessageLayout) -> Batch:
         """Return times and columns of the messages of one layout; a column is NaN where the list is empty."""
 
         def find(_: bytes) -> dict[str, tuple[int, str] | None]:
@@ -243,15 +243,15 @@ class TopicDecoder:
                 return of_pair(found[SECONDS], found[NANOSECONDS])
             return of_number(found[SECONDS], self._time_unit) if SECONDS in found else None
 
-        places = self._in_message(int(own[0]), rows, find)
-        found = layout.columns(rows.select(own), {n: place for n, place in places.items() if place is not None})
-        time_ns = self._in_message(int(own[0]), rows, moments)
+        places = self._in_message(int(indices[0]), rows, find)
+        found = layout.columns(rows.select(indices), {n: place for n, place in places.items() if place is not None})
+        time_ns = self._in_message(int(indices[0]), rows, moments)
         self.coarse_time |= SECONDS in found and found[SECONDS].dtype.kind == "f"
-        empty, columns = np.full(len(own), np.nan), {}
+        empty, columns = np.full(len(indices), np.nan), {}
         for name in self._paths:
             columns[name] = found[name].astype(np.float64) if name in found else empty
             absent = columns[name] == -1.0 if name in VECTORS else np.array([name not in found])  # the same in all
-            self._note_absent(name, absent, own)
+            self._note_absent(name, absent, indices)
         return Batch(time_ns, columns)
 
     def _decoded(self, rows: Rows, decode: Decode) -> Batch:
@@ -299,14 +299,14 @@ class TopicDecoder:
                 )
                 raise IngestError(message, self.path, code="other_unit", hint=f"write unit: {unit} for {channel}")
 
-    def _note_absent(self, name: str, absent: Mask, own: Index) -> None:
+    def _note_absent(self, name: str, absent: Mask, index: Index) -> None:
         """Raise ``IngestError`` if a quantity is absent in some messages only; ``own``: indices of the messages."""
         before = self._absent.setdefault(name, bool(absent[0]))
         changed = np.flatnonzero(absent != before)
         if changed.size:
             covariance = name in VECTORS
             what = f"{name} is absent (covariance -1)" if covariance else f"{self._paths[name].text} is empty"
-            message = f"{what} in some messages on {self.topic}, see message {self.count + int(own[changed[0]]) + 1}"
+            message = f"{what} in some messages on {self.topic}, see message {self.count + int(index[changed[0]]) + 1}"
             raise IngestError(message, self.path, code="absent" if covariance else "bad_message")
 
 

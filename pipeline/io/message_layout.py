@@ -146,15 +146,15 @@ class MessageLayout:
 
     def matching(self, rows: Rows) -> Index:
         """Return the indices of the messages with this layout."""
-        own = np.flatnonzero(rows.sizes == len(self.sample))
-        if not own.size:
-            return own
+        same_size = np.flatnonzero(rows.sizes == len(self.sample))
+        if not same_size.size:
+            return same_size
         words = [word for span in self.fixed for word in _words(*span)]
-        table = rows.select(own).table(self._items({f"{at}": (at, f"<u{width}") for at, width in words}))
-        same = np.ones(len(own), np.bool_)
+        table = rows.select(same_size).table(self._items({f"{at}": (at, f"<u{width}") for at, width in words}))
+        same = np.ones(len(same_size), np.bool_)
         for at, width in words:
             same &= table[f"{at}"] == int.from_bytes(self.sample[at : at + width], "little")
-        return own[same]
+        return same_size[same]
 
     def columns(self, rows: Rows, wanted: dict[str, tuple[int, str]]) -> dict[str, NDArray[np.generic]]:
         """Return columns of all messages as copies; ``wanted``: name to (offset, type)."""

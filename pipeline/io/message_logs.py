@@ -179,9 +179,9 @@ def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[Messag
 def _of_ulog(log: LogReader) -> Iterator[Rows]:
     from pyulog import ULog  # noqa: PLC0415  (an extra)
 
-    with log.file.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()) as said:
+    with log.file.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()) as output:
         ulog = ULog(stream)
-    complaint = said.getvalue().partition("\n")[0]
+    complaint = output.getvalue().partition("\n")[0]
     if ulog.file_corruption or "corrupt" in complaint:
         message = f"damaged ULog file: {complaint or 'a part of it is no message'}"
         raise IngestError(message, log.path, hint=COPY_AGAIN)
@@ -251,9 +251,9 @@ def _of_dataflash(log: LogReader) -> Iterator[Rows]:
         units = {n: known.get_unit(n) for n in columns}
         instance = table[known.instance_field] if known.instance_field in columns else np.zeros(len(table), np.int64)
         for sensor in np.unique(instance).tolist():
-            own = instance == sensor
-            times = table[TIME][own].astype(np.int64) * 1000
-            part = {n: c[own] for n, c in columns.items()}
+            of_sensor = instance == sensor
+            times = table[TIME][of_sensor].astype(np.int64) * 1000
+            part = {n: c[of_sensor] for n, c in columns.items()}
             yield _of_columns(log, _instance(known.name, sensor), part, units, times)
 
 
@@ -304,9 +304,9 @@ def _by_length(log: LogReader, place: str, arrays: Columns, units: Mapping[str, 
     """Yield the arrays of a group as topics, one for each length."""
     lengths = sorted({len(a) for a in arrays.values()})
     for length in lengths:
-        own = {n: a for n, a in arrays.items() if len(a) == length}
-        name = (place or "/") if len(lengths) == 1 else f"{place}/{min(own)}"
-        yield _of_columns(log, name, own, {n: u for n, u in units.items() if n in own})
+        of_length = {n: a for n, a in arrays.items() if len(a) == length}
+        name = (place or "/") if len(lengths) == 1 else f"{place}/{min(of_length)}"
+        yield _of_columns(log, name, of_length, {n: u for n, u in units.items() if n in of_length})
 
 
 def _samples(array: NDArray[Any]) -> NDArray[Any] | None:

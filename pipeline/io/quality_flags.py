@@ -178,13 +178,13 @@ def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[n
     notes = []
     flags[every] |= STUCK
     for rows in [every] if where else stretches:
-        own = {channel: stuck[0] for channel, at in found.items() if (stuck := at[np.isin(at, rows)]).size}
-        channel, row = next(iter(own.items()))
+        first_rows = {channel: stuck[0] for channel, at in found.items() if (stuck := at[np.isin(at, rows)]).size}
+        channel, row = next(iter(first_rows.items()))
         unit = next(SENSOR_UNITS[sensor] for sensor, triad in TRIADS.items() if channel in triad)
         one = f"stays at {table.values[channel][row] + 0.0:.6g} {unit}"
-        stay = one if len(own) == 1 and not where else f"stay{'s' * (len(own) == 1)} at one value{where}"
+        stay = one if len(first_rows) == 1 and not where else f"stay{'s' * (len(first_rows) == 1)} at one value{where}"
         first, last = int(rows[0]), int(rows[-1])
-        detail = f"{', '.join(own)} {stay} for longer than noise allows"
+        detail = f"{', '.join(first_rows)} {stay} for longer than noise allows"
         if not where:
             detail += f", for {(table.time_ns[last] - table.time_ns[first]) / 1e9:.3g} s"
         if not where and "table_angle" in table.values:

@@ -52,8 +52,8 @@ def read_recordings(
     refused: list[InputError] = []
     for name, candidates in candidate_files(procedure, ingest).items():
         entry = procedure["recordings"][name]
-        there = [[f for f in files if os.path.exists(f"{folder}/{f}")] for files in candidates]  # noqa: PTH110  (fast)
-        files, wanted = next(((f, c) for f, c in zip(there, candidates, strict=True) if f), ([], []))
+        present = [[f for f in files if os.path.exists(f"{folder}/{f}")] for files in candidates]  # noqa: PTH110  (fast)
+        files, wanted = next(((f, c) for f, c in zip(present, candidates, strict=True) if f), ([], []))
         if not files:
             missing += [] if entry.get("optional", False) else [f"{name} (tried {_tried(candidates)})"]
             continue
@@ -67,7 +67,7 @@ def read_recordings(
         except IngestError as error:
             refused.append(error)
             continue
-        other = [f for existing in there for f in existing if f not in files]
+        other = [f for existing in present for f in existing if f not in files]
         if other:
             detail = f"{', '.join(other)} exists too and was not read"
             recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(other), 0, 0, detail)))
@@ -154,10 +154,10 @@ def to_recording(
             hint = "one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]"
             raise IngestError(message, table.path, code="gcsv", hint=hint)
         maps = dict.fromkeys(TRIADS, map_of_orientation(stated))
-    left = [s for s, m in maps.items() if np.linalg.det(axis_matrix(m)) < 0 and TRIADS[s][0] in values]
-    if left:  # not a rotation: some sensors have left-handed axes, so that the map is used
-        detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left)
-        notes.insert(0, Note("N-LEFTHANDED", len(left), 0, 0, f"left-handed axis map: {detail}"))
+    left_handed = [s for s, m in maps.items() if np.linalg.det(axis_matrix(m)) < 0 and TRIADS[s][0] in values]
+    if left_handed:  # not a rotation: some sensors have left-handed axes, so that the map is used
+        detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left_handed)
+        notes.insert(0, Note("N-LEFTHANDED", len(left_handed), 0, 0, f"left-handed axis map: {detail}"))
     readings: dict[str, Values | None] = dict.fromkeys(TRIADS)
     for which, triad in TRIADS.items():
         stacked = _stack(values, triad)

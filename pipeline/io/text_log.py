@@ -203,9 +203,9 @@ class TextLog:
 
     def _chunks(self) -> Iterator[bytes]:
         """Yield the bytes of the file without byte order mark and without NUL bytes at its end."""
-        position, left = 0, os.fstat(self.stream.fileno()).st_size  # a file that grows is not followed
-        while chunk := self.stream.read(min(self.size, left)):
-            left -= len(chunk)
+        position, remaining = 0, os.fstat(self.stream.fileno()).st_size  # a file that grows is not followed
+        while chunk := self.stream.read(min(self.size, remaining)):
+            remaining -= len(chunk)
             self.digest.update(chunk)
             if position == 0:
                 refuse_foreign(chunk[:16], self.path)
@@ -214,7 +214,7 @@ class TextLog:
                     self.first_notes.append(Note("N-BOM", 1, 1, 1, detail))
                     chunk = chunk.removeprefix(BOM)
             if b"\0" in chunk:
-                rest = self.stream.read(left)
+                rest = self.stream.read(remaining)
                 self.digest.update(rest)
                 data = self._without_nul(chunk + rest, position)
                 yield from (data[start : start + self.size] for start in range(0, len(data), self.size))

@@ -120,13 +120,13 @@ def sorted_once(time: Integers, columns: Iterable[NDArray[Any]]) -> tuple[Index,
     NaN is equal to NaN.
     """
     order = np.argsort(time, kind="stable")
-    again = np.flatnonzero(np.diff(time[order]) == 0) + 1
-    one, other = order[again - 1], order[again]
-    same = np.ones(len(again), np.bool_)
+    repeats = np.flatnonzero(np.diff(time[order]) == 0) + 1
+    one, other = order[repeats - 1], order[repeats]
+    same = np.ones(len(repeats), np.bool_)
     for column in columns:
         both_nan = np.isnan(column[one]) & np.isnan(column[other]) if column.dtype.kind == "f" else False
         same &= (column[one] == column[other]) | both_nan
-    return order, again, same
+    return order, repeats, same
 
 
 def in_order(
@@ -151,22 +151,22 @@ def in_order(
         allowed = f"up to {reorder_s:g} s are put in order: ingest.mcap.reorder_s"
         hint = f"a log that was restarted belongs in two files ({allowed})"
         raise IngestError(message, path, code="bad_time", hint=hint)
-    order, again, same = sorted_once(time, columns)
+    order, repeats, same = sorted_once(time, columns)
     inversions = int((steps < 0).sum())
     if inversions:
         detail = f"times on {topic} go back {inversions} times, by up to {late.max() / 1e9:.9g} s; sorted by time"
         notes.append(Note("N-SORT", inversions, 0, 0, detail))
-    if again.size:
+    if repeats.size:
         if not same.all():
-            place = again[np.argmin(same)]
+            place = repeats[np.argmin(same)]
             one, other = order[place - 1], order[place]
             message = (
                 f"message {other + 1} on {topic}: header stamp {time[other] / 1e9:.9g} s as message {one + 1}, with "
                 f"other numbers ({int((~same).sum())} such messages)"
             )
             raise IngestError(message, path, code="bad_time", hint="two sensors may send on one topic")
-        notes.append(Note("N-DUP", int(again.size), 0, 0, f"messages on {topic} that stand there twice were dropped"))
-        order = np.delete(order, again)
+        notes.append(Note("N-DUP", int(repeats.size), 0, 0, f"messages on {topic} that stand there twice were dropped"))
+        order = np.delete(order, repeats)
     return order, notes
 
 

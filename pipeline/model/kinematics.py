@@ -214,17 +214,17 @@ def _motion_of_attitude(
 
     def at(before: float | Values, offset: float | Values = 0.0) -> Motion:
         offset = before + offset
-        there = (time + offset) * clock
-        q = spline(there) if np.any(offset) else attitude
+        table_time = (time + offset) * clock
+        q = spline(table_time) if np.any(offset) else attitude
         level = attitude_matrix(q)
         force = gravity_g * level[:, 2, :]
-        omega = np.degrees(2.0 * conjugate_product(q, spline(there, 1)))
+        omega = np.degrees(2.0 * conjugate_product(q, spline(table_time, 1)))
         return logged(
             Motion(
                 time=time,
                 specific_force=force,
                 angular_rate=omega if earth is None else omega + np.einsum("i,nij->nj", earth, level),
-                angular_acceleration=np.degrees(2.0 * conjugate_product(q, spline(there, 2))),
+                angular_acceleration=np.degrees(2.0 * conjugate_product(q, spline(table_time, 2))),
                 specific_force_rate=-np.cross(np.radians(omega), force),
                 temperature=None,
                 angle=None,

@@ -179,18 +179,18 @@ class ExponentialRegression:
 
     def _along(self, time: Values, temperature: Values) -> Values:
         """Return the line within a stretch; from one known sample, its temperature."""
-        at = time - self._stretch * (STRETCH * self.memory)
+        since = time - self._stretch * (STRETCH * self.memory)
         missing = np.isnan(temperature)
         excess = np.where(missing, 0.0, temperature - REFERENCE_TEMPERATURE)
-        weight = np.where(missing, 0.0, np.exp(at / self.memory))
-        weighted_time = weight * at
-        terms = np.array([weight, weighted_time, weighted_time * at, weight * excess, weighted_time * excess])
+        weight = np.where(missing, 0.0, np.exp(since / self.memory))
+        weighted_time = weight * since
+        terms = np.array([weight, weighted_time, weighted_time * since, weight * excess, weighted_time * excess])
         sums = np.add.accumulate(np.column_stack([self._sums, terms]), axis=1)[:, 1:]
         self._sums = sums[:, -1]
         s0, s1, s2, r0, r1 = sums
-        first, second = s1 - at * s0, s2 - 2.0 * at * s1 + at * at * s0
+        first, second = s1 - since * s0, s2 - 2.0 * since * s1 + since * since * s0
         determinant = s0 * second - first * first
         sloping = determinant > DEGENERATE * s0 * s0 * self.memory * self.memory
-        value = np.divide(r0, s0, out=np.full(len(at), np.nan), where=s0 > 0)
-        np.divide(second * r0 - first * (r1 - at * r0), determinant, out=value, where=sloping)
+        value = np.divide(r0, s0, out=np.full(len(since), np.nan), where=s0 > 0)
+        np.divide(second * r0 - first * (r1 - since * r0), determinant, out=value, where=sloping)
         return np.asarray(value + REFERENCE_TEMPERATURE, np.float64)

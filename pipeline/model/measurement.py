@@ -76,10 +76,10 @@ def compensate(
     ``effects``: those to subtract, by default all effects of the sensor. Errors as of ``solve``.
     """
     sensor = calibration.sensor
-    own = "specific_force" if sensor == "accelerometer" else "angular_rate"
+    field = "specific_force" if sensor == "accelerometer" else "angular_rate"
 
     def motion_at(truths: Truths, _number: int) -> Motion:
-        return replace(motion, **{own: truths[sensor]})  # type: ignore[arg-type]
+        return replace(motion, **{field: truths[sensor]})  # type: ignore[arg-type]
 
     part = Part.of(calibration, sensor_effects(calibration) if effects is None else effects)
     return solve({sensor: part}, {sensor: reading}, motion_at)[sensor]

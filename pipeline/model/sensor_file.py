@@ -85,7 +85,7 @@ def without_overridden(sensor: dict[str, Any], keys: set[str]) -> dict[str, Any]
         sensor_config = sensor.get(part) if isinstance(sensor, dict) else None
         sensor_config = sensor_config if isinstance(sensor_config, dict) else {}
         assumed = sensor_config.get("assumed")
-        left = [key for key in assumed or () if f"sensor.{part}.{key}" not in keys]
-        if assumed and len(left) < len(assumed):
-            sensor = {**sensor, part: {**sensor_config, "assumed": left}}
+        remaining = [key for key in assumed or () if f"sensor.{part}.{key}" not in keys]
+        if assumed and len(remaining) < len(assumed):
+            sensor = {**sensor, part: {**sensor_config, "assumed": remaining}}
     return sensor

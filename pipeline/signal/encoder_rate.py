@@ -130,9 +130,9 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
         before, after = first in apart, last in apart
         around = slice(first if before else max(first - EDGE, 0), last if after else min(last + EDGE, n))
         vague[first : first + EDGE * before] = vague[max(last - EDGE * after, first) : last] = before or after
-        part, own = slice(first - around.start, last - around.start), slice(first, last)
+        part, span = slice(first - around.start, last - around.start), slice(first, last)
         if around.stop - around.start <= 2 * EDGE:
-            rate[own], noise[own] = np.gradient(angle[around], time[around])[part], np.sqrt(0.5) * error / interval
+            rate[span], noise[span] = np.gradient(angle[around], time[around])[part], np.sqrt(0.5) * error / interval
             continue
         size = error if step else (_errors(time[around], angle[around])[1] or error)
         found, spread = _stretch(time[around], angle[around], size)
@@ -140,7 +140,7 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
         start, stop = _longest_steady(slope)
         if stop - start >= MOSTLY * len(slope):
             spread = max(spread, _stretch(time[around][start:stop], angle[around][start:stop], size)[1])
-        smooth[own], noise[own], rate[own] = found[part], spread, slope[part]
+        smooth[span], noise[span], rate[span] = found[part], spread, slope[part]
     return EncoderRate(smooth, rate, noise, vague)
 
 

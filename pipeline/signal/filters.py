@@ -339,10 +339,10 @@ def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:
         block = slice(start, start + BLOCK)
         near = slice(*np.searchsorted(t, [t[block][0] - 5 * bandwidth, t[block][-1] + 5 * bandwidth]))
         x, n, v = (t[near] - t[block][0]) / bandwidth, count[near], value[near] - value[start]
-        at = (t[block] - t[block][0]) / bandwidth
-        weights = np.exp(-0.5 * (x - at[:, None]) ** 2)
+        middle = (t[block] - t[block][0]) / bandwidth
+        weights = np.exp(-0.5 * (x - middle[:, None]) ** 2)
         s0, s1, s2, r0, r1 = (weights @ np.stack([n, n * x, n * x * x, n * v, n * x * v], 1)).T
-        s1, s2, r1 = s1 - at * s0, s2 - at * (2.0 * s1 - at * s0), r1 - at * r0  # about the cell itself
+        s1, s2, r1 = s1 - middle * s0, s2 - middle * (2.0 * s1 - middle * s0), r1 - middle * r0  # about the cell itself
         determinant = s0 * s2 - s1 * s1
         alone = determinant <= 1e-12 * s0 * s0
         line = np.where(alone, r0 / s0, (s2 * r0 - s1 * r1) / np.where(alone, 1.0, determinant))

@@ -231,10 +231,10 @@ def _references(medians: Values, ends: Values) -> tuple[Values, Mask]:
         still = np.abs(ends[:, 0] - ends[:, 1]).max(axis=1) < RATE_LIMIT_DPS
         resting = ~(still & (np.abs(medians - middle).max(axis=1) > RATE_LIMIT_DPS))
         return np.where(resting[:, None], medians, middle), resting
-    for i, own in enumerate(medians):
+    for i, median_rate in enumerate(medians):
         first = int(np.clip(i - NEIGHBOURS // 2, 0, max(len(medians) - NEIGHBOURS, 0)))
         around = median(medians[first : first + NEIGHBOURS])
-        if np.abs(own - around).max() > RATE_LIMIT_DPS:
+        if np.abs(median_rate - around).max() > RATE_LIMIT_DPS:
             out[i], resting[i] = around, False
     return out, resting
 

@@ -229,18 +229,18 @@ def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) 
     acceleration, stay = course.acceleration_dps2, rest(course.dwell_s)
     steps = [rest(max(course.warm_up_rest_s, course.dwell_s))]
     axes: list[Values] = []
-    start = at = positions[0] @ rotation_by(tilt[0])
+    start = attitude = positions[0] @ rotation_by(tilt[0])
     upward = [int(np.argmax(positions[:, 2, axis])) for axis in range(3)]
     for face, axis in [*((f, None) for f in range(1, 6)), *zip(upward, range(3), strict=True)]:
         target = positions[face] @ rotation_by(tilt[face] + AGAIN * accuracy * rng.standard_normal(3))
-        about, angle = axis_and_angle(at.T @ target)
+        about, angle = axis_and_angle(attitude.T @ target)
         steps += [turn(angle, course.step_rate_dps, acceleration), stay]
         axes += [about] * bool(angle)
-        at = target
+        attitude = target
         for rate, sign in product(course.rates_dps, course.signs) if axis is not None else ():
             about = (np.eye(3)[axis] + off[axis]) / np.linalg.norm(np.eye(3)[axis] + off[axis])
             angle = sign * 360.0 * course.turns + course.turn_error_deg * float(rng.standard_normal())
             steps += [turn(angle, rate, acceleration), stay]
             axes.append(about)
-            at = at @ rotation_by(angle * about)
+            attitude = attitude @ rotation_by(angle * about)
     return Moves(Program(steps), np.array(axes), start)

@@ -189,11 +189,11 @@ class Eased(Gimbals):
 
     def angles(self, time: Values) -> tuple[Values, ...]:
         """Return the gimbal angles and their first two derivatives: three (3, n) arrays in deg and s."""
-        since, left = (np.clip(t / COMES_UP_S, 0.0, 1.0) for t in (time, self.duration - time))
+        since, remaining = (np.clip(t / COMES_UP_S, 0.0, 1.0) for t in (time, self.duration - time))
         between = np.clip(time - COMES_UP_S, 0.0, self.duration - 2.0 * COMES_UP_S)
-        run = COMES_UP_S * (_path(since) + 0.5 - _path(left)) + between
-        speed = _speed(since) * _speed(left)
-        change = (_growth(since) - _growth(left)) / COMES_UP_S
+        run = COMES_UP_S * (_path(since) + 0.5 - _path(remaining)) + between
+        speed = _speed(since) * _speed(remaining)
+        change = (_growth(since) - _growth(remaining)) / COMES_UP_S
         angle, rate, acceleration = super().angles(run)
         return angle, rate * speed, acceleration * speed**2 + rate * change
 

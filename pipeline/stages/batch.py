@@ -118,10 +118,10 @@ def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:
     packs = [*job.inputs.values(), *([Pack(Path(job.run["previous"]))] if job.run.get("previous") else [])]
     run = {key: value for key, value in job.run.items() if key not in {"previous", "again"}}
     found = hashlib.sha256(json.dumps([run, settings], sort_keys=True).encode())
-    own = (f"{unit}.", f"{unit}_")
+    prefixes = (f"{unit}.", f"{unit}_")
     try:
         for pack in packs:
-            for name in (n for n in pack.names() if n.startswith(own) and not n.endswith(INPUTS_OF)):
+            for name in (n for n in pack.names() if n.startswith(prefixes) and not n.endswith(INPUTS_OF)):
                 found.update(name.encode() + pack.read(name))
     except DamagedFileError:
         return ""
@@ -170,9 +170,9 @@ def merge_common(content: dict[str, Any]) -> dict[str, Any]:
     return content
 
 
-def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    below = {k: _merged(common[k], v) for k, v in own.items() if isinstance(v, dict) and k in common}
-    return {**common, **own, **below}
+def _merged(common: dict[str, Any], unit_settings: dict[str, Any]) -> dict[str, Any]:
+    below = {k: _merged(common[k], v) for k, v in unit_settings.items() if isinstance(v, dict) and k in common}
+    return {**common, **unit_settings, **below}
 
 
 def record_output(job: Job, output: Path, names: Sequence[str] = ("",)) -> None:

@@ -37,7 +37,7 @@ DIAGRAM = "reliability.svg"
 
 def page(cases: Sequence[JSON], command: str) -> str:
     """Return the page; ``command``: the command that reproduces it."""
-    said, families = table_of(cases), family_scores(cases)
+    answers, families = table_of(cases), family_scores(cases)
     text: str = template("study.md").render(
         command=command,
         code=" and ".join(sorted({f"`{case['code']}`" for case in cases if "code" in case})) or "unknown",
@@ -45,10 +45,10 @@ def page(cases: Sequence[JSON], command: str) -> str:
         answers=[score.cells for score in answer_scores(cases)],
         reliable=[[f"{float(name):.2g}", *cells] for name, *cells, _ in (bin_.cells for bin_ in reliability(cases))],
         diagram=DIAGRAM,
-        by_size=found_at(said),
+        by_size=found_at(answers),
         by_signal=by_signal(cases),
-        confusions=confusions(said),
-        instead=instead(said),
+        confusions=confusions(answers),
+        instead=instead(answers),
         shapes=of_shapes(cases),
         misses=_misses(cases, families),
         faults=[[case["key"], case["error"]] for case in cases if "error" in case],
@@ -82,9 +82,9 @@ def _said(case: JSON) -> str:
     return " + ".join(case["selected"]) or "nothing"
 
 
-def found_at(said: pd.DataFrame) -> Rows:
+def found_at(answers: pd.DataFrame) -> Rows:
     """Return for each sensor and effect in how many cases of each size it was selected first, ``n of m``."""
-    rows_of_size = said[said["family"].isin(OF_SIZE) & (said["model"] == "mpu6050")]
+    rows_of_size = answers[answers["family"].isin(OF_SIZE) & (answers["model"] == "mpu6050")]
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for (sensor, name, size), first in rows_of_size.groupby(["sensor", "hidden", "family"])["first"]:
         row = rows.setdefault((sensor, name), dict.fromkeys(OF_SIZE, ""))
@@ -92,16 +92,16 @@ def found_at(said: pd.DataFrame) -> Rows:
     return [[sensor, f"`{name}`", *row.values()] for (sensor, name), row in rows.items()]
 
 
-def confusions(said: pd.DataFrame) -> Rows:
+def confusions(answers: pd.DataFrame) -> Rows:
     """Return how often another effect was named for one hidden effect, the most frequent first."""
-    wrong = said[~said["left_out"] & (said["family"] != "unseen") & ~said["alone"]]
+    wrong = answers[~answers["left_out"] & (answers["family"] != "unseen") & ~answers["alone"]]
     counts = wrong.groupby(["sensor", "hidden", "said"]).size().sort_values(ascending=False, kind="stable")
     return [[sensor, f"`{name}`", other, count] for (sensor, name, other), count in counts.items()]
 
 
-def instead(said: pd.DataFrame) -> Rows:
+def instead(answers: pd.DataFrame) -> Rows:
     """Return the answers for effects that were removed from the catalogue, with or without a warning."""
-    counts = said[said["left_out"]].groupby(["sensor", "hidden", "said", "warned"]).size()
+    counts = answers[answers["left_out"]].groupby(["sensor", "hidden", "said", "warned"]).size()
     return [[sensor, f"`{name}`", *rest, count] for (sensor, name, *rest), count in counts.items()]
 
 
@@ -109,10 +109,10 @@ def by_signal(cases: Iterable[JSON]) -> Rows:
     """Return the share of the hidden effects that were selected, by bins of their lambda."""
     found = pd.DataFrame(
         [
-            (left, any(named(case, name, selected) for selected in case["selected"]))
+            (signal, any(named(case, name, selected) for selected in case["selected"]))
             for case in cases
             if "error" not in case and not case["left_out"] and case["family"] != "unseen"
-            for name, left in (case.get("signal_left") or {}).items()
+            for name, signal in (case.get("signal_left") or {}).items()
         ],
         columns=["left", "selected"],
     )

@@ -115,13 +115,13 @@ def judge(case: Case) -> list[JSON]:
     out = []
     for sensor in SENSORS if case.kind == "null" else (case.sensor,):
         began = time.process_time()
-        said = say(recordings, case.model, sensor, case.left_out, case.method)
-        said |= {"key": case.key, "sensor": sensor, "cpu_s": time.process_time() - began}
+        result = say(recordings, case.model, sensor, case.left_out, case.method)
+        result |= {"key": case.key, "sensor": sensor, "cpu_s": time.process_time() - began}
         if case.left_out:
-            said["whole"] = say(recordings, case.model, sensor, method=case.method)
+            result["whole"] = say(recordings, case.model, sensor, method=case.method)
         if case.kind in HELD_OUT:
-            said["held_out"] = _held_out(recordings, case.model, sensor, said["selected"], case.method)
-        out.append(said)
+            result["held_out"] = _held_out(recordings, case.model, sensor, result["selected"], case.method)
+        out.append(result)
     return out
 
 

@@ -287,9 +287,9 @@ def reliability(cases: Sequence[JSON]) -> list[Score]:
         if "error" not in case
         for name, probability in case["probability"].items()
     ]
-    said, there = np.array(pairs, float).reshape(-1, 2).T
-    place = np.clip(np.searchsorted(EDGES, said, side="right") - 1, 0, len(EDGES) - 2)
-    return [each for k in np.unique(place) for each in share(repr(float(said[place == k].mean())), there[place == k])]
+    stated, true = np.array(pairs, float).reshape(-1, 2).T
+    place = np.clip(np.searchsorted(EDGES, stated, side="right") - 1, 0, len(EDGES) - 2)
+    return [each for k in np.unique(place) for each in share(repr(float(stated[place == k].mean())), true[place == k])]
 
 
 def reliability_diagram(cases: Sequence[JSON]) -> str:

@@ -249,6 +249,6 @@ def _angle_errors(recording: Recording, bias: Values, matrix: Values) -> Values:
     angle = cumulative_trapezoid(error, recording.time, axis=0, initial=0)
     turned = np.asarray(recording.table_angle)
     edges = np.arange(turned[0], turned[-1] + 1e-6, SEGMENT_DEG)
-    at = np.searchsorted(turned, np.maximum(edges, turned[0] + 1e-9))
-    at[0] = np.flatnonzero(turned > turned[0] + 1e-9)[0] - 1
-    return np.asarray(np.sqrt(np.mean(np.diff(angle[np.minimum(at, len(turned) - 1)], axis=0) ** 2, axis=0)))
+    samples = np.searchsorted(turned, np.maximum(edges, turned[0] + 1e-9))
+    samples[0] = np.flatnonzero(turned > turned[0] + 1e-9)[0] - 1
+    return np.asarray(np.sqrt(np.mean(np.diff(angle[np.minimum(samples, len(turned) - 1)], axis=0) ** 2, axis=0)))

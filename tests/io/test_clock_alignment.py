@@ -168,6 +168,7 @@ def test_topics_of_another_clock_are_aligned_where_the_profile_says_so(tmp_path:
         read_recordings({"recordings": entries}, {"mcap": settings}, sensor, tmp_path)
     own = {"mcap": {**settings, "table_clock": "own"}}
     found = read_recordings({"recordings": entries}, own, sensor, tmp_path)[0]
+    assert "joined" not in found.source  # no second file
     offset, uncertainty, *_ = clock_errors(found, one, truth)
     assert abs(offset) < 3.5 * uncertainty
     motion = reference_motion(found)

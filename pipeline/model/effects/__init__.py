@@ -222,9 +222,9 @@ def effect_from(
     if declared.name in built_in_files():
         place = f"{where}:{line}" if (line := lines().get(("name",))) else where
         raise ConfigurationError(f"name: a built-in effect is called {declared.name}; give yours another name", place)
-    own = replace(declared, source=declared.source or f"the user's own, {where}")
+    with_source = replace(declared, source=declared.source or f"the user's own, {where}")
     source = {**definition, "sensors": list(declared.sensors)}
-    return FormulaEffect(own, source | ({"axes": list(declared.axes)} if "axes" in definition else {}))
+    return FormulaEffect(with_source, source | ({"axes": list(declared.axes)} if "axes" in definition else {}))
 
 
 def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:

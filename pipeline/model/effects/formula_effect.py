@@ -146,17 +146,17 @@ class FormulaEffect(DeclaredEffect):
     def _check_finite(self, signals: dict[str, Any], motion: Motion) -> None:
         """Raise ``InputError`` for a formula that is not finite where its signals are finite."""
         for axis, formula in (each for term in (*self._by_axis, *self._shared) for each in term.formulas.items()):
-            own = {name: signal for name, signal in _of_axis(signals, axis).items() if name in formula.signals}
-            if any(signal is None for signal in own.values()):
+            used = {name: signal for name, signal in _of_axis(signals, axis).items() if name in formula.signals}
+            if any(signal is None for signal in used.values()):
                 continue
-            value, *given = np.broadcast_arrays(formula(own), *own.values())
+            value, *given = np.broadcast_arrays(formula(used), *used.values())
             rows, columns = np.nonzero(~np.isfinite(value) & np.logical_and.reduce(np.isfinite(given)))
             if len(rows):
                 i, c = int(rows[0]), int(columns[0])
-                at = ", ".join(f"{name} = {signal[i, c]:.6g}" for name, signal in zip(own, given, strict=True))
+                places = ", ".join(f"{name} = {signal[i, c]:.6g}" for name, signal in zip(used, given, strict=True))
                 raise InputError(
                     f"effect {self.name}: {formula.text} is not finite at {motion.time[i]:.6g} s{_of(motion)}, where "
-                    f"{at}; write the formula so that it has a value everywhere (band, maximum), or leave it out"
+                    f"{places}; write the formula so that it has a value everywhere (band, maximum), or leave it out"
                 )
 
 

@@ -123,15 +123,15 @@ class _OfRecordings(DeclaredEffect):
 
     def moved(self, motion: Motion, values: Values) -> Motion:
         """Return the motion in the frame of the rotated unit."""
-        own = self._place(motion)
-        return rotated(motion, self.rotation(motion, values[own])) if own.stop and np.any(values[own]) else motion
+        place = self._place(motion)
+        return rotated(motion, self.rotation(motion, values[place])) if place.stop and np.any(values[place]) else motion
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the derivative of ``K u'`` with respect to each parameter, zeros for the other recordings."""
         columns = np.zeros((len(motion.time), 3, len(values)))
-        own = self._place(motion)
-        if own.stop:
-            columns[:, :, own] = rotation_columns(sensor, motion, K, partial(self.rotation, motion), values[own])
+        place = self._place(motion)
+        if place.stop:
+            columns[:, :, place] = rotation_columns(sensor, motion, K, partial(self.rotation, motion), values[place])
         return columns
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
