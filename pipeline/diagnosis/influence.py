@@ -24,6 +24,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.diagnosis.residual_dependence import bases_of, curves_of, smooth_tests
 from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan, each_explains
@@ -180,8 +181,6 @@ SIMULATIONS = 199  # the share is known to 3.5 % (standard error) at worst
 
 def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     """Return ``share_worse``, the share of simulations that fit worse, and ``simulations``, their number."""
-    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
-
     bases, observations, scan = bases_of(selection), selection.observations.weakened, Scan(selection)
     fitted = ProjectedCurves(scan, curves_of(bases))
     within = np.append(scan.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
@@ -205,7 +204,9 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
             for c, own in enumerate(cross)
         )
         gain = 2.0 * (likelihood(left[:, None] - drop) - before)
-        p = chdtrc(3 * np.arange(1, len(kept) + 1)[:, None], np.maximum(gain, 0.0))[fewest - 1 :].min(axis=0)
+        p = scipy.special.chdtrc(3 * np.arange(1, len(kept) + 1)[:, None], np.maximum(gain, 0.0))[fewest - 1 :].min(
+            axis=0
+        )
         least = np.minimum(least, p)
     return {"share_worse": float(np.mean(least[1:] <= least[0])), "simulations": SIMULATIONS}
 

@@ -19,6 +19,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.diagnosis import functional_forms as forms
 from pipeline.diagnosis.findings import Case, Findings
@@ -108,9 +109,7 @@ def findings(case: Case) -> Findings:
         white=float(np.sqrt(np.mean(model.white**2))),
         expected_wander=None if expected is None else float(np.sqrt(np.mean(expected.wander**2))),
         advice=advice,
-        full=(lambda: calibration_of(model, selection.fits[-1], calibration, case.settings))
-        if selection.names
-        else None,
+        full=(lambda: calibrated(selection.fits[-1])) if selection.names else None,
         other=case.accelerometer if case.sensor == "gyroscope" else None,
         on_table=False,
         departures=[text for stage in calibration.stages for text in stage.details.get("departures", ())],
@@ -270,8 +269,6 @@ def _squared(model: Model, state: State) -> float:
 
 def dependences(selection: Selection) -> list[dict[str, Any]]:
     """Return the covariates on which the residual still depends, each with its p-value, the likeliest first."""
-    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
-
     model = selection.model
     tests = _curves_of(selection)
     terms = [_curves(covariate, formulas, model.sensor) for covariate, formulas in tests]
@@ -284,7 +281,7 @@ def dependences(selection: Selection) -> list[dict[str, Any]]:
         factor = found.correction(j, at, count, equations.scatter) if count else 0.0
         gain = factor * max(2.0 * (found.with_candidate(j)[0] - before), 0.0)
         delta = gain - count * float(np.log(len(equations.residual)))
-        p = float(chdtrc(max(count, 1), gain))
+        p = float(scipy.special.chdtrc(max(count, 1), gain))
         if delta > GATE_BIC and p * len(tests) < GATE_P and delta > named.get(covariate, (0.0, 1.0))[0]:
             named[covariate] = (delta, p)
     ordered = sorted(named.items(), key=lambda item: -item[1][0])

@@ -143,7 +143,7 @@ def _reason(this: Effect, selection: Selection) -> str:
 def _faint(this: Effect, selection: Selection) -> str:
     """Return why an effect that did not show would not have; empty where it would."""
     limits, score = selection.limits.get(this.name), selection.alone.get(this.name)
-    if limits is None or score is None or score.delta_bic > GATE_BIC:
+    if limits is None or not np.all(np.isfinite(limits)) or score is None or score.delta_bic > GATE_BIC:
         return ""
     ranking, held = selection.ranking, selection.chosen()
     gate = score.parameters * float(np.log(ranking.samples)) + GATE_BIC

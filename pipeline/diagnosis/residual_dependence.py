@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.polynomial.chebyshev import chebvander
 
 from pipeline.diagnosis.functional_forms import Span, signals_of
@@ -64,8 +65,6 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[t
 
 def _significant(selection: Selection, explained: Curves | None) -> dict[str, tuple[float, float]]:
     """Return delta BIC and p-value of the best test in each covariate that passes the gate."""
-    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
-
     scan = Scan(selection, explained)
     tests = [_smooth_tests(selection, scan)]
     if selection.names or selection.fit.residual_rms > ABOVE * float(np.sqrt(np.mean(selection.start.scale**2))):
@@ -73,7 +72,7 @@ def _significant(selection: Selection, explained: Curves | None) -> dict[str, tu
     count = sum(len(names) for names, _, _ in tests)
     found: dict[str, tuple[float, float]] = {}
     for names, delta, parameters in tests:
-        p = chdtrc(parameters, np.maximum(delta + parameters * np.log(scan.samples), 0.0))
+        p = scipy.special.chdtrc(parameters, np.maximum(delta + parameters * np.log(scan.samples), 0.0))
         for k in np.argsort(delta):
             if delta[k] > GATE_BIC and p[k] * count < GATE_P and delta[k] > found.get(names[k], (0.0, 0.0))[0]:
                 found[names[k]] = (float(delta[k]), float(p[k]))

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.design import true_motion
 from pipeline.estimation.gauss_markov import WHITE, GaussMarkov
@@ -141,14 +142,12 @@ class Scan:
         Their (t, 3, m) ``drops`` are those of so many columns on each axis; ``scanned`` counts parameters such as a
         place.
         """
-        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
-
         order = np.argsort(-drops.max(axis=0), axis=0)
         together = np.cumsum(np.take_along_axis(drops, order[None], axis=1), axis=1)
         likelihoods = self.log_likelihood(self.left.sum(axis=1)[:, None, None] - together)
         gained = np.maximum(2.0 * (likelihoods.max(axis=0) - self.before), 0.0)
         k = columns * np.arange(1, 4)[:, None] + scanned
-        delta, p = gained - k * float(np.log(self.samples)), chdtrc(k, gained)
+        delta, p = gained - k * float(np.log(self.samples)), scipy.special.chdtrc(k, gained)
         best, at = delta.argmax(axis=0), likelihoods.argmax(axis=0)
         return [
             Gain(float(delta[a, m]), float(p[a, m]), tuple(sorted(order[: a + 1, m].tolist())), int(at[a, m]))

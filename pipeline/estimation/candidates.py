@@ -164,18 +164,14 @@ def is_held(name: str, parameter: Mapping[str, Any]) -> bool:
 
 
 def limits_of(sensor: str, sensor_config: Mapping[str, Any]) -> dict[str, Values]:
-    """Return the limits of plausibility of every effect's parameters, absolute values.
+    """Return the limits of plausibility of every effect's parameters, absolute values; infinite where there is none.
 
     ``sensor_config``: ``effects`` of the sensor file: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
     one or, without the axis, for some of them.
     """
     given = sensor_config.get("effects") or {}
-    found = {}
-    for name, this in catalogue().items():
-        limits = parameter_limits(this, sensor, given) if sensor in this.sensors else np.array([np.inf])
-        if len(limits) and np.all(np.isfinite(limits)):
-            found[name] = limits
-    return found
+    found = {n: parameter_limits(this, sensor, given) for n, this in catalogue().items() if sensor in this.sensors}
+    return {name: limits for name, limits in found.items() if len(limits)}
 
 
 def candidates_for(observations: Observations, configured: Sequence[str]) -> list[Effect]:

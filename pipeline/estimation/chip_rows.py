@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.gauss_markov import Blocks, Prior
@@ -60,15 +61,13 @@ class Shared:
 
     def rows(self, offsets: Mapping[str, float]) -> tuple[Means, Means] | None:
         """Return the rows by each chip, the second one's stamps moved by its offsets, s; None: there are none."""
-        from scipy.interpolate import CubicSpline  # noqa: PLC0415  (0.3 s, needed by boards only)
-
         (time, theirs), (one, two), valid = self.time, self.truth, self.valid[0]
         if any(offsets.values()) or not np.array_equal(time, theirs):
             known = (self.valid[1] & np.append(np.diff(theirs) <= GAP * self.interval, True)).astype(float)
             moved = {}
             for sensor, values in two.items():
                 at = time - offsets[sensor]
-                moved[sensor] = CubicSpline(theirs, values)(at)
+                moved[sensor] = scipy.interpolate.CubicSpline(theirs, values)(at)
                 valid = valid & (np.interp(at, theirs, known, 0.0, 0.0) > 1.0 - 1e-9)
             two = moved
         else:
@@ -139,8 +138,6 @@ def _followed(rate: Values) -> Mask:
 
 def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: float) -> Means:
     """Return the rows of one chip: time, f, w, their derivatives, and the mean of omega omega^T (n, 3, 3)."""
-    from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by boards only)
-
     k = max(round(ROW_S / interval), 1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], valid, [False]]).astype(int)))
     gaps = np.flatnonzero(np.diff(time) > GAP * interval) + 1
@@ -154,7 +151,7 @@ def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: f
             row = {"time": time[start:stop]}
             for sensor, values in signals.items():
                 row[sensor] = values[start:stop]
-                row[sensor + "'"] = make_interp_spline(row["time"], row[sensor], k=5)(row["time"], 1)
+                row[sensor + "'"] = scipy.interpolate.make_interp_spline(row["time"], row[sensor], k=5)(row["time"], 1)
             if "gyroscope" in row:
                 omega = np.radians(row["gyroscope"])
                 row["turn"] = omega[:, :, None] * omega[:, None, :]

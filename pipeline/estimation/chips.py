@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.chip_rows import (
@@ -155,9 +156,7 @@ def _solved(sensors: Sequence[str], a: Means, b: Means) -> tuple[Values, Means, 
 
 def vector_of(R: Values) -> Values:
     """Return the vector of a rotation, rad: (3,) array."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s, needed by boards only)
-
-    return np.asarray(Rotation.from_matrix(R).as_rotvec())
+    return np.asarray(scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec())
 
 
 def _first_rotation(a: Means, b: Means, sensors: Sequence[str]) -> Values:
@@ -334,7 +333,8 @@ def _combined(fits: Sequence[Fit], errors: Sequence[Error], *, on_table: bool) -
         D = np.eye(len(x))[:3] - np.eye(len(x))[second : second + 3]
         apart = D @ x
         chi2 = float(apart @ np.linalg.solve(D @ total @ D.T, apart))
-        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s, needed by boards only)
-
-        agreement = {"angle_deg": float(np.degrees(np.linalg.norm(apart))), "p_value": float(chdtrc(3, chi2))}
+        agreement = {
+            "angle_deg": float(np.degrees(np.linalg.norm(apart))),
+            "p_value": float(scipy.special.chdtrc(3, chi2)),
+        }
     return Estimate(names, T @ x, [replace(e, of_fits=T @ e.of_fits) for e in errors], agreement)

@@ -28,6 +28,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Prior, Setting
@@ -159,15 +160,13 @@ def _within(weight: Values, sigma: Values, probability: float) -> Values:
 
     The probability is concave in x, so that Newton's method from below stays below.
     """
-    from scipy.special import ndtr, ndtri  # noqa: PLC0415  (0.1 s that only fits pay)
-
-    quantile = float(ndtri(0.5 + probability / 2.0))
+    quantile = float(scipy.special.ndtri(0.5 + probability / 2.0))
     sigma = np.maximum(sigma, 1e-9)
     x: Values = quantile * sigma.min(axis=0)
     for _ in range(STEPS):
         ratio = x / sigma
         density = weight @ (np.exp(-0.5 * ratio**2) / sigma) * np.sqrt(2.0 / np.pi)
-        step = (probability - weight @ (2.0 * ndtr(ratio) - 1.0)) / np.maximum(density, 1e-300)
+        step = (probability - weight @ (2.0 * scipy.special.ndtr(ratio) - 1.0)) / np.maximum(density, 1e-300)
         x = np.minimum(x + step, quantile * sigma.max(axis=0))
         if np.all(np.abs(step) <= SMALL_STEP * x):
             break
@@ -177,11 +176,9 @@ def _within(weight: Values, sigma: Values, probability: float) -> Values:
 @cache
 def _quantiles() -> tuple[Values, Values, Values]:
     """Return 1 / nu, the ratio of both quantiles of Student's t, and the outer one: (k,) arrays."""
-    from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (as above)
-
     inverse = np.linspace(0.0, 1.0 / FEWEST, 101)
     inner, outer = (
-        np.append(ndtri(upper), stdtrit(1.0 / inverse[1:], upper))
+        np.append(scipy.special.ndtri(upper), scipy.special.stdtrit(1.0 / inverse[1:], upper))
         for upper in (0.5 + ONE_SIGMA / 2.0, 0.5 + COVERED / 2.0)
     )
     return inverse, np.asarray(outer / inner, np.float64), np.asarray(outer, np.float64)

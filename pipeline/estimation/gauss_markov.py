@@ -30,6 +30,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -241,8 +242,6 @@ class GaussMarkov:
     """
 
     def __init__(self, blocks: Blocks, settings: Sequence[Setting], variance: Values | None = None) -> None:
-        from scipy.linalg.lapack import dpttrf  # noqa: PLC0415  (0.1 s that only fits pay)
-
         self._order = order = blocks.order
         v = (1.0 / blocks.weight if variance is None else variance)[order]
         start, length, clock = blocks.start[order], blocks.length[order], blocks.clock[order]
@@ -257,7 +256,7 @@ class GaussMarkov:
         diagonal[:, 1:] += phi * (phi * own[:, :-1] - 2.0 * q * near)
         beside = np.zeros_like(own)
         beside[:, :-1] = q * near - phi * own[:, :-1]
-        self._d, self._e, info = dpttrf(diagonal.ravel(), beside.ravel()[:-1])
+        self._d, self._e, info = scipy.linalg.lapack.dpttrf(diagonal.ravel(), beside.ravel()[:-1])
         assert info == 0  # noqa: S101  (T is a covariance)
         self.log_determinant: Values = np.sum(np.log(self._d.reshape(h.shape)) + 2.0 * np.log(h), axis=1)
 
@@ -283,11 +282,9 @@ class GaussMarkov:
 
     def solve(self, columns: Values) -> Values:
         """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""
-        from scipy.linalg.lapack import dpttrs  # noqa: PLC0415  (as above)
-
         w = columns.T[:, None, self._order] / self._half
         w[:, :, 1:] -= self._phi * w[:, :, :-1]
-        solved, info = dpttrs(self._d, self._e, w.reshape(len(w), -1).T)
+        solved, info = scipy.linalg.lapack.dpttrs(self._d, self._e, w.reshape(len(w), -1).T)
         assert info == 0  # noqa: S101
         solved = np.asarray(solved.T).reshape(w.shape)
         solved[:, :, :-1] -= self._phi * solved[:, :, 1:]

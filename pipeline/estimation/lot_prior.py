@@ -16,6 +16,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
@@ -143,18 +144,16 @@ def _tested(x: Values, own: Values, own_freedom: Values, predicted: Prediction) 
 
     The largest deviation by Student's t, times the number of parameters; all together by Hotelling's form of F.
     """
-    from scipy.special import fdtrc, stdtr  # noqa: PLC0415  (0.1 s that only lots need)
-
     mean, variance, freedom = predicted
     v, size = np.diagonal(own, axis1=1, axis2=2), x.shape[1]
     u = np.sqrt(v + variance)
     parts = np.sqrt(np.stack([v, variance])).reshape(2, -1)
     nu = effective_degrees_of_freedom(parts, np.stack([own_freedom, freedom]).reshape(2, -1)).reshape(x.shape)
     z = (x - mean) / u
-    one = size * 2.0 * stdtr(np.minimum(nu, 1e9), -np.abs(z)).min(axis=1)
+    one = size * 2.0 * scipy.special.stdtr(np.minimum(nu, 1e9), -np.abs(z)).min(axis=1)
     correlation = (own + variance[:, :, None] * np.eye(size)) / (u[:, :, None] * u[:, None, :])
     squared = np.einsum("ij,ij->i", z, np.linalg.solve(correlation, z[..., None])[..., 0])
-    together = fdtrc(size, 1.0 / np.maximum(np.mean(1.0 / nu, axis=1), 1e-9), squared / size)
+    together = scipy.special.fdtrc(size, 1.0 / np.maximum(np.mean(1.0 / nu, axis=1), 1e-9), squared / size)
     return z, np.minimum(1.0, 2.0 * np.minimum(one, together))
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.noise_likelihood import at_once, solved, spectrum_of
 from pipeline.estimation.noise_regression import Regression, Stretch
@@ -253,11 +254,9 @@ def _short(values: Values) -> list[float]:
 
 def _p_value(spectrum: Spectrum, fit: Fits) -> float:
     """Return the probability of a spectrum that departs as much from the fit."""
-    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s)
-
     spread = 2.0 / (9.0 * spectrum.count)
     z = (np.cbrt(fit.power[0] / fit.total[0] / spectrum.count) - 1.0 + spread) / np.sqrt(spread)
-    return float(chdtrc(max(len(z) - int(np.sum(fit.kinds >= 0)), 1), float(z @ z)))
+    return float(scipy.special.chdtrc(max(len(z) - int(np.sum(fit.kinds >= 0)), 1), float(z @ z)))
 
 
 def _terms(

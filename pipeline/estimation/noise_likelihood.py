@@ -25,6 +25,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.noise_terms import MARKOV, fixed_shapes, markov_shape
 
@@ -67,10 +68,8 @@ class Spectrum:
 
 def spectrum_of(stretches: Sequence[Values], interval: float) -> Spectrum:
     """Return the spectrum of stretches of samples: (a, n, c) arrays, readings first, then deterministic columns."""
-    from scipy.fft import dct  # noqa: PLC0415  (0.1 s)
-
     rows = [
-        dct(values - values.mean(axis=1, keepdims=True), axis=1, norm="ortho", overwrite_x=True)[:, 1:]
+        scipy.fft.dct(values - values.mean(axis=1, keepdims=True), axis=1, norm="ortho", overwrite_x=True)[:, 1:]
         for values in stretches
     ]
     w = np.concatenate([np.pi * np.arange(1, values.shape[1]) / values.shape[1] for values in stretches])

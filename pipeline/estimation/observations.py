@@ -51,7 +51,6 @@ class Part:
     """The rows of one recording."""
 
     name: str
-    role: str
     motion: Motion
     reading: Values  # (m, 3), g or deg/s
     # (m,); samples of each row, minus what a filter's correlation takes from their information
@@ -259,7 +258,6 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     within = np.sum(squares, axis=0)
     return Part(
         recording.name,
-        recording.role,
         seen,
         means,
         rows.count * information,

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.evidence import NEGLIGIBLE, Given, Pick, Problem, Set
 from pipeline.estimation.free_curves import BEND
@@ -245,8 +246,6 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
 
     ``mixtures``: weights (m,), means and standard deviations (m, k). Returns a (k,) array of each.
     """
-    from scipy.special import ndtr  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
-
     if not mixtures:
         return []
     counts = [mean.shape[1] for _, mean, _ in mixtures]
@@ -264,7 +263,7 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
     found = np.minimum(2.0 * np.sqrt(total(mean**2 + deviation**2) / whole), high)
     for _ in range(HALVINGS):  # of Newton, or halvings where a step of it leaves the interval
         above, beneath = (np.clip((found[of] + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0))
-        off = total(ndtr(above) - ndtr(-beneath)) - BELOW * whole
+        off = total(scipy.special.ndtr(above) - scipy.special.ndtr(-beneath)) - BELOW * whole
         density = total((np.exp(-0.5 * above**2) + np.exp(-0.5 * beneath**2)) / deviation) / np.sqrt(2.0 * np.pi)
         low, high = np.where(off < 0.0, found, low), np.where(off < 0.0, high, found)
         following = found - off / np.maximum(density, 1e-300)

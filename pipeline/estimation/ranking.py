@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.design import BASE, Design, Term
 from pipeline.estimation.gauss_markov import WHITE, Setting
@@ -42,7 +43,6 @@ class Score:
     # each (p,); estimates and standard uncertainties, nonlinear parameters at their start
     values: Values
     uncertainty: Values
-    log_likelihood: float
     setting: int  # index of its best noise setting
     admissible: bool = True  # whether it adds anything that the chosen effects cannot do
     plausible: bool = True  # whether the estimates are within the sensor's limits
@@ -176,8 +176,6 @@ class Ranking:
         self, members: Sequence[int], products: Values, before: float, limits: dict[str, Values]
     ) -> Iterator[tuple[int, Score]]:
         """Yield the scores of candidates that have as many directions."""
-        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only rankings pay)
-
         places = [slice(self.places[j][0], self.places[j][-1] + 1) for j in members]
         inner = np.stack([products[:, at, at] for at in places])
         cross = np.stack([products[:, at, -1] for at in places])
@@ -200,11 +198,10 @@ class Ranking:
                 Score(
                     this.name,
                     gain - k * float(np.log(self.samples)),
-                    float(chdtrc(k, gain)),
+                    float(scipy.special.chdtrc(k, gain)),
                     k,
                     values,
                     uncertainty,
-                    float(likelihood[i, best]),
                     best,
                     bool(weakest[i] > NEW),
                     limit is None or bool(np.all(np.abs(values) - 2.0 * uncertainty <= limit)),

@@ -23,6 +23,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
 from pipeline.estimation.design import Start, Term, ordinary_base, placed, without_unknown_motion
@@ -74,41 +75,28 @@ def select(
     ``known``: its effects are starts for the configured ones. ``accelerometer``, for the gyroscope: its mountings.
     ``search``: without it, no effect is scored: base and the candidates' products alone.
     """
-    observations = weighted(observations, noise)
+    observations, grid = weighted(observations, noise), selection_grid(noise)
 
     def searched(observations: Observations) -> Selection:
-        return _selection(observations, configured, noise, sensor_config, known, accelerometer, search=search)
+        """Select effects by all rows of the observations."""
+        start = ordinary_base(observations, noise)
+        base = fit_best(observations, starts_of(configured, observations, known, accelerometer), start, grid)
+        candidates = {}
+        for this in candidates_for(observations, configured):
+            prior = prior_of(this, observations, accelerometer, configured)
+            candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
+        ranking = Ranking.at(observations, base, base, candidates, grid)
+        limits = limits_of(observations.sensor, sensor_config)
+        found = Selection(
+            observations, noise, sensor_config, start, grid, limits, candidates, base, base, ranking, ranking
+        )
+        if search:
+            found.run()
+        return found
 
     found = searched(observations)
     remaining = without_unknown_motion(observations, found.fit.terms)
     return found if remaining is observations else searched(remaining)
-
-
-def _selection(  # noqa: PLR0917  (as ``select``)
-    observations: Observations,
-    configured: Sequence[str],
-    noise: Noise | None,
-    sensor_config: Mapping[str, Any],
-    known: SensorCalibration | None,
-    accelerometer: SensorCalibration | None,
-    *,
-    search: bool,
-) -> Selection:
-    """Select effects by all rows of the observations."""
-    start, settings = ordinary_base(observations, noise), selection_grid(noise)
-    base = fit_best(observations, starts_of(configured, observations, known, accelerometer), start, settings)
-    candidates = {}
-    for this in candidates_for(observations, configured):
-        prior = prior_of(this, observations, accelerometer, configured)
-        candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
-    ranking = Ranking.at(observations, base, base, candidates, settings)
-    limits = limits_of(observations.sensor, sensor_config)
-    found = Selection(
-        observations, noise, sensor_config, start, settings, limits, candidates, base, base, ranking, ranking
-    )
-    if search:
-        found.run()
-    return found
 
 
 @dataclass
@@ -193,18 +181,15 @@ class Selection:
         fit = fit_terms(self.observations, terms, self.start, self.settings)
         self.fits[*self.names, score.name] = fit
         before, _ = self.ranking.of_model(self.ranking.of_effects(self.names))
-        from scipy.special import chdtrc  # noqa: PLC0415  (as in Ranking)
-
         gain = max(2.0 * (fit.log_likelihood - before), 0.0)
         values = fit.terms[-1].values
         uncertainty = np.sqrt(np.diag(fit.covariance))[-len(values) :]
         return replace(
             score,
             delta_bic=gain - score.parameters * float(np.log(self.ranking.samples)),
-            p_value=float(chdtrc(score.parameters, gain)),
+            p_value=float(scipy.special.chdtrc(score.parameters, gain)),
             values=values,
             uncertainty=uncertainty,
-            log_likelihood=fit.log_likelihood,
             plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= self.limits.get(score.name, np.inf))),
         )
 

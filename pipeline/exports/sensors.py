@@ -21,6 +21,7 @@ from math import comb
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.io.channel_table import STRAIGHT, maps_of_log
 from pipeline.model.calibration_file import FAST_S, sentences
@@ -306,9 +307,7 @@ def lever_arm_of(chip: dict[str, Any]) -> list[float]:
 
 def static_transform(rotation: Values, place: Values) -> str:
     """Return the pose of a chip in the axes of the reference chip as options of ``static_transform_publisher``."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s, needed by boards only)
-
-    values = [*place, *Rotation.from_matrix(np.asarray(rotation).T).as_quat().tolist()]
+    values = [*place, *scipy.spatial.transform.Rotation.from_matrix(np.asarray(rotation).T).as_quat().tolist()]
     return " ".join(f"--{n} {v:.9g}" for n, v in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True))
 
 

@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.design import Term
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
@@ -211,12 +212,10 @@ class TurntableLimits(DetectionLimits):
             return self._passes(self._gain(share**2 * signal), k)
 
         def ahead(share: float) -> Values:
-            from scipy.special import ndtr  # noqa: PLC0415  (0.1 s that only plans pay)
-
             over = self._gain(share**2 * left_of)
             mean = over - more * (float(np.log(self.ranking.samples)) - 1.0)
             deviation = np.sqrt(4.0 * over + 2.0 * np.abs(more))
-            return np.asarray(np.where(deviation < TIED, tie, ndtr(mean / np.maximum(deviation, TIED))))
+            return np.asarray(np.where(deviation < TIED, tie, scipy.special.ndtr(mean / np.maximum(deviation, TIED))))
 
         return _Signal(found, ahead, shares)
 
@@ -243,11 +242,9 @@ class TurntableLimits(DetectionLimits):
 
     def _passes(self, gain: Values, k: int) -> Values:
         """Return the probability that a gain passes the gate."""
-        from scipy.special import chdtri, chndtr  # noqa: PLC0415  (0.1 s that only plans pay)
-
         bic = GATE_BIC + k * float(np.log(self.ranking.samples))
-        gate = max(bic, float(chdtri(k, GATE_P / len(self.names))))
-        return np.asarray(1.0 - chndtr(gate, k, gain))
+        gate = max(bic, float(scipy.special.chdtri(k, GATE_P / len(self.names))))
+        return np.asarray(1.0 - scipy.special.chndtr(gate, k, gain))
 
 
 def noise_sums(blocks: Blocks, samples: float, settings: Sequence[Setting], true: Setting) -> Values:
@@ -324,8 +321,6 @@ class RestLimits(DetectionLimits):
 
     def _passes(self, bic: Values, k: int) -> Values:
         """Return 1 where a delta BIC passes the gate, else 0."""
-        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only plans pay)
-
         gain = bic + k * float(np.log(self.equations))
-        significant = chdtrc(k, np.maximum(gain, 0.0)) * len(self.names) < GATE_P
+        significant = scipy.special.chdtrc(k, np.maximum(gain, 0.0)) * len(self.names) < GATE_P
         return np.asarray((bic > GATE_BIC) & significant, float)

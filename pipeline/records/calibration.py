@@ -175,13 +175,6 @@ class Contribution:
         freedom = self.degrees_of_freedom[selected]
         return replace(self, covariance=self.covariance[selected, selected], degrees_of_freedom=freedom, parts=parts)
 
-    def placed(self, place: Values) -> Contribution:
-        """Return the contribution to q parameters that include these p; ``place``: (q, p) selection matrix."""
-        parts = {name: place @ values for name, values in self.parts.items()}
-        freedom = np.full(len(place), np.inf)
-        freedom[np.argmax(place, axis=0)] = self.degrees_of_freedom
-        return replace(self, covariance=place @ self.covariance @ place.T, degrees_of_freedom=freedom, parts=parts)
-
     def to_json(self) -> dict[str, Any]:
         """Return the published line; the sensitivity is contribution / input uncertainty."""
         contribution, u = self.standard_uncertainty, self.input_uncertainty

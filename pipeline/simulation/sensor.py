@@ -48,6 +48,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import effect, effect_from
@@ -236,8 +237,6 @@ def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.
 
     ``sessions``: (n,) sample times of successive recordings, s, each evenly sampled.
     """
-    from scipy.signal import lfilter  # noqa: PLC0415  (0.3 s, needed where readings are made alone)
-
     out, last, before = [], rng.standard_normal(3), sessions[0][0]
     for time in sessions:
         step = (time[-1] - time[0]) / (len(time) - 1) if len(time) > 1 else 0.0
@@ -245,7 +244,7 @@ def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.
         across = np.exp(-(time[0] - before) / correlation_time)
         drive = np.sqrt(1.0 - r * r) * rng.standard_normal((len(time), 3))
         drive[0] = across * last + np.sqrt(1.0 - across * across) * rng.standard_normal(3)
-        process = lfilter([1.0], [1.0, -r], drive, axis=0)
+        process = scipy.signal.lfilter([1.0], [1.0, -r], drive, axis=0)
         out.append(process)
         last, before = process[-1], time[-1]
     return out

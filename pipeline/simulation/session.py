@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 import yaml
 
 from pipeline.errors import ConfigurationError
@@ -287,8 +288,6 @@ def _joined(
 
 def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values, *, wrapped: bool) -> dict[str, Values]:
     """Return angle, rate and attitude of a table at increasing times of a session, in which ``planned`` start."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (few simulations need it)
-
     angle, rate, level = np.zeros(len(time)), np.zeros(len(time)), np.zeros((len(time), 3, 3))
     which = np.clip(np.searchsorted(starts, time, side="right") - 1, 0, None)
     last = 0.0
@@ -299,7 +298,7 @@ def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values, *
         rate[here] = np.linalg.norm(pose.omega, axis=1) if pose.rate is None else pose.rate
         level[here] = pose.level
         last = float(angle[here][-1])
-    attitude = continuous(np.roll(Rotation.from_matrix(level).as_quat(), 1, axis=1))
+    attitude = continuous(np.roll(scipy.spatial.transform.Rotation.from_matrix(level).as_quat(), 1, axis=1))
     return {"table_angle": angle % 360.0 if wrapped else angle, "table_rate": rate, "table_attitude": attitude}
 
 

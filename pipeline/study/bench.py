@@ -38,7 +38,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
+from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import effect
@@ -135,11 +137,9 @@ def _white(sensor_config: Mapping[str, Any]) -> float:
 
 
 def _autoregression(count: int, coefficient: float, rng: np.random.Generator) -> Values:
-    from scipy.signal import lfilter  # noqa: PLC0415  (0.3 s, as in the simulator)
-
     drive = np.sqrt(1.0 - coefficient**2) * rng.standard_normal((count, 3))
     drive[0] = rng.standard_normal(3)
-    return np.asarray(lfilter([1.0], [1.0, -coefficient], drive, axis=0))
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -coefficient], drive, axis=0))
 
 
 def _one_over_f(count: int, rng: np.random.Generator) -> Values:
@@ -242,10 +242,9 @@ def at_detection(case: Case) -> Case:
 
 def _squared_residual(products: Values, column: int, others: list[int]) -> float:
     """Return the squared norm of a column minus its projection onto others, from the products of all columns."""
-    cross, inner = products[others, column], products[np.ix_(others, others)]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
-    inverse = np.linalg.pinv(inner * np.outer(scale, scale), rcond=1e-12, hermitian=True)
-    return float(products[column, column] - (scale * cross) @ inverse @ (scale * cross))
+    cross = products[others, column]
+    inverse = scaled_inverse(products[np.ix_(others, others)])
+    return float(products[column, column] - cross @ inverse @ cross)
 
 
 def _used(case: Case) -> list[Recording]:

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.free_curves import OTHER
 from pipeline.report.chart import Dots, Figure, Line, Panel, chart
@@ -144,9 +145,7 @@ class Score(NamedTuple):
 
 def wilson(hits: int, total: int) -> tuple[float, float]:
     """Return the 95 % interval of a share."""
-    from scipy.stats import binomtest  # noqa: PLC0415  (0.5 s, needed at the end of a study)
-
-    found = binomtest(hits, total).proportion_ci(0.95, method="wilson")
+    found = scipy.stats.binomtest(hits, total).proportion_ci(0.95, method="wilson")
     return float(found.low), float(found.high)
 
 

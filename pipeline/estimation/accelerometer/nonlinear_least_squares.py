@@ -44,7 +44,13 @@ from pipeline.estimation.noise_prior import prior_of
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import blocks_of_samples
-from pipeline.estimation.uncertainty_budget import combined, gravity_line, limit_contribution, noise_contribution
+from pipeline.estimation.uncertainty_budget import (
+    combined,
+    gravity_line,
+    limit_contribution,
+    noise_contribution,
+    stage_parameters,
+)
 from pipeline.model.kinematics import table_motion
 from pipeline.records import Mask, Noise, Recording, SensorCalibration, Values, coverage_factor
 
@@ -369,12 +375,9 @@ def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]
     for k in np.flatnonzero(ROWS != COLUMNS):
         values[3 + k] /= S[k]
         J[3 + k, 3 + k], J[3 + k, diagonal[int(COLUMNS[k])]] = 1.0 / S[k], -values[3 + k] / S[k]
-    own = np.sqrt(np.clip(np.diag(J @ covariance[np.ix_(PLACE, PLACE)] @ J.T), 0.0, None))
     units = ["g"] * 3 + ["1" if i == j else "rad" for i, j in zip(ROWS, COLUMNS, strict=True)]
-    return {
-        str(name): {"value": float(value), "unit": unit, "standard_uncertainty": float(u)}
-        for name, value, unit, u in zip(NAMES, values, units, own, strict=True)
-    }
+    named = zip(NAMES.tolist(), zip(values.tolist(), units, strict=True), strict=True)
+    return stage_parameters(dict(named), J @ covariance[np.ix_(PLACE, PLACE)] @ J.T)
 
 
 def _details(rows: Orientations, solved: _Solved, freedom: float) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.accelerometer.turn_extremes import (
@@ -323,11 +324,9 @@ def _linear_map(
     sinusoids: Sequence[Sequence[Sinusoid]], theta: Values, chain: Callable[[Values], Corrected]
 ) -> LinearMap:
     """Return the map from readings to ``Corrected.vector``, by the derivative of all stages so far."""
-    from scipy.linalg import block_diag  # noqa: PLC0415  (0.1 s that only fits pay)
-
     here = chain(theta).vector()
     columns = np.stack([(chain(theta + STEP * e).vector() - here) / STEP for e in np.eye(len(theta))], axis=1)
-    x, y, z = (np.asarray(block_diag(*(turn[c].weights for turn in sinusoids))) for c in range(3))
+    x, y, z = (np.asarray(scipy.linalg.block_diag(*(turn[c].weights for turn in sinusoids))) for c in range(3))
     J_x, J_y, J_z = np.split(columns, np.cumsum([len(x), len(y)]), axis=1)
     return LinearMap((x, y, z), (J_x, J_y, J_z))
 

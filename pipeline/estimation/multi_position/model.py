@@ -28,6 +28,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+import scipy
 
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import block_covariance
@@ -109,14 +110,12 @@ class Equations:
 
     def whitened(self, noise: NoiseHypothesis, values: Values) -> tuple[Values, float]:
         """Return (n, p) values with ``L^-1`` applied, where ``L L^T = C``, and log det C."""
-        from scipy.linalg.lapack import dpotrf, dtrtrs  # noqa: PLC0415  (0.1 s that only fits pay)
-
         if self.common is None and not noise.direction and not noise.bias.ratio:
             variance = self.variance(noise)
             return values / np.sqrt(variance)[:, None], float(np.sum(np.log(variance)))
-        L, failed = dpotrf(self.covariance(noise), lower=1)
+        L, failed = scipy.linalg.lapack.dpotrf(self.covariance(noise), lower=1)
         assert failed == 0  # noqa: S101
-        solved, failed = dtrtrs(L, values, lower=1)
+        solved, failed = scipy.linalg.lapack.dtrtrs(L, values, lower=1)
         assert failed == 0  # noqa: S101
         return solved, 2.0 * float(np.sum(np.log(np.diag(L))))
 
@@ -140,8 +139,6 @@ class Block:
 
 def stacked(blocks: Sequence[Block], model: Model, state: State, candidates: Sequence[Term]) -> Equations:
     """Return the equations of some blocks, those of the rests first."""
-    from scipy.linalg import block_diag  # noqa: PLC0415  (0.1 s that only fits pay)
-
     rows = np.cumsum([0, *(len(block.residual) for block in blocks)])
     times = [block.stretches for block in blocks if block.stretches is not None]
     start, length, recording = (np.concatenate([time[k] for time in times]) for k in range(3))
@@ -160,7 +157,9 @@ def stacked(blocks: Sequence[Block], model: Model, state: State, candidates: Seq
         if all(part is None for part in parts):
             return None
         sizes = [(n, n) for n in np.diff(rows)]
-        return np.asarray(block_diag(*(np.zeros(n) if p is None else p for p, n in zip(parts, sizes, strict=True))))
+        return np.asarray(
+            scipy.linalg.block_diag(*(np.zeros(n) if p is None else p for p, n in zip(parts, sizes, strict=True)))
+        )
 
     same = recording[:, None] == recording
     return Equations(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.candidates import AUTO
+from pipeline.estimation.candidates import AUTO, limits_of
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, trials_of
@@ -25,7 +25,7 @@ from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, f
 from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_observable
 from pipeline.estimation.multi_position.likelihood import prior_hypotheses, selection_hypotheses
 from pipeline.estimation.multi_position.model import Model, State, parameter_places, refusal, stepped
-from pipeline.estimation.multi_position.selection import Selection, fit_configured, limits_of
+from pipeline.estimation.multi_position.selection import Selection, fit_configured
 from pipeline.estimation.noise_prior import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.table_errors import TIME_BASE

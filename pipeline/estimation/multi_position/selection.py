@@ -19,8 +19,9 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
-from pipeline.estimation.candidates import starts_of, time_constants
+from pipeline.estimation.candidates import limits_of, starts_of, time_constants
 from pipeline.estimation.design import Term
 from pipeline.estimation.evidence import Problem, linear_problem
 from pipeline.estimation.gauss_markov import random_walks
@@ -36,13 +37,13 @@ from pipeline.estimation.multi_position.model import Equations, Model, State, ca
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
-from pipeline.model.effects import catalogue, effect
-from pipeline.model.effects.base import Effect, parameter_limits
+from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from typing import Any
 
+    from pipeline.model.effects.base import Effect
     from pipeline.records import Mask, Noise, SensorCalibration, Values
 
 
@@ -76,12 +77,6 @@ def fit_configured(
         state = State(start.bias, start.matrix, tuple(Term(t.effect, np.array(t.values, float)) for t in terms))
         fits.append(fit(model, state, hypotheses, limits or {}))
     return max(fits, key=lambda found: found.log_likelihood)
-
-
-def limits_of(sensor: str, sensor_config: Mapping[str, Any]) -> dict[str, Values]:
-    """Return the limits of every effect's parameters, infinite where the sensor file has none."""
-    given = sensor_config.get("effects") or {}
-    return {name: parameter_limits(e, sensor, given) for name, e in catalogue().items() if sensor in e.sensors}
 
 
 class Selection:
@@ -143,7 +138,7 @@ class Selection:
             after, own = found.with_candidate(j)
             gain = factor * max(2.0 * (after - before), 0.0)
             score = self._score(term, added, gain, found.raw[j][own], found.residual[own])
-            score = replace(score, log_likelihood=after, setting=own, admissible=factor > 0.0)
+            score = replace(score, setting=own, admissible=factor > 0.0)
             if name in out.scores and out.scores[name].delta_bic >= score.delta_bic:
                 continue
             shown = found.shown(j, at)
@@ -155,7 +150,6 @@ class Selection:
 
     def _projected(self, names: Sequence[str]) -> tuple[list[Term], ProjectedCandidates, Equations]:
         """Return the candidates with some of the selected effects projected out."""
-        kept = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
         fitted = {term.effect.name: term.values for term in self.fit.state.terms}
         terms = []
         for this in self.candidates:
@@ -163,13 +157,11 @@ class Selection:
                 terms.append(Term(this, np.where(_nonlinear(this, self.model.sensor), fitted[this.name], 0.0)))
             elif this.name not in names:
                 terms += [Term(this, values) for values in this.starts(self.model.sensor)]
-        equations = self.model.equations(replace(self.fit.state, terms=tuple(kept)), terms)
+        equations = self.model.equations(self._state(names), terms)
         return terms, project_out(equations, self.hypotheses), equations
 
     def _score(self, term: Term, added: int, gain: float, raw: Values, residual: Values) -> Score:
         """Return the score of a candidate after one linear step."""
-        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only rankings pay)
-
         inverse = np.linalg.pinv(raw, rcond=NEW)
         n, step = len(residual), inverse @ residual
         left = residual - raw @ step
@@ -178,11 +170,10 @@ class Selection:
         return Score(
             term.effect.name,
             gain - added * float(np.log(n)),
-            float(chdtrc(added, gain)),
+            float(scipy.special.chdtrc(added, gain)),
             added,
             values,
             uncertainty,
-            0.0,
             0,
             plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= self.limits[term.effect.name])),
         )
@@ -196,24 +187,29 @@ class Selection:
 
     def _refine(self, scored: Scored, names: Sequence[str], before: float) -> None:
         """Take those that compete to their optimum, where one linear step may not lead there."""
-        from scipy.special import chdtrc  # noqa: PLC0415  (as above)
-
         top = max((s.delta_bic for s in scored.scores.values()), default=0.0)
         for score in list(scored.scores.values()):
             curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > GATE_BIC)
             if not curved or score.delta_bic < max(COMPETES * top, 0.0):
                 continue
-            terms = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
-            start = replace(self.fit.state, terms=(*terms, Term(effect(score.name), score.values)))
-            found = fit(self.model, start, self.hypotheses, self.kept_near)
+            found = self._fitted(self._state(names), Term(effect(score.name), score.values))
             gain = max(2.0 * (found.log_likelihood - before), 0.0) * scored.spare[score.name]
             scored.scores[score.name] = replace(
                 score,
                 delta_bic=gain - score.parameters * float(np.log(len(found.residual))),
-                p_value=float(chdtrc(score.parameters, gain)),
+                p_value=float(scipy.special.chdtrc(score.parameters, gain)),
                 values=found.state.terms[-1].values,
-                log_likelihood=found.log_likelihood,
             )
+
+    def _state(self, names: Collection[str]) -> State:
+        """Return the state of the fit with base, configured and some of the selected effects."""
+        terms = (t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names)
+        return replace(self.fit.state, terms=tuple(terms))
+
+    def _fitted(self, start: State, *further: Term) -> Fit:
+        """Fit from a state, with further effects."""
+        state = replace(start, terms=(*start.terms, *further))
+        return fit(self.model, state, self.hypotheses, self.kept_near)
 
     def _best(self, scored: Scored) -> Score | None:
         """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
@@ -236,14 +232,12 @@ class Selection:
     def _add(self, score: Score) -> None:
         self.names.append(score.name)
         self.steps[score.name] = score
-        terms = (*self.fit.state.terms, Term(effect(score.name), score.values))
-        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.hypotheses, self.kept_near)
+        self.fit = self._fitted(self.fit.state, Term(effect(score.name), score.values))
 
     def _remove(self, name: str) -> None:
         self.names.remove(name)
         del self.steps[name]
-        terms = tuple(t for t in self.fit.state.terms if t.effect.name != name)
-        self.fit = fit(self.model, replace(self.base.state, terms=terms), self.hypotheses, self.kept_near)
+        self.fit = self._fitted(replace(self.base.state, terms=self._state(self.names).terms))
 
     def _own(self, name: str) -> Scored:
         return self._scored([n for n in self.names if n != name])
@@ -269,11 +263,8 @@ class Selection:
 
     def _ladder(self) -> list[Fit]:
         """Return the fits of the base and with each further selected effect."""
-        fits = [self.base]
-        for count in range(1, len(self.names)):
-            terms = self.fit.state.terms[: self.held + count]
-            fits.append(fit(self.model, replace(self.fit.state, terms=terms), self.hypotheses, self.kept_near))
-        return [*fits, self.fit] if self.names else fits
+        further = [self._fitted(self._state(self.names[:count])) for count in range(1, len(self.names))]
+        return [self.base, *further, self.fit] if self.names else [self.base]
 
 
 def _nonlinear(this: Effect, sensor: str) -> Mask:
@@ -281,13 +272,9 @@ def _nonlinear(this: Effect, sensor: str) -> Mask:
     return np.array([p.name in this.nonlinear for p in this.parameters(sensor)])
 
 
-def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect] = ()) -> Answers:
-    """Return probabilities, answer set and upper limits.
-
-    ``hidden``: effects that the recordings cannot show. ``others``: further candidates.
-    """
-    shown = {this.name: this for this in (*selection.candidates, *others)}
-    effects = {name: this for name, this in shown.items() if name not in hidden or name in selection.names}
+def posterior(selection: Selection, hidden: Collection[str]) -> Answers:
+    """Return probabilities, answer set and upper limits; ``hidden``: effects that the recordings cannot show."""
+    effects = {e.name: e for e in selection.candidates if e.name not in hidden or e.name in selection.names}
     return answers([Search(_problem(selection, effects), seeds=[selection.names])], lambda _: 0, effects)
 
 
