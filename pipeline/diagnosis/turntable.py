@@ -105,7 +105,7 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         held_out=held_out,
         beyond=max((answers.probability(this.name) for this in others), default=0.0),
     )
-    explained, white_square = reported.first.explained([]), float(np.mean(reported.start.scale**2))
+    explained, white_square = reported.first.explained(), float(np.mean(reported.start.scale**2))
 
     def drop_alone(name: str) -> float:
         most = max((explained[j] for j in reported.first.indices(name)), default=0.0)

@@ -23,8 +23,7 @@ def fit(
 ) -> SensorCalibration:
     """Fit the effects of ``settings["effects"][sensor]`` together with bias and matrix, whatever the method was.
 
-    ``settings``: sections ``effects``, ``sensor`` and ``table``; ``procedure`` for recordings by hand. Returns
-    ``previous`` unchanged if there are no effects to add.
+    Returns ``previous`` unchanged if there are no effects to add.
     """
     before = previous or SensorCalibration(sensor)
     by_hand = is_multi_position(sensor, recordings)

@@ -236,7 +236,7 @@ class Blocks:
 
 
 class GaussMarkov:
-    """C at the settings of a grid: solutions, products, log determinant, traces and draws.
+    """C at the settings of a grid: solutions, products, log determinant and draws.
 
     ``variance``: (m,), v; without it ``1 / weight``.
     """
@@ -246,12 +246,12 @@ class GaussMarkov:
         v = (1.0 / blocks.weight if variance is None else variance)[order]
         start, length, clock = blocks.start[order], blocks.length[order], blocks.clock[order]
         tau = np.array([s.time for s in settings])[:, None]
-        self._q = q = np.array([s.ratio for s in settings])[:, None] ** 2
+        q = np.array([s.ratio for s in settings])[:, None] ** 2
         self._half = h = _half_average(length, tau)
         same, step = clock[1:] == clock[:-1], np.maximum(np.diff(start), length[:-1])
-        self._near = near = np.where(same, np.exp(-(step - length[:-1]) / tau), 0.0)
+        near = np.where(same, np.exp(-(step - length[:-1]) / tau), 0.0)
         self._phi = phi = np.where(same, np.exp(-step / tau), 0.0)
-        self._own = own = (v + q * variance_of_average(length, tau)) / h**2
+        own = (v + q * variance_of_average(length, tau)) / h**2
         diagonal = own.copy()
         diagonal[:, 1:] += phi * (phi * own[:, :-1] - 2.0 * q * near)
         beside = np.zeros_like(own)
@@ -305,28 +305,6 @@ class GaussMarkov:
         squares = np.einsum("gcc->gc", products[:, p:, p:]) - np.sum(cross * np.linalg.solve(inner, cross), axis=1)
         logarithm: Values = self.log_determinant + np.linalg.slogdet(inner)[1]
         return logarithm, np.maximum(squares, 0.0)
-
-    def trace_with(self, true: GaussMarkov) -> Values:
-        """Return ``tr(C^-1 C0)`` with the covariance C0 of one other setting of the same blocks: (g,) array.
-
-        Off the diagonal both ``T^-1`` and C0 are products of one factor per block between, so that sums over all
-        pairs follow by one recursion.
-        """
-        shape = self._half.shape
-        d, e = self._d.reshape(shape), self._e_by_setting()
-        inverse = 1.0 / d  # diagonal of T^-1
-        for k in range(shape[1] - 2, -1, -1):
-            inverse[:, k] += e[:, k] ** 2 * inverse[:, k + 1]
-        own, lower, phi = inverse.copy(), inverse.copy(), self._phi
-        own[:, :-1] += (2.0 * phi * e + phi**2) * inverse[:, 1:]
-        lower[:, :-1] += phi * e * inverse[:, 1:]
-        ratio = true._half / self._half
-        total: Values = np.sum(own * true._own * ratio**2, axis=1)
-        across = np.zeros(shape[0])
-        for k in range(shape[1] - 1):
-            across = -e[:, k] * true._phi[0, k] * across - (e[:, k] + phi[:, k]) * ratio[:, k] * true._near[0, k]
-            total += 2.0 * true._q[0] * across * lower[:, k + 1] * ratio[:, k + 1]
-        return total
 
     def draw(self, rng: np.random.Generator, count: int) -> Values:
         """Return block means drawn from C at the first setting: (m, count) array."""

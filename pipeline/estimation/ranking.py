@@ -262,9 +262,9 @@ class Ranking:
             if i != j and len(at) and np.linalg.eigvalsh(left[np.ix_(at, at)])[-1] < NEW
         }
 
-    def explained(self, selected: Sequence[int]) -> Values:
-        """Return the whitened sum of squares that each candidate takes from base and selected, white noise: (c,)."""
-        products = self.chosen(selected)[0]
+    def explained(self) -> Values:
+        """Return the whitened sum of squares that each candidate takes from the base, white noise: (c,)."""
+        products = self.products[0]
         out = np.zeros(len(self.candidates))
         for j, place in enumerate(self.places):
             if len(place):
@@ -279,17 +279,16 @@ class Ranking:
         return float(np.sum(limits[:count] ** 2 * np.diag(self.beside[setting, block, block])))
 
 
-def without(products: Values, index: Index, taken: Values | None = None) -> Values:
+def without(products: Values, index: Index) -> Values:
     """Return products of columns after some of them are projected out of all: (t, p, p) array.
 
     Zeros in theirs, and in those of columns of which only rounding is left; the last column, the readings, is kept.
 
-    ``products``: (t, p, p). ``index``: (q,). ``taken``: their ``projection``, where it is known.
+    ``products``: (t, p, p). ``index``: (q,).
     """
     if len(index) == 0:
         return products
-    taken = projection(products, index) if taken is None else taken
-    rest = products - products[:, index, :].transpose(0, 2, 1) @ taken
+    rest = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
     new = np.einsum("tpp->tp", rest) > LEFT * np.einsum("tpp->tp", products)
     new[:, -1] = True
     rest *= new[:, :, None]

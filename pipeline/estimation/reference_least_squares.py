@@ -61,12 +61,7 @@ ADVICE = {
 def fit(
     sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Fit bias and matrix of a sensor against the table's motion.
-
-    ``previous``: only its stages are kept. ``settings``: sections ``table`` and ``sensor``. Raises
-    ``CannotCalibrateError`` if no recording of the sensor's own logs the table's motion; ``NotObservableError`` if the
-    recordings do not determine all columns.
-    """
+    """Fit bias and matrix of a sensor against the table's motion (``pipeline.estimation.stages``); its own role."""
     parts = [_select(sensor, part) for part in parts_of(recordings, sensor, settings["table"], NAME)]
     y = np.concatenate([part.reading(sensor) for part in parts])
     u = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])

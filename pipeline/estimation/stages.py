@@ -2,7 +2,15 @@
 
 A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``: a new
 stage needs only such a module and its name in a method's list. The stages of the staged method are functions of one
-module for each sensor, and some stages are the same for both sensors.
+module for each sensor, and some stages are the same for both sensors: they take the name or the sensor first. Of all
+stages,
+
+    recordings : all of a unit; a fit takes those of the roles that it names
+    previous   : the result of the stage before, whose stages the new result continues; None for the first
+    settings   : sections of the configuration; ``noise`` by sensor, where an earlier stage of the run estimated it
+
+and raise ``CannotCalibrateError`` where there is no recording for them, ``NotObservableError`` where the recordings do
+not determine their parameters, ``ConfigurationError`` where they cannot follow the stage before.
 
 The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effects of an existing calibration, for
 validation and diagnosis with the recordings. Its uncertainty is taken from its file. If the file states none, the
@@ -59,10 +67,7 @@ def fit_stage(
     previous: SensorCalibration | None,
     settings: Mapping[str, Any],
 ) -> SensorCalibration:
-    """Run a stage on the result of the stage before.
-
-    Raises ``CannotCalibrateError`` if the sensor's method is null, or the stage cannot use these recordings.
-    """
+    """Run a stage on the result of the stage before; of a sensor whose method is null there is none."""
     if stage == NOT_WANTED:
         raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")
     if stage == GIVEN:

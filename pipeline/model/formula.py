@@ -147,33 +147,33 @@ class Formula:
         return self._c.format(axis=axis)
 
 
-def parse(text: str, where: str | None = None) -> Formula:
-    """Parse a formula; ``where``: its file and line, for messages.
+def parse(text: str) -> Formula:
+    """Parse a formula.
 
     Raises ``ConfigurationError`` with the position in the text if it contains anything but numbers, signals, functions
     and operators, or is too long or too deeply nested.
     """
     line = " ".join(text.split())
     if not line:
-        raise _refusal(line, 0, "it is empty", where)
+        raise _refusal(line, 0, "it is empty")
     if len(line) > LONGEST:
-        raise ConfigurationError(f"a formula of {len(line)} characters; at most {LONGEST} are read", where)
+        raise ConfigurationError(f"a formula of {len(line)} characters; at most {LONGEST} are read")
     strange = STRANGE.search(line)
     if strange:
         found = strange.group()
-        raise _refusal(line, strange.start(), f"{found!r} has no place in a formula{HINTS.get(found, '')}", where)
+        raise _refusal(line, strange.start(), f"{found!r} has no place in a formula{HINTS.get(found, '')}")
     depth = accumulate((character == "(") - (character == ")") for character in line)
     if max(depth) > DEEPEST:
-        raise ConfigurationError(f"a formula with brackets {DEEPEST} deep; use several terms", where)
+        raise ConfigurationError(f"a formula with brackets {DEEPEST} deep; use several terms")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             tree = ast.parse(line, mode="eval")
     except SyntaxError as error:
-        raise _refusal(line, (error.offset or 1) - 1, f"this is no formula ({error.msg})", where) from None
+        raise _refusal(line, (error.offset or 1) - 1, f"this is no formula ({error.msg})") from None
     except (ValueError, RecursionError, MemoryError) as error:
-        raise _refusal(line, 0, f"this is no formula ({error})", where) from None
-    reader = _Reader(line, where)
+        raise _refusal(line, 0, f"this is no formula ({error})") from None
+    reader = _Reader(line)
     evaluate, c = reader.read(tree.body, 1)
     return Formula(line, frozenset(reader.signals), evaluate, c)
 
@@ -181,8 +181,8 @@ def parse(text: str, where: str | None = None) -> Formula:
 class _Reader:
     """Translates the tree of one formula into a numpy function and a C expression; collects its signals."""
 
-    def __init__(self, text: str, where: str | None) -> None:
-        self.text, self.where = text, where
+    def __init__(self, text: str) -> None:
+        self.text = text
         self.signals: set[str] = set()
         self.nodes = 0
 
@@ -263,7 +263,7 @@ class _Reader:
         return sign * self._value(number)
 
     def _refused(self, node: ast.expr, reason: str) -> ConfigurationError:
-        return _refusal(self.text, node.col_offset, reason, self.where)
+        return _refusal(self.text, node.col_offset, reason)
 
 
 def c_number(value: float) -> str:
@@ -280,6 +280,6 @@ def _applied(function: Callable[..., Any], *parts: Evaluate) -> Evaluate:
     return lambda signals: function(*(part(signals) for part in parts))
 
 
-def _refusal(text: str, place: int, reason: str, where: str | None) -> ConfigurationError:
+def _refusal(text: str, place: int, reason: str) -> ConfigurationError:
     shown = text if len(text) <= 60 else f"{text[:57]}..."
-    return ConfigurationError(f"formula {shown!r}, position {place + 1}: {reason}", where)
+    return ConfigurationError(f"formula {shown!r}, position {place + 1}: {reason}")

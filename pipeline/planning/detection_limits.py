@@ -252,8 +252,9 @@ def noise_sums(blocks: Blocks, samples: float, settings: Sequence[Setting], true
 
     It is that of the block means, and one for each sample beyond.
     """
-    trace = GaussMarkov(blocks, settings).trace_with(GaussMarkov(blocks, [true]))
-    return np.asarray(samples - len(blocks.weight) + trace)
+    C = np.diag(1.0 / blocks.weight) + true.ratio**2 * blocks.covariance(true.time)
+    traces = np.trace(GaussMarkov(blocks, settings).solve(C), axis1=1, axis2=2)
+    return np.asarray(samples - len(blocks.weight) + traces)
 
 
 class RestLimits(DetectionLimits):

@@ -139,14 +139,10 @@ class _Solved:
 def fit(
     recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Fit bias, scale factors and misalignment of the accelerometer.
+    """Fit bias, scale factors and misalignment of the accelerometer (``pipeline.estimation.stages``).
 
-    ``recordings``: rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``).
-    ``previous``: the result of the stage before; only its stages are kept. ``settings``: sections ``table``
-    (``gravity_g``), ``procedure`` (``holdout_every``; ``faces``: the full matrix, by
-    ``pipeline.estimation.multi_position.result``) and ``sensor``. Raises ``CannotCalibrateError`` if there is no
-    recording for it; ``NotObservableError`` if the orientations are too few or too much alike, or a stated face is
-    missing.
+    Rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``). Where the procedure states
+    faces, the full matrix (``pipeline.estimation.multi_position.result``).
     """
     if not settings["procedure"].get("faces"):
         return _fit_triangular(recordings, previous, settings)

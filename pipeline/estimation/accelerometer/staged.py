@@ -245,13 +245,7 @@ def follow(extremes: Extremes, names: Sequence[str], start: Corrected | None = N
 def fit(
     name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Run one stage of the staged method on the output of the stage before.
-
-    ``recordings``: those of role ``accelerometer`` are used. ``settings``: sections ``table``, ``method`` and
-    ``sensor``. Raises ``CannotCalibrateError`` if no recording of the accelerometer logs the table's motion;
-    ``NotObservableError`` if there is no turn about one of the axes, or it does not show a sinusoid;
-    ``ConfigurationError`` if the stage before is not one of this method.
-    """
+    """Run one stage of the staged method (``pipeline.estimation.stages``); role ``accelerometer``, on a table."""
     before = stages_before("accelerometer", previous, STAGES)
     as_printed = bool(settings["method"].get("as_printed", False))
     gravity_g = float(settings["table"].get("gravity_g", 1.0))

@@ -73,12 +73,9 @@ class _Factors:
 def fit(
     recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Fit the matrix of the gyroscope to integrated turns.
+    """Fit the matrix of the gyroscope to integrated turns (``pipeline.estimation.stages``).
 
-    ``recordings``: those of role ``gyroscope`` are used; each must log the table's motion. ``previous``: the result of
-    the stage ``bias``. ``settings``: sections ``table``, ``method`` (``as_printed``) and ``sensor``. Raises
-    ``CannotCalibrateError`` if no recording of the gyroscope logs the table's motion; ``NotObservableError`` if there
-    is no turn about one of the axes; ``ConfigurationError`` if no stage before it estimated the bias.
+    Role ``gyroscope``, on a table, after the stage ``bias``.
     """
     if previous is None:
         raise ConfigurationError(

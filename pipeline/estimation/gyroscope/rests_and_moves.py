@@ -39,12 +39,9 @@ ADVICE = "record some 24 rests, each in another orientation, with moves about ch
 def fit(
     recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Fit bias and matrix of the gyroscope.
+    """Fit bias and matrix of the gyroscope (``pipeline.estimation.stages``).
 
-    ``recordings``: those of role ``rests``. ``previous``: only its stages are kept. ``settings``: sections ``table``
-    (``gravity_g``), ``procedure`` (``holdout_every``) and ``sensor``. Raises ``CannotCalibrateError`` if there are no
-    rests by hand, or the accelerometer cannot be calibrated; ``NotObservableError`` if the moves are too few or too
-    much alike.
+    Role ``rests``, with the readings of the accelerometer, which is calibrated on the way.
     """
     if not is_multi_position("gyroscope", recordings):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")

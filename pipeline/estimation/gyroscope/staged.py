@@ -143,12 +143,9 @@ def follow(response: Response, names: Sequence[str], start: Sequence[Mapping[str
 def fit(
     name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Run one stage of the staged method on the output of the stage before.
+    """Run one stage of the staged method (``pipeline.estimation.stages``).
 
-    ``recordings``: those of role ``gyroscope`` are used, and for want of a rest in them those of role ``static``.
-    ``settings``: sections ``table``, ``method`` and ``sensor``. Raises ``CannotCalibrateError`` if no recording of the
-    gyroscope logs the table's motion; ``NotObservableError`` if there is no rest, or no steady turn about an axis that
-    the stage needs; ``ConfigurationError`` if the stage before is not one of this method.
+    Role ``gyroscope``, on a table; for want of a rest in these recordings, role ``static`` too.
     """
     before = stages_before("gyroscope", previous, STAGES)
     as_printed = bool(settings["method"].get("as_printed", False))

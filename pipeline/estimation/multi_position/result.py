@@ -81,9 +81,8 @@ def fit_effects_by_rests(
 ) -> SensorCalibration:
     """Fit the effects of ``settings["effects"]`` together with bias and matrix to rests and moves.
 
-    ``before``: of the sensor's method. ``settings``: sections ``effects``, ``sensor``, ``table`` and ``procedure``.
-    Returns ``before`` unchanged where there is nothing to add. Raises ``NotObservableError`` if rests and moves do not
-    determine an effect; ``ConfigurationError`` if an effect is unknown or not one of this sensor.
+    ``before``: of the sensor's method; returned unchanged where there is nothing to add. Raises ``NotObservableError``
+    if rests and moves do not determine an effect; ``ConfigurationError`` if it is unknown or not one of this sensor.
     """
     sensor = before.sensor
     wanted, sensor_config = settings["effects"][sensor], settings["sensor"][sensor]
