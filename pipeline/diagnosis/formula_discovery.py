@@ -37,7 +37,8 @@ from pipeline.model.formula import SIGNALS, parse
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
 
-    from pipeline.records import Noise, SensorCalibration, Values
+    from pipeline.diagnosis.findings import Case
+    from pipeline.records import Values
 
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
 NEEDED = {"temperature": "bias_temperature"}  # covariate: the effect that is observable where the covariate varies
@@ -73,20 +74,13 @@ def dependent(selection: Selection) -> list[dict[str, Any]]:
     return [{"covariate": name, "p_value": p, "delta_bic": delta} for name, p, delta in dependences(selection)]
 
 
-def discover(
-    selection: Selection,
-    unknown: list[dict[str, Any]],
-    configured: Sequence[str],
-    noise: Noise | None,
-    sensor_config: Mapping[str, Any],
-    *,
-    accelerometer: SensorCalibration | None = None,
-) -> Discovery:
+def discover(selection: Selection, unknown: list[dict[str, Any]], case: Case) -> Discovery:
     """Search for a formula in addition to base, configured and selected effects.
 
     ``unknown`` is what ``dependent`` returned of the selection. Where the residual stays far above the noise with the
     best form, the form is not what is missing, and none is suggested.
     """
+    noise = case.noise
     floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
     best, least = Discovery(selection, selection, unknown), _worth(selection, []) + CLEARLY
     for context in [selection, without_effects(selection)] if selection.names else [selection]:
@@ -100,8 +94,8 @@ def discover(
         if 0.0 < FAR_ABOVE * floor < _beside(context, form).residual_rms:
             continue
         with _registered(form):
-            names = [*configured, definition["name"]]
-            again = select(context.observations, names, noise, sensor_config, accelerometer=accelerometer)
+            names = [*case.configured, definition["name"]]
+            again = select(context.observations, names, noise, case.sensor_config, accelerometer=case.accelerometer)
         if _worth(again, terms) <= least:
             continue
         least = _worth(again, terms)

@@ -46,12 +46,12 @@ def findings(case: Case) -> Findings:
     Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
     """
     observations = observe(case.sensor, case.recordings, case.settings["table"])
-    given = case.configured, case.noise, case.sensor_config
-    selection = select(observations, *given, case.calibration, accelerometer=case.accelerometer)
+    known = case.noise, case.sensor_config, case.calibration
+    selection = select(observations, case.configured, *known, accelerometer=case.accelerometer)
     unknown = dependent(selection)
 
     def search() -> Findings | None:
-        found = discover(selection, unknown, *given, accelerometer=case.accelerometer)
+        found = discover(selection, unknown, case)
         try:
             return _offered(_described(found, case), found) if found.suggested else None
         except ConvergenceError:  # a form that held-out readings cannot be corrected by is no effect of a sensor
@@ -122,7 +122,7 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         return f"to make {plain(shown)} observable: record {catalogue()[shown].excitation}" if shown else ""
 
     def calibrated(fit: Fit) -> SensorCalibration:
-        return calibration_of(sensor, fit, selection.observations, None, case.settings)
+        return calibration_of(fit, selection.observations, None, case.settings)
 
     scores = reported.ranking.log_likelihoods(reported.chosen())
     hypotheses = list(zip(reported.ranking.settings, scores.tolist(), strict=True))[1:]  # the first is white noise
@@ -192,7 +192,7 @@ def _held_out(selection: Selection, fits: Sequence[Fit], case: Case) -> tuple[li
     samples = [s for s in found if s is not None and s.known.any()]
     if not samples:
         return None, 0.0
-    calibrations = [calibration_of(sensor, fit, selection.observations, None) for fit in fits]
+    calibrations = [calibration_of(fit, selection.observations, None) for fit in fits]
     corrected = [[with_known_effects(calibration, each, None) for each in samples] for calibration in calibrations]
     directed = all(true is not None for each in corrected for _, _, true in each)
     errors: list[float] = []

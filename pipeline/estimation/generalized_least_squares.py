@@ -311,11 +311,10 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     if known is not observations:
         observations, fit = known, fit_terms(known, fit.terms, fit, grid)
     require_observable(observations, fit)
-    return calibration_of(sensor, fit, observations, start, settings, noise)
+    return calibration_of(fit, observations, start, settings, noise)
 
 
-def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
-    sensor: str,
+def calibration_of(
     fit: Fit,
     observations: Observations,
     before: SensorCalibration | None,
@@ -327,7 +326,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     With ``settings``, the uncertainties include the accuracies of the table, except those that an effect of the fit
     estimates.
     """
-    fit, turned = fit_in_mean_frame(fit)
+    (fit, turned), sensor = fit_in_mean_frame(fit), observations.sensor
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
     change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.estimation.design import BASE, Design, Term
+from pipeline.estimation.design import BASE, Design, Start, Term
 from pipeline.estimation.gauss_markov import WHITE, Setting
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.observations import Observations
     from pipeline.records import Index, Values
 
@@ -50,58 +49,39 @@ class Score:
 
 
 class Ranking:
-    """Every candidate as a small linear problem beside base and configured effects.
+    """Every candidate as a small linear problem beside base and configured effects, at a fit.
 
-    ``configured``: effects that belong to the base. ``candidates``: one effect may be there several times, at several
-    values of its nonlinear parameters. ``scale``: (3,).
+    Fitted effects are at their values, others at each of their starts: one effect may be there several times.
+
+    ``base``: the fit of base and configured effects. ``candidates``: by name.
     """
 
-    def __init__(  # noqa: PLR0917  (they are the problem)
+    def __init__(
         self,
         observations: Observations,
-        configured: Sequence[Term],
-        candidates: Sequence[Term],
-        K: Values,
-        scale: Values,
+        base: Start,
+        fit: Start,
+        candidates: Mapping[str, Term],
         settings: Sequence[Setting],
     ) -> None:
-        self.sensor = observations.sensor
-        self.candidates = list(candidates)
         self.settings = [WHITE, *settings]
         self.samples = 3.0 * observations.samples
-        self.within = float(np.sum(observations.scatter / scale**2))
-        design = Design(observations, [*configured, *candidates], K, scale, project=True)
+        self.within = float(np.sum(observations.scatter / fit.scale**2))
+        fitted = {term.effect.name: replace(term, full=False) for term in fit.terms}
+        self.candidates: list[Term] = []
+        for name, term in candidates.items():
+            if name in fitted or term.effect.moves:
+                self.candidates.append(fitted.get(name, term))
+            else:
+                self.candidates += [Term(term.effect, values) for values in term.effect.starts(observations.sensor)]
+        configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
+        design = Design(observations, [*configured, *self.candidates], fit.K, fit.scale, project=True)
         stacked, logarithms = design.products(self.settings)
         self.design, self.stacked, self.logarithms = design, stacked, logarithms
         self.penalty = 0.5 * logarithms - np.array([setting.prior for setting in self.settings])
         known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
         self.beside = products = without(stacked, np.arange(known))[:, known:, known:]
         self._reduce(products, design.sizes()[known:], [s.start - known for s in design.slices[len(configured) :]])
-
-    @classmethod
-    def at(
-        cls,
-        observations: Observations,
-        base: Fit,
-        fit: Fit,
-        candidates: Mapping[str, Term],
-        settings: Sequence[Setting],
-    ) -> Ranking:
-        """Return the linear problem at a fit: fitted effects at their values, others at each of their starts.
-
-        ``base``: the fit of base and configured effects. ``candidates``: by name.
-        """
-        fitted = {term.effect.name: replace(term, full=False) for term in fit.terms}
-        found: list[Term] = []
-        for name, term in candidates.items():
-            if name in fitted:
-                found.append(fitted[name])
-            elif term.effect.moves:
-                found.append(term)
-            else:
-                found += [Term(term.effect, values) for values in term.effect.starts(observations.sensor)]
-        configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
-        return cls(observations, configured, found, fit.K, fit.scale, settings)
 
     def _reduce(self, products: Values, sizes: Values, starts: Sequence[int]) -> None:
         """Keep of each candidate the directions that the motion excites, scaled to unit norm under white noise."""

@@ -85,7 +85,7 @@ def select(
         for this in candidates_for(observations, configured):
             prior = prior_of(this, observations, accelerometer, configured)
             candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
-        ranking = Ranking.at(observations, base, base, candidates, grid)
+        ranking = Ranking(observations, base, base, candidates, grid)
         limits = limits_of(observations.sensor, sensor_config)
         found = Selection(
             observations, noise, sensor_config, start, grid, limits, candidates, base, base, ranking, ranking
@@ -241,7 +241,7 @@ class Selection:
     def _refit(self) -> None:
         """Fit configured and selected effects together and rebuild the candidates there."""
         self._fit_selected()
-        self.ranking = Ranking.at(self.observations, self.base, self.fit, self.candidates, self.settings)
+        self.ranking = Ranking(self.observations, self.base, self.fit, self.candidates, self.settings)
 
     def _fit_selected(self) -> None:
         key = tuple(self.names)

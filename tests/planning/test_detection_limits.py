@@ -58,7 +58,7 @@ def _found(planned: dict[str, dict[str, Any]], names: dict[str, str], factor: fl
             observations = observe(sensor, recordings, table)
             start = ordinary_base(observations, noise)
             term = Term(effect(name), np.zeros(len(hidden[f"{sensor}.{name}"])))
-            ranking = Ranking(observations, [], [term], start.K, start.scale, selection_grid(noise))
+            ranking = Ranking(observations, start, start, {name: term}, selection_grid(noise))
             score = ranking.scores([], {})[0]
             found[sensor] += score.delta_bic > GATE_BIC and score.p_value * len(catalogue()) < GATE_P
     return found
