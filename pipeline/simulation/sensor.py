@@ -52,7 +52,7 @@ import scipy
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import effect, effect_from
-from pipeline.model.effects.base import parameter_limits, truth
+from pipeline.model.effects.base import STANDARD_GRAVITY, parameter_limits, truth
 from pipeline.records import SENSORS, Motion
 from pipeline.signal.rests import still_samples
 from pipeline.simulation.trajectory import Turn, mounted, rotation_about, rotation_by
@@ -67,7 +67,6 @@ if TYPE_CHECKING:
     Alteration = Callable[["Scene", Values], "Scene"]
     Hidden = dict[str, tuple[Effect, Values]]  # by name: an effect and the values of its parameters
 
-STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
 # Edges of the panels in time constants: exp(-20) is 2e-9.
 PANELS = np.concatenate([np.linspace(0.0, 2.0, 21), np.linspace(2.25, 6.0, 16), np.linspace(7.0, 20.0, 14)])
 

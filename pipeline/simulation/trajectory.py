@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import scipy
 
 from pipeline.model.kinematics import attitude_matrix, level_at_zero, turn_by_vector
 from pipeline.simulation.rate_table import TurnErrors
@@ -247,23 +248,10 @@ def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) 
 
 
 def axis_and_angle(rotation: Values) -> tuple[Values, float]:
-    """Return the unit axis and the angle in deg, 0 to 180, of a rotation matrix.
-
-    The quaternion is the eigenvector of Bar-Itzhack's matrix for its largest eigenvalue; it is accurate also at 180
-    deg.
-    """
-    d, off = rotation, np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]])
-    skew = off - np.array([d[1, 2], d[2, 0], d[0, 1]])
-    matrix = np.empty((4, 4))
-    matrix[0, 0] = np.trace(d)
-    matrix[0, 1:] = matrix[1:, 0] = skew
-    matrix[1:, 1:] = d + d.T - np.trace(d) * np.eye(3)
-    q = np.linalg.eigh(matrix)[1][:, -1]
-    q = q if q[0] >= 0.0 else -q
-    size = float(np.linalg.norm(q[1:]))
-    if size == 0.0:
-        return np.array([1.0, 0.0, 0.0]), 0.0
-    return q[1:] / size, float(np.degrees(2.0 * np.arctan2(size, q[0])))
+    """Return the unit axis and the angle in deg, 0 to 180, of a rotation matrix."""
+    vector = scipy.spatial.transform.Rotation.from_matrix(rotation).as_rotvec(degrees=True)
+    angle = float(np.linalg.norm(vector))
+    return (vector / angle, angle) if angle > 0.0 else (np.array([1.0, 0.0, 0.0]), 0.0)
 
 
 def orientations_24() -> Values:

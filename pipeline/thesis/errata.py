@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from pipeline.model.effects.base import STANDARD_GRAVITY
 from pipeline.thesis.conclusions import Errors, gain_of_filter
 from pipeline.thesis.results import AXES, DEVICES, JSON, RATES, Results, matrix_of, read_printed, values
 from pipeline.thesis.seeds import CAUSES, LOST, TIME_CONSTANT_S
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 BANGKOK = 9.783  # m/s^2, WGS 84 normal gravity at 13.7 deg N
-STANDARD = 9.80665  # m/s^2, standard gravity (CGPM 1901)
 TRUE_SCALE = {
     "mpu6050-1": (1.001, 0.994, 0.980),
     "mpu6050-2": (0.993, 0.996, 0.986),
@@ -72,7 +72,7 @@ def evidence(printed: Path, results: Results, rows: pd.DataFrame) -> JSON:
         "O": [results.parameter(f"{stop}-staged", "accelerometer", "orthogonality", f"O_P_{a}") for a in "yz"],
         "cross_term": np.radians(0.286),
         "errors": [results.errors(f"{stop}-{m}", "accelerometer")[1] for m in ("staged", "least-squares")],
-        "gravity": {"bangkok": BANGKOK, "ratio": BANGKOK / STANDARD},
+        "gravity": {"bangkok": BANGKOK, "ratio": BANGKOK / STANDARD_GRAVITY},
         "late_deg": 30.0 * TIME_CONSTANT_S,
         "loss_percent": 100.0 * (1.0 - gain_of_filter(30.0)),
         "behind": {
