@@ -2,13 +2,15 @@
 
     temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
     repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
-    time base     : dM = M e of a gyroscope whose rows were counted at the sensor's stated rate (note N-SYNTHTIME)
+    time base     : dM = M e of a gyroscope whose rows were counted at the sensor's stated rate (note N-SYNTHTIME), or
+                    on a table whose rate is 1 + e times the change of its angle over the log's time
 
 where a is the standard uncertainty of the thermometer, R the range of temperatures recorded, c the sensor file's limits
 of the change per degC (or the fitted effect: then without the root, and R is 0), r standard deviations from one
-switching-on to the next, and e the sensor file's limit of ``clock_rate``, of rectangular distribution. They are added
-after the last stage of a fit, with ``up_to`` of each source that is not included and whose error has a known limit:
-relative for the elements of the matrix, in the sensor's unit for the bias.
+switching-on to the next, and e the sensor file's limit of ``clock_rate`` or what the table's log shows, of rectangular
+distribution: the log does not show which of rate, angle and time is wrong. They are added after the last stage of a
+fit, with ``up_to`` of each source that is not included and whose error has a known limit: relative for the elements of
+the matrix, in the sensor's unit for the bias.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ import numpy as np
 from pipeline.estimation.table_errors import TIME_BASE, type_b
 from pipeline.estimation.uncertainty_budget import GRAVITY, NOT_STATED, clock_contribution, with_uncertainty
 from pipeline.model.kinematics import EARTH_RATE_DPS
+from pipeline.preprocessing.evidence import EXPANDED
+from pipeline.preprocessing.reference_scale import SIGNIFICANT, rate_against_angle
 from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, Recording, SensorCalibration, Values
 from pipeline.signal.filters import temperature_of
 
@@ -56,6 +60,7 @@ def with_stated(
             lines += warm
     limits = sensor_config.get("effects") or {}
     lines += _counted_time(calibration, recordings, limits.get("clock_rate"))
+    lines += _rate_off_angle(calibration, recordings, settings.get("table") or {})
     known = {line.source.partition(" (")[0] for line in lines} | set(missing)
     kept = [entry for entry in budget["not_included"] if entry["source"] not in known]
     left = [_bounded(entry, settings.get("table") or {}, limits.get("clock_rate")) for entry in kept]
@@ -78,6 +83,22 @@ def _counted_time(
         return []
     remark = f"rows counted at the stated rate, by the sensor file's limit of clock_rate, {limit_ppm:g} ppm"
     return [clock_contribution(calibration, limit_ppm / np.sqrt(3.0), RECTANGULAR, remark)]
+
+
+def _rate_off_angle(
+    calibration: SensorCalibration, recordings: Sequence[Recording], table: Mapping[str, Any]
+) -> list[Contribution]:
+    """Return the line of a table whose rate is not the change of its angle, beyond the rate's stated accuracy."""
+    stated = table.get("rate_accuracy")
+    if calibration.sensor != "gyroscope" or stated is None:
+        return []
+    turns = [r for r in recordings if r.role == "gyroscope" and r.table_angle is not None]
+    found = filter(None, map(rate_against_angle, turns))
+    off = max((abs(ratio - 1.0) for ratio, spread, _ in found if abs(ratio - 1.0) > SIGNIFICANT * spread), default=0.0)
+    if off <= EXPANDED * float(stated):
+        return []
+    remark = f"the table's rate and the change of its angle differ by up to {1e6 * off:.3g} ppm"
+    return [clock_contribution(calibration, 1e6 * off / np.sqrt(3.0), RECTANGULAR, remark)]
 
 
 def _clock_unstated(entry: Mapping[str, Any]) -> bool:

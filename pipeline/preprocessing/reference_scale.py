@@ -81,7 +81,7 @@ WHOLE_TURN_DEG = 330.0  # of gravity's phase, from which its harmonics are told 
 ALIKE_SAMPLES = 64.0  # neighbours whose residuals go together, by which the variance of the slope is enlarged
 SIGNIFICANT = 6.0  # standard uncertainties, as in pipeline.signal.rests
 QUARTZ = 2e-4  # relative: two quartz clocks of +-100 ppm each
-CURVED_PHASE = 1e-2  # relative: clocks without quartz, and what lever arms leave of gravity's phase
+GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz, what lever arms leave of its phase
 SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, what nonlinearities of an accelerometer leave of gravity's direction
 FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, ROUNDS = 200, 24, 4  # samples; blocks of a sandwich estimate; Gauss-Newton steps
 ALIKE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
@@ -232,7 +232,24 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
 
 
 def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
-    """Return a sentence where a turn's rate is not exactly that of its angle, or of gravity.
+    """Return a sentence where a turn's rate is not exactly that of its angle, or of gravity."""
+    found = rate_against_angle(recording)
+    if found is None:
+        return None
+    ratio, spread, samples = found
+    logged = recording.table_angle is not None
+    against, least = (limits.column(recording, "table_angle"), QUARTZ) if logged else GRAVITY_TURNS
+    if abs(ratio - 1.0) <= limits.rate_stated + least + SIGNIFICANT * spread:
+        return None
+    return (
+        f"{limits.column(recording, 'table_rate')} is {ratio:.6g} times the rate at which {against} turns, over "
+        f"{samples} samples at constant rate (standard uncertainty {spread:.2g}; the stated accuracy allows "
+        f"{limits.rate_stated:.2g}): one of them, or the clock of {limits.column(recording, 'time')}, is wrong by that"
+    )
+
+
+def rate_against_angle(recording: Recording) -> tuple[float, float, int] | None:
+    """Return how many times as large as the change of its angle a turn's rate is, its uncertainty, and the samples.
 
     At constant rate the angle's increment is the rate times the interval, exactly. Without an angle the sum of the rate
     is regressed on gravity's phase and its first two harmonics, in which biases and cross-axis sensitivity distort it.
@@ -245,25 +262,15 @@ def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
     even &= (np.abs(rate[1:]) > LEAST_TOTAL_DEG) & ~gaps(recording)
     even[1:-1] &= even[2:] & even[:-2]  # two samples on either side of a short move's peak are alike by chance
     even[[0, -1]] = False
-    if even.sum() < FEWEST:
+    samples = int(even.sum())
+    if samples < FEWEST:
         return None
-    if recording.table_angle is not None:
-        found = rate[1:][even] * dt[even] / np.diff(recording.table_angle)[even]
-        ratio = float(np.median(found))
-        spread = MEDIAN_SIZE * float(np.median(np.abs(found - ratio))) / np.sqrt(len(found))
-        against, least = limits.column(recording, "table_angle"), QUARTZ
-    else:
+    if recording.table_angle is None:
         fit = _against_phase(recording, 0.5 * (rate[1:] + rate[:-1]) * dt, even)
-        if fit is None:
-            return None
-        (ratio, spread), against, least = fit, "gravity's direction", CURVED_PHASE
-    if abs(ratio - 1.0) <= limits.rate_stated + least + SIGNIFICANT * spread:
-        return None
-    return (
-        f"{limits.column(recording, 'table_rate')} is {ratio:.6g} times the rate at which {against} turns, over "
-        f"{int(even.sum())} samples at constant rate (standard uncertainty {spread:.2g}; the stated accuracy allows "
-        f"{limits.rate_stated:.2g}): one of them, or the clock of {limits.column(recording, 'time')}, is wrong by that"
-    )
+        return None if fit is None else (*fit, samples)
+    found = rate[1:][even] * dt[even] / np.diff(recording.table_angle)[even]
+    ratio = float(np.median(found))
+    return ratio, MEDIAN_SIZE * float(np.median(np.abs(found - ratio))) / np.sqrt(samples), samples
 
 
 def _against_phase(recording: Recording, steps: Values, even: Mask) -> tuple[float, float] | None:

@@ -135,6 +135,20 @@ def test_rows_counted_at_a_stated_rate_have_the_error_of_the_sensors_clock() -> 
     assert "time base" not in {source.partition(",")[0] for source, _ in beyond_uncertainty(stated.to_json())}
 
 
+def test_a_rate_that_is_not_the_change_of_its_angle_is_in_the_uncertainty() -> None:
+    turns, off = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.001).turns_at([60.0, -60.0]), 1.5e-4
+    turns = [replace(r, table_rate=(1.0 + off) * r.table_rate) for r in turns]
+    config = settings(rate_accuracy=5e-6) | {"sensor": {"gyroscope": SHEETS["gyroscope"]}}
+    fit = reference_least_squares.fit("gyroscope", turns, None, config)
+    truth, found = np.linalg.inv(K), with_stated(fit, turns, config).to_json()
+    error = np.abs(np.diag(np.array(found["matrix"]) - truth))
+    assert error == pytest.approx(off * np.diag(truth), rel=0.2)  # the rate was wrong; angle and time were right
+    assert np.all(error > np.diag(fit.to_json()["expanded_uncertainty"]["matrix"]))
+    assert np.all(error < np.diag(found["expanded_uncertainty"]["matrix"]))
+    precise = with_stated(fit, turns, config | {"table": config["table"] | {"rate_accuracy": 1e-4}})
+    assert np.array_equal(precise.covariance, fit.covariance)  # the stated accuracy explains the difference
+
+
 @pytest.mark.parametrize(
     ("table", "up_to"), [({}, 0.0044), ({"gravity_g": 0.9976}, None), ({"gravity_accuracy_g": 0.0}, None)]
 )
