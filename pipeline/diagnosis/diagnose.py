@@ -33,6 +33,7 @@ REFERENCE, SEATS = (
     "N-REFERENCE",
     "N-SEATS",
 )  # notes: the reference contradicts itself; one mounting does not explain all
+LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that move a turn axis in the body
 COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # parts compared with the uncertainty of both fits
 FULL = "full"  # ``diagnosis.depth`` at which everything is computed, whatever the verdict
 
@@ -52,9 +53,9 @@ def diagnose(
 
     ``calibration``: its effects are starts for those that are configured. ``recordings``: all of the unit; those of
     role ``validation`` judge, and take no part in the selection. ``settings``: sections ``sensor``, ``table`` and
-    ``effects``; ``procedure`` for recordings by hand. ``accelerometer``: for the gyroscope by hand, which needs the
-    direction of gravity; without it, it is calibrated again. ``gravity``: diagnosis of the accelerometer, for a
-    gyroscope whose mountings it determines. ``moves``: part ``gravity_direction`` of ``validations/<unit>.json``, for a
+    ``effects``; ``procedure`` for recordings by hand. ``accelerometer``: for a gyroscope; by hand it needs the direction
+    of gravity, and without it, it is calibrated again. ``gravity``: diagnosis of the accelerometer, which determines the
+    mountings or shows that the turn axes of the gyroscope lean. ``moves``: part ``gravity_direction`` of ``validations/<unit>.json``, for a
     gyroscope by hand. ``validation``: the sensor's part of ``validations/<unit>.json``; without it, a free fit stands
     for the calibration.
 
@@ -70,6 +71,7 @@ def diagnose(
     procedure = multi_position if by_hand else turntable
     configured = configured_effects(sensor, settings, [] if by_hand else recordings)
     by_gravity = sensor == "gyroscope" and MOUNTING in configured
+    leaning = {} if by_hand or sensor == "accelerometer" else _leaning(gravity, accelerometer)
     if by_gravity:
         accelerometer = mountings_by_gravity(recordings, settings)
     elif not by_hand:  # its own mountings are no prior
@@ -83,6 +85,8 @@ def diagnose(
             evidence = replace(evidence, moves=(moves["rms_deg"]["after"], moves["largest_expected_rms_deg"]))
         if by_gravity and gravity:
             evidence = replace(evidence, doubts=[*evidence.doubts, *_doubts_of_gravity(gravity, case)])
+        elif leaning and not leaning.keys() & {*configured, *document["selected"]}:
+            evidence = replace(evidence, doubts=[*evidence.doubts, *_doubts_of_axes(leaning, calibration)])
         verdict = judged(document, evidence)
         return verdict, full or may_be_unknown(verdict["verdict"], evidence)
 
@@ -205,6 +209,27 @@ def _doubts_of_gravity(accelerometer: Mapping[str, Any], case: Case) -> list[str
         return []
     fault = "an error of the table that shifts the mountings: add it to effects.accelerometer"
     return [f"{who} misses {' and '.join(missing)}, {fault}"] if missing else []
+
+
+def _leaning(diagnosis: Mapping[str, Any] | None, fit: SensorCalibration | None) -> dict[str, float]:
+    """Return by how much turn axes lean at most by the effects that an accelerometer has or misses, deg."""
+    selected = (diagnosis or {}).get("selected", ())
+    found = {e["effect"]: e["parameters"] for e in (diagnosis or {}).get("ranking", ()) if e["effect"] in selected}
+    found |= {e.name: e.parameters for e in (fit.effects if fit else ())}
+    return {name: max(abs(p["value"]) for p in found[name].values()) for name in LEANING if name in found}
+
+
+def _doubts_of_axes(leaning: Mapping[str, float], calibration: SensorCalibration) -> list[str]:
+    """Return why a matrix is wrong whose turn axes lean: no gyroscope tells that from a misalignment of its own."""
+    if calibration.covariance is None:
+        return []
+    U = np.degrees(2.0 * np.sqrt(float(np.max(np.diag(calibration.covariance)[3:12]))))
+    return [
+        f"by the accelerometer's {name} the turn axes lean by up to {size:.2g} deg, and the matrix of the gyroscope is "
+        f"off by as much ({np.radians(size):.2g}), beyond its uncertainty"
+        for name, size in leaning.items()
+        if size > U
+    ]
 
 
 def _tilt_is_within_uncertainty(case: Case) -> bool:

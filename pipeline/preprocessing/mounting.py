@@ -91,7 +91,8 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
         also = f"; likewise refused: {', '.join(d.turn.name for d in others)}" if others else ""
         file = first.turn.recording.source.get("file")
         raise IngestError(first.problem + also, file, code=first.code, hint=hint)
-    applied = {} if seated else zeros
+    stated = {t.name: t.stated.zero_deg for t in found if tolerance.same_zero(t)}  # the rest is the mounting's
+    applied = stated if seated else zeros
     used = {t.name: _as_found(t, departures.get(t.name), applied) for t in known}
     recordings = [_turned_attitude(r) if departures else r for r in recordings]
     doubts = seat_notes(list(used.values()), table, sensor) if table.get("seat_deg") is None else {}
@@ -280,6 +281,10 @@ class _Tolerance:
     angle_deg: float  # of the zero and of the direction of the turn axis
     offset_s: float  # largest plausible time offset: in turns one way it is a part of the zero
     lost: float  # relative standard deviation of what a table without encoders loses; three of them, over half of it
+
+    def same_zero(self, turn: Turn) -> bool:
+        """Return whether the zero that is found may be the stated one."""
+        return turn.found is not None and abs(turn.found.zero_deg - turn.stated.zero_deg) <= self.angle_deg
 
     def of_zero(self, fit: TurnFit) -> float:
         """Return how far the zero of a turn may be off, deg."""

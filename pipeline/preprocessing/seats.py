@@ -190,14 +190,21 @@ def _letters(vector: Values) -> str:
 
 
 def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> dict[str, Note]:
-    """Return the doubt about each recording of a unit, by name; the turns of one setup are compared."""
+    """Return the doubt about each recording of a unit, by name.
+
+    The turns of one setup are compared; all together where no setup holds turns about all three axes.
+    """
     orthogonality, angle = (float(table.get(k) or 0.0) for k in ("orthogonality_deg", "angle_accuracy_deg"))
     allowed = max(SMALLEST_DEG, TIMES_STATED * float(np.hypot(orthogonality, angle)))
     effects = (sensor.get("accelerometer") or {}).get("effects") or {}
     limits = [float(effects.get(name) or limit) for name, limit in LIMITS.items()]
     details: dict[str, str] = {}
-    for setup in dict.fromkeys(t.recording.setup for t in turns):
-        own, slow = _conventional([(t, t.stated) for t in turns if t.recording.setup == setup])
+    setups = [
+        _conventional([(t, t.stated) for t in turns if t.recording.setup == setup])
+        for setup in dict.fromkeys(t.recording.setup for t in turns)
+    ]
+    complete = [(own, slow) for own, slow in setups if {c.axis for c in slow} == set(range(3))]
+    for own, slow in complete or [_conventional([(t, t.stated) for t in turns])]:
         in_doubt = any(note.code == "N-REFERENCE" for c in slow for note in c.turn.recording.notes)
         if in_doubt or {c.axis for c in slow} != set(range(3)):
             continue  # an angle that is in doubt already tells nothing of seats

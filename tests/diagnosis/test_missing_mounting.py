@@ -25,9 +25,9 @@ COURSE: dict[str, Any] = {
 TURNS = [f"{kind}_{axis}" for kind in ("accel", "gyro") for axis in "xyz"]
 
 
-def simulated(**bench: Any) -> tuple[list[Any], dict[str, Any]]:
+def simulated(effects: dict[str, Any] | None = None, **bench: Any) -> tuple[list[Any], dict[str, Any]]:
     """Return the recordings of a unit, and settings of a table with one mounting."""
-    unit = UnitDescription("u", sensor="stim300", course=COURSE, imperfections=bench)
+    unit = UnitDescription("u", sensor="stim300", course=COURSE, imperfections=bench, effects=effects or {})
     return simulate_unit(unit, 8, 0)[0], settings_of("stim300", "reference_least_squares")
 
 
@@ -43,7 +43,8 @@ def judged(recordings: list[Any], settings: dict[str, Any]) -> dict[str, tuple[d
         assert fit is not None
         fits[sensor] = fit
         held = validate(fit, checked, noises[sensor], settings)
-        said = diagnose(fit, checked, noises[sensor], settings, fits["accelerometer"], validation=held)
+        gravity = found["accelerometer"][0] if found else None
+        said = diagnose(fit, checked, noises[sensor], settings, fits["accelerometer"], validation=held, gravity=gravity)
         found[sensor] = said, held["steps"][-1]["rms_error"] / held["noise_floor"]
     return found
 
@@ -62,6 +63,19 @@ def test_mountings_are_named_for_both_sensors_and_explain_the_error_once_added()
         assert over_floor < 1.1
         hidden = {entry["effect"] for entry in said["not_observable"]}
         assert "table_axis_nonorthogonality" in hidden  # the mountings contain it
+
+
+@pytest.mark.parametrize("added", [[], ["table_axis_nonorthogonality"]])
+def test_a_gyroscope_is_doubted_where_gravity_shows_that_its_turn_axes_lean(added: list[str]) -> None:
+    lean = {"table_axis_nonorthogonality": [0.05, -0.04, 0.06, 0.03, -0.05, 0.04]}
+    recordings, settings = simulated(lean)
+    recordings = [replace(r, table_attitude=None) for r in recordings]  # which would contradict the matrix as well
+    settings = {**settings, "effects": {"accelerometer": added, "gyroscope": []}}
+    found = {sensor: said for sensor, (said, _) in judged(recordings, settings).items()}
+    assert found["accelerometer"]["verdict"] == ("nothing_missing" if added else "missing_effect")
+    assert found["gyroscope"]["verdict"] == "reference_in_doubt"
+    told = found["gyroscope"]["reason"].partition("table_axis_nonorthogonality the turn axes lean by up to ")[2]
+    assert float(told.split()[0]) == pytest.approx(0.06, abs=0.01)
 
 
 def test_a_zero_in_the_accelerometers_model_leaves_the_gyroscope_its_diagnosis() -> None:

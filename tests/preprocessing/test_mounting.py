@@ -42,6 +42,15 @@ def test_every_stated_orientation_sense_and_zero_gives_the_true_sensor(axis: str
             assert np.all(np.abs(error) < 5.0 * standard)
 
 
+def test_where_turns_have_mountings_a_sense_that_is_found_leaves_the_stated_zero() -> None:
+    setups = {"y": Setup("y", sense=-1, seat=(0.4, 1.6, -0.5))}
+    recordings = recordings_of(setups)
+    checked = check_mounting(recordings, settings_of(recordings, seat_deg=2.0))
+    for before, after in zip(recordings, checked, strict=True):
+        assert before.table_angle is not None
+        assert np.array_equal(after.table_angle, (-1.0 if before.axis == "y" else 1.0) * before.table_angle)
+
+
 def _pair(recording: Recording, sensor: str) -> tuple[np.ndarray, np.ndarray]:
     motion = reference_motion(recording)
     reading = recording.reading(sensor)

@@ -62,6 +62,13 @@ def test_a_gyroscope_turn_in_another_seat_is_told_by_gravity() -> None:
     assert np.allclose(told, (0.6, 0.0, -0.5), atol=0.03)
 
 
+def test_turns_of_a_setup_each_are_compared_with_each_other() -> None:
+    seats = {"x": (0.0, 0.6, -0.5), "y": (-0.4, 0.0, 0.7), "z": (0.5, -0.6, 0.0)}
+    each = [replace(r, setup=f"on_{r.axis}") for r in recordings_of({a: Setup(a, seat=s) for a, s in seats.items()})]
+    assert set(doubted(each)) == {r.name for r in each}
+    assert not doubted([replace(r, setup=f"on_{r.axis}") for r in recordings_of({})])
+
+
 @pytest.mark.parametrize("size", [0.1, 0.9])
 def test_tilt_and_leaning_axes_are_left_to_the_diagnosis(size: float) -> None:
     rng = np.random.default_rng(5)
