@@ -53,11 +53,11 @@ def diagnose(
 
     ``calibration``: its effects are starts for those that are configured. ``recordings``: all of the unit; those of
     role ``validation`` judge, and take no part in the selection. ``settings``: sections ``sensor``, ``table`` and
-    ``effects``; ``procedure`` for recordings by hand. ``accelerometer``: for a gyroscope; by hand it needs the direction
-    of gravity, and without it, it is calibrated again. ``gravity``: diagnosis of the accelerometer, which determines the
-    mountings or shows that the turn axes of the gyroscope lean. ``moves``: part ``gravity_direction`` of ``validations/<unit>.json``, for a
-    gyroscope by hand. ``validation``: the sensor's part of ``validations/<unit>.json``; without it, a free fit stands
-    for the calibration.
+    ``effects``; ``procedure`` for recordings by hand. ``accelerometer``: for a gyroscope; by hand it needs the
+    direction of gravity, and without it, it is calibrated again. ``gravity``: diagnosis of the accelerometer, which
+    determines the mountings or shows that the turn axes of the gyroscope lean. ``moves``: part
+    ``gravity_direction`` of ``validations/<unit>.json``, for a gyroscope by hand. ``validation``: the sensor's part
+    of ``validations/<unit>.json``; without it, a free fit stands for the calibration.
 
     Returns ``verdict, reason`` (``pipeline.diagnosis.verdict``), ``residual_over_noise, selected, ranking, probability,
     answer_set, upper_limit`` (``pipeline.estimation.posterior``), ``to_distinguish, not_observable, unexplained,
