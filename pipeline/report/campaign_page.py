@@ -20,6 +20,7 @@ from pipeline.report.fleet import parameter_table, wide
 from pipeline.report.held_out_section import FAR
 from pipeline.report.numbers import number, percent, plain, unit_text
 from pipeline.report.pages import script_data, template
+from pipeline.report.parameters import CROSS_AXIS
 from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
@@ -108,8 +109,12 @@ def render(
 
 
 def _beyond_limits(parameters: pd.DataFrame) -> list[tuple[str, list[str]]]:
-    """Return the units with a parameter beyond a limit of the sensor file, by sensor."""
-    beyond = parameters[parameters["value"].abs() > parameters["limit"]].groupby("sensor")["unit"].unique()
+    """Return the units with a parameter beyond a limit of the sensor file, by sensor.
+
+    Cross-axis terms, which may include how a unit sits on a table, are left to the strip plots.
+    """
+    own = parameters[~parameters["parameter"].str.contains(CROSS_AXIS)]
+    beyond = own[own["value"].abs() > own["limit"]].groupby("sensor")["unit"].unique()
     return [(f"{sensor}, beyond the sensor file's limits", list(units)) for sensor, units in beyond.items()]
 
 

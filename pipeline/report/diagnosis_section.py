@@ -30,7 +30,6 @@ GATE = LINEAR_TO  # delta BIC, strong evidence: A. E. Raftery, Sociological Meth
 CLOSE = 0.8  # share of the selected effect's delta BIC from which another effect is named as a rival
 MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart or its caption has room for
 MOST_LIMITS = 8  # upper limits that a chart has room for
-COLOURS = {2: "selected", 4: "above the threshold", 3: "below the threshold"}
 ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, bins being correlated
 MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they leave it by more
 SIGNALS = {
@@ -44,10 +43,9 @@ SIGNALS = {
 }
 
 
-def evidence_figures(sensor: str, found: JSON) -> list[Figure]:
-    """Return the charts of a sensor's diagnosis."""
-    first = [f for f in (ranking(sensor, found), added_variable(sensor, found)) if f]
-    return first + unexplained(sensor, found)
+def evidence_figures(sensor: str, found: JSON) -> list[Figure | None]:
+    """Return the charts of a sensor's diagnosis; None in the place of one that it has no data for."""
+    return [ranking(sensor, found), added_variable(sensor, found), *unexplained(sensor, found)]
 
 
 def limit_rows(sensor: str, found: JSON, sensor_config: JSON) -> list[JSON]:
@@ -121,8 +119,7 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
         others=len(entries) - len(shown),
         hidden=first([plain(h["effect"]) for h in hidden], MOST_HIDDEN),
     )
-    legend = tuple((f"c{c}", t) for c, t in COLOURS.items() if c in {row.colour for row in rows})
-    figure = Figure(f"{sensor}-ranking", finding, caption, legend)
+    figure = Figure(f"{sensor}-ranking", finding, caption)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"
     return bars(figure, rows, label, levels={f"threshold {GATE:g}": GATE}, kind="symlog", brackets=brackets)
 
@@ -132,11 +129,11 @@ def _evidence(entry: JSON) -> float:
 
 
 def _ranking_row(entry: JSON, selected: Sequence[str]) -> Point:
-    value, alike = _evidence(entry), entry.get("look_alikes") or []
-    colour = 2 if entry["effect"] in selected else 4 if value > GATE else 3
-    beyond = " (beyond the sensor file's limits)" if value > GATE and not entry.get("plausible", True) else ""
+    value, alike, chosen = _evidence(entry), entry.get("look_alikes") or [], entry["effect"] in selected
+    beyond = value > GATE and not entry.get("plausible", True)
+    label = plain(entry["effect"]) + ", selected" * chosen + ", beyond the sensor file's limits" * beyond
     note = "like " + ", ".join(f"{plain(a['effect'])} {percent(a['share'])}" for a in alike) if alike else ""
-    return Point(plain(entry["effect"]) + beyond, value, colour, note=note)
+    return Point(label, value, 2 if chosen else 4 if value > GATE else 3, note=note)
 
 
 def _brackets(shown: Sequence[JSON], selected: Sequence[str]) -> list[dict[int, str]]:

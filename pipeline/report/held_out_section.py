@@ -84,8 +84,7 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
         held_out=held_out.get("held_out", True),
         sources=[SOURCES[held_out["noise"][key]] for key in keys],
     )
-    words = "if it were added" + (" with the suggested shape" if found.get("suggested_effect") else "")
-    figure = Figure(f"{sensor}-staircase-{kind}", finding, caption, (("c4", words),) if added else ())
+    figure = Figure(f"{sensor}-staircase-{kind}", finding, caption)
     label = f"root mean square error, {unit} (logarithmic)"
     return bars(figure, rows + added, label, levels={f"noise floor {number(floor)}": floor or 0.0})
 
@@ -98,7 +97,8 @@ def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
         return []
     if not 1.0 / ALIKE < chosen[0]["held_out_error_before"] / reached < ALIKE:
         return []
-    return [Point(f"+ {plain(r['effect'])}, if added", r["held_out_error_after"], 4) for r in chosen]
+    words = "if added with the suggested shape" if found.get("suggested_effect") else "if added"
+    return [Point(f"+ {plain(r['effect'])}, {words}", r["held_out_error_after"], 4) for r in chosen]
 
 
 def held_out_figures(
@@ -122,16 +122,25 @@ def held_out_figures(
             raw = np.linalg.norm(samples.reading, axis=1) - samples.magnitude
             after = np.linalg.norm(vector, axis=1) - reference
             name, floor = f"{sensor}-held-out-{recording.name}", held_out.get("noise_floor")
-            out.append(held_out_over_time(name, sensor, recording, raw, after, floor=floor))
+            by_hand = table.get("motion") == "none"
+            out.append(held_out_over_time(name, sensor, recording, raw, after, floor=floor, by_hand=by_hand))
     return out
 
 
 def held_out_over_time(
-    name: str, sensor: str, recording: Recording, raw: Values, calibrated: Values, *, floor: float | None = None
+    name: str,
+    sensor: str,
+    recording: Recording,
+    raw: Values,
+    calibrated: Values,
+    *,
+    floor: float | None = None,
+    by_hand: bool = False,
 ) -> Figure:
     """Draw the error of the magnitude in held-out motion before and after calibration.
 
-    ``raw, calibrated``: (n,) arrays of magnitude minus reference, g or deg/s; ``floor``: rms error by noise alone.
+    ``raw, calibrated``: (n,) arrays of magnitude minus reference, g or deg/s; ``floor``: rms error by noise alone;
+    ``by_hand``: the unit's own acceleration is in the readings while it moves.
     """
     unit, x = SENSOR_UNITS[sensor], recording.time - recording.time[0]
     after: list[Layer] = [Samples(x, calibrated, 2, mean=True)]
@@ -140,7 +149,9 @@ def held_out_over_time(
         Panel([Area(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),
     ]
     rms = [float(np.sqrt(np.nanmean(v**2))) for v in (raw, calibrated)]
-    finding, caption, description = sentences("held_out", name=recording.name, sensor=sensor, rms=rms, unit=unit)
+    finding, caption, description = sentences(
+        "held_out", name=recording.name, sensor=sensor, rms=rms, unit=unit, by_hand=by_hand
+    )
     return chart(Figure(name, finding, caption, BEFORE_AFTER), description, panels, "time, s")
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 LEFT_OUT = "marked ones, and those that the method does not use: beside rests or steady turns, or of a vague log"
+CROSS_AXIS = "cross_axis"  # elements of K outside its diagonal, as a sensor file limits them
 NAMED = 5  # parameters beyond the limits of the sensor file that the top of a page names
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
 
@@ -95,7 +96,7 @@ def reading_errors(part: JSON) -> list[Parameter]:
 
     scale = [element(f"scale_factor_error_{a}", K[i, i] - 1.0, i, i) for i, a in enumerate(AXES)]
     return scale + [
-        element(f"cross_axis_{a}{b}", K[i, j], i, j) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
+        element(f"{CROSS_AXIS}_{a}{b}", K[i, j], i, j) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
     ]
 
 
@@ -109,8 +110,8 @@ def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
     found = [(p, p.words.capitalize(), sensor_config.get("bias")) for p in fitted[:3]]
     for p in reading_errors(part):
         kind, _, axes = p.name.rpartition("_")
-        if kind == "cross_axis":
-            found.append((p, f"{axes[0]} reads of {axes[1]}", sensor_config.get("cross_axis")))
+        if kind == CROSS_AXIS:
+            found.append((p, f"{axes[0]} reads of {axes[1]}", sensor_config.get(CROSS_AXIS)))
         else:
             found.append((p, f"Scale factor error {axes}", sensor_config.get("scale_factor")))
     found += [(p, _of_effect(p), effects.get(p.name.partition(".")[0])) for p in fitted[12:]]
@@ -121,12 +122,14 @@ def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
     ]
 
 
-def beyond_limits(rows: Sequence[JSON]) -> list[str]:
+def beyond_limits(rows: Sequence[JSON], *, mounted: bool) -> list[str]:
     """Return the parameters beyond the limits of the sensor file with their share of it, the largest first.
 
-    ``rows``: of ``parameter_rows``.
+    ``rows``: of ``parameter_rows``; ``mounted``: cross-axis terms include how the unit sits on a table, and are left
+    out.
     """
-    largest = sorted((row for row in rows if row["share"] > 1.0), key=lambda row: -row["share"])
+    beyond = (row for row in rows if row["share"] > 1.0 and not (mounted and row["p"].name.startswith(CROSS_AXIS)))
+    largest = sorted(beyond, key=lambda row: -row["share"])
     return first([f"{row['name'].lower()} ({percent(row['share'])})" for row in largest], NAMED)
 
 

@@ -104,7 +104,6 @@ def _sensor(
     at_rest = (calibration.get("noise") or {}).get(sensor)
     limits, kind = limit_rows(sensor, found, sensor_config), VERDICTS.get(found.get("verdict", ""), "")
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
-    steps = [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)]
     parameters = parameter_rows(part, sensor_config)
     return {
         "held_out": held_out,
@@ -112,7 +111,7 @@ def _sensor(
         "after": last.get("rms_error"),
         "floor": held_out.get("noise_floor"),
         "steps": [{**step, "label": step_label(step["name"])} for step in held_out.get("steps", [])],
-        "step_figures": [figure for figure in steps if figure],
+        "step_figures": [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)],
         "model_figures": [measurement_and_model(sensor, r, noise) for r in traces],
         "held_out_figures": held_out_figures(sensor, calibration, held_out, recordings, table),
         "residual_figures": residual_figures(sensor, traces, noise),
@@ -121,14 +120,12 @@ def _sensor(
         "noise_remarks": remarks(at_rest),
         "matrix": fitted_parameters(part)[3:12],
         "parameters": parameters,
-        "beyond_limits": beyond_limits(parameters),
-        "mounted": table.get("motion", "none") != "none",
+        "beyond_limits": beyond_limits(parameters, mounted=table.get("motion", "none") != "none"),
         "rests": rest_rows(part),
         "diagnosis": found,
         "ranking": ranking_rows(found),
-        "evidence_figures": evidence_figures(sensor, found),
+        "evidence_figures": [*evidence_figures(sensor, found), upper_limits(sensor, limits)],
         "limits": limits,
-        "limit_figures": [figure for figure in [upper_limits(sensor, limits)] if figure],
         "implausible": sentences(sensor, part),
         "beyond": beyond_uncertainty(part),
         "kind": "" if far and kind == "good" else kind,

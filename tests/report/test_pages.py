@@ -183,8 +183,9 @@ def test_a_parameter_beyond_a_limit_is_named_at_the_top_of_both_pages(unit: Unit
     bias = abs(np.array(unit.calibration["accelerometer"]["bias"]))
     x, y, _ = np.argsort(-bias)
     limit = float(bias[[x, y]].mean())  # the largest bias exceeds it, the others do not
-    sheet = {**unit.settings["sensor"]["accelerometer"], "bias": limit, "cross_axis": 1.0, "scale_factor": 1.0}
+    sheet = {**unit.settings["sensor"]["accelerometer"], "bias": limit, "scale_factor": 1.0, "cross_axis": 1e-9}
     settings = {**unit.settings, "sensor": {**unit.settings["sensor"], "accelerometer": sheet}}
+    settings["table"] = {**unit.settings["table"], "motion": "logged"}  # cross-axis terms include how the unit sits
     top = Text(render(unit.calibration, unit.validation, unit.diagnosis, [], settings)).text.partition("Diagnosis")[0]
     assert f"Beyond the sensor file's limits: bias {'xyz'[x]} ({100.0 * bias[x] / limit:.0f} %)." in top
     own = {"U0": unit_parameters(unit.calibration, {"accelerometer": sheet})}
