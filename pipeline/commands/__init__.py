@@ -1,15 +1,15 @@
-"""The commands: a function of ``argv`` each (``pipeline.__main__.COMMANDS``). Here: their parsers and options."""
+"""The commands, each a function of ``argv`` (``pipeline.__main__.COMMANDS``), and the options that they share."""
 
 from __future__ import annotations
 
 import argparse
 from typing import Any
 
-OF_RANGE = "full scale of the accelerometer in g, then of the gyroscope in deg/s (default: those of the sensor's file)"
+OF_RANGE = "full scale of the accelerometer in g, then of the gyroscope in deg/s (default: from the sensor file)"
 SHARED: dict[str, dict[str, Any]] = {
     "--sensor": {"metavar": "NAME", "help": "sensor model, a name in configs/sensor: full scale, counts, noise"},
     "--range": {"type": float, "nargs": "+", "metavar": "RANGE", "help": OF_RANGE},
-    "--ingest": {"metavar": "PROFILE", "help": "how the log is read: a name in configs/ingest, or a profile's file"},
+    "--ingest": {"metavar": "PROFILE", "help": "format of the log: a name in configs/ingest, or the file of a profile"},
     "--results": {"metavar": "DIR", "default": "results", "help": "folder of all results (default: results)"},
 }
 
@@ -21,7 +21,7 @@ def parser_of(
     shared: tuple[str, ...] = (),
     **settings: Any,  # noqa: ANN401  (of argparse)
 ) -> argparse.ArgumentParser:
-    """Return the parser of a command: its text as it is written, and the options of ``SHARED`` that it has."""
+    """Return the parser of a command with some options of ``SHARED``; line breaks of its texts are kept."""
     form = argparse.RawDescriptionHelpFormatter
     about = (description or "").partition("\n\n")[0]
     parser = argparse.ArgumentParser(

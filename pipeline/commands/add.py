@@ -28,18 +28,18 @@ if TYPE_CHECKING:
     from pipeline.config.devices import Edit
 
 EPILOG = """\
-The effects are then part of the unit's model in every run. The run computes again what depends on them, and its last
-lines state how the held-out error changed.
+The effects are then part of the model of the unit in every run. The run repeats the stages that depend on them, and
+its last lines state the change of the held-out error.
 
 examples:
   python -m pipeline add demo mpu6050-2-hidden gyroscope.g_sensitivity
   python -m pipeline add my_bench U1 gyroscope.g_sensitivity accelerometer.lever_arm --no-run
-  python -m pipeline add my_fleet --missing                 to each unit, the missing effects of its own diagnosis
+  python -m pipeline add my_fleet --missing                 to each unit, the effects that its diagnosis found missing
   python -m pipeline add my_fleet --missing g_sensitivity   only this effect, in the units where it is missing
   python -m pipeline add my_bench U1 --suggested            the formula that the diagnosis suggests, as effects/*.yaml
   python -m pipeline remove demo mpu6050-2-hidden gyroscope.g_sensitivity
 
-Effects that are set in units.csv or on the command line override the file: the command is then refused, and names the
+Effects in units.csv or on the command line override the file. The command is then refused, and the message names the
 place to edit.
 """
 
@@ -47,7 +47,7 @@ place to edit.
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline add CAMPAIGN UNIT SENSOR.EFFECT ...``."""
     parser = _parser("add", __doc__)
-    words = "add to each unit what its diagnosis in the last run found to be missing, or of this only EFFECT"
+    words = "add to each unit the effects that its diagnosis in the last run found missing, or only EFFECT of these"
     parser.add_argument("--missing", nargs="?", const="", metavar="EFFECT", help=words)
     words = "write the formulas that the last run suggests for the unit to effects/, and add them"
     parser.add_argument("--suggested", action="store_true", help=words)
@@ -64,12 +64,12 @@ def main(argv: Sequence[str]) -> int:
 
 
 def remove(argv: Sequence[str]) -> int:
-    """Remove effects of a unit from <campaign>/devices/<unit>.yaml, and run the campaign: undoes add."""
+    """Remove effects from <campaign>/devices/<unit>.yaml, and run the campaign: undoes add."""
     return _change(_parser("remove", remove.__doc__).parse_args(argv), undo=True)
 
 
 def _write_suggested(arguments: argparse.Namespace) -> tuple[list[Path], list[str]]:
-    """Write the formulas suggested for a unit as effects of the campaign; return the new files and SENSOR.EFFECT."""
+    """Write the suggested formulas of a unit as effects of the campaign; return the new files and SENSOR.EFFECT."""
     if not arguments.unit or arguments.effects:
         raise ConfigurationError("--suggested takes a unit and no effects: it reads them from the results")
     directory = find_campaign(arguments.campaign)
@@ -79,38 +79,38 @@ def _write_suggested(arguments: argparse.Namespace) -> tuple[list[Path], list[st
         parts = json.loads(read_published(document))
     except FileNotFoundError:
         raise MissingInputError("does not exist: run the campaign first", str(document)) from None
-    found = {s: parts[s] for s in SENSORS if parts.get(s) and parts[s].get("suggested_effect")}
-    if not found:
+    suggesting = {s: parts[s] for s in SENSORS if parts.get(s) and parts[s].get("suggested_effect")}
+    if not suggesting:
         raise ConfigurationError("the diagnosis suggests no formula for this unit", str(document))
     written, names = [], []
-    for sensor, part in found.items():
+    for sensor, part in suggesting.items():
         text, plain = read_published(diagnoses / part["suggested_file"]).decode(), part["suggested_effect"]["name"]
         for name in chain([plain], (f"{plain}_{k}" for k in count(2))):
             file = directory / "effects" / f"{name}.yaml"
-            own = text.replace(plain, name)
+            content = text.replace(plain, name)
             if not file.is_file():
                 file.parent.mkdir(exist_ok=True)
-                write_atomically(file, own)
+                write_atomically(file, content)
                 print(f"{file} written")
                 written.append(file)
-            if file.read_text(encoding="utf-8") == own:
+            if file.read_text(encoding="utf-8") == content:
                 names.append(f"{sensor}.{name}")
                 break
     return written, names
 
 
 def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
-    """Edit the device files and run the campaign; the exit code is that of the run."""
-    given = _settings(arguments.config)
+    """Edit the device files and run the campaign; return the exit code of the run."""
+    run_settings = _settings(arguments.config)
     directory = find_campaign(arguments.campaign)
-    composer, layers = read_layers(directory, given)
-    wanted = _wanted(arguments, directory.name)
-    edits = [edit_effects(unit, effects, layers, composer, remove=undo) for unit, effects in wanted.items()]
+    composer, layers = read_layers(directory, run_settings)
+    effects_of = _effects_of_units(arguments, directory.name)
+    edits = [edit_effects(unit, effects, layers, composer, remove=undo) for unit, effects in effects_of.items()]
     for edit in edits:
         _apply(edit)
-    if not undo and (told := _of_the_bench(chain.from_iterable(wanted.values()))):
-        print(told)
-    settings = {"campaign": arguments.campaign, **given}
+    if not undo and (note := _bench_note(chain.from_iterable(effects_of.values()))):
+        print(note)
+    settings = {"campaign": arguments.campaign, **run_settings}
     if arguments.results != RESULTS:
         settings["results"] = arguments.results
     command = run_command(settings).replace("--cores 2", f"--cores {arguments.cores}", 1)
@@ -121,14 +121,14 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
     return run_snakemake(arguments, arguments.config)
 
 
-def _of_the_bench(effects: Iterable[tuple[str, str]]) -> str:
-    """Return which effects belong to the bench, and what they are good for; empty where all are the sensor's."""
+def _bench_note(effects: Iterable[tuple[str, str]]) -> str:
+    """Return a note about the effects that belong to the bench; empty if there are none."""
     known = {name: catalogue().get(name.partition("@")[0]) for _, name in effects}
-    names = sorted(name for name, this in known.items() if this is not None and this.owner != "sensor")
+    names = sorted(name for name, effect in known.items() if effect is not None and effect.owner != "sensor")
     if not names:
         return ""
     what = "an effect of the bench (table, mounting, place or one recording), not of the sensor"
-    use = "It frees the fit from an error of the bench; apply does not correct it in field logs"
+    use = "It removes an error of the bench from the fit; apply does not correct it in field logs"
     return f"note: {', '.join(names)}: {what}. {use}"
 
 
@@ -143,8 +143,8 @@ def _parser(command: str, description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
-def _wanted(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tuple[str, str]]]:
-    """Return unit to its effects, each as sensor and name."""
+def _effects_of_units(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tuple[str, str]]]:
+    """Return the effects to add or remove, as sensor and name, by unit."""
     missing = getattr(arguments, "missing", None)
     if missing is None:
         if not arguments.unit or not arguments.effects:
@@ -156,11 +156,10 @@ def _wanted(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tupl
     file = folder / "summary.csv"
     if not file.is_file():
         raise MissingInputError("does not exist: run the campaign first", str(file))
-    found = {row["unit"]: _missing(row, missing) for row in read_summary(folder)}
-    found = {unit: effects for unit, effects in found.items() if effects}
-    if not found:
+    effects_of = {row["unit"]: effects for row in read_summary(folder) if (effects := _missing(row, missing))}
+    if not effects_of:
         raise ConfigurationError(f"{missing or 'an effect'} is missing in no unit", str(file))
-    return found
+    return effects_of
 
 
 def _missing(row: Mapping[str, str], only: str) -> list[tuple[str, str]]:
@@ -174,14 +173,14 @@ def _missing(row: Mapping[str, str], only: str) -> list[tuple[str, str]]:
 
 
 def _settings(words: Sequence[str]) -> dict[str, Any]:
-    """Return what ``--config`` gives, read as Snakemake reads it."""
-    found = {}
+    """Parse the settings of ``--config`` in the way of Snakemake."""
+    settings = {}
     for word in words:
         key, equal, value = word.partition("=")
         if not equal or key in ("campaign", "results"):
             raise ConfigurationError(f"--config {word}: KEY=VALUE of the run is expected, not of campaign or results")
-        found[key] = yaml.load(value, yaml.BaseLoader)  # noqa: S506  (texts, lists and mappings only)
-    return found
+        settings[key] = yaml.load(value, yaml.BaseLoader)  # noqa: S506  (texts, lists and mappings only)
+    return settings
 
 
 def _apply(edit: Edit) -> None:

@@ -1,4 +1,4 @@
-"""Apply a unit's calibration to a log: write calibrated readings."""
+"""Apply the calibration of a unit to a log, and write the calibrated readings."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 EPILOG = """\
-Of a CSV log, the columns of the sensors are replaced by calibrated ones in g and deg/s (accel_x_g .. gyro_z_dps); all
-other cells stay as they are. Of an MCAP log, all messages stay byte for byte, and a topic with calibrated Imu messages
-is added. Logs of other formats give CSV with the columns time_s, accel_x_g .. gyro_z_dps, temperature_degc.
+In a CSV log, calibrated columns in g and deg/s (accel_x_g .. gyro_z_dps) replace the columns of the sensors; all other
+cells are unchanged. In an MCAP log, all messages are unchanged, and a topic with calibrated Imu messages is added. For
+a log of another format, the output is a CSV with the columns time_s, accel_x_g .. gyro_z_dps, temperature_degc.
 
-Columns, units, counts and axes of the log are those of the recordings with which the unit was calibrated, unless
---ingest names another profile, or its file. Where the profile joins files of one recording (the accelerometer in one,
-the gyroscope in the other), name one or all of them; the output is a CSV as of other formats. CSV and MCAP are read in
-a stream; logs of other formats and joined files are held in memory.
+The log is expected to have the columns, units, counts and axes of the recordings with which the unit was calibrated,
+unless --ingest names another profile or its file. If the profile joins files of one recording (accelerometer and
+gyroscope in separate files), name one or all of them; the output is a CSV with the columns above. CSV and MCAP are read
+in a stream; logs of other formats and joined files are read into memory.
 
 The bias of a gyroscope changes from one power-on to the next. Where the log holds some seconds in which the unit lies
 still, name them: --rest 0:10 subtracts the mean rate of the longest rest from 0 to 10 s, from the first sample of the
@@ -79,7 +79,7 @@ def main(argv: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("apply", __doc__, EPILOG, ("--ingest",))
     add = parser.add_argument
-    words = f"the log: .mcap, {', '.join(MESSAGE_FORMATS)}, or text; several files only where the profile joins them"
+    words = f"the log: .mcap, {', '.join(MESSAGE_FORMATS)}, or text; several files only if the profile joins them"
     add("logs", type=Path, nargs="+", metavar="LOG", help=words)
     add(
         "--calibration",
@@ -90,13 +90,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     words = "file to write: MCAP for an MCAP log, else CSV; - for the standard output"
     add("-o", "--output", type=Path, required=True, metavar="OUT", help=words)
-    words = "MCAP: topic of the calibrated messages (default: that of the readings, with _calibrated at its end)"
+    words = "MCAP: topic of the calibrated messages (default: topic of the readings with the suffix _calibrated)"
     add("--topic", metavar="TOPIC", help=words)
     words = "time constant of the causal smoothing of the temperature, s; 0: none (default: %(default)g)"
     add("--temperature-smoothing", type=float, default=SMOOTHING_S, metavar="S", dest="smoothing", help=words)
     words = "s from the first sample in which the unit lies still: the gyroscope's bias is measured again there"
     add("--rest", type=_seconds, metavar="FROM:TO", help=words)
-    words = "file of an effect in Python with which the calibration was made; the file is run; may be repeated"
+    words = "file of a Python effect that the calibration uses; the file is run; may be repeated"
     add("--python-effect", action="append", default=[], metavar="FILE", dest="python_effects", help=words)
     return parser
 
@@ -114,13 +114,13 @@ def _seconds(text: str) -> tuple[float, float]:
 
 
 def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:
-    """Return the log, or the files with readings of one recording, in the order of the profile that joins them."""
+    """Return the log, or all files with readings of one recording, in the order of the profile that joins them."""
     if logs[0].suffix.lower() not in (".mcap", *MESSAGE_FORMATS):
-        from pipeline.field_logs.text_output import sensor_parts  # noqa: PLC0415  (MCAP needs no parser of text)
+        from pipeline.field_logs.text_output import sensor_parts  # noqa: PLC0415  (a text parser, not for MCAP)
 
         parts = sensor_parts(profile.ingest)
         if len(parts) > 1:
-            from pipeline.commands.readings import grouped  # noqa: PLC0415  (Hydra: 0.3 s that few logs need)
+            from pipeline.commands.readings import grouped  # noqa: PLC0415  (imports Hydra: 0.3 s)
 
             recordings = grouped(logs, dict(profile.ingest))
             if len(recordings) > 1:
@@ -132,12 +132,12 @@ def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:
 
 
 def _profile(calibration: Path, ingest: str | None, log: Path) -> LogProfile:
-    """Return the layout of the log: that of the unit's recordings, or that of a named profile or a profile's file."""
+    """Return the layout of the log: of the recordings of the unit, or of the profile ``ingest`` (name or file)."""
     document = read_calibration(calibration)
     profile = LogProfile.of_calibration(document, str(calibration))
     if ingest is None:
         return profile
-    from pipeline.commands.readings import config_of_log  # noqa: PLC0415  (Hydra: 0.3 s that few logs need)
+    from pipeline.commands.readings import config_of_log  # noqa: PLC0415  (imports Hydra: 0.3 s)
 
     sensor = document.get("sensor")
     known = (CONFIGS / "sensor" / f"{sensor}.yaml").is_file()

@@ -1,7 +1,7 @@
-"""Print a unit's resolved configuration with the origin of each value.
+"""Print the resolved configuration of a unit with the origin of each value.
 
-A value stands in the file of a group's option or in ``configs/config.yaml``, or the strongest override of it, or of a
-branch above it, has set it; a key that stands nowhere has the schema's default.
+The origin of a value is its strongest override, or that of a branch above it; else the file of an option or
+``configs/config.yaml``; else the default of the schema.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from pipeline.config.layers import Layer
 
 Key = tuple[str, ...]  # the path of a value
-COLUMN = 56  # where the origins stand
+COLUMN = 56  # of the origins
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run ``python -m pipeline config UNIT [OVERRIDE ...]``; what is printed is YAML."""
+    """Run ``python -m pipeline config UNIT [OVERRIDE ...]``; the output is YAML."""
     parser = parser_of("config", __doc__)
     parser.add_argument("unit", metavar="UNIT", help="a unit of units.csv")
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="further settings, as in a run")
@@ -56,7 +56,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _overrides(layers: Sequence[Layer]) -> list[str]:
-    """Return the overrides of the unit, and which of them a stronger one replaces."""
+    """Return lines with the overrides of the unit; a note marks those that a stronger override replaces."""
     if not layers:
         return ["# No overrides: all values are defaults."]
     keys = [parse(text)[0] for _, text in layers]
@@ -92,23 +92,25 @@ def _leaves(node: Mapping[str, Any], above: Key) -> Iterator[tuple[Key, Any]]:
 
 
 def _origins(composer: Composer, layers: Sequence[Layer]) -> dict[Key, str]:
-    """Return the origin of each key, or of the branch above it; that of an option is at the ``name`` of its group."""
+    """Return the origin of each key, or of a branch above it; the origin of an option has the key (group, "name")."""
     groups, _ = composer.split([text for _, text in layers])
-    chosen = composer.complete(groups)
-    procedure = chosen.get("procedure", default_option("procedure"))
-    chosen_by = {"table": f"default of procedure {procedure}"}
-    chosen_by["method"] = f"default of table {chosen['table']} with procedure {procedure}"
+    options = composer.complete(groups)
+    procedure = options.get("procedure", default_option("procedure"))
+    defaults_of = {
+        "table": f"default of procedure {procedure}",
+        "method": f"default of table {options['table']} with procedure {procedure}",
+    }
     origins: dict[Key, str] = {}
     for group in GROUPS:
-        option = chosen.get(group) or default_option(group)
+        option = options.get(group) or default_option(group)
         for key, value in _leaves(read_option(group, option, tuple(composer.searchpath)), (group,)):
             reference = f", {value}" if isinstance(value, str) and "${" in value else ""
-            unknown = group == "sensor" and value is None and key[-1] in NEEDED
-            origins[key] = _file(composer, group, "generic" if unknown else option) + reference
-        origins[group, "name"] = chosen_by.get(group, "default, configs/config.yaml")
+            assumed = group == "sensor" and value is None and key[-1] in NEEDED
+            origins[key] = _file(composer, group, "generic" if assumed else option) + reference
+        origins[group, "name"] = defaults_of.get(group, "default, configs/config.yaml")
     defaults = read_option("", "config", ())
     origins |= {key: "configs/config.yaml" for key, _ in _leaves(defaults, ()) if key[0] != "defaults"}
-    sensor = read_option("sensor", chosen.get("sensor") or default_option("sensor"), tuple(composer.searchpath))
+    sensor = read_option("sensor", options.get("sensor") or default_option("sensor"), tuple(composer.searchpath))
     for origin, text in layers:
         for name, value in range_settings(*parse(text), sensor):
             path = (name, "name") if name in GROUPS and isinstance(value, str) else tuple(name.split("."))
@@ -117,8 +119,8 @@ def _origins(composer: Composer, layers: Sequence[Layer]) -> dict[Key, str]:
 
 
 def _file(composer: Composer, group: str, option: str) -> str:
-    own = any((root / group / f"{option}.yaml").is_file() for root in composer.searchpath)
-    return f"{'the campaign, ' if own else ''}{CONFIGS.name}/{group}/{option}.yaml"
+    of_campaign = any((root / group / f"{option}.yaml").is_file() for root in composer.searchpath)
+    return f"{'the campaign, ' if of_campaign else ''}{CONFIGS.name}/{group}/{option}.yaml"
 
 
 def _origin(key: Key, origins: Mapping[Key, str], config: Mapping[str, Any], composer: Composer) -> str:
@@ -128,7 +130,7 @@ def _origin(key: Key, origins: Mapping[Key, str], config: Mapping[str, Any], com
         return "effects of the campaign's own"
     if key[:2] == ("method", "stages"):
         return _file(composer, "method", config["method"][key[2]])
-    found = next((origins[key[:length]] for length in range(len(key), 0, -1) if key[:length] in origins), None)
-    if found is None and key[0] == "sensor" and key[2:3] == ("effects",):
+    origin = next((origins[key[:length]] for length in range(len(key), 0, -1) if key[:length] in origins), None)
+    if origin is None and key[0] == "sensor" and key[2:3] == ("effects",):
         return "limits of the campaign's own effects"
-    return found or "not set anywhere: the default"
+    return origin or "not set anywhere: the default"

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 EPILOG = """\
-The format of IN follows from its name and content, that of OUT from its name: kalibr.yaml, px4.params,
-calibration.json ... The written file is read back and compared with IN; the terminal states what is lost. Formats in
-counts, and those with noise densities, need --sensor where IN does not name the sensor.
+The format of IN follows from its name and content, the format of OUT from its name: kalibr.yaml, px4.params,
+calibration.json ... The written file is read back and compared with IN; the command prints what is lost. Formats in
+counts, and formats with noise densities, need --sensor if IN does not name the sensor.
 
 examples:
   python -m pipeline convert results/demo/calibrations/mpu6050-1.json px4.params
@@ -39,8 +39,8 @@ def main(argv: Sequence[str]) -> int:
     add = parser.add_argument
     add("source", type=Path, metavar="IN", help="a calibration in any of the formats")
     add("target", type=Path, metavar="OUT", help="the file to write")
-    add("--from", dest="source_format", metavar="FORMAT", help="format of IN, where name and content are ambiguous")
-    add("--to", dest="target_format", metavar="FORMAT", help="format of OUT, where its name is another")
+    add("--from", dest="source_format", metavar="FORMAT", help="format of IN, if name and content are ambiguous")
+    add("--to", dest="target_format", metavar="FORMAT", help="format of OUT, if it differs from the name")
     arguments = parser.parse_args(argv)
     imported = read_any(arguments.source, arguments.source_format, counts_of(sensor_config(arguments.sensor)))
     config = sensor_config(arguments.sensor, imported)
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def sensor_config(sensor: str | None, imported: ImportedCalibration | None = None) -> dict[str, Any]:
-    """Return the configuration of a sensor, by its name or that in a calibration: sensor to its part, may be empty."""
+    """Return the file of a sensor model, named by ``sensor`` or by the calibration; empty if neither names one."""
     name = sensor or (imported.document or {}).get("sensor") if imported else sensor
     file = CONFIGS / "sensor" / f"{name}.yaml"
     if name is None or (sensor is None and not file.is_file()):

@@ -1,4 +1,4 @@
-"""Print a diagnosis in plain words, or the equation of a calibration with its numbers and a worked sample."""
+"""Print a diagnosis in words, or the equation of a calibration with its numbers and a worked example."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 EPILOG = """\
 examples:
-  python -m pipeline explain demo mpu6050-2-hidden                       what is missing, and the evidence
-  python -m pipeline explain results/demo/calibrations/mpu6050-1.json    how the numbers are to be used
-  python -m pipeline explain kalibr.yaml                                 the same of another program's calibration
+  python -m pipeline explain demo mpu6050-2-hidden                       missing effects, and the evidence
+  python -m pipeline explain results/demo/calibrations/mpu6050-1.json    how to use the numbers
+  python -m pipeline explain kalibr.yaml                                 likewise for a calibration of another program
 """
 
 
@@ -49,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
     words = "a campaign, the folder of its results, or a file: a diagnosis or a calibration"
     parser.add_argument("campaign", metavar="WHAT", help=words)
     parser.add_argument("units", metavar="UNIT", nargs="*", help="units of the campaign (default: all)")
-    words = "format of a calibration, where name and content of the file are ambiguous"
+    words = "format of a calibration, if name and content of the file are ambiguous"
     parser.add_argument("--from", dest="format", metavar="FORMAT", help=words)
     arguments = parser.parse_args(argv)
     file = Path(arguments.campaign)
@@ -66,13 +66,13 @@ def main(argv: Sequence[str]) -> int:
 
 def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
     """Return the diagnoses and failures of the units; ``MissingInputError`` if there are none."""
-    given = Path(campaign)
-    if is_published(given):
-        folder, files, failures = given.parent.parent, {given.stem: given}, {}
+    path = Path(campaign)
+    if is_published(path):
+        folder, files, failures = path.parent.parent, {path.stem: path}, {}
     else:
-        folders = [folder for folder in (given, results / given.name) if (folder / "diagnoses").is_dir()]
+        folders = [folder for folder in (path, results / path.name) if (folder / "diagnoses").is_dir()]
         if not folders:
-            raise MissingInputError(f"no diagnoses in {given} or {results / given.name}; run the campaign first")
+            raise MissingInputError(f"no diagnoses in {path} or {results / path.name}; run the campaign first")
         folder = folders[0]
         failed = folder / "failures.json"
         failures = {failure["unit"]: failure for failure in (read_json(failed) if failed.is_file() else [])}
@@ -94,14 +94,15 @@ def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
     return Selection(folder, diagnoses, {unit: f for unit, f in failures.items() if not units or unit in units})
 
 
-def explain(found: Selection) -> str:
+def explain(selection: Selection) -> str:
     """Return the diagnoses as text, each with the error on held-out motion and the commands that add effects."""
-    entries, results = read_history(found.folder), str(found.folder.parent)
-    settings = (entries[-1].get("settings") if entries else None) or {"campaign": found.folder.name}
+    folder, diagnoses, failures = selection
+    entries, results = read_history(folder), str(folder.parent)
+    settings = (entries[-1].get("settings") if entries else None) or {"campaign": folder.name}
     units: list[JSON] = []
-    for unit, document in found.diagnoses.items():
+    for unit, document in diagnoses.items():
         validation, calibration = (
-            _json(found.folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
+            _json(folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
         )
         name = document.get("unit", unit)
         units.append({
@@ -118,9 +119,9 @@ def explain(found: Selection) -> str:
                     for source, reason in beyond_uncertainty(calibration.get(s))
                 ),
                 *(
-                    f"{s.capitalize()}: {lack}."
+                    f"{s.capitalize()}: {reason}."
                     for s in SENSORS
-                    if (lack := (calibration.get(s) or {}).get("not_determined"))
+                    if (reason := (calibration.get(s) or {}).get("not_determined"))
                 ),
                 *(f"Left out: {line}." for line in left_out(calibration.get("inputs"))),
             ],
@@ -128,30 +129,30 @@ def explain(found: Selection) -> str:
         })  # fmt: skip
     findings = [
         Finding(unit, sensor, document[sensor]["verdict"], document[sensor]["selected"])
-        for unit, document in found.diagnoses.items()
+        for unit, document in diagnoses.items()
         for sensor in SENSORS
         if document.get(sensor)
     ]
     counts = Counter(finding.verdict.replace("_", " ") for finding in findings).most_common()
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
-    failed = [f"failed: {', '.join(found.failures)}"] if found.failures else []
+    failed = [f"failed: {', '.join(failures)}"] if failures else []
     text: str = template("explain.txt").render(
         far=FAR,
-        counted=f"{len(findings)} sensors of {len(found.diagnoses)} units: {counted}",
+        counted=f"{len(findings)} sensors of {len(diagnoses)} units: {counted}",
         groups=[*lines_of(verdict_groups(findings)), *failed],
         commands=next_commands(findings, settings, results)[:-1],  # the last is this command
-        units=[*units, *({"name": unit, "failure": failure} for unit, failure in found.failures.items())],
+        units=[*units, *({"name": unit, "failure": failure} for unit, failure in failures.items())],
     )
     return text
 
 
 def _is_diagnosis(document: object) -> bool:
-    """Return whether a document holds both sensors, without the status that a calibration has."""
+    """Return whether a document has parts of both sensors and, unlike a calibration, no status."""
     return isinstance(document, dict) and set(SENSORS) <= set(document) and "status" not in document
 
 
 def _json(file: Path) -> Any:  # noqa: ANN401
-    """Return the content of a JSON file; None where it does not exist or is not JSON."""
+    """Return the content of a JSON file; None if it does not exist or is not JSON."""
     try:
         return json.loads(read_published(file))
     except (OSError, ValueError):

@@ -54,13 +54,13 @@ def main(argv: Sequence[str]) -> int:
     if (table["motion"] == "none") == (procedure_name in TABLE_PROCEDURES):
         known = ", ".join(TABLE_PROCEDURES)
         raise ConfigurationError(
-            f"procedure {procedure_name} does not fit table {table_name}: {known} need a table, the others go without "
-            "one (table hand); docs/record.md shows both"
+            f"procedure {procedure_name} does not fit table {table_name}: {known} need a table, the others need none "
+            "(table hand); docs/record.md shows both"
         )
     unit = UnitDescription(arguments.unit, sensor=sensor_name, table=table_name, procedure=procedure_name)
     text = readme(unit, arguments.directory.resolve().name)
     if ranges != _ranges_of(sensor):
-        text += "\nThe sizes hold for the ranges of the sensor's file; campaign.yaml states the ranges of this bench.\n"
+        text += "\nThe sizes apply to the ranges in the sensor file; campaign.yaml states the ranges of this bench.\n"
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)
     folder.mkdir(parents=True, exist_ok=True)
     (arguments.directory / "README.md").write_text(text, encoding="utf-8")
@@ -77,7 +77,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _accuracy(name: str, table: dict[str, Any]) -> str:
-    """Return the accuracy of the table that the results assume, and how to state another."""
+    """Return the assumed accuracy of the table, and how to state another, in words."""
     if table["motion"] == "none":
         return f"table {name}: there is no table; the unit is placed by hand"
     others = ", ".join(option for option in _options("table") if option != name)
@@ -89,7 +89,7 @@ def _accuracy(name: str, table: dict[str, Any]) -> str:
 
 
 def _chosen(group: str, given: str | None, default: str) -> str:
-    """Return the option of a group: as given, as answered on a terminal, or the default."""
+    """Return the option of a group: the given one, the user's answer on a terminal, or the default."""
     if given is not None or not sys.stdin.isatty():
         return given or default
     files = sorted((CONFIGS / group).glob("*.yaml"))
@@ -100,15 +100,15 @@ def _chosen(group: str, given: str | None, default: str) -> str:
 
 
 def _chosen_ranges(sensor: dict[str, Any], given: list[float] | None) -> list[float]:
-    """Return the range of each sensor: as given, as answered on a terminal, or those of the sensor's file."""
-    held = _ranges_of(sensor)
+    """Return the range of each sensor: the given one, the user's answer on a terminal, or that of the sensor file."""
+    defaults = _ranges_of(sensor)
     if given is None and sys.stdin.isatty():
-        shown = " ".join(f"{value:g}" for value in held)
+        shown = " ".join(f"{value:g}" for value in defaults)
         try:
             given = [float(word) for word in input(f"ranges, g and deg/s [{shown}]: ").split()]
         except ValueError:
             raise ConfigurationError(f"ranges: expected two numbers such as {shown}") from None
-    return [*(given or []), *held[len(given or []) :]]
+    return [*(given or []), *defaults[len(given or []) :]]
 
 
 def _ranges_of(sensor: dict[str, Any]) -> list[float]:
@@ -116,20 +116,21 @@ def _ranges_of(sensor: dict[str, Any]) -> list[float]:
 
 
 def _campaign(procedure: str, name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
-    """Return ``campaign.yaml``: the settings of the ranges are comments where they are those of the sensor's file."""
-    held = [(s, sensor[s]["full_scale"], SENSOR_UNITS[s]) for s in SENSORS if sensor.get(s)]
-    other = [
-        None if value == float(full_scale) else value for value, (_, full_scale, _) in zip(wanted, held, strict=False)
+    """Return ``campaign.yaml``; settings of ranges that equal those of the sensor file are comments."""
+    defaults = [(s, sensor[s]["full_scale"], SENSOR_UNITS[s]) for s in SENSORS if sensor.get(s)]
+    changed = [
+        None if value == float(full_scale) else value
+        for value, (_, full_scale, _) in zip(wanted, defaults, strict=False)
     ]
     larger = []
-    for s, full_scale, _ in held:
+    for s, full_scale, _ in defaults:
         listed = [float(r) for r in sensor[s].get("ranges") or ()] or [2.0 * full_scale]
         larger.append(min((r for r in listed if r > full_scale), default=full_scale))
     text: str = template("campaign.yaml").render(
         procedure=procedure,
         sensor=name,
-        held=held,
-        settings=settings_of_ranges(sensor, [*other, *wanted[len(other) :]]),
+        held=defaults,
+        settings=settings_of_ranges(sensor, [*changed, *wanted[len(changed) :]]),
         example=settings_of_ranges(sensor, larger),
         groups={group: _options(group) for group in GROUPS},
     )

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 EPILOG = """\
-The unit must rest during the whole log. The slow terms need hours; a term for which the log is too short is printed as
-an upper limit (<). -o writes the file of another program, chosen by its name (kalibr_imu.yaml, vins.yaml), or all
-results as .json.
+The unit must rest during the whole log. The slow terms need hours; for a term that needs a longer log, an upper limit
+(<) is printed. -o writes the file of another program, chosen by its name (kalibr_imu.yaml, vins.yaml), or all results
+as .json.
 
 examples:
   python -m pipeline noise static.csv
@@ -45,21 +45,21 @@ def main(argv: Sequence[str]) -> int:
     config = config_of_log(log, arguments.ingest, arguments.sensor)
     ingest, sensor_config = config["ingest"], config["sensor"] if arguments.sensor else {}
     recording = Reading.alone([log], ingest, sensor_config, role="static").checked()
-    found = identify_noise([recording])
-    print("\n\n".join(_told(sensor, found[sensor]) for sensor in SENSORS).replace(MINUS, "-"))
+    noise = identify_noise([recording])
+    print("\n\n".join(_table_of(sensor, noise[sensor]) for sensor in SENSORS).replace(MINUS, "-"))
     if target is None:
         return 0
-    document = {"unit": log.stem, "sensor": arguments.sensor, "noise": found}
+    document = {"unit": log.stem, "sensor": arguments.sensor, "noise": noise}
     document["inputs"] = [{"rate_hz": round(1.0 / recording.interval, 6)}]
-    text = json_text(found)
+    text = json_text(noise)
     if target.suffix != ".json":
-        known = {s: config["sensor"][s] if arguments.sensor else {} for s in SENSORS}
-        identified = {s: any(axis["terms"] for axis in (found[s]["axes"] or {}).values()) for s in SENSORS}
-        missing = [s for s in SENSORS if not identified[s] and not known[s]]
+        sensor_file = {s: config["sensor"][s] if arguments.sensor else {} for s in SENSORS}
+        identified = {s: any(axis["terms"] for axis in (noise[s]["axes"] or {}).values()) for s in SENSORS}
+        missing = [s for s in SENSORS if not identified[s] and not sensor_file[s]]
         if missing:
             raise ConfigurationError(f"the log holds no noise of the {' and '.join(missing)}: state --sensor", str(log))
-        exported = {"sensor": known, "table": {"gravity_g": 1.0}}
-        (text,) = export(target.name, ExportedUnit(document, exported)).values()
+        settings = {"sensor": sensor_file, "table": {"gravity_g": 1.0}}
+        (text,) = export(target.name, ExportedUnit(document, settings)).values()
     write_atomically(target, text)
     print(f"written: {target}", file=sys.stderr)
     return 0
@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _told(sensor: str, noise: JSON) -> str:
+def _table_of(sensor: str, noise: JSON) -> str:
     lines = [sensor]
     if noise["source"]:
         lines[0] += f": {noise['samples']} samples, {number(noise['length_s'])} s without a gap"

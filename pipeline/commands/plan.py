@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 FILE = "simulation.yaml"
 EPILOG = """\
 For each effect the plan states the smallest size that the diagnosis would find in half of the units, at the noise of
-the sensor file; its share of the sensor file's limit; effects with a similar signal; and up to which size one of
-these would be named instead.
+the sensor file; this size as a share of the limit in the sensor file; effects with a similar signal; and the size up
+to which one of these would be named instead.
 
 examples:
   python -m pipeline plan
@@ -52,14 +52,14 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _joined(argv: Sequence[str]) -> list[str]:
-    """Return the arguments with what follows ``--against`` joined to it, as it begins with a dash itself."""
-    found: list[str] = []
+    """Join ``--against`` and its value by ``=``, because argparse refuses a separate value with a leading dash."""
+    words: list[str] = []
     for argument in argv:
-        if found and found[-1] == "--against":
-            found[-1] = f"--against={argument}"
+        if words and words[-1] == "--against":
+            words[-1] = f"--against={argument}"
         else:
-            found.append(argument)
-    return found
+            words.append(argument)
+    return words
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -86,23 +86,23 @@ def _parser() -> argparse.ArgumentParser:
 def _register_effects(arguments: Mapping[str, Any]) -> None:
     campaign: Path | None = arguments["campaign"]
     of_campaign = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
-    for own in read_effect_files([*of_campaign, *arguments["effects"]]).values():
-        register(own)
+    for effect in read_effect_files([*of_campaign, *arguments["effects"]]).values():
+        register(effect)
 
 
 def unit_of(arguments: Mapping[str, Any], base: UnitDescription | None) -> UnitDescription:
-    """Return what is to be planned: the options, over a description where there is one."""
-    given = described(arguments)
+    """Return the unit to plan: a description, if there is one, in which the options replace values."""
+    options = described(arguments)
     if base is None:
-        return UnitDescription(unit="plan", **given)
+        return UnitDescription(unit="plan", **options)
     if not {"table", "procedure"} & set(arguments):
-        del given["table"]
-    course = {**base.course, **given.pop("course", {})}
-    return replace(base, **given, course=course)
+        del options["table"]
+    course = {**base.course, **options.pop("course", {})}
+    return replace(base, **options, course=course)
 
 
 def _described_unit(arguments: Mapping[str, Any]) -> UnitDescription | None:
-    """Return the unit of the description that is asked for, None where none is."""
+    """Return the unit of the description that the options name; None without a description."""
     source, campaign, name = (arguments[key] for key in ("source", "campaign", "unit"))
     if source is not None and campaign is not None:
         raise ConfigurationError("--from and --campaign both name a description; give one of them")
@@ -110,7 +110,7 @@ def _described_unit(arguments: Mapping[str, Any]) -> UnitDescription | None:
         source = campaign / FILE
         if campaign.is_dir() and not source.is_file():
             raise ConfigurationError(
-                f"this campaign has no {FILE}, so how it is recorded is not known; "
+                f"this campaign has no {FILE}, so its procedure is unknown; "
                 "give its sensor, table, procedure and course as options",
                 str(campaign),
             )
@@ -125,7 +125,7 @@ def _described_unit(arguments: Mapping[str, Any]) -> UnitDescription | None:
 
 
 def _other(options: str, arguments: Mapping[str, Any], first: UnitDescription) -> UnitDescription:
-    """Return the second procedure: the first with some options changed."""
+    """Return the second procedure: the first with changed options."""
     parser = argparse.ArgumentParser(prog="--against", argument_default=argparse.SUPPRESS, exit_on_error=False)
     add_recording_options(parser)
     try:

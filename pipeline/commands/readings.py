@@ -1,4 +1,4 @@
-"""How a log is read that a command names: its files, and the configuration that its campaign or its options give."""
+"""Find the files of a log that a command reads, and the configuration from its campaign or from the options."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 DEFAULT_PROFILE = "canonical_csv"
-SEARCHED_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
+SEARCHED_FOLDERS = 4  # from the folder of the log upwards: a campaign is above raw/<unit>/
 
 
 @dataclass
 class Reading:
-    """Files that are read as one recording, and the sections of the configuration by which they are read."""
+    """Files that are read as one recording, and the sections of the configuration for it."""
 
     files: list[Path]
     settings: dict[str, Any]
@@ -41,24 +41,24 @@ class Reading:
     def alone(
         cls, files: list[Path], ingest: dict[str, Any], sensor: dict[str, Any], said: str = "", role: str = "rests"
     ) -> Reading:
-        """Return how files are read that belong to no campaign: without a table."""
+        """Return the reading of files that belong to no campaign, without a table."""
         recordings = {files[0].stem: {"role": role, "axis": None}}
         settings = {"procedure": {"recordings": recordings}, "table": {}, "sensor": sensor, "ingest": ingest}
         return cls(files, settings, said)
 
     @property
     def has_topics(self) -> bool:
-        """Whether the recording is a log of messages: MCAP, or a format that an extra reads."""
+        """Whether the recording is a message log: MCAP, or a format that needs an extra."""
         return self.files[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS)
 
     def recording(self) -> Recording:
-        """Return the recording, not compared with others."""
+        """Return the recording, without checks."""
         ((name, entry),) = self.settings["procedure"]["recordings"].items()
         table = read_table(self.files, self.settings["ingest"], session=entry.get("session"))
         return to_recording(name, entry, table, self.settings["sensor"], checks_of(self.settings["ingest"]))
 
     def checked(self) -> Recording:
-        """Return the recording, checked alone."""
+        """Return the recording after the checks of a single recording."""
         return check_recordings([self.recording()], self.settings)[0]
 
 
@@ -71,21 +71,21 @@ def grouped(files: Sequence[Path], ingest: dict[str, Any]) -> list[list[Path]]:
             groups[file] = [file]
             continue
         patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]
-        found = next((m for p in patterns if (m := re.fullmatch(p, file.name))), None)
-        if found is None:
+        match = next((m for p in patterns if (m := re.fullmatch(p, file.name))), None)
+        if match is None:
             raise ConfigurationError(f"matches none of the profile's parts ({', '.join(parts)})", str(file))
-        stem = found.group(1) if found.groups() else ""
+        stem = match.group(1) if match.groups() else ""
         groups[file.parent / stem] = [file.parent / p.replace(FILE, stem) for p in parts]
     return list(groups.values())
 
 
 def absolute(file: Path) -> Path:
-    """Return an absolute path in which links are not followed."""
+    """Return an absolute path without following links."""
     return Path(os.path.abspath(file))  # noqa: PTH100  (resolve() follows links)
 
 
 def campaign_of(file: Path) -> Path | None:
-    """Return the campaign that a file, or the link to it, lies in; None where it lies in none."""
+    """Return the campaign that contains a file or the link to it; None if there is none."""
     above = [*absolute(file).parents, *file.resolve().parents]
     return next((d for d in above if (d / "units.csv").is_file()), None)
 
@@ -93,8 +93,8 @@ def campaign_of(file: Path) -> Path | None:
 def recordings_of_files(
     files: Sequence[Path], campaign: Campaign, units: Sequence[str]
 ) -> tuple[dict[str, list[str]], list[Path]]:
-    """Return which recordings of which units files are, and the files that are none."""
-    known: dict[Path, tuple[str, list[str]]] = {}
+    """Return the names of the recordings that files contain, by unit, and the files of no recording."""
+    known: dict[Path, tuple[str, list[str]]] = {}  # file to its unit and recordings
     for unit in units:
         config, folder = campaign.units[unit].config, campaign.folder(unit)
         for name, candidates in candidate_files(config["procedure"], config["ingest"]).items():
@@ -116,20 +116,20 @@ def recordings_of_files(
 def config_of_log(
     file: Path, profile: str | None, sensor: str | None, more: Sequence[str] = (), campaign: Path | None = None
 ) -> dict[str, Any]:
-    """Return the configuration by which a log is read alone: by a profile (default: ``DEFAULT_PROFILE``) and a sensor.
+    """Return the configuration for a single log, from a profile (default: ``DEFAULT_PROFILE``) and a sensor.
 
-    The options of the campaign that is named, or that the log lies in, may be named too. ``more``: further overrides.
+    Both may be options of ``campaign`` or, by default, of the campaign that contains the log. ``more``: overrides.
     """
     campaign = campaign or campaign_of(file)
     return composed(named(profile, file, campaign) if profile else DEFAULT_PROFILE, sensor, campaign, more)
 
 
 def named(profile: str, file: Path, campaign: Path | None) -> str:
-    """Return a profile as it is to be read: a name that is known, or the only saved file of that name.
+    """Return a known name of a profile unchanged, else the path of the only saved file with that name.
 
-    A file is looked for in the working directory, in the folders about the log, and in ``configs/ingest`` of each of
-    these and of the campaigns below the working directory. Raises ``ConfigurationError`` if files of that name hold
-    different profiles, or there is none.
+    The search includes the working directory, the folders above the log, and ``configs/ingest`` of each of these and of
+    the campaigns below the working directory. Raises ``ConfigurationError`` if there is no such file, or if files of
+    that name contain different profiles.
     """
     known = [root / "ingest" / f"{profile}.yaml" for root in (CONFIGS, *([campaign / "configs"] if campaign else []))]
     if Path(profile).suffix in (".yaml", ".yml") or any(place.is_file() for place in known):
@@ -137,28 +137,28 @@ def named(profile: str, file: Path, campaign: Path | None) -> str:
     folders = [Path.cwd(), *list(file.resolve().parents)[:SEARCHED_FOLDERS]]
     places = [place for folder in folders for place in (folder, folder / "configs" / "ingest")]
     places += sorted(Path.cwd().glob("*/configs/ingest"))
-    found = {f.resolve(): f.read_bytes() for place in places if (f := place / f"{profile}.yaml").is_file()}
-    if len(set(found.values())) > 1:
-        raise ConfigurationError(f"--ingest {profile} is one of {', '.join(map(str, found))}; name its path")
-    if not found:
+    saved = {f.resolve(): f.read_bytes() for place in places if (f := place / f"{profile}.yaml").is_file()}
+    if len(set(saved.values())) > 1:
+        raise ConfigurationError(f"--ingest {profile} is one of {', '.join(map(str, saved))}; name its path")
+    if not saved:
         valid = nearest(profile, {f.stem for place in known for f in place.parent.glob("*.yaml")})
         raise ConfigurationError(f"--ingest {profile}: no such ingest{valid}; name a profile of your own by its file")
-    return str(next(iter(found)))
+    return str(next(iter(saved)))
 
 
 def composed(profile: str, sensor: str | None, campaign: Path | None, more: Sequence[str] = ()) -> dict[str, Any]:
-    """Return a configuration with a profile, and with ``more`` overrides."""
+    """Return a configuration with a profile (name or file), a sensor and overrides ``more``."""
     path = Path(profile)
     layers = ["procedure=multi_position", *([f"sensor={sensor}"] if sensor else []), *more]
     with tempfile.TemporaryDirectory() as folder:
-        own = campaign or Path(folder)
+        directory = campaign or Path(folder)
         if path.suffix in (".yaml", ".yml"):
             if not path.is_file():
                 raise ConfigurationError("there is no such file", profile)
-            own = Path(folder)
-            (own / "configs" / "ingest").mkdir(parents=True)
-            copyfile(path, own / "configs" / "ingest" / f"{path.stem}.yaml")
+            directory = Path(folder)
+            (directory / "configs" / "ingest").mkdir(parents=True)
+            copyfile(path, directory / "configs" / "ingest" / f"{path.stem}.yaml")
         try:
-            return Composer(own).unit("check", [*layers, f"ingest={path.stem}"])
+            return Composer(directory).unit("check", [*layers, f"ingest={path.stem}"])
         except Problem as problem:
-            raise ConfigurationError(str(problem), profile if own == Path(folder) else None) from None
+            raise ConfigurationError(str(problem), profile if directory == Path(folder) else None) from None

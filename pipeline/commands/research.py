@@ -1,4 +1,4 @@
-"""Research on the product: the blind study of the diagnosis, and the comparison with the thesis."""
+"""Run the blind study of the diagnosis, and the comparison with the thesis."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ if TYPE_CHECKING:
 STUDY = """\
 families: {}
 
-The truth is written to DIR/truth.jsonl, which the diagnosis never reads; the diagnoses to DIR/results.jsonl. A case
-with a result is not run again, so the same command continues an interrupted study; use a new directory after a
+The truth is written to DIR/truth.jsonl, which the diagnosis never reads, and the diagnoses to DIR/results.jsonl. The
+same command continues an interrupted study, because a case with a result is not run again. Use a new directory after a
 change of the code. A case takes one to three seconds.
 """
 THESIS = """\
-page    what a run of the campaign does: compares the results in DIR with the printed figures of the campaign
+page    compares the results in DIR with the printed figures of the campaign, as a run of the campaign does
 seeds   simulates the campaign's recordings with every seed and writes FILE (data/thesis/seeds.csv is made by
         python -m pipeline thesis seeds --campaign data/thesis --output data/thesis/seeds.csv; 10 minutes)
 """
 
 
 def study(argv: Sequence[str]) -> int:
-    """Run the blind study of the diagnosis: hide effects at random, diagnose them, count what is found."""
+    """Run the blind study of the diagnosis: hide random effects, diagnose the units, and count correct answers."""
     from pipeline.run_progress import Countdown  # noqa: PLC0415
-    from pipeline.study.cases import FAMILIES  # noqa: PLC0415  (what a comparison with the thesis does not need)
+    from pipeline.study.cases import FAMILIES  # noqa: PLC0415  (not needed for a comparison with the thesis)
     from pipeline.study.page import DIAGRAM, page  # noqa: PLC0415
     from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study  # noqa: PLC0415
     from pipeline.study.scores import answer_scores, cases_of, family_scores, reliability_diagram  # noqa: PLC0415
 
     parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder for the truth and the results")
-    words = "families of cases, with commas; a first word (null, shape) means all families that begin with it; or all"
+    words = "families of cases, separated by commas; a first word (null, shape) selects all families with it; or all"
     parser.add_argument("--families", default="single,pairs,null_normal", help=words)
     parser.add_argument("--n", type=int, default=100, help="cases of each family (default: 100)")
     parser.add_argument("--seed", type=int, default=1, help="seed of all random numbers (default: 1)")
     parser.add_argument("--processes", type=int, default=1, help="processor cores (default: 1)")
-    words = "write the study as a Markdown page, and its diagram to images/ beside it"
+    words = "write the study as a Markdown page, and its diagram to the folder images/ next to it"
     parser.add_argument("--table", type=Path, metavar="FILE", help=words)
     arguments = parser.parse_args(argv)
     families = _families(arguments.families, FAMILIES)
@@ -70,18 +70,18 @@ def study(argv: Sequence[str]) -> int:
 
 
 def _families(text: str, known: Sequence[str]) -> list[str]:
-    """Return the families that are asked for, each once."""
-    found: list[str] = []
+    """Return the families that ``--families`` selects, each once."""
+    families: list[str] = []
     for name in text.split(","):
-        these = [f for f in known if name in (f, "all")] or [f for f in known if f.startswith(f"{name}_")]
-        if not these:
+        selected = [f for f in known if name in (f, "all")] or [f for f in known if f.startswith(f"{name}_")]
+        if not selected:
             raise ConfigurationError(f"no family is called {name!r}; known: {', '.join(known)}")
-        found += [family for family in these if family not in found]
-    return found
+        families += [family for family in selected if family not in families]
+    return families
 
 
 def thesis(argv: Sequence[str]) -> int:
-    """Compare the results with those printed in the thesis, and judge its conclusions over many seeds."""
+    """Compare the results with the figures of the thesis, and test its conclusions over many seeds."""
     parser = parser_of("thesis", thesis.__doc__, THESIS)
     parser.add_argument("what", choices=("page", "seeds"))
     parser.add_argument(
@@ -101,7 +101,7 @@ def thesis(argv: Sequence[str]) -> int:
         return 0
     if arguments.results is None:
         parser.error("page needs --results DIR, of a run of the campaign")
-    from pipeline.thesis.page import render  # noqa: PLC0415  (the study needs no page)
+    from pipeline.thesis.page import render  # noqa: PLC0415  (not needed for the study)
 
     write_atomically(arguments.output, render(arguments.campaign, arguments.results))
     return 0
@@ -113,12 +113,12 @@ def _seeds(campaign: Path, count: int, processes: int, output: Path) -> None:
 
     import pandas as pd  # noqa: PLC0415
 
-    from pipeline.thesis.seeds import COLUMNS, sets_of, study_of  # noqa: PLC0415  (the page needs none of the estimators)
+    from pipeline.thesis.seeds import COLUMNS, sets_of, study_of  # noqa: PLC0415  (estimators: not for the page)
 
     rows = []
     sets = sets_of(campaign)
     with ProcessPoolExecutor(processes) as pool:
-        for name, found in zip(sets, pool.map(partial(study_of, campaign, range(count)), sets), strict=True):
-            rows += found
-            print(f"{name}: {len(found)} rows", file=sys.stderr, flush=True)
+        for name, of_set in zip(sets, pool.map(partial(study_of, campaign, range(count)), sets), strict=True):
+            rows += of_set
+            print(f"{name}: {len(of_set)} rows", file=sys.stderr, flush=True)
     pd.DataFrame(rows, columns=COLUMNS).to_csv(output, index=False, float_format="%.5g", lineterminator="\n")

@@ -23,34 +23,35 @@ examples:
   imu-calibration run my_bench --config 'unit_overrides={U1: [filter.cutoff_hz=2]}'
   imu-calibration run my_bench -- --dry-run
 
-Snakemake runs the stages: what is up to date is not computed again. Options after -- are passed on to Snakemake.
+Snakemake runs only stages whose inputs, settings or code have changed. Options after -- are passed on to Snakemake.
 """
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run ``imu-calibration run CAMPAIGN [OVERRIDE ...]``; the exit code is that of the run."""
+    """Run ``imu-calibration run CAMPAIGN [OVERRIDE ...]``; return the exit code of Snakemake."""
     parser = parser_of("run", __doc__, EPILOG)
     parser.add_argument(
         "campaign",
         metavar="CAMPAIGN",
-        help="a campaign's directory, or the name of one that is shipped: demo, published",
+        help="directory of a campaign, or the name of a shipped campaign: demo, published",
     )
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="settings for every unit (Hydra overrides)")
     add_run_options(parser)
-    at = list(argv).index("--") if "--" in argv else len(argv)
-    arguments = parser.parse_args(argv[:at])
+    end = list(argv).index("--") if "--" in argv else len(argv)
+    arguments = parser.parse_args(argv[:end])
     config = list(arguments.config)
     if arguments.overrides:
         if any(word.startswith("overrides=") for word in config):
             raise ConfigurationError("overrides are given twice, as KEY=VALUE and by --config; give them once")
         config.append(f"overrides={json.dumps(arguments.overrides)}")
-    return run_snakemake(arguments, config, argv[at + 1 :])
+    return run_snakemake(arguments, config, argv[end + 1 :])
 
 
 def run_snakemake(arguments: argparse.Namespace, config: Sequence[str], options: Sequence[str] = ()) -> int:
-    """Run a campaign with the shipped rules, settings KEY=VALUE and options of Snakemake; return the exit code.
+    """Run a campaign with the shipped rules; return the exit code.
 
-    ``arguments`` holds ``campaign`` and what ``add_run_options`` adds.
+    ``arguments``: ``campaign`` and the options of ``add_run_options``; ``config``: settings KEY=VALUE; ``options``: of
+    Snakemake.
     """
     settings = [f"campaign={arguments.campaign}", *config]
     settings += [f"results={arguments.results}"] * (arguments.results != RESULTS)

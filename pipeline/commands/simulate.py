@@ -1,4 +1,4 @@
-"""Write a campaign of simulated units, with any physical effect hidden in them."""
+"""Write a campaign of simulated units with hidden physical effects."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 FILE = "simulation.yaml"
 EPILOG = """\
-The campaign follows from a description: DIR/simulation.yaml or --from FILE. Where there is none, or options are given,
-it follows from the options, and their description is written to DIR/simulation.yaml.
+The campaign follows from a description: DIR/simulation.yaml or --from FILE. With options, or without a description, it
+follows from the options, and the command writes their description to DIR/simulation.yaml.
 
 examples:
   python -m pipeline simulate data/fleet --units 100 --samples 10000 --seed 1
@@ -71,12 +71,12 @@ def main(argv: Sequence[str]) -> int:
         (directory / FILE).write_text(text, encoding="utf-8")
     directory.mkdir(parents=True, exist_ok=True)
     folder = directory if source is None else source.parent
-    for own in read_effect_files(sorted((folder / "effects").glob("*.yaml"))).values():
-        register(own)
+    for effect in read_effect_files(sorted((folder / "effects").glob("*.yaml"))).values():
+        register(effect)
     total = len(description.units)
     countdown, done = Countdown(total), count(1)
 
-    def tell(text: str) -> None:
+    def print_unit(text: str) -> None:
         number = next(done)
         left = countdown.left(number)
         print(f"{text} ({number} of {total}{', ' * bool(left)}{left})", flush=True)
@@ -84,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
     for sensor in sorted({unit.sensor for unit in description.units}):
         assumed = assumed_figures(sensor, read_config("sensor", sensor))
         print(f"note: {assumed}\n" if assumed else "", end="")
-    write_campaign(description, directory, (lambda _: None) if quiet else tell, sheet_only=sheet_only)
+    write_campaign(description, directory, (lambda _: None) if quiet else print_unit, sheet_only=sheet_only)
     print(f"then: {run_command({'campaign': str(directory)})}")
     return 0
 
@@ -93,9 +93,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = parser_of("simulate", __doc__, EPILOG, argument_default=argparse.SUPPRESS)
     add = parser.add_argument
     add("directory", type=Path, metavar="DIR", help="directory of the campaign; it is created if it does not exist")
-    add("--from", dest="source", type=Path, default=None, metavar="FILE", help="description of what to simulate (YAML)")
+    add("--from", dest="source", type=Path, default=None, metavar="FILE", help="description of the simulation (YAML)")
     add("--quiet", action="store_true", default=False, help="print no line for each unit")
-    add("--sheet-only", action="store_true", default=False, help="write units.csv, and leave the recordings to the run")
+    add("--sheet-only", action="store_true", default=False, help="write only units.csv; the run writes the recordings")
     add("--units", type=int, metavar="N", help="number of units (default: 1)")
     add("--prefix", metavar="NAME", help="names of the units: NAME001, NAME002 ... (default: U)")
     add("--seed", type=int, help="seed of all random numbers (default: 0)")
@@ -117,7 +117,7 @@ def _described(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _effect(text: str) -> tuple[str, Any]:
-    """Return name and size of an effect: ``name``, ``name=0.1`` or ``name=0.1,0.2,0.3``."""
+    """Split ``name``, ``name=0.1`` or ``name=0.1,0.2,0.3`` into name and size of an effect."""
     name, given, size = text.partition("=")
     if not given:
         return name, None

@@ -1,7 +1,7 @@
-"""A trial of a unit: the stages of a run from ``ingest`` to ``calibration``, in this process and a temporary folder.
+"""Run the stages of one unit from ``ingest`` to ``calibration`` in this process and a temporary folder.
 
-What a run refuses is refused here, by the same functions with the same settings. Diagnosis, exports and pages are left
-out.
+A trial uses the functions and settings of a run, so it refuses the same recordings. It has no diagnosis, exports or
+pages.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class Trial:
-    """What came of a unit.
+    """The result of a trial.
 
-    ``recordings``: as ingest leaves them. ``failure``: the record of what a run would refuse, None where it calibrates
-    the unit. ``not_calibrated``: the reason of each sensor that would be null. ``not_determined``: what its
-    rests do not determine, of each that would not be.
+    ``recordings``: output of ingest. ``failure``: the failure record of a run, None if the unit is calibrated.
+    ``not_calibrated``: sensor that is not calibrated to the reason. ``not_determined``: calibrated sensor to the
+    quantities that its rests do not determine.
     """
 
     recordings: list[Recording] = field(default_factory=list)
@@ -41,16 +41,16 @@ class Trial:
 
 
 def try_unit(campaign: Campaign, unit: str, until: str = "calibration", *, incomplete: bool = False) -> Trial:
-    """Return what a run would make of a unit.
+    """Run the stages of a unit and return the result.
 
-    ``until``: the last stage that is tried: ``ingest``, ``fit`` (without the stage ``effects``, which takes longest) or
-    ``calibration``. ``incomplete``: recordings that do not exist are left out.
+    ``until``: the last stage: ``ingest``, ``fit`` (without ``effects``, the slowest stage of a fit) or ``calibration``.
+    ``incomplete``: accept missing recordings.
     """
     row = campaign.units[unit]
     if incomplete:
         procedure = row.config["procedure"]
-        there = {name: entry | {"optional": True} for name, entry in procedure["recordings"].items()}
-        row = replace(row, config=row.config | {"procedure": procedure | {"recordings": there}})
+        optional = {name: entry | {"optional": True} for name, entry in procedure["recordings"].items()}
+        row = replace(row, config=row.config | {"procedure": procedure | {"recordings": optional}})
     batches, chains = cut_batches({unit: row}, 1)
     ((batch, _),) = batches.items()
     files = settings_of_jobs(replace(campaign, units={unit: row}, batches=batches, chains=chains, compare=[]))[batch]
@@ -60,7 +60,7 @@ def try_unit(campaign: Campaign, unit: str, until: str = "calibration", *, incom
         until, ["ingest", "filter", *fits, "validate", "calibration"]
     )
     packs: dict[str, Pack] = {}
-    found = Trial()
+    trial = Trial()
     with tempfile.TemporaryDirectory() as folder:
         for output in outputs:
             stage, sensor, name = [*output.split("/"), "", ""][:3]
@@ -74,8 +74,8 @@ def try_unit(campaign: Campaign, unit: str, until: str = "calibration", *, incom
             try:
                 job = Job(stage, {unit: settings}, content, packs, path, Path(folder))
                 made = getattr(import_module(f"pipeline.stages.{MODULES[stage]}"), f"{stage}_unit")(job, unit, settings)
-            except Exception as error:  # noqa: BLE001  (as a run: it stops this unit alone)
-                found.failure = failure_of(error, unit, output)
+            except Exception as error:  # noqa: BLE001  (like in a run, it stops only this unit)
+                trial.failure = failure_of(error, unit, output)
                 break
             finally:
                 forget()
@@ -83,9 +83,9 @@ def try_unit(campaign: Campaign, unit: str, until: str = "calibration", *, incom
                 add({file: as_bytes(member) for file, member in made.items()})
             packs[sensor or stage] = Pack(path)
             if stage == "ingest":
-                found.recordings = from_parquet(packs["ingest"].read(f"{unit}.parquet"), str(path))
+                trial.recordings = from_parquet(packs["ingest"].read(f"{unit}.parquet"), str(path))
             if stage == "calibration":
                 document = packs["calibration"].json(f"{unit}.json")
-                found.not_calibrated = document["not_calibrated"]
-                found.not_determined = {s: document[s]["not_determined"] for s in FITS if document[s]}
-    return found
+                trial.not_calibrated = document["not_calibrated"]
+                trial.not_determined = {s: document[s]["not_determined"] for s in FITS if document[s]}
+    return trial

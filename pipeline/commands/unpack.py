@@ -1,17 +1,11 @@
-"""Publish the files of units of a large campaign, whose files are in packs.
-
-Beyond ``publish_limit`` units a campaign publishes no files for each unit (docs/fleet.md). This command adds them for
-those that are asked for; later runs keep them.
-
-  python -m pipeline unpack my_fleet U0123 U0124
-"""
+"""Publish the files of units of a large campaign, whose files are in packs."""
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.commands import parser_of
 from pipeline.errors import MissingInputError
 from pipeline.files import flushed_together, write_atomically
 from pipeline.history import read_history
@@ -23,18 +17,22 @@ from pipeline.stages.gather import publish_histories
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+EPILOG = """\
+Above publish_limit units a run publishes no files of single units (docs/fleet.md). This command publishes them for the
+named units; later runs keep them.
+
+  python -m pipeline unpack my_fleet U0123 U0124
+"""
+
 
 def main(argv: Sequence[str]) -> int:
-    """Publish the files of the units."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline unpack", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Run ``python -m pipeline unpack C UNIT ...``."""
+    parser = parser_of("unpack", __doc__, EPILOG, ("--results",))
     parser.add_argument("campaign", metavar="C", type=Path, help="a campaign, or its results")
     parser.add_argument("units", metavar="UNIT", nargs="+", help="units whose files are published")
-    parser.add_argument("--results", type=Path, default=Path("results"), help="where results are (default: results)")
     arguments = parser.parse_args(argv)
-    given, units = arguments.campaign, arguments.units
-    results = given if (given / "summary.csv").is_file() else arguments.results / given.name
+    campaign, units = arguments.campaign, arguments.units
+    results = campaign if (campaign / "summary.csv").is_file() else Path(arguments.results) / campaign.name
     batches = batches_of(results)
     if not batches:
         raise MissingInputError("holds no packs: run the campaign first, or its units have files already", str(results))

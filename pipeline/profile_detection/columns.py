@@ -1,6 +1,6 @@
-"""The layout of an unknown text log, and its columns that may hold time, readings, temperature and the table's log.
+"""Find the layout of an unknown text log, and its likely columns of time, readings, temperature and table log.
 
-It is used to propose a profile only and is never applied unasked.
+The result only serves to propose a profile. It is never applied without the user's request.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     Triad = tuple[int, int, int]
 
 COUNTING = 0.98  # share of steps by exactly 1
-FEWEST_RISES = 4  # of a time for each fall; a noisy reading falls as often as it rises
-SCATTER = 0.2  # of intervals over their median: times of arrival, not of sampling
+FEWEST_RISES = 4  # of a time, per fall; a noisy reading falls as often as it rises
+SCATTER = 0.2  # of intervals, relative to their median: above, times are of arrival, not of sampling
 TEMPERATURE_RANGE = (-60.0, 130.0)  # degC, of electronics and their tests
 
-OFFSETS = (32768.0, 8192.0, 2048.0)  # middle of 16, 14 and 12 bits without a sign
-NEAR_OFFSET = 1 / 16  # of it, within which the median rates lie: 16 deg/s of +-250 deg/s, above usual biases
+OFFSETS = (32768.0, 8192.0, 2048.0)  # middle of unsigned 16, 14 and 12 bits
+NEAR_OFFSET = 1 / 16  # of the offset, for median rates: 16 deg/s of +-250 deg/s, above usual biases
 
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
 MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|om|omega|rot|rate)([xyz])")
@@ -57,7 +57,7 @@ TABLE_CHANNEL_WORDS = {
     "table_rate": {"rate", "speed", "velocity", "vel", "dps"},
     "table_angle": {"angle", "position", "pos", "deg", "cdeg", "encoder", "enc"},
 }
-SQUARED = (["s"], ["ms"], ["mps"])  # before a 2 that is a power, not an axis
+SQUARED = (["s"], ["ms"], ["mps"])  # words before a 2 that is an exponent, not an axis
 UNIT_ENDINGS = (
     ("m/s^2", ("m s 2", "mps 2", "ms 2")), ("deg/s", ("dps", "deg s", "degps")),
     ("rad/s", ("rad s", "rads", "radps", "rad")), ("degC", ("degc", "deg c", "c")), ("mg", ("mg",)), ("g", ("g",)),
@@ -65,8 +65,8 @@ UNIT_ENDINGS = (
     ("us", ("us", "micros", "usec", "microseconds")), ("ns", ("ns", "nanos", "nsec", "nanoseconds")), ("deg", ("deg",)),
 )  # fmt: skip
 LINES_TRIED = 400  # with each separator
-MOST_ROWS = 200_000  # read as numbers; bounds the cost
-FEWEST_ROWS = FEWEST_COLUMNS = 3  # less is no log of a three-axis sensor
+MOST_ROWS = 200_000  # that are parsed; limits the time
+FEWEST_ROWS = FEWEST_COLUMNS = 3  # of the log of a three-axis sensor
 SEPARATORS = (",", ";", "\t", "|", " ")
 NUMBER = {
     ".": re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"),
@@ -78,111 +78,111 @@ RATE_KEY = re.compile(r"(fs|odr|(sampl\w*[ _]?)?(rate|freq\w*))\b", re.IGNORECAS
 
 @dataclass
 class Columns:
-    """The index of the column that may hold each channel of a log."""
+    """The indices of the columns that probably contain the channels of a log."""
 
     log: Log
     time: int | None = None
     counter: int | None = None  # of samples
-    arrival: int | None = None  # a time that scatters beside a counter without a gap, which then is the time
+    arrival: int | None = None  # a time with scattering intervals; a counter without gaps then gives the time
     triads: dict[str, Triad] = field(default_factory=dict)  # sensor to its x, y, z
     others: dict[str, int] = field(default_factory=dict)  # temperature, table_angle ..
-    steady: bool = True  # time, or the counter of samples, never falls back
-    turn: tuple[float, str] | None = None  # counts a turn of the table's encoder, and how they show
+    steady: bool = True  # time, or the counter of samples, never decreases
+    turn: tuple[float, str] | None = None  # counts per turn of the table's encoder, and the evidence
     remarks: list[str] = field(default_factory=list)
 
     def free(self) -> list[int]:
-        """Return the columns of numbers that hold nothing known."""
+        """Return the columns of numbers that are assigned to no channel."""
         used = {self.time, self.counter, self.arrival, *self.others.values(), *sum(self.triads.values(), ())}
         return [i for i in self.log.numbers if i not in used]
 
 
 def whole(values: Values) -> bool:
-    """Return whether numbers are integers."""
+    """Return whether all values are integers."""
     return bool(np.all(values == np.rint(values)))
 
 
 def words_of(name: str) -> list[str]:
-    """Return the words of a name in lower case; brackets at its end count where they hold an axis."""
+    """Return the words of a name in lower case, without brackets at its end unless they contain an axis."""
     bracket = BRACKETS.search(name)
     axis = bracket is not None and bracket.group(1).strip().lower() in AXIS_WORDS
     words = [w.lower() for w in WORD.findall(name if axis or bracket is None else name[: bracket.start()])]
     merged = [(w, MERGED.fullmatch(w)) for w in words]
-    return [part for w, found in merged for part in (found.groups() if found else (w,))]
+    return [part for w, match in merged for part in (match.groups() if match else (w,))]
 
 
 def stated_unit(name: str, channel: str) -> tuple[str | None, str]:
-    """Return the unit of a channel that a name states, in brackets or in its last words, and the evidence."""
+    """Return the unit that a name states for a channel, in brackets or in its last words, and the evidence."""
     unit = unit_in_brackets(name)
     words = [w.lower() for w in WORD.findall(name)]
     while words and (words[-1] in ("x", "y", "z", "0", "1", "3") or (words[-1] == "2" and words[-2:-1] not in SQUARED)):
         words = words[:-1]
     ending = " ".join(words)
     if unit not in UNITS[channel]:
-        found = [
+        matching = [
             candidate
             for candidate, spellings in UNIT_ENDINGS
             for s in spellings
             if candidate in UNITS[channel]
             and (ending.endswith(f" {s}") or (ending == s and s in TIME_FIRST | TIME_WORDS))
         ]
-        unit = found[0] if found else SPELLINGS.get(words[-1]) if len(words) > 1 else None
+        unit = matching[0] if matching else SPELLINGS.get(words[-1]) if len(words) > 1 else None
     return (unit, f"the name says {unit}") if unit in UNITS[channel] else (None, "")
 
 
 def find_columns(log: Log) -> Columns:
-    """Return the columns that may hold the channels of a log."""
-    found = Columns(log)
+    """Return the columns that probably contain the channels of a log."""
+    columns = Columns(log)
     words = {i: words_of(log.names[i]) if log.named else [] for i in log.numbers}
-    _find_time(found, words)
+    _find_time(columns, words)
     for sensor in (*TRIADS, "?"):
         named = {i: w for i, w in words.items() if _sensor_of(w) == sensor}
         triad = _triad(named)
         if triad is not None:
-            found.triads[sensor] = triad
-            _remark_on_other_triads(found, sensor, named)
+            columns.triads[sensor] = triad
+            _remark_on_other_triads(columns, sensor, named)
     for sensor, triad in _triads_by_one_letter(log).items():
-        found.triads.setdefault(sensor, triad)
-    bare = found.triads.pop("?", None)
-    if bare is not None and not found.triads:
-        found.triads[_sensor_of_file(log, bare)] = bare
-        found.remarks.append(f"taken as the {next(iter(found.triads))} by the file's name and numbers; check it")
+        columns.triads.setdefault(sensor, triad)
+    axes_only = columns.triads.pop("?", None)
+    if axes_only is not None and not columns.triads:
+        columns.triads[_sensor_of_file(log, axes_only)] = axes_only
+        columns.remarks.append(f"taken as the {next(iter(columns.triads))} by the file's name and numbers; check it")
     if not log.named:
-        _find_triads_without_names(found)
+        _find_triads_without_names(columns)
     for i, w in words.items():
         channel = _other_channel(log.names[i], w)
         low, high = TEMPERATURE_RANGE
         values = log.numbers[i]
         possible = low < float(np.median(values)) < high
-        if channel and channel not in found.others and (channel != "temperature" or possible or whole(values)):
-            found.others[channel] = i
-        elif w == ["t"] and possible and not _advances(values):  # a column called T, which may be a time
-            found.others.setdefault("temperature", i)
-    return found
+        if channel and channel not in columns.others and (channel != "temperature" or possible or whole(values)):
+            columns.others[channel] = i
+        elif w == ["t"] and possible and not _advances(values):  # a column called T, which could also be a time
+            columns.others.setdefault("temperature", i)
+    return columns
 
 
 def _triads_by_one_letter(log: Log) -> dict[str, Triad]:
-    """Return the sensors of three names that differ in a letter x, y, z beside the sensor's name: axr, ayr, azr."""
+    """Find triads of names that differ in one letter x, y, z next to the name of a sensor: axr, ayr, azr."""
     groups: dict[tuple[str, str], dict[str, int]] = {}
     for index in log.numbers if log.named else ():
         name = log.names[index].lower()
         for at in (i for i, letter in enumerate(name) if letter in "xyz"):
             groups.setdefault((name[:at], name[at + 1 :]), {})[name[at]] = index
-    found: dict[str, Triad] = {}
+    triads: dict[str, Triad] = {}
     for (before, after), axes in groups.items():
-        beside = {*re.findall("[a-z]+$", before), *re.findall("^[a-z]+", after)}
-        for sensor, known in SENSOR_WORDS.items():
-            if len(axes) == len("xyz") and beside & known:
-                found.setdefault(sensor, (axes["x"], axes["y"], axes["z"]))
-    return found
+        adjacent = {*re.findall("[a-z]+$", before), *re.findall("^[a-z]+", after)}
+        for sensor, sensor_words in SENSOR_WORDS.items():
+            if len(axes) == len("xyz") and adjacent & sensor_words:
+                triads.setdefault(sensor, (axes["x"], axes["y"], axes["z"]))
+    return triads
 
 
 def _axis_of(words: list[str]) -> str:
-    """Return the axis that a name ends in, or has before its unit; empty for none."""
+    """Return the last word that is an axis; empty for none."""
     return next((w for w in reversed(words) if w in AXIS_WORDS), "")
 
 
 def _sensor_of(words: list[str]) -> str:
-    """Return the sensor that a name states, empty for none, ``?`` where it is an axis alone."""
+    """Return the sensor that a name states, empty for none, ``?`` if the name is only an axis."""
     axis = _axis_of(words)
     if not axis or set(words) & NO_SENSOR:
         return ""
@@ -191,7 +191,7 @@ def _sensor_of(words: list[str]) -> str:
 
 
 def _other_channel(name: str, words: list[str]) -> str:
-    """Return the channel beside time and readings that a name states, empty for none."""
+    """Return the channel other than time and readings that a name states, empty for none."""
     canonical = [c for c in CHANNELS[6:] if name.lower().startswith(c)]
     if canonical:
         return canonical[0]
@@ -202,41 +202,42 @@ def _other_channel(name: str, words: list[str]) -> str:
     return ""
 
 
-def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
-    numbers = found.log.numbers
+def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
+    """Find the column of the time, or of a counter of samples."""
+    numbers = columns.log.numbers
     rising = [i for i, v in numbers.items() if len(v) > 2 and bool(np.all(np.diff(v) > 0))]
     counters = [i for i, v in numbers.items() if len(v) > 2 and bool(np.mean(np.diff(v) == 1.0) > COUNTING)]
     of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
     named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
-    unnamed = [i for i in rising if i not in counters and (not found.log.named or i in of_sensor)]
-    unnamed = unnamed if not found.log.named or len(unnamed) == 1 else []
+    unnamed = [i for i in rising if i not in counters and (not columns.log.named or i in of_sensor)]
+    unnamed = unnamed if not columns.log.named or len(unnamed) == 1 else []
     candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
     steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
     if gap_free and steps.sum() > 0 and np.std(steps) > SCATTER * abs(float(np.median(steps))):
-        found.arrival, found.counter = candidates[0], gap_free[0]
+        columns.arrival, columns.counter = candidates[0], gap_free[0]
     elif candidates:
-        found.time = candidates[0]
+        columns.time = candidates[0]
     elif counters:
-        found.counter = counters[0]
-    index = found.counter if found.time is None else found.time
-    found.steady = index is None or index in rising
+        columns.counter = counters[0]
+    index = columns.counter if columns.time is None else columns.time
+    columns.steady = index is None or index in rising
     if index is not None and index not in rising:
-        back = int(np.count_nonzero(np.diff(numbers[index]) <= 0))
-        found.remarks.append(
-            f"{found.log.names[index]} does not increase at {back} rows: sessions one after the other (session: 1, "
+        falls = int(np.count_nonzero(np.diff(numbers[index]) <= 0))
+        columns.remarks.append(
+            f"{columns.log.names[index]} does not increase at {falls} rows: several sessions (session: 1, "
             "2 .. reads one of them), or a counter that overflows"
         )
 
 
 def _advances(values: Values) -> bool:
-    """Return whether numbers rise far more often than they fall, as times of several sessions do."""
+    """Return whether numbers rise far more often than they fall, like times of several sessions."""
     steps = np.diff(values)
     return int(np.count_nonzero(steps > 0)) > FEWEST_RISES * int(np.count_nonzero(steps < 0))
 
 
 def _triad(words: dict[int, list[str]]) -> Triad | None:
-    """Return the columns of x, y and z among those of one sensor, the first of each axis where there are several."""
+    """Return the columns of x, y and z among the columns of one sensor: the first of each axis."""
     axes: dict[str, int] = {}
     for index, w in words.items():
         axes.setdefault(_axis_of(w), index)
@@ -247,19 +248,20 @@ def _triad(words: dict[int, list[str]]) -> Triad | None:
     return None
 
 
-def _remark_on_other_triads(found: Columns, sensor: str, words: dict[int, list[str]]) -> None:
-    """Remark on further columns that may be the same sensor: another one of the board, or filtered readings."""
+def _remark_on_other_triads(columns: Columns, sensor: str, words: dict[int, list[str]]) -> None:
+    """Add a remark on other triads for the same sensor: a second sensor of the board, or filtered readings."""
     groups: dict[tuple[str, ...], dict[int, list[str]]] = {}
     for index, w in words.items():
         at = len(w) - 1 - w[::-1].index(_axis_of(w))
         groups.setdefault((*w[:at], *w[at + 1 :]), {})[index] = w
     triads = [t for group in groups.values() if (t := _triad(group)) is not None]
     if len(triads) > 1:
-        texts = [", ".join(found.log.names[i] for i in t) for t in triads]
-        taken = ", ".join(found.log.names[i] for i in found.triads[sensor])
+        texts = [", ".join(columns.log.names[i] for i in t) for t in triads]
+        taken = ", ".join(columns.log.names[i] for i in columns.triads[sensor])
         others = "; ".join(text for text in texts if text != taken)
         what = sensor if sensor != "?" else "sensor"
-        found.remarks.append(f"{len(triads)} triads may be the {what}: taken {taken}; the others are {others}; choose")
+        remark = f"{len(triads)} triads may be the {what}: taken {taken}; the others are {others}; choose"
+        columns.remarks.append(remark)
 
 
 def _sensor_of_file(log: Log, triad: Triad) -> str:
@@ -270,7 +272,7 @@ def _sensor_of_file(log: Log, triad: Triad) -> str:
 
 
 def _offset(log: Log, triads: Sequence[Triad]) -> float:
-    """Return the offset of counts without a sign, about which the readings of one sensor lie; 0 for other numbers."""
+    """Return the offset of unsigned counts, about which the readings of one sensor lie; 0 for other numbers."""
     readings = np.array([[log.numbers[i] for i in triad] for triad in triads])
     medians, unsigned = np.median(readings, axis=2), whole(readings) and readings.min() >= 0.0
     for offset in OFFSETS if unsigned and readings.max() < 2.0 * OFFSETS[0] else ():
@@ -280,41 +282,41 @@ def _offset(log: Log, triads: Sequence[Triad]) -> float:
 
 
 def _spread(log: Log, triad: Triad, offset: float) -> float:
-    """Return the relative spread of a vector's length over an offset, which is small for gravity."""
+    """Return the relative spread of the length of a vector minus its offset, which is small for gravity."""
     norm = np.linalg.norm(np.column_stack([log.numbers[i] for i in triad]) - offset, axis=1)
     low, middle, high = np.quantile(norm, [0.16, 0.5, 0.84])
     return float((high - low) / max(middle, 1e-30))
 
 
-def _find_triads_without_names(found: Columns) -> None:
-    """Find the sensors by content: gravity keeps its length."""
-    log = found.log
-    free = [i for i, v in log.numbers.items() if i not in (found.time, found.counter) and np.ptp(v) > 0]
+def _find_triads_without_names(columns: Columns) -> None:
+    """Find the triads of a log without names: the length of the accelerometer's vector varies least."""
+    log = columns.log
+    free = [i for i, v in log.numbers.items() if i not in (columns.time, columns.counter) and np.ptp(v) > 0]
     groups = list(zip(free[::3], free[1::3], free[2::3], strict=False))
     if len(groups) == 1:
         sensor = _sensor_of_file(log, groups[0])
-        found.triads[sensor] = groups[0]
-        found.remarks.append(f"no names: columns {groups[0]} are taken as the {sensor}'s x, y, z; check it")
+        columns.triads[sensor] = groups[0]
+        columns.remarks.append(f"no names: columns {groups[0]} are taken as the {sensor}'s x, y, z; check it")
     elif groups:
         offset = _offset(log, groups)
         force = min(groups, key=lambda group: _spread(log, group, offset))
         rate = next(group for group in groups if group != force)
-        found.triads |= {"accelerometer": force, "gyroscope": rate}
-        found.remarks.append(
-            f"no names: columns {force} are taken as the accelerometer's x, y, z, for their length varies by "
-            f"{_spread(log, force, offset):.1%} only, {rate} as the gyroscope's; check it"
+        columns.triads |= {"accelerometer": force, "gyroscope": rate}
+        columns.remarks.append(
+            f"no names: columns {force} are taken as the accelerometer's x, y, z, because their length varies by only "
+            f"{_spread(log, force, offset):.1%}, and {rate} as the gyroscope's; check it"
         )
 
 
 @dataclass(frozen=True)
 class Log:
-    """An unknown log as columns: of a text log, or of a topic of a log of messages."""
+    """The columns of an unknown text log, or of a topic of a message log."""
 
     path: str
     csv: dict[str, Any]  # the section ``csv`` of a profile, without columns
-    keys: list[str | int]  # what a profile calls each column: its name, its index, or the path of a field
-    names: list[str]  # of the columns; of a field with the unit that the file states
-    numbers: dict[int, Values]  # the columns that hold finite numbers only
+    keys: list[str | int]  # of each column in a profile: name, index, or path of a field
+    names: list[str]  # of the columns; for a field, with the unit that the file states
+    numbers: dict[int, Values]  # columns with only finite numbers
     evidence: dict[str, str] = field(default_factory=dict)  # by key of ``csv``
     remarks: list[str] = field(default_factory=list)
     topic: str | None = None
@@ -326,21 +328,21 @@ class Log:
 
 
 def find_layout(data: bytes, path: str) -> Log:
-    """Return a text as columns; refuse one of which no part is a table of numbers."""
+    """Split a text into columns; raises ``IngestError`` if it contains no table of numbers."""
     lines = data.decode("utf-8", "replace").splitlines()
     tried = [_try(lines[:LINES_TRIED], separator, decimal) for separator in SEPARATORS for decimal in NUMBER]
     width, start, separator, decimal = max(tried, key=lambda t: (t[0], -t[1]))
     names, skip, comment = _names(lines, start, separator)
-    kept = lines[start : start + MOST_ROWS]
-    rows = [cells for cells in _cells(kept, separator) if len(cells) == len(names)]
+    parsed = lines[start : start + MOST_ROWS]
+    rows = [cells for cells in _cells(parsed, separator) if len(cells) == len(names)]
     numbers = _numbers(rows, decimal)
     if width < FEWEST_COLUMNS or len(rows) < FEWEST_ROWS or not numbers:
         first = " / ".join(lines[:3])[:150]
         raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
     stated = ((STATED_NUMBER.search(line), line.strip()) for line in lines[:start] if RATE_KEY.search(line))
-    rates = ((float(found.group(1)), line) for found, line in stated if found)
+    rates = ((float(match.group(1)), line) for match, line in stated if match)
     rate_hz, rate_line = next((rate for rate in rates if rate[0]), (None, ""))
-    named, odd = names != _numbered(len(names)), len(kept) - len(rows)
+    named, odd = names != _numbered(len(names)), len(parsed) - len(rows)
     csv_section = {
         "delimiter": "whitespace" if separator == " " else separator,
         "decimal": decimal,
@@ -366,7 +368,7 @@ def _numbered(count: int) -> list[str]:
 
 
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[int, int, str, str]:
-    """Return how many columns of numbers a separator and decimal point give, and the line where they begin."""
+    """Return the number of columns of numbers for a separator and decimal point, and the line where they begin."""
     if not lines or (decimal == "," and (separator == "," or not any("," in line for line in lines))):
         return 0, 0, separator, decimal
     rows = _cells(lines, separator)
@@ -388,7 +390,8 @@ def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int
 
 
 def _numbers(rows: list[list[str]], decimal: str) -> dict[int, Values]:
-    out = {}
+    """Return the columns that contain only finite numbers, by index."""
+    columns = {}
     for index, cells in enumerate(zip(*rows, strict=True)):
         texts = [c.replace(",", ".") for c in cells] if decimal == "," else cells
         try:
@@ -396,5 +399,5 @@ def _numbers(rows: list[list[str]], decimal: str) -> dict[int, Values]:
         except ValueError:
             continue
         if np.isfinite(column).all():
-            out[index] = column
-    return out
+            columns[index] = column
+    return columns

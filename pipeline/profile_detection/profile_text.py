@@ -1,4 +1,4 @@
-"""The text of a proposed profile: YAML with the evidence of each line, and the columns that it does not use."""
+"""Write a proposed profile as YAML, with the evidence for each line and the columns that it does not use."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
 def as_yaml(proposal: Proposal, name: str) -> str:
     """Return a proposal as the text of a profile that Hydra reads."""
     files = ", ".join(Path(f).name for f in proposal.files)
-    lines = _comment(f"Proposed by python -m pipeline check for {files}. Read each line: nothing of it is certain.")
+    lines = _comment(f"Proposed by python -m pipeline check for {files}. Check each line: no line is certain.")
     for remark in proposal.remarks:
         lines += _comment(f"To decide: {remark}.")
     if proposal.topic is not None:
@@ -52,36 +52,36 @@ def as_yaml(proposal: Proposal, name: str) -> str:
 
 def _not_used(proposal: Proposal, part: int, indent: str) -> list[str]:
     used = {entry["column"] for entry in proposal.columns[part].values()}
-    return [f"{indent}# not used: {c} ({found})" for c, found in proposal.seen[part].items() if c not in used]
+    return [f"{indent}# not used: {c} ({content})" for c, content in proposal.seen[part].items() if c not in used]
 
 
 def not_found(proposal: Proposal) -> list[str]:
-    """Return sentences on the sensors and references that no column is assigned to, and what to add."""
+    """Return sentences about the sensors and references without a column, and the lines to add."""
     channels = {c for entries in proposal.columns for c, e in entries.items() if e["column"] != UNKNOWN}
-    found = [
+    missing = [
         f"the {s}, which such a log cannot calibrate. If the log holds it, add {', '.join(triad)}, each with its "
         f"column and unit ({', '.join(UNITS_OF[s])}, or counts with counts_per_unit)."
         for s, triad in TRIADS.items()
         if not set(triad) <= channels
     ]
     if not channels & set(TABLE_CHANNELS):
-        found.append(
+        missing.append(
             "the angle or rate of a table. If a column is its encoder, add table_angle with the column, unit: counts "
-            "and counts_per_unit (counts a turn / 360). Without a table nothing is to be added."
+            "and counts_per_unit (counts per turn / 360). Without a table, add nothing."
         )
     if "temperature" not in channels:
-        found.append("the temperature. If a column holds it, add temperature with the column and unit: degC.")
-    return [line for text in found for line in textwrap.wrap(f"NOT FOUND: {text}", WIDTH, subsequent_indent="  ")]
+        missing.append("the temperature. If a column holds it, add temperature with the column and unit: degC.")
+    return [line for text in missing for line in textwrap.wrap(f"NOT FOUND: {text}", WIDTH, subsequent_indent="  ")]
 
 
 def _entries(entries: Entries, evidence: dict[str, str], indent: str) -> list[str]:
     lines: list[str] = []
-    said: set[str] = set()
+    explained: set[str] = set()
     for channel, entry in entries.items():
         key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
-        if key in evidence and key not in said:
+        if key in evidence and key not in explained:
             lines += _comment(evidence[key], indent)
-            said.add(key)
+            explained.add(key)
         inner = ", ".join(f"{k}: {_scalar(v)}" for k, v in entry.items())
         lines.append(f"{indent}{channel}: {{{inner}}}")
     return lines
@@ -92,7 +92,7 @@ def _comment(text: str, indent: str = "") -> list[str]:
 
 
 def _scalar(value: Any) -> str:  # noqa: ANN401  (any scalar of YAML)
-    """Return a scalar as YAML: JSON is YAML; plain words need no quotes."""
+    """Return a scalar as YAML: plain words without quotes, else JSON."""
     if not isinstance(value, str):
         return json.dumps(value)
     keyword = value.lower() in ("true", "false", "yes", "no", "on", "off", "null", "y", "n")

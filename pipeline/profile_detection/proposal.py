@@ -1,8 +1,8 @@
-"""A profile proposed for unknown logs, each guess with its evidence; it is never applied unasked.
+"""Propose a profile for unknown logs, with the evidence for each guess; it is never applied without a request.
 
-The names of columns tell which channel they may hold. Units follow from what a name states, else from physics
-(``unit_guesses``). Two files with the same times, one with the accelerometer and one with the gyroscope, are parts of
-one recording. What one file does not determine is taken from another of the same layout.
+Channels follow from the names of columns. Units follow from names, else from physics (``unit_guesses``). Two files with
+equal times, one with the accelerometer and one with the gyroscope, are parts of one recording. An entry that one file
+does not determine is taken from another file of the same layout.
 """
 
 from __future__ import annotations
@@ -53,39 +53,39 @@ Entries = dict[str, dict[str, Any]]
 
 @dataclass
 class Proposal:
-    """A proposed profile; ``???`` stands for what has to be filled in."""
+    """A proposed profile; ``???`` marks a value that the user must fill in."""
 
-    files: list[str]  # of a recording in parts, the file of each
+    files: list[str]  # of the recordings, or of the parts of one recording
     logs: list[Log]
-    csv: dict[str, Any]  # the section without columns
-    columns: list[Entries]  # of each part, channel to its entry
+    csv: dict[str, Any]  # the section ``csv`` without columns
+    columns: list[Entries]  # for each part, channel to its entry
     evidence: dict[str, str]  # by key of ``csv``, ``time``, sensor or channel
-    seen: list[dict[str | int, str]]  # of each part, column to what it holds
-    remarks: list[str] = field(default_factory=list)  # what has to be decided, or is odd
+    seen: list[dict[str | int, str]]  # for each part, column to a description of its content
+    remarks: list[str] = field(default_factory=list)  # open decisions and irregularities
 
     @property
     def parts(self) -> list[str]:
-        """Names of the parts' files, empty where there is one file a recording."""
+        """Names of the files of the parts; empty if a recording is one file."""
         return [Path(log.path).name for log in self.logs] if len(self.logs) > 1 else []
 
     @property
     def topic(self) -> str | None:
-        """The topic of a log of messages; None of a text log."""
+        """The topic of a message log; None for a text log."""
         return self.logs[0].topic
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is left to be filled in."""
+        """Whether it has a sensor and no value to fill in."""
         channels = {c for entries in self.columns for c in entries}
         return any(set(t) <= channels for t in TRIADS.values()) and not self.unknown()
 
     def unknown(self) -> list[str]:
-        """Return the names of what has to be filled in."""
-        found = [k for k, v in self.csv.items() if v == UNKNOWN]
-        return found + [c for entries in self.columns for c, e in entries.items() if UNKNOWN in e.values()]
+        """Return the keys and channels with a value to fill in."""
+        keys = [k for k, v in self.csv.items() if v == UNKNOWN]
+        return keys + [c for entries in self.columns for c, e in entries.items() if UNKNOWN in e.values()]
 
     def ingest(self, name: str, sensor: dict[str, Any]) -> dict[str, Any]:
-        """Return the proposal as the section ``ingest`` of a configuration, with what it takes from the sensor's."""
+        """Return the proposal as the section ``ingest`` of a configuration, with the counts of the sensor's file."""
         figures = {OF_SENSOR.format(s): sensor[s]["counts_per_unit"] for s in TRIADS if s in sensor}
         columns = [
             {c: {k: figures.get(v, v) for k, v in entry.items()} for c, entry in entries.items()}
@@ -100,11 +100,11 @@ class Proposal:
 
 
 def propose(logs: Sequence[Log], sensor: dict[str, Any] | None = None) -> list[Proposal]:
-    """Return the profiles that text logs seem to ask for, those of the same layout together.
+    """Return a proposal for each layout among the logs.
 
-    ``sensor``: its configuration, where the user states one; counts that the log does not tell are taken from it.
+    ``sensor``: the configuration of the sensor, if the user states one, for counts that the log does not determine.
     """
-    recordings: list[list[Columns]] = []  # of one file each, or of two with the same times and one sensor each
+    recordings: list[list[Columns]] = []  # each of one file, or of two files with equal times and one sensor each
     for columns in map(find_columns, logs):
         other = next((parts for parts in recordings if len(parts) == 1 and _belong_together(parts[0], columns)), None)
         if other is None:
@@ -131,7 +131,7 @@ def _belong_together(one: Columns, two: Columns) -> bool:
 
 
 def _alike(one: Proposal, two: Proposal) -> bool:
-    """Return whether one profile reads both: the same names, or others only for channels that a file may lack."""
+    """Return whether one profile can read both: equal names, or different names only for optional channels."""
     if one.parts or two.parts:
         return False
     if [log.names for log in one.logs] == [log.names for log in two.logs] and one.csv == two.csv:
@@ -145,7 +145,7 @@ def _alike(one: Proposal, two: Proposal) -> bool:
 
 
 def _fill_in(proposal: Proposal, other: Proposal) -> None:
-    """Take from another file of the same layout what this one could not tell, or does not hold."""
+    """Add entries from another file of the same layout that this file does not determine or contain."""
     proposal.files += other.files
     if proposal.csv.get("delimiter") != other.csv.get("delimiter"):
         proposal.csv["delimiter"] = AUTO
@@ -205,7 +205,7 @@ def _described(values: Values | None) -> str:
 
 
 def _add_template(proposal: Proposal) -> None:
-    """Add the lines of both sensors, to be filled in, where none was found beside other columns than a table's log."""
+    """Add lines of both sensors to fill in, unless the log is of a table or has topics."""
     proposal.remarks.append("no three columns have the names or values of an accelerometer or a gyroscope")
     if proposal.topic is not None or "table_rate" in proposal.columns[0]:
         return
@@ -220,10 +220,10 @@ def _add_template(proposal: Proposal) -> None:
 def _gyroscope(
     parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: dict[str, Any]
 ) -> Guess:
-    """Return the unit of the rates by the table, by gravity, or of counts by the sensor's configuration."""
+    """Return the unit of the rates from the table, from gravity, or, for counts, from the configuration."""
     moves, why_none = list[Move](), "no accelerometer beside it that determines the unit"
     if force is not None and not parts[0].steady:
-        why_none = "the rows are not one series in time, so the turns of gravity cannot tell the unit"
+        why_none = "the rows are not one series in time, so the turns of gravity do not determine the unit"
     elif force is not None:
         moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
         why_none = "" if moves else "no move between rests rotates gravity, which would show the unit"
@@ -235,7 +235,7 @@ def _gyroscope(
 
 
 def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
-    """Propose where the time comes from, and return it in s; None where it is not known."""
+    """Propose the source of the time, and return the time in s; None if it is unknown."""
     first = parts[0].log
     if parts[0].arrival is not None and parts[0].counter is not None:
         return _counted(parts[0], parts[0].counter, proposal)
@@ -243,7 +243,7 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
         values, name = first.numbers[parts[0].time], first.names[parts[0].time]
         guess = time_unit(values, *stated_unit(name, "time"))
         if "ticks" in words_of(name):
-            text = f"{name}: counts_per_unit is the number of ticks a second"
+            text = f"{name}: counts_per_unit is the number of ticks per second"
             guess = Guess({"unit": COUNTS, "counts_per_unit": UNKNOWN}, text)
         proposal.csv["rate_hz"] = None
         proposal.evidence.pop("rate_hz", None)
@@ -262,7 +262,7 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
 
 
 def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | None:
-    """Propose a counter of samples as time, at the mean rate of times of arrival that scatter beside it."""
+    """Propose a counter of samples as time, with the mean rate from the times of arrival."""
     log, rate = columns.log, None
     key, count = log.keys[counter], log.numbers[counter]
     evidence = f"{key} counts samples: counts_per_unit is the sampling rate in Hz"
@@ -271,8 +271,8 @@ def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | Non
         second = time_unit(arrival, *stated_unit(name, "time")).second_s
         if second is not None:
             rate = float(f"{(count[-1] - count[0]) / ((arrival[-1] - arrival[0]) * second):.6g}")
-        said = "the sampling rate in Hz" if rate is None else f"{rate:g} Hz on average by {name}"
-        evidence = f"{key} counts samples without a gap, and the intervals of {name} scatter; {said}"
+        stated = "the sampling rate in Hz" if rate is None else f"{rate:g} Hz on average by {name}"
+        evidence = f"{key} counts samples without a gap, and the intervals of {name} scatter; {stated}"
     proposal.csv["rate_hz"] = None
     proposal.columns[0]["time"] = {"column": key, "unit": COUNTS, "counts_per_unit": UNKNOWN if rate is None else rate}
     proposal.evidence["time"] = evidence
@@ -280,7 +280,7 @@ def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | Non
 
 
 def _in_dps(rate: Values, proposal: Proposal) -> Values | None:
-    """Return rates in deg/s, but for their offset; None where their unit is not known."""
+    """Return rates in deg/s, without correction of their offset; None if their unit is unknown."""
     entry = next(e[GYROSCOPE[0]] for e in proposal.columns if GYROSCOPE[0] in e)
     counts = entry.get("counts_per_unit", 1.0)
     if entry["unit"] == UNKNOWN or isinstance(counts, str):
@@ -297,7 +297,7 @@ def _readings(sensor: str, parts: list[Columns]) -> Values | None:
 
 
 def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) -> None:
-    """Add a sensor's channels with the unit that their names state, else the one guessed."""
+    """Add the channels of a sensor, with the unit that their names state, else the guess."""
     place = next(i for i, c in enumerate(parts) if sensor in c.triads)
     log, triad = parts[place].log, parts[place].triads[sensor]
     proposal.evidence[sensor] = guess.evidence
@@ -312,6 +312,7 @@ def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) ->
 
 
 def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str) -> None:
+    """Add the channels other than time and readings."""
     log, (low, high) = columns.log, TEMPERATURE_RANGE
     for channel, index in columns.others.items():
         values = log.numbers[index]
@@ -323,7 +324,7 @@ def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str)
         if channel == "table_angle" and stated is None and columns.turn:
             turn, why = columns.turn
             entries[channel] |= {"unit": COUNTS, "counts_per_unit": float(f"{turn / 360.0:.12g}")}
-            proposal.evidence[channel] = f"{span}, and {why}: {turn} / 360 counts a degree"
+            proposal.evidence[channel] = f"{span}, and {why}: {turn} / 360 counts per degree"
         if channel == "table_angle" and CENTIDEGREES in words_of(log.names[index]):
             entries[channel] |= {"unit": COUNTS, "counts_per_unit": 100.0}
             proposal.evidence[channel] = f"the name says hundredths of a degree: {span}"

@@ -1,6 +1,6 @@
-"""What ingest makes of a log, in lines for a person: time, channels, rests, clipping, units, notes; and its topics.
+"""Describe a recording in lines for the terminal: time, channels, rests, clipping, units, notes and topics.
 
-The topics of an unknown log of messages are also layouts of columns, which serve to propose a profile only.
+The topics of an unknown message log also become layouts of columns, which only serve to propose a profile.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ if TYPE_CHECKING:
     from pipeline.io.mcap_reader import MessageReader
     from pipeline.records import Note, Recording, Values
 
-ENOUGH = 500_000  # samples that rests and moves are looked for in
+MOST_SAMPLES = 500_000  # searched for rests and moves
 FEWEST_SAMPLES = 3  # of a rest, for a variance
 PLATEAU = 3  # samples at the largest value; noise repeats it less often
-CLEARLY = 2.0  # times that one unit of the rates misses by more than another, from which the moves show the unit
+DECISIVE_RATIO = 2.0  # of the misfits of two units of the rates, from which the moves determine the unit
 LABEL = 16  # width of the labels, characters
 WIDTH = 118  # characters of a line
-LISTED_NOTES = 20  # the rest is counted; they fit one screen
+LISTED_NOTES = 20  # fit one screen; the others are counted
 LONGEST_ARRAY = 16  # elements of a field that may be readings
-LONGEST_LIST = 4  # elements listed of an array
-MOST_FIELDS = 24  # listed of a message
-MOST_TOPICS = 20  # listed one a line
+LONGEST_LIST = 4  # elements of an array that are listed
+MOST_FIELDS = 24  # of a message that are listed
+MOST_TOPICS = 20  # with a line each
 
 Line = tuple[str, str]
 
 
 def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list[Line]:
-    """Return what a recording holds, as pairs of label and text; ``sensor`` has the full scales."""
+    """Return the description of a recording as pairs of label and text; ``sensor`` has the full scales."""
     rests = _rests(recording)
     lines = [("time", _time(recording))]
     for name in SENSORS:
@@ -72,11 +72,11 @@ def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list
 
 
 def as_text(lines: Sequence[Line]) -> str:
-    """Return facts as a table of text."""
-    out = []
+    """Return pairs of label and text as wrapped lines in two columns."""
+    wrapped = []
     for label, text in lines:
         first = f"  {label:<{LABEL}}"
-        out += textwrap.wrap(
+        wrapped += textwrap.wrap(
             text,
             WIDTH,
             initial_indent=first,
@@ -84,7 +84,7 @@ def as_text(lines: Sequence[Line]) -> str:
             break_long_words=False,
             break_on_hyphens=False,
         )
-    return "\n".join(out)
+    return "\n".join(wrapped)
 
 
 def _time(recording: Recording) -> str:
@@ -111,11 +111,11 @@ def _rests(recording: Recording) -> list[tuple[int, int]]:
     force = recording.accelerometer
     if force is None or recording.samples < 20 or (turns and recording.table_rate is not None):
         return []
-    return rests_of(force[:ENOUGH], recording.interval)
+    return rests_of(force[:MOST_SAMPLES], recording.interval)
 
 
 def _turns(recording: Recording) -> bool:
-    """Return whether the table's log changes: that of an encoder that is not connected does not."""
+    """Return whether the log of the table changes; the log of an unconnected encoder does not."""
     return any(log is not None and np.ptp(log) > 0.0 for log in (recording.table_angle, recording.table_rate))
 
 
@@ -137,28 +137,28 @@ def _sensor(name: str, readings: Values, rests: Sequence[tuple[int, int]]) -> st
 
 
 def _table(recording: Recording) -> list[Line]:
-    found = []
+    texts = []
     if recording.table_angle is not None:
         low, high = float(recording.table_angle.min()), float(recording.table_angle.max())
-        found.append(f"angle {_number(low)}{f' to {_number(high)}' if high > low else ''} deg")
+        texts.append(f"angle {_number(low)}{f' to {_number(high)}' if high > low else ''} deg")
     if recording.table_rate is not None:
         rate = recording.table_rate
         text = f"rate {_number(float(rate.min()))} to {_number(float(rate.max()))} deg/s"
         if recording.gyroscope is not None and np.ptp(rate) > 1.0:
-            alike = [float(np.corrcoef(rate, w)[0, 1]) if np.ptp(w) else 0.0 for w in recording.gyroscope.T]
-            axis = int(np.argmax(np.abs(alike)))
-            if abs(alike[axis]) > 0.9:
+            correlations = [float(np.corrcoef(rate, w)[0, 1]) if np.ptp(w) else 0.0 for w in recording.gyroscope.T]
+            axis = int(np.argmax(np.abs(correlations)))
+            if abs(correlations[axis]) > 0.9:
                 slope = float(np.polyfit(rate, recording.gyroscope[:, axis], 1)[0])
-                text += f" (the gyroscope's {AXES[axis]} reads {slope:.3f} of it, correlation {alike[axis]:.4f})"
-        found.append(text if np.any(rate) else "rate 0 deg/s")
+                text += f" (the gyroscope's {AXES[axis]} reads {slope:.3f} of it, correlation {correlations[axis]:.4f})"
+        texts.append(text if np.any(rate) else "rate 0 deg/s")
     if recording.table_attitude is not None:
-        found.append("attitude")
+        texts.append("attitude")
     clock = recording.source.get("table_clock")
     if clock:
-        found.append(f"a clock of its own, {clock['offset_s']:.6g} s ahead and gaining {clock['drift_ppm']:.3g} ppm")
-    if found and recording.table_attitude is None and not _turns(recording):
-        found.append("it does not change: the table did not turn, or its encoder is not connected")
-    return [("table", "; ".join(found))] if found else []
+        texts.append(f"a clock of its own, {clock['offset_s']:.6g} s ahead and gaining {clock['drift_ppm']:.3g} ppm")
+    if texts and recording.table_attitude is None and not _turns(recording):
+        texts.append("it does not change: the table did not turn, or its encoder is not connected")
+    return [("table", "; ".join(texts))] if texts else []
 
 
 def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> str:
@@ -172,48 +172,48 @@ def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> s
 
 
 def _clipping(recording: Recording, sensor: Mapping[str, Any]) -> str:
-    """Tell what reaches full scale or, where that is not known, what stays at its largest value."""
-    known = {s: (sensor.get(s) or {}).get("full_scale") for s in SENSORS}
+    """Describe the readings at full scale or, if that is unknown, the readings that stay at their largest value."""
+    full_scale = {s: (sensor.get(s) or {}).get("full_scale") for s in SENSORS}
     flags = recording.flags
-    found = []
+    texts = []
     for name in SENSORS:
         readings = recording.reading(name)
         if readings is None:
             continue
-        if known[name] is not None:
+        if full_scale[name] is not None:
             largest = float(np.abs(readings).max())
-            found.append(f"{name} up to {_number(largest)} of {known[name]:g} {SENSOR_UNITS[name]}")
+            texts.append(f"{name} up to {_number(largest)} of {full_scale[name]:g} {SENSOR_UNITS[name]}")
             continue
         for channel, values in zip(TRIADS[name], readings.T, strict=True):
-            found += [f"{channel} stays at {text}: clipped?" for text in _plateaus(values)]
-    marked = 0 if flags is None else int(np.count_nonzero(flags & CLIPPED))
+            texts += [f"{channel} stays at {text}: clipped?" for text in _plateaus(values)]
+    clipped = 0 if flags is None else int(np.count_nonzero(flags & CLIPPED))
     stuck = 0 if flags is None else int(np.count_nonzero(flags & STUCK))
-    if all(known.values()):
-        found.append(f"{marked} rows at full scale" if marked else "none at full scale")
-    elif not found:
-        found.append("no reading stays at its largest value (--sensor NAME compares with a full scale)")
-    return "; ".join([*found, *([f"{stuck} rows stuck"] if stuck else [])])
+    if all(full_scale.values()):
+        texts.append(f"{clipped} rows at full scale" if clipped else "none at full scale")
+    elif not texts:
+        texts.append("no reading stays at its largest value (--sensor NAME compares with a full scale)")
+    return "; ".join([*texts, *([f"{stuck} rows stuck"] if stuck else [])])
 
 
 def _plateaus(values: Values) -> list[str]:
-    """Return in words where a channel stays at its largest or smallest value, as one that is clipped does."""
+    """Describe the plateaus of a channel at its largest and smallest value, which indicate clipping."""
     same = values[1:] == values[:-1]
     if same.mean() > 0.5 or equal_share(same) > 0.5:
         return []  # too coarse or too quiet to decide
-    found = []
+    texts = []
     for extreme in (values.max(), values.min()):
-        at = values == extreme
-        longest = max((b - a for a, b in runs(at)), default=0)
+        equal = values == extreme
+        longest = max((b - a for a, b in runs(equal)), default=0)
         if longest >= PLATEAU:
-            found.append(f"{_number(float(extreme))} for {longest} samples ({int(at.sum())} in all)")
-    return found
+            texts.append(f"{_number(float(extreme))} for {longest} samples ({int(equal.sum())} in all)")
+    return texts
 
 
 def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]:
-    """Tell whether gravity turns from rest to rest as the rates say."""
+    """State whether the integrated rates agree with the rotation of gravity between rests."""
     if recording.accelerometer is None or recording.gyroscope is None or recording.samples < 20:
         return []
-    part = slice(0, ENOUGH)
+    part = slice(0, MOST_SAMPLES)
     force = recording.accelerometer[part]
     means = [force[a:b].mean(axis=0) for a, b in rests]
     centre = sphere(np.array(means))[0] if len(means) >= FEWEST_RESTS_FOR_A_SPHERE else np.zeros(3)
@@ -222,33 +222,33 @@ def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]
         return [("units", _rates_and_gravity(moves))]
     if recording.table_rate is not None:
         return []
-    return [("units", "no move between rests turns gravity, so nothing shows whether the rates' unit is right")]
+    return [("units", "no move between rests turns gravity, so the unit of the rates cannot be checked")]
 
 
 def _rates_and_gravity(moves: Sequence[Move]) -> str:
-    """Tell how far the rates turn gravity as it turned, and whether another unit or other axes would be nearer."""
+    """State the misfit of the integrated rates to the rotation of gravity, also for other units and other axes."""
     scales = (1.0, DEGREES, 1 / DEGREES)
-    left, *others = misfit_deg(moves, scales)
+    declared, *others = misfit_deg(moves, scales)
     best = int(np.argmin(others))
     angle, way = np.median([(m.angle_deg, m.way) for m in moves], axis=0)
     over = f"{counted(len(moves), 'move')} that turn{'s' * (len(moves) == 1)} it by {angle:.0f} deg (medians)"
     axes = other_axes(moves)
     if axes is not None:
         return f"accelerometer and gyroscope contradict each other: {axes[0]}: check the order and signs of the axes"
-    if left <= FAILS_DEG and CLEARLY * left <= others[best]:
+    if declared <= FAILS_DEG and DECISIVE_RATIO * declared <= others[best]:
         return (
-            f"gravity turns as the rates say, to within {left:.2g} deg in {over}; that is {left / way:.1%} of the "
-            f"{way:.0f} deg turned through, where scale factors and biases are not calibrated yet; another unit of the "
-            f"rates misses by {others[best]:.0f} deg"
+            f"the rates agree with the rotation of gravity to within {declared:.2g} deg in {over}; that is "
+            f"{declared / way:.1%} of the {way:.0f} deg turned through, with uncalibrated scale factors and biases; "
+            f"in another unit the rates miss by {others[best]:.0f} deg"
         )
-    if others[best] <= FITS_DEG and CLEARLY * others[best] <= left:
+    if others[best] <= FITS_DEG and DECISIVE_RATIO * others[best] <= declared:
         return (
             f"check the unit of the rates: multiplied by {scales[1 + best]:.4g} they turn gravity to within "
-            f"{others[best]:.2g} deg in {over}, as declared to within {left:.2g} deg"
+            f"{others[best]:.2g} deg in {over}, as declared to within {declared:.2g} deg"
         )
     return (
-        f"nothing shows whether the rates' unit is right: as declared they turn gravity to within {left:.2g} deg in "
-        f"{over}, in another unit to within {others[best]:.2g} deg"
+        f"the moves do not determine the unit of the rates: as declared they turn gravity to within {declared:.2g} deg "
+        f"in {over}, in another unit to within {others[best]:.2g} deg"
     )
 
 
@@ -268,15 +268,15 @@ def _number(value: float, digits: int = 4) -> str:
 
 
 def topics_of(path: Path) -> list[Log]:
-    """Return the topics of a log with their first messages; refuse a log none of whose topics may hold readings."""
-    found: dict[int, Log] = {}
+    """Return the topics of a log as columns, most sensors first; raises ``IngestError`` if none may hold readings."""
+    topics: dict[int, Log] = {}
     listed = []
     with open_reader(path) as reader:
         for rows in reader.rows():
-            if rows.channel not in found and (log := _topic(reader, rows)) is not None:
-                found[rows.channel] = log
+            if rows.channel not in topics and (log := _topic(reader, rows)) is not None:
+                topics[rows.channel] = log
         listed = [f"{c.topic} ({reader.counts[n]})" for n, c in reader.channels.items()]
-    best = sorted(found.values(), key=lambda t: (-len(find_columns(t).triads), -len(next(iter(t.numbers.values())))))
+    best = sorted(topics.values(), key=lambda t: (-len(find_columns(t).triads), -len(next(iter(t.numbers.values())))))
     if not best or not find_columns(best[0]).triads:
         message = f"no topic holds the three axes of a sensor; the file has {', '.join(listed) or 'no topics'}"
         raise IngestError(message, str(path), code="no_table")
@@ -284,17 +284,17 @@ def topics_of(path: Path) -> list[Log]:
 
 
 def _topic(reader: MessageReader, rows: Rows) -> Log | None:
-    """Return a topic's messages as columns; None where they are too few, vary in length or are no arrays."""
+    """Return the messages of a topic as columns; None if they are too few, vary in length or have no numbers."""
     channel = reader.channels[rows.channel]
     try:
         find = ros_layouts(channel, reader.schemas.get(channel.schema_id))
         layout = find(rows.payload(0)) if find is not None and len(rows.starts) >= FEWEST_ROWS else None
-    except (ValueError, KeyError):  # a definition that is none, or a message that is not what it says
+    except (ValueError, KeyError):  # an invalid definition, or a message that contradicts it
         return None
     if layout is None or not layout.places or len(layout.matching(rows)) < len(rows.starts):
         return None
-    found = layout.columns(rows, layout.elements(LONGEST_ARRAY))
-    columns: dict[str, Any] = {n: c[:MOST_ROWS].astype(np.float64) for n, c in found.items()}
+    arrays = layout.columns(rows, layout.elements(LONGEST_ARRAY))
+    columns: dict[str, Any] = {n: c[:MOST_ROWS].astype(np.float64) for n, c in arrays.items()}
     for seconds, nanos in STAMPS:
         for base in [n.removesuffix(f".{seconds}") for n in columns if n.endswith(f".{seconds}")]:
             if f"{base}.{nanos}" in columns:
@@ -308,25 +308,25 @@ def _topic(reader: MessageReader, rows: Rows) -> Log | None:
 
 
 def topic_lines(path: Path, *, fields: bool) -> list[Line]:
-    """Return what a log of messages holds, as pairs of label and text; nothing where it cannot be walked through.
+    """Return the content of a message log as pairs of label and text; empty if it cannot be read.
 
-    ``fields``: whether the fields of messages of types that ingest does not know are listed.
+    ``fields``: whether to list the fields of messages of unknown types.
     """
     first: dict[int, bytes] = {}
     try:
-        with open_reader(path) as found:
-            for rows in found.rows():
+        with open_reader(path) as reader:
+            for rows in reader.rows():
                 if rows.channel not in first:
                     first[rows.channel] = rows.payload(0)
     except (IngestError, OSError):
         return []
-    lines = [("container", _container(found))]
-    if len(found.channels) > MOST_TOPICS:
-        return [*lines, ("topics", ", ".join(f"{c.topic} ({found.counts[n]})" for n, c in found.channels.items()))]
-    for number, channel in found.channels.items():
-        schema = found.schemas.get(channel.schema_id)
+    lines = [("container", _container(reader))]
+    if len(reader.channels) > MOST_TOPICS:
+        return [*lines, ("topics", ", ".join(f"{c.topic} ({reader.counts[n]})" for n, c in reader.channels.items()))]
+    for number, channel in reader.channels.items():
+        schema = reader.schemas.get(channel.schema_id)
         kind = f"{schema.name}, {channel.message_encoding}" if schema else channel.message_encoding or "no encoding"
-        text = f"{channel.topic} ({kind}): {counted(found.counts[number], 'message')}"
+        text = f"{channel.topic} ({kind}): {counted(reader.counts[number], 'message')}"
         if fields and number in first and not (schema and short_name(schema.name) in KINDS):
             text += _fields(channel, schema, first[number])
         lines.append(("topic", text))
@@ -334,7 +334,7 @@ def topic_lines(path: Path, *, fields: bool) -> list[Line]:
 
 
 def _container(reader: MessageReader) -> str:
-    """Return the size of a log of messages, and whether it proves to be complete."""
+    """Return the size of a message log, and the result of the check of its integrity."""
     size, proof = counted(reader.count, "message"), "integrity: not_verifiable, without checksums"
     if not isinstance(reader, McapReader):
         return f"{MESSAGE_FORMATS[Path(reader.path).suffix.lower()].kind} with {size}; {proof}"
@@ -344,17 +344,17 @@ def _container(reader: MessageReader) -> str:
 
 
 def counted(number: int, what: str) -> str:
-    """Return a number of things in words."""
+    """Return a number with its noun, in the plural except for 1."""
     return f"{number:,} {what}{'s'[: number != 1]}"
 
 
 def _fields(channel: Channel, schema: Schema | None, payload: bytes) -> str:
-    """Return the paths of a message's numbers, for a map of fields."""
+    """Return the paths of the numbers in a message, for the fields of a profile."""
     try:
         find_layout, decode = ros_layouts(channel, schema), object_decoder(channel, schema)
-        found = find_layout(payload).elements(LONGEST_LIST) if find_layout else _numbers(decode and decode(payload), "")
-        paths = list(islice(found, MOST_FIELDS + 1))
-    except Exception:  # noqa: BLE001  (any decoder's trouble with a stranger's message: then nothing is listed)
+        names = find_layout(payload).elements(LONGEST_LIST) if find_layout else _numbers(decode and decode(payload), "")
+        paths = list(islice(names, MOST_FIELDS + 1))
+    except Exception:  # noqa: BLE001  (a decoder may raise anything for an unknown message: nothing is listed)
         return ""
     more = " .." if len(paths) > MOST_FIELDS else ""
     return f", with {', '.join(paths[:MOST_FIELDS])}{more}" if paths else ""

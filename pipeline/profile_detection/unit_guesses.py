@@ -1,10 +1,10 @@
-"""Units that fit the numbers of an unknown log, each with its evidence.
+"""Guess the units of the numbers in an unknown log, each with its evidence.
 
-specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; of counts, it is the number of counts per g
+specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; in counts, it is the number of counts per g
 angular rate   : the unit in which the integrated rates rotate gravity from rest to rest (``gravity_rotation``)
 time           : intervals of sensors are 0.05 to 200 ms long
-encoder        : gravity turns with the table, f = c + a cos(2 pi n / N) + b sin(2 pi n / N), with N counts a turn;
-                 about a vertical shaft, the gyroscope tells N to within its scale factor
+encoder        : gravity turns with the table, f = c + a cos(2 pi n / N) + b sin(2 pi n / N), with N counts per turn;
+                 about a vertical shaft, the gyroscope determines N to within its scale factor
 """
 
 from __future__ import annotations
@@ -27,49 +27,49 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 UNKNOWN = "???"
-OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: the figure of the sensor's configuration
+OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: a reference to the configuration of the sensor
 MPU60X0_TEMPERATURE = {"counts_per_unit": 340.0, "offset": -12420.2}  # MPU-6000/6050 register map 4.2, 4.18
 CLOSE = 0.12  # bias and scale factor of a low-cost sensor in one position
-CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and a unit that leans on the table
-SLOWEST = 1.0  # deg/s rms of a table: below, noise and bias wander tell more than the table
-FOLLOWED = 0.3  # share of the rates' rms that the table's rate leaves at most: axes lean, and rates are noisy
-CLOSE_BY_TURNS = 0.2  # those of both sensors, in few moves
+CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and misalignment on the table
+SLOWEST = 1.0  # deg/s rms of a table: below, noise and bias wander are larger
+LARGEST_RESIDUAL = 0.3  # rms of the rates after the fit of the table's rate, of before: misalignment and noise
+CLOSE_BY_TURNS = 0.2  # bias and scale factor of both sensors, in few moves
 USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
-EVEN = 0.02  # of the span, off a straight line
-SCALES = np.geomspace(1.0, 1000.0, 481)  # counts per deg/s that are tried, 1.4 % apart
-ASSUMED_HZ = 100.0  # where the time is not known
+EVEN = 0.02  # largest departure from a straight line, of the span
+SCALES = np.geomspace(1.0, 1000.0, 481)  # grid of counts per deg/s, in steps of 1.4 %
+ASSUMED_HZ = 100.0  # if the time is unknown
 CONVINCING_DEG = 12.0  # below half of the residual angle of the next usual scale in a quarter turn
 TOO_FAST_FOR_RADIANS = 40.0  # rad/s, 2300 deg/s: beyond the range of usual sensors
-BURSTS = 0.1  # mean over median interval, from which both are told
+BURSTS = 0.1  # relative difference of mean and median interval, from which both are stated
 RATES_HZ = (5.0, 20_000.0)  # sampling rates of inertial sensors
 SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
-FLATTEST = 0.1  # smallest over largest extent of rests in a plane: axes lean and scale by some percent
+FLATTEST = 0.1  # smallest over largest extent of rests in a plane: misalignment and scale factors are some percent
 FEWEST_RESTS_FOR_A_SPHERE = 9  # twice the four unknowns, and one
 
 CENTIDEGREES = "cdeg"  # in the name of a table's angle
-NO_ENCODER = NO_SENSOR | {"roll", "pitch", "yaw", "heading", "tilt", "angle", "quat"}  # a sensor's own estimate
-# Counts a turn of encoders: 8 to 20 bits, and usual numbers of lines, once, twice and four times.
+NO_ENCODER = NO_SENSOR | {"roll", "pitch", "yaw", "heading", "tilt", "angle", "quat"}  # estimates of a sensor
+# Counts per turn of encoders: 8 to 20 bits, and usual numbers of lines, once, twice and four times.
 ENCODERS = (
     *(2**bits for bits in range(8, 21)),
     *(k * n for n in (500, 600, 900, 1000, 1250, 2500, 9000) for k in (1, 2, 4)),
 )
-CLOSE_TURN = 0.01  # half of the least distance of two of them, but 4000 and 4096
-LEFT_BY_GRAVITY = 0.1  # share of the force's rms: axes lean, and the log lags by some ms
-SHORTEST_TURN = 0.9  # of a turn; over half of one, other columns pass for an angle
-SEARCHED = 0.1  # about a usual number of counts, for one between them
-MOST_FITTED = 20_000  # rows; bounds the cost
+CLOSE_TURN = 0.01  # half of the least relative distance between two of them, except 4000 and 4096
+LARGEST_MISFIT = 0.1  # of the fit of gravity, of the force's rms: misalignment, and a lag of the log by some ms
+SHORTEST_TURN = 0.9  # of a turn; with half a turn, other columns could fit as an angle
+SEARCHED = 0.1  # relative range about a usual number of counts, for numbers between them
+MOST_FITTED = 20_000  # rows; limits the time
 
 
 @dataclass(frozen=True)
 class Guess:
-    """What may be said of a column."""
+    """A guess of the unit of a column."""
 
-    entry: dict[str, Any]  # of a profile; ``???`` stands for what has to be filled in
+    entry: dict[str, Any]  # of a profile; ``???`` marks a value that the user must fill in
     evidence: str
-    second_s: float | None = None  # length of a time's unit
-    centre: Values = field(default_factory=lambda: np.zeros(3))  # of the sphere on which rests lie: offset and bias
+    second_s: float | None = None  # length of the unit of a time, s
+    centre: Values = field(default_factory=lambda: np.zeros(3))  # of the sphere through the rests: offset and bias
 
 
 def time_unit(values: Values, stated: str | None, why: str) -> Guess:
@@ -103,7 +103,7 @@ def force_unit(force: Values, interval_s: float) -> Guess:
     rests = rests_of(force, interval_s)
     means = np.array([force[a:b].mean(axis=0) for a, b in rests])
     at_rest = np.concatenate([force[a:b] for a, b in rests]) if rests else force
-    size = float(np.median(np.linalg.norm(at_rest, axis=1)))  # of samples: a slow turn may pass for a rest
+    size = float(np.median(np.linalg.norm(at_rest, axis=1)))  # of samples: a slow turn can be detected as a rest
     where = f"|a| is {size:.4g} at rest" if rests else f"|a| is {size:.4g} on the whole"
     centre, radius = np.zeros(3), size
     if len(rests) >= FEWEST_RESTS_FOR_A_SPHERE:
@@ -121,7 +121,7 @@ def force_unit(force: Values, interval_s: float) -> Guess:
 
 
 def _counts_per_g(rests: int, centre: Values, radius: float, size: float, where: str) -> Guess:
-    """Return counts per g: the usual number that is near, else the radius of the sphere through the rests."""
+    """Return the entry in counts per g: with a usual offset, with a close usual number, or with the median |a|."""
     middle = float(np.mean(centre))
     offset = min((0.0, *OFFSETS), key=lambda o: abs(middle - o))
     if offset and abs(middle - offset) > 0.5 * radius:
@@ -149,10 +149,10 @@ def sphere(points: Values) -> tuple[Values, float]:
 
 
 def rate_unit(rate: Values, moves: Sequence[Move], why_none: str, *, timed: bool) -> Guess:
-    """Return the unit of (n, 3) angular rates by the ``moves`` between rests in which gravity turns (``why_none``).
+    """Return the unit of (n, 3) angular rates from the ``moves`` between rests in which gravity turns.
 
-    Where the time is not known (``timed``), its unit is a hundredth of an interval, and only the product of scale and
-    sampling rate can be told.
+    ``why_none``: the reason if there are no moves. Without a time (``timed`` False) an interval of 1 / ``ASSUMED_HZ``
+    is assumed, and only the product of scale and sampling rate can be determined.
     """
     largest = float(np.abs(rate - np.median(rate, axis=0)).max())
     if whole(rate):
@@ -167,7 +167,7 @@ def rate_unit(rate: Values, moves: Sequence[Move], why_none: str, *, timed: bool
 
 
 def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
-    """Return the unit of (n, 3) angular rates by the table's, deg/s, in the same rows; None: they do not follow it."""
+    """Return the unit of (n, 3) angular rates from the table's rate, deg/s, in the same rows; None if they differ."""
     size = slope(rate, table_rate)
     if size is None or np.std(table_rate) < SLOWEST:
         return None
@@ -181,17 +181,19 @@ def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
 
 
 def slope(rate: Values, table: Values) -> float | None:
-    """Return the length of (n, 3) rates per unit of the table's rate; None where they do not follow it."""
+    """Return the length of (n, 3) rates per unit of the table's rate; None if they are not proportional to it."""
     table, centred = table - table.mean(), rate - rate.mean(axis=0)
     if not np.any(table):
         return None
     slopes = table @ centred / (table @ table)
-    left = centred - np.outer(table, slopes)
-    return None if np.sum(left**2) > FOLLOWED**2 * np.sum(centred**2) else float(np.linalg.norm(slopes))
+    residual = centred - np.outer(table, slopes)
+    if np.sum(residual**2) > LARGEST_RESIDUAL**2 * np.sum(centred**2):
+        return None
+    return float(np.linalg.norm(slopes))
 
 
 def _usual_counts(measured: float, close: float) -> tuple[dict[str, Any], str]:
-    """Return the entry of a gyroscope in counts, with the usual counts per deg/s where they are near, and a remark."""
+    """Return the entry of a gyroscope in counts, with the usual counts per deg/s if they are close, and a remark."""
     usual = min(USUAL_COUNTS_PER_DPS, key=lambda c: abs(np.log(measured / c)))
     if abs(measured / usual - 1) < close:
         return {"unit": COUNTS, "counts_per_unit": usual}, f"; {usual:g} is the usual number near it"
@@ -199,22 +201,22 @@ def _usual_counts(measured: float, close: float) -> tuple[dict[str, Any], str]:
 
 
 def _degrees_or_radians(moves: Sequence[Move]) -> Guess:
-    left = misfit_deg(moves, (1.0, DEGREES))
-    best = int(np.argmin(left))
+    misfit = misfit_deg(moves, (1.0, DEGREES))
+    best = int(np.argmin(misfit))
     unit = ("deg/s", "rad/s")[best]
-    text = f"taken as {unit} they turn gravity to within {left[best]:.1f} deg over {len(moves)} moves"
-    if left[best] > CONVINCING_DEG:
+    text = f"taken as {unit} they turn gravity to within {misfit[best]:.1f} deg over {len(moves)} moves"
+    if misfit[best] > CONVINCING_DEG:
         return Guess({"unit": UNKNOWN}, f"{text}, and no better otherwise: not convincing")
-    return Guess({"unit": unit}, f"{text} (the other unit misses by {left[1 - best]:.0f} deg)")
+    return Guess({"unit": unit}, f"{text} (the other unit misses by {misfit[1 - best]:.0f} deg)")
 
 
 def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Guess:
     unknown = {"unit": COUNTS, "counts_per_unit": UNKNOWN}
     if not moves:
         return Guess(unknown, otherwise)
-    left = misfit_deg(moves, (1 / SCALES).tolist())
-    best = int(np.argmin(left))
-    measured, angle = float(SCALES[best]), left[best]
+    misfit = misfit_deg(moves, (1 / SCALES).tolist())
+    best = int(np.argmin(misfit))
+    measured, angle = float(SCALES[best]), misfit[best]
     if angle > CONVINCING_DEG:
         return Guess(unknown, f"counts; at best they turn gravity to within {angle:.0f} deg: not convincing")
     seen = f"so gravity turns to within {angle:.1f} deg over {len(moves)} move{'s'[: len(moves) > 1]}"
@@ -227,7 +229,7 @@ def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Gu
 
 
 def other_range(guess: Guess, sensor: dict[str, Any]) -> list[str]:
-    """Return a remark where the accelerometer's counts are not those of the sensor that is stated."""
+    """Return a remark if the accelerometer's counts differ from those of the stated sensor."""
     stated, seen = sensor.get("accelerometer", {}).get("counts_per_unit"), guess.entry.get("counts_per_unit")
     if not stated or not seen or abs(seen / stated - 1) < CLOSE:
         return []
@@ -237,7 +239,7 @@ def other_range(guess: Guess, sensor: dict[str, Any]) -> list[str]:
 
 
 def counts_of_sensor(guess: Guess, name: str, sensor: dict[str, Any]) -> Guess:
-    """Return the counts that the log does not tell by the sensor's configuration, if one is stated."""
+    """Return a guess of counts that refers to the configuration of the sensor, if one is stated."""
     figure = OF_SENSOR.format(name)
     if name not in sensor:
         text = f'{guess.evidence}; "{figure}" takes counts_per_unit from the configuration of the sensor and its range'
@@ -250,13 +252,13 @@ def counts_of_sensor(guess: Guess, name: str, sensor: dict[str, Any]) -> Guess:
 
 
 def even_steps(values: Values) -> bool:
-    """Return whether numbers grow evenly with the rows, as times and counters do."""
+    """Return whether numbers grow evenly with the rows, like times and counters."""
     line = np.linspace(values[0], values[-1], len(values))
     return bool(np.ptp(values) > 0.0 and np.abs(values - line).max() < EVEN * np.ptp(values))
 
 
 def temperature_counts(span: str, sensor: str) -> Guess:
-    """Return the entry of a temperature in counts, which only the data sheet of the sensor tells."""
+    """Return the entry of a temperature in counts; its scale and offset are only in the data sheet of the sensor."""
     known = MPU60X0_TEMPERATURE if sensor.startswith("mpu60") else dict.fromkeys(MPU60X0_TEMPERATURE, UNKNOWN)
     evidence = (
         f"whole numbers {span}, so counts: degC = (counts - offset) / counts_per_unit, both in the data sheet "
@@ -268,7 +270,7 @@ def temperature_counts(span: str, sensor: str) -> Guess:
 def find_encoder(
     parts: Sequence[Columns], force: Values | None, rate_dps: Values | None, time_s: Values | None
 ) -> None:
-    """Find the counts a turn of an encoder that is named, or else the column that counts the turns of the readings."""
+    """Find the counts per turn of the named encoder, else a column that counts the turns of the readings."""
     for columns in parts:
         numbers, names = columns.log.numbers, columns.log.names
         named = columns.others.get("table_angle")
@@ -278,8 +280,8 @@ def find_encoder(
             columns.turn = turn, f"starts again after {turn} counts"
             continue
         free = [i for i in columns.free() if not set(words_of(names[i])) & NO_ENCODER]
-        found = ((i, _encoder_turn(numbers[i], force, rate_dps, time_s)) for i in (free if named is None else [named]))
-        index, columns.turn = next(((i, turn) for i, turn in found if turn), (named, None))
+        turns = ((i, _encoder_turn(numbers[i], force, rate_dps, time_s)) for i in (free if named is None else [named]))
+        index, columns.turn = next(((i, turn) for i, turn in turns if turn), (named, None))
         if columns.turn and index is not None:
             columns.others["table_angle"] = index
             what = f"{names[index]} is taken as the table's encoder by its numbers" if named is None else names[index]
@@ -287,7 +289,7 @@ def find_encoder(
 
 
 def unit_by_table(columns: Columns, rate: Values, time_s: Values | None) -> Guess | None:
-    """Return what the table's rate, or the slope of its angle, in the same rows says of the gyroscope's unit."""
+    """Return the unit of the gyroscope from the table's rate, or the slope of its angle, in the same rows."""
     channel = next((c for c in ("table_rate", "table_angle") if c in columns.others), None)
     if channel is None or (channel == "table_angle" and not columns.steady):
         return None
@@ -308,7 +310,7 @@ def unit_by_table(columns: Columns, rate: Values, time_s: Values | None) -> Gues
 
 
 def counts_a_turn(values: Values) -> int | None:
-    """Return the counts a turn of an encoder that starts again at each turn; None where it shows no such count."""
+    """Return the counts per turn of an encoder that starts again at each turn; None if they cannot be determined."""
     steps = np.abs(np.diff(values))
     wraps = np.flatnonzero(steps[1:-1] > np.ptp(values) / 2.0) + 1
     if not wraps.size or not whole(values):
@@ -321,10 +323,10 @@ def counts_a_turn(values: Values) -> int | None:
 def _encoder_turn(
     counts: Values, force: Values | None, rate_dps: Values | None, time_s: Values | None
 ) -> tuple[float, str] | None:
-    """Return the counts a turn of an encoder and how they show; None where they do not, or it is no encoder.
+    """Return the counts per turn of an encoder and the evidence; None if they cannot be determined.
 
-    They show by a start again at each turn; by gravity, f = c + a cos(2 pi n / N) + b sin(2 pi n / N); or by the
-    slope of the counts over the turn of the gyroscope, (n, 3) in deg/s, to within its scale factor.
+    They follow from gravity, f = c + a cos(2 pi n / N) + b sin(2 pi n / N), or from the slope of the counts over the
+    rate of the gyroscope, (n, 3) in deg/s, to within its scale factor.
     """
     if not whole(counts) or even_steps(counts) or not np.any(np.diff(counts)):
         return None
@@ -346,22 +348,22 @@ def _turn_by_gravity(counts: Values, force: Values) -> tuple[float, str] | None:
     step = -(-len(counts) // MOST_FITTED)
     counts, force = counts[::step] - counts[0], force[::step]
     power = float(np.sum((force - force.mean(axis=0)) ** 2))
-    if power < FOLLOWED**2 * float(np.sum(force**2)):
+    if power < LARGEST_RESIDUAL**2 * float(np.sum(force**2)):
         return None  # gravity does not turn
 
-    def left(turn: float) -> float:
+    def misfit(turn: float) -> float:
         phase = 2.0 * np.pi * counts / turn
         A = np.column_stack([np.ones(len(phase)), np.cos(phase), np.sin(phase)])
         return float(np.sqrt(np.sum((force - A @ np.linalg.lstsq(A, force, rcond=None)[0]) ** 2) / power))
 
-    usual = min((n for n in ENCODERS if n * SHORTEST_TURN < np.ptp(counts)), key=left, default=None)
+    usual = min((n for n in ENCODERS if n * SHORTEST_TURN < np.ptp(counts)), key=misfit, default=None)
     if usual is None:
         return None
     bounds = (usual * (1.0 - SEARCHED), usual * (1.0 + SEARCHED))
-    measured = float(minimize_scalar(left, bounds=bounds, method="bounded").x)
-    if min(left(measured), left(usual)) > LEFT_BY_GRAVITY:
+    measured = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
+    if min(misfit(measured), misfit(usual)) > LARGEST_MISFIT:
         return None
-    seen = f"gravity turns once in {measured:.4g} counts, to within {left(measured):.1%}"
-    if left(usual) < LEFT_BY_GRAVITY and abs(measured / usual - 1.0) < CLOSE_TURN:
+    seen = f"gravity turns once in {measured:.4g} counts, to within {misfit(measured):.1%}"
+    if misfit(usual) < LARGEST_MISFIT and abs(measured / usual - 1.0) < CLOSE_TURN:
         return usual, f"{seen}; {usual} is the usual number near it"
     return float(f"{measured:.4g}"), f"{seen} (no usual number)"

@@ -244,7 +244,7 @@ def test_parts_of_one_recording_are_read_together(tmp_path: Path, capsys: pytest
     checked = Checked(capsys, tmp_path / "gyroscope.txt", "--ingest", "xsens_mti_multi_position")
     assert checked.code == 0
     assert "51,175 rows over 511.7 s" in checked.words
-    assert "gravity turns as the rates say" in checked.words
+    assert "the rates agree with the rotation of gravity" in checked.words
 
 
 @pytest.mark.parametrize(
@@ -390,7 +390,7 @@ def test_a_wrong_unit_of_few_moves_and_swapped_axes_are_told(
         return Checked(capsys, tmp_path / "log.csv").words
 
     w += 0.05 * rng.standard_normal(w.shape)
-    assert "gravity turns as the rates say, to within 0." in words(w, len(f))
+    assert "the rates agree with the rotation of gravity to within 0." in words(w, len(f))
     assert "check the unit of the rates: multiplied by 57.3 they turn gravity to within" in words(w / 57.29578, 800)
     assert "contradict each other" in words(w[:, [1, 0, 2]], len(f))
 
