@@ -29,9 +29,9 @@ unless --ingest names another profile or its file. If the profile joins files of
 gyroscope in separate files), name one or all of them; the output is a CSV with the columns above. CSV and MCAP are read
 in a stream; logs of other formats and joined files are read into memory.
 
-The bias of a gyroscope changes from one power-on to the next. Where the log holds some seconds in which the unit lies
-still, name them: --rest 0:10 subtracts the mean rate of the longest rest from 0 to 10 s, from the first sample of the
-log. It is stated, with its uncertainty.
+The bias of a gyroscope changes from one power-on to the next. If the unit rests for some seconds of the log, state
+them: --rest 0:10 subtracts the mean rate of the longest rest in the first 10 s of the log. The command prints this rate
+with its uncertainty.
 
 examples:
   python -m pipeline apply --calibration results/demo/calibrations/U1.json drive.csv -o drive_calibrated.csv
@@ -94,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--topic", metavar="TOPIC", help=words)
     words = "time constant of the causal smoothing of the temperature, s; 0: none (default: %(default)g)"
     add("--temperature-smoothing", type=float, default=SMOOTHING_S, metavar="S", dest="smoothing", help=words)
-    words = "s from the first sample in which the unit lies still: the gyroscope's bias is measured again there"
+    words = "interval with a rest, s from the first sample: the gyroscope's bias is measured there"
     add("--rest", type=_seconds, metavar="FROM:TO", help=words)
     words = "file of a Python effect that the calibration uses; the file is run; may be repeated"
     add("--python-effect", action="append", default=[], metavar="FILE", dest="python_effects", help=words)

@@ -1,15 +1,15 @@
-"""Exports: a calibration in the formats of the programs that use it. One ``templates/*.j2`` is one format.
+"""Write a calibration in the formats of other programs. Each ``templates/*.j2`` defines one format.
 
-A template has two parts, separated by a line ``---``: a declaration (``Format``: what the format can hold, in which
-units, and how ``convert`` reads it back), and the text of the file in Jinja2. The text has the variables
+A template has two parts, separated by a line ``---``: a declaration (``Format``: quantities and units of the format,
+and how ``convert`` reads it), and the text of the file in Jinja2. The text has the variables
 
-    accelerometer, gyroscope   ``sensors.ExportedSensor`` in the units of the format, None where it is not calibrated
-    sensors                    those of the two that are calibrated, by name
-    remarks                    convention, what is left out, the error that remains, the held-out errors
+    accelerometer, gyroscope   ``sensors.ExportedSensor`` in the units of the format, None if it is not calibrated
+    sensors                    the calibrated sensors, by name
+    remarks                    convention, omitted quantities, the remaining error, the held-out errors
     unit, document, settings   name of the unit, its calibration, the sections ``sensor`` and ``table``
 
-and the functions of ``sensors.FUNCTIONS``. The name of the template without ``.j2`` is that of the format and,
-by default, that of its file. Nothing else lists the formats.
+and the functions of ``sensors.FUNCTIONS``. The name of the template without ``.j2`` is the name of the format and, by
+default, of its file. Formats are listed nowhere else.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """What a format can hold: the keys above the line ``---`` of a template."""
+    """The declaration of a format: the keys above the line ``---`` of a template."""
 
-    consumer: str  # who reads the file
-    equation: str  # how that corrects a reading
-    source: str  # where that is documented
-    file: str  # name of the file, in which {unit} is the name of the unit; by default that of the template
-    units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]  # of readings; a sensor without one is not in the format
-    sensor_endings: dict[str, str] = field(default_factory=dict)  # of the names of files that hold one sensor each
+    consumer: str  # program that reads the file
+    equation: str  # by which the consumer corrects a reading
+    source: str  # documentation of the equation
+    file: str  # name of the file, with {unit} for the name of the unit; default: name of the template
+    units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]  # of readings; the format has only sensors with a unit
+    sensor_endings: dict[str, str] = field(default_factory=dict)  # of file names, if each sensor has a separate file
     required: list[str] = field(default_factory=list)  # sensors that must be calibrated; "board": the reference chip
     required_counts: list[str] = field(default_factory=list)  # sensors whose counts per unit must be known
-    matrix: dict[str, Literal["full", "diagonal", "none"]] = field(default_factory=dict)  # what it holds; full
-    effects: list[str] = field(default_factory=list)  # that it holds too; "all": its text writes or names each of them
-    effects_in_part: dict[str, str] = field(default_factory=dict)  # effect that it approximates, to how well
-    opening_remarks: list[str]  # before all others; with {unit}, {sensor}, {counts[...]}, {sensors[0]...}
-    closing_remarks: list[str] = field(default_factory=list)  # after those on what is left out
-    temperature_remarks: list[str] = field(default_factory=list)  # only where a bias depends on the temperature
-    noise: bool = False  # whether it holds noise parameters: remarks state their origin, interval, effective density
-    error_sentence: str | None = None  # {}: a held-out error; by default: of the export or of the full calibration
+    matrix: dict[str, Literal["full", "diagonal", "none"]] = field(default_factory=dict)  # part in the format; full
+    effects: list[str] = field(default_factory=list)  # in the format; "all": the text contains or names all of them
+    effects_in_part: dict[str, str] = field(default_factory=dict)  # approximated effect to the accuracy, in words
+    opening_remarks: list[str]  # the first remarks; with {unit}, {sensor}, {counts[...]}, {sensors[0]...}
+    closing_remarks: list[str] = field(default_factory=list)  # after the remarks on omitted quantities
+    temperature_remarks: list[str] = field(default_factory=list)  # only if a bias depends on the temperature
+    noise: bool = False  # whether it has noise parameters: remarks state their origin, interval, effective density
+    error_sentence: str | None = None  # {}: a held-out error; default: of the export or of the full calibration
     read_back: JSON = field(default_factory=dict)  # how ``convert`` reads it (``reading``); empty: no calibration
 
 
@@ -73,13 +73,13 @@ def _environment() -> Environment:
 
 
 def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
-    """Return the text of a template that is no format."""
+    """Render a template that is not a format."""
     return _environment().get_template(name).render(values)
 
 
 @cache
 def formats() -> dict[str, tuple[Format, Template]]:
-    """Return declaration and text of every format, by the name of the template, in alphabetical order."""
+    """Return declaration and text of every format, by name, in alphabetical order."""
     formats_by_name: dict[str, tuple[Format, Template]] = {}
     for template in sorted(TEMPLATES.glob("*.j2")):
         header, _, text = template.read_text(encoding="utf-8").partition("\n---\n")
@@ -95,7 +95,7 @@ def formats() -> dict[str, tuple[Format, Template]]:
 
 @dataclass(frozen=True)
 class ExportedUnit:
-    """A unit to export: its documents, as in ``exports``, and what several formats need of them."""
+    """A unit to export: its documents, as in ``exports``, and quantities that several formats need."""
 
     document: JSON
     settings: JSON
@@ -104,7 +104,7 @@ class ExportedUnit:
 
     @cached_property
     def calibrations(self) -> dict[str, SensorCalibration]:
-        """Of the sensors that are calibrated."""
+        """Calibrations of the calibrated sensors."""
         return {s: SensorCalibration.from_json(s, self.document[s]) for s in SENSORS if self.document.get(s)}
 
     @cached_property
@@ -126,7 +126,7 @@ def exports(
 ) -> dict[str, str]:
     """Return the texts of a calibration in every format, by file name.
 
-    ``calibration, validation, diagnosis``: as in the published files of the unit; ``settings``: the sections ``sensor``
+    ``calibration, validation, diagnosis``: the published documents of the unit; ``settings``: the sections ``sensor``
     and ``table`` of its configuration.
     """
     exported = ExportedUnit(calibration, settings, validation, diagnosis)
@@ -134,9 +134,9 @@ def exports(
 
 
 def export(format_name: str, exported: ExportedUnit, file: str | None = None) -> dict[str, str]:
-    """Return the texts of one format by file name: none where the format can hold nothing of this unit.
+    """Return the texts of one format by file name; empty if a sensor that the format requires is missing.
 
-    ``file``: the name to use, by default that of the declaration; a file for each sensor has its ending added.
+    ``file``: name of the file, by default from the declaration; the ending of a sensor with a separate file is added.
     """
     declared, template = formats()[format_name]
     path = Path(declared.file.replace("{unit}", exported.document["unit"]) if file is None else file)
@@ -149,7 +149,7 @@ def export(format_name: str, exported: ExportedUnit, file: str | None = None) ->
 
 
 def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> str | None:
-    """Return the text of a file, None where a sensor or its counts are missing."""
+    """Return the text of a file, None if a required sensor or its counts are missing."""
     sensors = exported.sensors(declared)
     without_counts = [s for s in declared.required_counts if s in sensors and not sensors[s].counts]
     available = {*sensors, "board"} if (exported.document.get("board") or {}).get("chips") else set(sensors)
@@ -166,8 +166,8 @@ def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> s
 
 
 def _remarks(declared: Format, sensors: dict[str, ExportedSensor], exported: ExportedUnit) -> list[str]:
-    """Return what a reader of the file must know, a sentence or a line each."""
-    held = [*declared.effects, *declared.effects_in_part]
+    """Return the remarks in the file, each a sentence or a line."""
+    included = [*declared.effects, *declared.effects_in_part]
     text = text_of(
         "remarks.txt",
         declared=declared,
@@ -178,7 +178,7 @@ def _remarks(declared: Format, sensors: dict[str, ExportedSensor], exported: Exp
         sensors=sensors,
         counts={s: sensor.counts for s, sensor in sensors.items()},
         lost={
-            s: [] if "all" in held else [name for name in sensor.effects if name not in held]
+            s: [] if "all" in included else [name for name in sensor.effects if name not in included]
             for s, sensor in sensors.items()
         },
         follows_temperature=any(sensor.follows_temperature for sensor in sensors.values()),
@@ -188,7 +188,7 @@ def _remarks(declared: Format, sensors: dict[str, ExportedSensor], exported: Exp
 
 
 def _comment(lines: list[str], mark: str = "# ", end: str = "\n", *, escape: tuple[str, str] = ("", "")) -> str:
-    """Return lines as comments; line ends that users wrote stay inside, and what would end the comment is split."""
+    """Return lines as comments; line ends within a line become blanks, and ``escape`` replaces an end of comment."""
     texts = (" ".join(line.splitlines()) for line in lines)
     return "".join(f"{mark}{text.replace(*escape) if escape[0] else text}{end}" for text in texts)
 
@@ -198,7 +198,7 @@ def _json(content: Any, indent: int = 2) -> str:  # noqa: ANN401
 
 
 def _yaml(content: Any) -> str:  # noqa: ANN401
-    """Return YAML, keys in their order and short lists on one line; by libyaml, which is faster, where there is one."""
+    """Return YAML with keys in their order and short lists on one line, by the faster libyaml if it is available."""
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
     text: str = yaml.dump(plain(content), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
     return text

@@ -1,9 +1,10 @@
-"""The effects of a calibration as C expressions of ``calibration.h``, sorted by what they depend on.
+"""Write the effects of a calibration as C expressions for ``calibration.h``.
 
-The header does what ``pipeline.model.compensation`` does with one sample, in the same order, so that double
-precision without fused operations gives the same last bit where no function of the C library is called. Effects of time
-and temperature alone (``steady``) are subtracted once. Those of the motion (``moving``) are subtracted by fixed point
-where a sensor's effects depend on its own calibrated reading, also through the other sensor (``circular_sensors``).
+The header performs the operations of ``pipeline.model.compensation`` for one sample, in the same order. Double
+precision without fused operations and without functions of the C library then gives the same last bit. Effects of only
+time and temperature (``steady``) are subtracted once. Effects of the motion (``moving``) are subtracted by a
+fixed-point iteration if they depend on the calibrated reading of the same sensor, also through the other sensor
+(``circular_sensors``).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ IN_C = set(SIGNALS) - {"specific_force_rate"}
 
 @dataclass
 class SensorPlan:
-    """The effects of one sensor: assignments in C, and what was left out, with the reason."""
+    """The effects of one sensor as assignments in C, and the omitted effects with the reason."""
 
     bias: list[str]
     matrix: list[list[str]]
@@ -43,7 +44,7 @@ class SensorPlan:
 
 @dataclass
 class Plan:
-    """The contents of the header: of each sensor, and which functions they need."""
+    """The contents of the header: the plan of each sensor, and the functions that it needs."""
 
     sensors: dict[str, SensorPlan]
     circular_sensors: set[str]
@@ -82,7 +83,7 @@ def plan_of(sensors: Mapping[str, ExportedSensor]) -> Plan:
 
 
 def _sensor_plan(sensor: str, calibration: SensorCalibration | None) -> tuple[SensorPlan, Steps]:
-    """Return bias, matrix and effects of a sensor; one that is not calibrated passes through."""
+    """Return bias, matrix and effects of a sensor; without a calibration its readings are unchanged."""
     if calibration is None:
         unchanged = [[c_number(float(i == j)) for j in range(3)] for i in range(3)]
         return SensorPlan([c_number(0.0)] * 3, unchanged), Steps.of(sensor, ())
@@ -106,7 +107,7 @@ def _sensor_plan(sensor: str, calibration: SensorCalibration | None) -> tuple[Se
 
 
 def _not_in_c(sensor: str, fitted: FittedEffect) -> str:
-    """Return why the header leaves an effect out; empty where it does not."""
+    """Return the reason why the header omits an effect; empty if it contains the effect."""
     if fitted.definition and "python" in fitted.definition:
         return "it is in Python; python -m pipeline apply --python-effect subtracts it"
     effect = effect_of(fitted)

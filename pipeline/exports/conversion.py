@@ -1,7 +1,7 @@
-"""Conversion of a calibration into another format, and its explanation in words and numbers.
+"""Convert a calibration into another format, and explain a calibration in words and numbers.
 
-What a conversion loses is not listed in advance: the written file is read back by the reader of its format, and
-compared. The explanation states the equation, the order of its operations, its signs, and a worked sample.
+The losses of a conversion are found by reading the written file back and comparing it. The explanation states the
+equation, the order of its operations, its signs, and a worked example.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding
-WALK_S = 100.0  # correlation time of the wander that stands for a random walk: K = s sqrt(2 / T), any T serves
+WALK_S = 100.0  # correlation time of the wander that represents a random walk: K = s sqrt(2 / T), for any T
 
 
 def document_of(imported: ImportedCalibration) -> JSON:
-    """Return ``calibrations/<unit>.json`` of what a file holds; what it does not state is null."""
+    """Return an imported calibration as ``calibrations/<unit>.json``; values that its file does not state are null."""
     if imported.document is not None:
         return imported.document
     missing = {s: f"{imported.format_name} holds no calibration of it" for s in SENSORS if s not in imported.sensors}
@@ -52,7 +52,7 @@ def document_of(imported: ImportedCalibration) -> JSON:
 
 
 def settings_of(imported: ImportedCalibration, config: Mapping[str, Any]) -> JSON:
-    """Return the settings that exports read: the sensor's configuration, with the noise that the file states."""
+    """Return the settings for exports: the configuration of the sensor, with the noise that the file states."""
     sensor: JSON = {s: dict(config.get(s) or {}) for s in SENSORS}
     for s, unit in SI.items():
         density, walk = (imported.noise.get(f"{s}_{what}") for what in ("noise_density", "random_walk"))
@@ -66,10 +66,10 @@ def settings_of(imported: ImportedCalibration, config: Mapping[str, Any]) -> JSO
 def convert(
     imported: ImportedCalibration, format_name: str, target: Path, config: Mapping[str, Any]
 ) -> tuple[list[Path], list[str]]:
-    """Write a calibration in a format; return the files and what is lost, in sentences.
+    """Write a calibration in a format; return the files and the losses, in sentences.
 
-    ``target``: the file; where the format has a file for each sensor, their endings are added to its stem.
-    ``config``: the sensor's configuration, sensor to its part, for counts and noise; may be empty.
+    ``target``: the file; if the format has a file for each sensor, their endings are added to its stem.
+    ``config``: configuration of each sensor, for counts and noise; may be empty.
     """
     document, settings = document_of(imported), settings_of(imported, config)
     if format_name == CALIBRATION:
@@ -95,7 +95,7 @@ def convert(
 
 
 def lost(imported: ImportedCalibration, format_name: str, file: Path, config: Mapping[str, Any]) -> list[str]:
-    """Return what a written file does not hold, in sentences, by reading it back."""
+    """Read a written file back, and return the losses in sentences."""
     declared = formats()[format_name][0]
     if not declared.read_back:
         return [f"bias and matrix: {format_name} is for {declared.equation}"]
@@ -121,7 +121,7 @@ def lost(imported: ImportedCalibration, format_name: str, file: Path, config: Ma
 
 
 def _differences(before: SensorCalibration, after: SensorCalibration, *, all_effects: bool) -> list[str]:
-    """Return what a sensor's calibration has lost, in sentences."""
+    """Return the differences of bias, matrix and effects in sentences."""
     unit = SENSOR_UNITS[before.sensor]
     bias, matrix = (np.abs(getattr(after, key) - getattr(before, key)).max() for key in ("bias", "matrix"))
     lines = []
@@ -140,7 +140,7 @@ def _differences(before: SensorCalibration, after: SensorCalibration, *, all_eff
 
 
 NUMBER = re.compile(r"\d+\.\d+(?:e[-+]?\d+)?")
-# The worked sample: a body that stands a little off level, turns, and is warmer than the reference temperature.
+# The worked example: a tilted body that turns, above the reference temperature.
 SAMPLE: dict[str, Any] = {
     "accelerometer": np.array([0.1, -0.2, 0.97]),
     "gyroscope": np.array([10.0, -20.0, 30.0]),
@@ -164,12 +164,12 @@ def explain_calibration(imported: ImportedCalibration) -> str:
 
 
 def explain_board(document: JSON) -> str:
-    """Return how the chips of a unit's board sit, in words and numbers; nothing where the unit is on no board."""
+    """Return the positions of the chips of the unit's board in words and numbers; empty without a board."""
     return text_of("board.txt", board=document["board"]) if document.get("board") else ""
 
 
 def _explained(calibration: SensorCalibration, imported: ImportedCalibration) -> JSON:
-    """Return what the explanation of a sensor states; the effects are those that the compensation subtracts."""
+    """Return the values in the explanation of a sensor; its effects are those that the compensation subtracts."""
     sensor, effects = calibration.sensor, sensor_effects(calibration)
     compensation = Compensation(imported.sensors.get("accelerometer"), imported.sensors.get("gyroscope"), imported.unit)
     truth = getattr(compensation.apply(**SAMPLE, smoothing=0.0), sensor)
@@ -195,7 +195,7 @@ def _explained(calibration: SensorCalibration, imported: ImportedCalibration) ->
 
 
 def _expanded_uncertainty(calibration: SensorCalibration) -> Values | None:
-    """Return the expanded uncertainties (95 %) of all parameters; None where none is known."""
+    """Return the expanded uncertainties (95 %) of all parameters; None if they are unknown."""
     if calibration.covariance is None:
         return None
     freedom = calibration.freedom if calibration.freedom is not None else np.array(calibration.degrees_of_freedom)
@@ -204,6 +204,6 @@ def _expanded_uncertainty(calibration: SensorCalibration) -> Values | None:
 
 
 def _plain(expression: str) -> str:
-    """Return a C expression of an effect without casts, its numbers to six digits."""
+    """Return a C expression of an effect without casts and with six digits."""
     bare = expression.replace("(imu_real)", "").replace("m->", "")
     return NUMBER.sub(lambda number: f"{float(number[0]):.6g}", bare)

@@ -1,8 +1,8 @@
-"""Exports read back: the file of a format to the calibration that it holds.
+"""Read a calibration from a file in one of the formats.
 
 The declaration of a template states under ``read_back`` how its file is read: the ``kind`` of text
-(``pipeline.exports.text_kinds``), and for each sensor ``where``, the path of a value that only a file with this sensor
-has, and an expression for each quantity:
+(``pipeline.exports.text_kinds``), and for each sensor ``where``, the path of a value that exists only if the file
+contains this sensor, and an expression for each quantity:
 
     bias | bias_after_matrix | bias_polynomial,   matrix | K,   g_sensitivity, scale_factor_temperature, bias_deviation
 
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jinja2 import TemplateError
 
-from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.errors import ConfigurationError, InputError, MissingInputError, first
 from pipeline.exports import formats
 from pipeline.exports.sensors import FACTORS, FUNCTIONS
 from pipeline.exports.text_kinds import Expressions, Node, parsed
@@ -38,59 +38,59 @@ if TYPE_CHECKING:
     from pipeline.exports import Format
     from pipeline.records import Values
 
-CALIBRATION = "calibration.json"  # the name of the product's own format among the formats
-LARGEST_BYTES = 50_000_000  # of a file to read; a calibration has some kilobytes, a vehicle's parameters 100
-UNIT_SCALE = (0.5, 2.0)  # range of a matrix's singular values where readings and truth have the same unit
+CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.json``
+LARGEST_BYTES = 50_000_000  # of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100
+UNIT_SCALE = (0.5, 2.0)  # range of the singular values of a matrix if readings and truth have the same unit
 EFFECT_IN_C = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
-TURNED_READINGS = re.compile(r"Turn the readings to body axes first: [^.]*\.")  # a remark of our own exports
-ROUNDING = 1e-12  # of the formats' own arithmetic, relative to the largest number
+TURNED_READINGS = re.compile(r"Turn the readings to body axes first: [^.]*\.")  # a remark in our exports
+ROUNDING = 1e-12  # rounding errors of the formats' arithmetic, relative to the largest number
 
 
 @dataclass(frozen=True)
 class ImportedCalibration:
-    """A calibration as a file holds it."""
+    """A calibration from a file."""
 
     format_name: str
-    unit: str  # the stem of the file where the format holds no name
-    sensors: dict[str, SensorCalibration]  # the covariance is None where the file states no uncertainty
-    noise: dict[str, float] = field(default_factory=dict)  # of Kalibr's four parameters those that it states
-    notes: list[str] = field(default_factory=list)  # what was assumed, and what was not read
-    document: dict[str, Any] | None = None  # ``calibrations/<unit>.json``, where the file is one
+    unit: str  # stem of the file if the format has no name of the unit
+    sensors: dict[str, SensorCalibration]  # the covariance is None if the file states no uncertainty
+    noise: dict[str, float] = field(default_factory=dict)  # the stated ones of Kalibr's four parameters
+    notes: list[str] = field(default_factory=list)  # assumptions, and values that were not read
+    document: dict[str, Any] | None = None  # ``calibrations/<unit>.json``, if the file is in this format
 
 
 def read_any(
     file: Path, format_name: str | None = None, counts: Mapping[str, float | None] | None = None
 ) -> ImportedCalibration:
-    """Read a calibration in any format; where a format has a file for each sensor, from either of them.
+    """Read a calibration in any format; if the format has a file for each sensor, ``file`` is one of them.
 
-    ``format_name``: or its beginning (``format_of``); found from the file's name and content where not given;
-    ``counts``: sensor to its counts per g or deg/s, for formats in counts. ``ConfigurationError``: no format, or
-    several, have this name; ``InputError``: the file does not hold what the format needs.
+    ``format_name``: a name or its beginning (``format_of``), by default found from name and content of the file;
+    ``counts``: sensor to its counts per g or deg/s, for formats in counts. Raises ``ConfigurationError`` if no format
+    or several formats have this name, ``InputError`` if the file lacks values that the format needs.
     """
-    named = None if format_name is None else format_of(format_name)
+    name = None if format_name is None else format_of(format_name)
     if not is_published(file):
         raise MissingInputError("there is no such calibration", str(file))
     text = _text(file)
-    named = named or _recognised(file, text)
-    if named == CALIBRATION:
+    name = name or _recognised(file, text)
+    if name == CALIBRATION:
         document = read_calibration(file)
         sensors = {s: c for s in SENSORS if (c := sensor_of(document, s, file)) is not None}
-        for s, c in sensors.items():  # a published one holds zeros where no uncertainty is known
+        for s, c in sensors.items():  # a published calibration has zeros for an unknown uncertainty
             if c.covariance is None or not np.any(np.diag(c.covariance) > 0.0):
                 sensors[s] = replace(c, covariance=None)
-        return ImportedCalibration(named, str(document["unit"]), sensors, document=document)
-    declared = formats()[named][0]
+        return ImportedCalibration(name, str(document["unit"]), sensors, document=document)
+    declared = formats()[name][0]
     if not declared.read_back:
-        raise InputError(f"the format {named} holds no calibration that can be read: {declared.equation}", str(file))
+        raise InputError(f"the format {name} holds no calibration that can be read: {declared.equation}", str(file))
     files = _files_of(file, declared)
-    parts = [_read_file(each, named, declared, counts or {}) for each in files]
+    parts = [_read_file(each, name, declared, counts or {}) for each in files]
     sensors = {s: c for part in parts for s, c in part.sensors.items()}
     notes = [f"read together with it: {each.name}" for each in files if each != file]
     return replace(parts[0], sensors=sensors, notes=[*notes, *(note for part in parts for note in part.notes)])
 
 
 def _files_of(file: Path, declared: Format) -> list[Path]:
-    """Return the file, and that of the other sensor in the same folder, where each has its own."""
+    """Return the file and, if each sensor has a separate file, the file of the other sensor in the same folder."""
     endings = declared.sensor_endings.values()
     ending = next((e for e in endings if file.stem.endswith(e)), None)
     if ending is None:
@@ -119,12 +119,12 @@ def _read_file(
 
 
 def counts_of(config: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return the counts per g or deg/s of each sensor by the sensor's configuration; None: not stated."""
+    """Return the counts per g or deg/s in the configuration of each sensor; None if not stated."""
     return {s: (config.get(s) or {}).get("counts_per_unit") for s in SENSORS}
 
 
 def format_of(words: str) -> str:
-    """Return the format whose name, beginning of the name, or pattern of file names fits."""
+    """Return the only format with this name, beginning of its name, or file name."""
     names = [CALIBRATION, *formats()]
     fitting = (
         [name for name in names if words in (name, name.partition(".")[0])]
@@ -138,7 +138,7 @@ def format_of(words: str) -> str:
 
 
 def _recognised(file: Path, text: str) -> str:
-    """Return the name of the only format whose keys a file has."""
+    """Return the name of the only format whose keys are in the file."""
     declarations = {name: declared for name, (declared, _) in formats().items() if declared.read_back}
     if file.name in formats():
         return file.name
@@ -159,7 +159,7 @@ def _recognised(file: Path, text: str) -> str:
 
 
 def _sensors_in(file: Path, declared: Format, content: Node) -> dict[str, dict[str, str]]:
-    """Return the expressions of the sensors that a file holds."""
+    """Return the expressions for the sensors in a file."""
     read_back, endings = declared.read_back, declared.sensor_endings
     expressions = {s: read_back["sensor"] for s in endings if file.stem.endswith(endings[s])} or read_back
     return {s: dict(expressions[s]) for s in SENSORS if s in expressions and content.has(expressions[s]["where"])}
@@ -196,8 +196,7 @@ def _read(
              if content.has(path) and content.at(path) is not None}  # fmt: skip
     unread = content.unread()
     if unread:
-        others = f" and {len(unread) - 12} more" if len(unread) > 12 else ""
-        notes.append(f"not read: {', '.join(unread[:12])}{others}")
+        notes.append(f"not read: {', '.join(first(unread, 12))}")
     notes += [f"{s}: the file states no bias; it counts as 0" for s, c in calibrations.items() if not np.any(c.bias)]
     return ImportedCalibration(format_name, file.stem, calibrations, noise, notes)
 
@@ -205,16 +204,16 @@ def _read(
 def _calibration(
     sensor: str, declared: Format, values: Mapping[str, Any], counts: float | None, notes: list[str]
 ) -> SensorCalibration:
-    """Return the calibration in g and deg/s that the values of a format's expressions are."""
+    """Return the calibration in g and deg/s from the values of the format's expressions."""
     factor = FACTORS[declared.units[sensor]]
-    held = {key: np.asarray(value, float) for key, value in values.items()}
-    matrix = held["matrix"].reshape(3, 3) if "matrix" in held else np.linalg.inv(held["K"].reshape(3, 3))
-    if "bias_polynomial" in held:
-        polynomial = held["bias_polynomial"].reshape(3, -1)
-    elif "bias_after_matrix" in held:
-        polynomial = np.linalg.solve(matrix, held["bias_after_matrix"].ravel())[:, None]
+    arrays = {key: np.asarray(value, float) for key, value in values.items()}
+    matrix = arrays["matrix"].reshape(3, 3) if "matrix" in arrays else np.linalg.inv(arrays["K"].reshape(3, 3))
+    if "bias_polynomial" in arrays:
+        polynomial = arrays["bias_polynomial"].reshape(3, -1)
+    elif "bias_after_matrix" in arrays:
+        polynomial = np.linalg.solve(matrix, arrays["bias_after_matrix"].ravel())[:, None]
     else:
-        polynomial = held["bias"].reshape(3, 1)
+        polynomial = arrays["bias"].reshape(3, 1)
     raw = factor  # units of the format per g or deg/s of a reading
     sizes = np.linalg.svd(matrix, compute_uv=False)
     if not UNIT_SCALE[0] < sizes[2] <= sizes[0] < UNIT_SCALE[1]:
@@ -232,26 +231,23 @@ def _calibration(
     if not all(np.isfinite(array).all() for array in (polynomial, matrix)):
         raise ValueError(f"{sensor}: a number is not finite")
     polynomial = polynomial / raw
-    if np.any(np.abs(held.get("left_out", 0.0)) > 0.0):
-        most = float(np.abs(held["left_out"]).max())
-        notes += [f"{sensor}: cross-axis terms change by up to {most:.2g} per degC, which is not read"] * (
-            most > ROUNDING
-        )
+    if (largest := float(np.abs(arrays.get("left_out", 0.0)).max())) > ROUNDING:
+        notes.append(f"{sensor}: cross-axis terms change by up to {largest:.2g} per degC, which is not read")
     effects = _thermal(sensor, polynomial, notes)
     for name, unit in (("g_sensitivity", raw), ("scale_factor_temperature", 1.0)):
-        if np.any(values_of := held.get(name, np.zeros(1))):
+        if np.any(values_of := arrays.get(name, np.zeros(1))):
             effects.append(_fitted(name, sensor, values_of.ravel() / unit))
     covariance = None
-    if "bias_deviation" in held and np.any(held["bias_deviation"]):
+    if "bias_deviation" in arrays and np.any(arrays["bias_deviation"]):
         size = 12 + sum(len(e.parameters) for e in effects)
         covariance = np.zeros((size, size))
-        covariance[:3, :3] = np.diag((held["bias_deviation"].ravel() / raw) ** 2)
+        covariance[:3, :3] = np.diag((arrays["bias_deviation"].ravel() / raw) ** 2)
         notes.append(f"{sensor}: the file states an uncertainty of the bias, and none of the matrix")
     return SensorCalibration(sensor, polynomial[:, 0], matrix, effects=tuple(effects), covariance=covariance)
 
 
 def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEffect]:
-    """Return the effect of a bias that follows the temperature: a polynomial in T - 25 degC, (3, k) array."""
+    """Return the effect of a bias that is a polynomial in T - 25 degC: coefficients (3, k)."""
     polynomial = np.where(np.abs(polynomial) > ROUNDING * np.abs(polynomial).max(), polynomial, 0.0)
     if np.any(polynomial[:, 3:]):
         notes.append(f"{sensor}: the bias beyond the second order of the temperature is left out")
@@ -261,6 +257,6 @@ def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEf
 
 
 def _fitted(name: str, sensor: str, values: Values) -> FittedEffect:
-    """Return a built-in effect with its values, whose uncertainty is not known."""
+    """Return a built-in effect with its values and unknown uncertainty."""
     named = zip(effect(name).parameters(sensor), values.tolist(), strict=True)
     return FittedEffect(name, {p.name: {"value": v, "unit": p.unit, "expanded_uncertainty": None} for p, v in named})

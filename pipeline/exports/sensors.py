@@ -1,18 +1,19 @@
-"""A calibrated sensor as the templates of exports get it, and functions that several formats need.
+"""Define a calibrated sensor in the unit of a format, and the functions that several formats need.
 
 truth = matrix @ (reading - bias - effects),    reading = bias + K @ truth + effects,    K = matrix^-1
 
-White noise n and random walk k, for estimators with these two terms alone, follow from the terms identified at rest:
+White noise n and random walk k, for estimators with only these two terms, follow from the terms identified at rest:
 
     n^2 = N^2 + sum 2 G^2 T  (T < ``FAST_S``)
     k^2 = K^2 + sum 2 G^2 / T  (other processes) + 3 (2 ln 2 / pi)^2 B^4 / n^2
 
-A fast Gauss-Markov process is white over the times that estimators average over; a slow one starts as the walk of the
-same increments. The walk for a bias instability B has its Allan variance where that of white noise has it. n is
-continuous: the standard deviation of a sample is n sqrt(rate). An axis without any slow term has the walk that stands
-for the bias wander of the sensor's configuration, s sqrt(2 / T), or its own upper limit if that is less. The figure of
-a sensor is the root mean square of its axes. Where no term was identified, the configuration gives both, with
-``n = noise_density / sqrt(2)``, because its density is one-sided. Quantisation, ramps and sinusoids are in neither.
+A fast Gauss-Markov process is white over the averaging times of estimators; a slow one begins like the random walk with
+the same increments. The walk for a bias instability B has the Allan variance of B at the averaging time at which the
+white noise has it. n is continuous: the standard deviation of a sample is n sqrt(rate). For an axis without a slow
+term, the walk is the lesser of its upper limit and the walk for the bias wander in the configuration, s sqrt(2 / T).
+The value of a sensor is the root mean square of its axes. If no term was identified, both follow from the
+configuration, with ``n = noise_density / sqrt(2)``, because its density is one-sided. Quantisation, ramps and sinusoids
+are not included.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
-AVERAGING_S = 1.0  # of the effective density in remarks; the diagnosis has others
+AVERAGING_S = 1.0  # averaging time of the effective density in remarks
 INSTABILITY_FLOOR = 2.0 * np.log(2.0) / np.pi  # Allan variance of a bias instability of 1 (IEEE Std 952)
 
 
 def noise(settings: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return Kalibr's four noise parameters in m/s^2 and rad/s; None where they are not known."""
+    """Return Kalibr's four noise parameters in m/s^2 and rad/s; None for unknown ones."""
     parameters: dict[str, float | None] = {}
     for sensor in SENSORS:
         figures = noise_figures(sensor, settings, document)
@@ -53,15 +54,15 @@ def noise(settings: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str,
 
 
 def nearest_density(effective: Mapping[str, Any]) -> JSON:
-    """Return the effective density over about ``AVERAGING_S``, of those that a diagnosis has."""
+    """Return the effective density of a diagnosis whose averaging time is nearest to ``AVERAGING_S``."""
     densities: list[JSON] = effective["densities"]
     return min(densities, key=lambda d: abs(np.log(d["averaging_time_s"] / AVERAGING_S)))
 
 
 def noise_figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, Any]) -> JSON:
-    """Return white noise and walk of a sensor in its own unit, their intervals (None: none), origins and doubts.
+    """Return white noise and walk of a sensor in g or deg/s, their intervals (or None), origins and doubts.
 
-    ``KeyError`` where nothing was measured and there is no configuration.
+    Raises ``KeyError`` without a measurement and a configuration.
     """
     identified = (document.get("noise") or {}).get(sensor) or {}
     of_axes = (identified.get("axes") or {}).values()
@@ -71,41 +72,41 @@ def noise_figures(sensor: str, settings: Mapping[str, Any], document: Mapping[st
     white = None if density is None else density / np.sqrt(2.0)
     walk = None if wander is None or not time else wander * np.sqrt(2.0 / time)
     origin = settings["sensor"][sensor].get("noise_origin")  # another program's file
-    out: JSON = {"white": white, "white_interval": None, "white_origin": origin or "of the sensor's configuration"}
-    out |= {"walk": walk, "walk_interval": None}
+    figures: JSON = {"white": white, "white_interval": None, "white_origin": origin or "of the sensor's configuration"}
+    figures |= {"walk": walk, "walk_interval": None}
     doubts = [identified.get("doubts"), *(axis.get("doubts") for axis in of_axes)]
-    out["doubts"] = list(dict.fromkeys(doubt for found in doubts for doubt in found or []))
-    out["walk_origin"] = origin or "for the bias wander of the sensor's configuration"
+    figures["doubts"] = list(dict.fromkeys(doubt for of_part in doubts for doubt in of_part or []))
+    figures["walk_origin"] = origin or "for the bias wander of the sensor's configuration"
     if not axes:
-        return out
-    found, walks = zip(*map(_white_and_walk, axes), strict=True)
-    whites = [w for w in found if w is not None]
+        return figures
+    of_white, walks = zip(*map(_white_and_walk, axes), strict=True)
+    whites = [w for w in of_white if w is not None]
     if whites:
-        out["white"], *out["white_interval"] = _rms(whites)
-        out["white_origin"] = f"measured at rest ({identified['source']}), root mean square of the axes"
+        figures["white"], *figures["white_interval"] = _rms(whites)
+        figures["white_origin"] = f"measured at rest ({identified['source']}), root mean square of the axes"
     measured = [w for w in walks if w is not None]
     limits = [t["random_walk"].get("upper_limit") for t, w in zip(axes, walks, strict=True) if w is None]
     bounds = [bound for limit in limits if (bound := min((v for v in (limit, walk) if v), default=None)) is not None]
     if measured or bounds:
-        out["walk"] = _rms([w[0] for w in measured] + bounds)
+        figures["walk"] = _rms([w[0] for w in measured] + bounds)
     if measured and bounds:
-        out["walk_origin"] = (
+        figures["walk_origin"] = (
             f"measured at rest on {len(measured)} of {len(axes)} axes; on the others it is the lesser of the sensor's "
             "configuration and the upper limit"
         )
     elif measured:
-        out |= {"walk_origin": "measured at rest", "walk_interval": _rms(measured)[1:]}
+        figures |= {"walk_origin": "measured at rest", "walk_interval": _rms(measured)[1:]}
     elif bounds:
         limit = f"{FACTORS[SI[sensor]] * max(v for v in limits if v):.3g} {SI[sensor]}/sqrt(s)"
-        out["walk_origin"] = (
+        figures["walk_origin"] = (
             f"not found at rest ({identified['length_s']:.3g} s), below {limit}: the lesser of the sensor's "
             "configuration and this limit"
         )
-    return out
+    return figures
 
 
 def _white_and_walk(terms: JSON) -> list[Values | None]:
-    """Return white noise and walk of an axis with the ends of their intervals, (3,); None where no term was found."""
+    """Return white noise and walk of an axis, each with the ends of its interval, (3,); None without a term."""
 
     def intervals(*parts: JSON) -> list[Values]:
         return [np.array([p["value"], *p["interval"]], float) for p in parts if p["value"] is not None]
@@ -125,7 +126,7 @@ def _rms(values: Sequence[Any]) -> Any:  # noqa: ANN401  (numbers, or lists of t
 
 
 OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic")
-TEMPERATURES = (-40.0, 85.0)  # degC, the widest that parts of this kind are made for
+TEMPERATURES = (-40.0, 85.0)  # degC, the widest specified range of such parts
 ORDER = 4  # coefficients of a polynomial of third order in the temperature
 
 
@@ -135,9 +136,9 @@ class ExportedSensor:
     Attributes
     ----------
     effects : dict of str to array
-        Values of the effects that belong to the sensor itself.
+        Values of the effects that the sensor causes.
     bench_effects : list of str
-        Effects of mounting, place, recording, table and timing, which no export carries.
+        Effects of mounting, place, recording, table and timing, which no export contains.
     counts : float or None
         Counts per g or deg/s.
     """
@@ -154,44 +155,44 @@ class ExportedSensor:
 
     @property
     def bias_after_matrix(self) -> Values:
-        """What is subtracted after the matrix: ``matrix @ bias``."""
+        """The bias in calibrated units: ``matrix @ bias``."""
         return np.asarray(self.matrix @ self.calibration.bias * self.factor)
 
     @property
     def bias_deviation(self) -> Values:
-        """Standard uncertainty of the bias; zeros where it is not known."""
+        """Standard uncertainty of the bias; zeros if it is unknown."""
         covariance = self.calibration.covariance
         return np.zeros(3) if covariance is None else np.sqrt(np.diag(covariance)[:3]) * self.factor
 
     @property
     def scale(self) -> Values:
-        """Scale factors that stand best for the whole matrix.
+        """Scale factors that best replace the full matrix.
 
-        ``s_i = K_ii / |K_i|^2`` minimises ``E (t_i - s_i K_i t)^2`` over truths t of any direction, K_i the rows of K.
+        ``s_i = K_ii / |K_i|^2`` minimises ``E (t_i - s_i K_i t)^2`` over all directions of the truth t; K_i: rows of K.
         """
         return np.asarray(np.diag(self.K) / np.sum(self.K**2, axis=1))
 
     @property
     def scale_error(self) -> float:
-        """Root mean square of the error that ``scale`` leaves, relative to the truth.
+        """Root mean square error after a correction by ``scale``, relative to the truth, over all its directions.
 
-        ``sqrt(sum_i (1 - K_ii^2 / |K_i|^2) / 3)`` over directions of the truth.
+        ``sqrt(sum_i (1 - K_ii^2 / |K_i|^2) / 3)``
         """
         return float(np.sqrt(np.sum(1.0 - np.diag(self.K) ** 2 / np.sum(self.K**2, axis=1)) / 3.0))
 
     @property
     def bias_error(self) -> float:
-        """Likewise of the error after the subtraction of the bias alone: ``|1 - K| / sqrt(3)``."""
+        """Likewise after a correction by only the bias: ``|1 - K| / sqrt(3)``."""
         return float(np.linalg.norm(np.eye(3) - self.K) / np.sqrt(3.0))
 
     @property
     def follows_temperature(self) -> bool:
-        """Whether the bias follows the temperature."""
+        """Whether the bias depends on the temperature."""
         return bool(set(OF_THE_BIAS) & set(self.effects))
 
     @property
     def bias_polynomial(self) -> Values:
-        """The bias, and how it changes per degC and per degC^2 from 25 degC: (3, 3) array, a row an axis."""
+        """Coefficients of the bias in powers 0 to 2 of T - 25 degC: (3, 3) array, one row per axis."""
         polynomial = np.zeros((3, 3))
         polynomial[:, 0] = self.calibration.bias
         polynomial[:, 1] += self.effects.get("bias_temperature", np.zeros(3))
@@ -200,19 +201,19 @@ class ExportedSensor:
 
     @property
     def g_sensitivity(self) -> Values:
-        """Rate read per specific force, in the sensor's unit per g: (3, 3) array."""
+        """Change of the reading per specific force, in the unit of the format per g: (3, 3) array."""
         return self.effects.get("g_sensitivity", np.zeros(9)).reshape(3, 3) * self.factor
 
     @property
     def noise_density(self) -> float:
-        """White noise by the sensor's configuration, unit/sqrt(Hz); 0 where it is not stated."""
+        """White noise in the configuration of the sensor, unit/sqrt(Hz); 0 if it is not stated."""
         return float((self.config["noise_density"] or 0.0) * self.factor)
 
     @property
     def temperature_polynomials(self) -> tuple[Values, Values]:
         """Coefficients in T, degC, of ``M(T)`` and ``b(T)`` in ``M raw + b``: (3, 3, 4) and (3, 4) arrays.
 
-        A scale factor that follows the temperature, K + D dT, is inverted to third order: ``M - M D M dT + ...``.
+        A scale factor that depends on the temperature, K + D dT, is inverted to third order: ``M - M D M dT + ...``.
         """
         M, D = self.matrix, np.diag(self.effects.get("scale_factor_temperature", np.zeros(3)))
         powers = [M]
@@ -225,26 +226,26 @@ class ExportedSensor:
                 added[:, i + j] -= power @ offset[:, j]
         return shifted(np.stack(powers, axis=2), REFERENCE_TEMPERATURE, 0.0), shifted(added, REFERENCE_TEMPERATURE, 0.0)
 
-    def left_by_matrix(self, held: str) -> list[str]:
-        """Return a sentence on the error that a format leaves which holds the diagonal of the matrix, or none of it."""
-        if held == "full":
+    def left_by_matrix(self, part: str) -> list[str]:
+        """Return a sentence on the error of a format with only this part of the matrix: full, diagonal or none."""
+        if part == "full":
             return []
         error, what = self.bias_error, f"The matrix of the {self.name} is"
-        if held == "diagonal":
+        if part == "diagonal":
             error, what = self.scale_error, f"Cross-axis terms of the {self.name} are"
-        left = f"{error:.2g} g at 1 g" if self.name == "accelerometer" else f"{100 * error:.2g} % of the rate"
-        return [f"{what} left out: that leaves about {left}."]
+        size = f"{error:.2g} g at 1 g" if self.name == "accelerometer" else f"{100 * error:.2g} % of the rate"
+        return [f"{what} left out: that leaves about {size}."]
 
 
 def shifted(coefficients: Values, before: float, after: float) -> Values:
-    """Turn coefficients in T - before, low orders first along the last axis, into those in T - after."""
+    """Convert coefficients in T - before, low orders first along the last axis, to coefficients in T - after."""
     step, orders = after - before, range(coefficients.shape[-1])
     change = [[comb(k, j) * step ** (k - j) if j <= k else 0.0 for j in orders] for k in orders]
     return np.asarray(coefficients @ np.array(change), np.float64)
 
 
 def before_use(document: dict[str, Any]) -> list[str]:
-    """Return what to know before using an export: how readings become body axes, and what is implausible."""
+    """Return remarks before the use of an export: conversion to body axes, priors of lots, implausible values."""
     maps = maps_of_log(document.get("log") or {})
     owners = dict.fromkeys(maps.values(), "sensor") if len(set(maps.values())) == 1 else {m: s for s, m in maps.items()}
     lines = []
@@ -281,8 +282,8 @@ def row_lengths(F: Values) -> tuple[Values, Values]:
 def accelerometer_frame(accelerometer: ExportedSensor | None, gyroscope: ExportedSensor | None) -> dict[str, Any]:
     """Return Kalibr's factors of both matrices, in the frame i in which the accelerometer's is lower triangular.
 
-    ``a_meas = M_a f_i + b_a``, ``w_meas = M_g C w_i + A C f_i + b_w`` with M_a, M_g lower triangular and C a rotation:
-    ``K_a = M_a Q``, ``f_i = Q f``, ``K_g Q^T = M_g C``, ``A = G Q^T C^T`` with G the g-sensitivity, so nothing is lost.
+    ``a_meas = M_a f_i + b_a``, ``w_meas = M_g C w_i + A C f_i + b_w`` with M_a, M_g lower triangular and C a rotation.
+    The factors are exact: ``K_a = M_a Q``, ``f_i = Q f``, ``K_g Q^T = M_g C``, ``A = G Q^T C^T``, G the g-sensitivity.
     """
     M_a, Q = (np.eye(3), np.eye(3)) if accelerometer is None else lower_times_rotation(accelerometer.K)
     pose = np.block([[Q, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
@@ -294,13 +295,13 @@ def accelerometer_frame(accelerometer: ExportedSensor | None, gyroscope: Exporte
 
 
 def pose(rotation: Values, place: Values) -> Values:
-    """Return T with ``p_i = T p_b``: (4, 4) array, R the rotation from b to i and r the place of i in the axes of b."""
+    """Return the (4, 4) transform T with ``p_i = T p_b``; rotation: from b to i; place: origin of i in axes of b."""
     R = np.asarray(rotation)
     return np.block([[R, (0.0 - R @ np.asarray(place))[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
 def lever_arm_of(chip: dict[str, Any]) -> list[float]:
-    """Return the place of a chip of a board, m; zeros where no lever arm could be estimated."""
+    """Return the position of a chip on a board, m; zeros for lever arms that could not be estimated."""
     parameters = (chip["parameters"].get(f"lever_arm_{axis}") for axis in AXES)
     return [p["value"] if p else 0.0 for p in parameters]
 
@@ -312,7 +313,7 @@ def static_transform(rotation: Values, place: Values) -> str:
 
 
 def sampling_rate(document: dict[str, Any]) -> float:
-    """Return the sampling rate of the unit's recordings, Hz; 0 where none is known."""
+    """Return the sampling rate of the first recording with a rate, Hz; 0 if none has one."""
     rates = [i["rate_hz"] for i in document.get("inputs", []) if i.get("rate_hz")]
     return float(rates[0]) if rates else 0.0
 

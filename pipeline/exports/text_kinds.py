@@ -1,11 +1,11 @@
-"""The texts of other programs' calibrations as trees of values, and the functions of the expressions in ``read_back``.
+"""Parse calibrations of other programs into trees of values; functions for the expressions in ``read_back``.
 
-json, yaml   : as they are; a list of mappings becomes a mapping by ``SensorType``, or by number
+json, yaml   : unchanged, but a list of mappings becomes a mapping by ``SensorType``, or by number
 ini          : sections with ``NAME = value`` (configparser); several numbers are separated by blanks or commas
 parameters   : a line for each parameter: ``NAME value``, ``NAME,value``, ``set NAME = a,b``, or PX4's five columns
 c            : initialised arrays of C by name, ``NAME ... = {...};``, without their nesting
 xml          : ``<define name= value=>`` by name
-numbers      : the 21 numbers with which the file begins, as ``numbers``
+numbers      : the 21 numbers at the beginning of the file, as ``numbers``
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ DEFINE = re.compile(r'<define\s+name="(\w+)"\s+value="([^"]*)"')
 
 
 class Node(dict[str, Any]):
-    """A mapping of a file that knows its place in it and which of its values were used."""
+    """A mapping in a file that stores its place in the file and records which values were used."""
 
     def __init__(self, content: dict[Any, Any], place: str = "", used: set[str] | None = None) -> None:
         self.place, self.used = place, set() if used is None else used
@@ -57,7 +57,7 @@ class Node(dict[str, Any]):
         return super().__getitem__(key)
 
     def get(self, key: str, default: Any = None) -> Any:  # noqa: ANN401
-        """Return a value, or a default where there is none."""
+        """Return a value, or a default if the key does not exist."""
         try:
             return self[key]
         except KeyError:
@@ -71,7 +71,7 @@ class Node(dict[str, Any]):
         return value
 
     def has(self, path: str) -> bool:
-        """Return whether there is a value at a dotted path."""
+        """Return whether a value exists at a dotted path."""
         value: Any = self
         for key in path.split("."):
             if not isinstance(value, Node) or key not in value:
@@ -89,22 +89,22 @@ class Node(dict[str, Any]):
                 yield place
 
     def unread(self) -> list[str]:
-        """Return the keys of the values that were not used, of parameters those of the same families."""
-        families = {place.partition("_")[0] for place in self.used}
+        """Return the keys of unused values; in a flat list of parameters, only those with the prefix of a used one."""
+        prefixes = {place.partition("_")[0] for place in self.used}
         nested = any(isinstance(value, Node) for value in self.values())
-        left = [p for p in self.leaves() if p not in self.used and (nested or p.partition("_")[0] in families)]
-        return list(dict.fromkeys(place.rpartition(".")[2] for place in left))
+        unused = [p for p in self.leaves() if p not in self.used and (nested or p.partition("_")[0] in prefixes)]
+        return list(dict.fromkeys(place.rpartition(".")[2] for place in unused))
 
 
 class Expressions(Environment):
-    """Jinja2's expressions over a tree, whose missing values are named by their place."""
+    """Jinja2 expressions on a tree; an error names the place of a missing value."""
 
     def __init__(self, variables: dict[str, Any]) -> None:
         super().__init__(undefined=StrictUndefined, autoescape=False)  # no HTML
         self.globals |= FUNCTIONS | variables
 
     def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401
-        """Return a value of a mapping, or an attribute."""
+        """Return a value of a mapping, or an attribute of another object."""
         return obj[attribute] if isinstance(obj, dict) else super().getattr(obj, attribute)
 
     def value(self, expression: object) -> Any:  # noqa: ANN401
@@ -113,7 +113,7 @@ class Expressions(Environment):
 
 
 def parsed(kind: str, text: str) -> Node:
-    """Return the tree of a text; ``ValueError`` where it is not of that kind."""
+    """Parse a text into a tree; raises ``ValueError`` if it is not of that kind."""
     try:
         content = PARSERS[kind](text)
     except (yaml.YAMLError, configparser.Error) as error:
@@ -137,7 +137,7 @@ def _parameters(text: str) -> dict[str, Any]:
 
 
 def _values(words: list[str]) -> Any:  # noqa: ANN401
-    """Return words with numbers for those that are numbers; of one word its value."""
+    """Convert words that are numbers; a single word gives its value instead of a list."""
     values = [float(w) if re.fullmatch(NUMBER, w) else w for w in words]
     return values[0] if len(values) == 1 else values
 
@@ -165,7 +165,7 @@ def _numbers(text: str) -> dict[str, Any]:
 
 PARSERS: dict[str, Callable[[str], Any]] = {
     "json": json.loads,
-    "yaml": lambda text: yaml.safe_load(text.removeprefix("%YAML:1.0")),  # as OpenCV writes, which YAML does not know
+    "yaml": lambda text: yaml.safe_load(text.removeprefix("%YAML:1.0")),  # OpenCV writes this invalid directive
     "ini": _ini,
     "parameters": _parameters,
     "c": _c_arrays,
@@ -175,30 +175,30 @@ PARSERS: dict[str, Callable[[str], Any]] = {
 
 
 def product(*matrices: Any) -> Values:  # noqa: ANN401
-    """Return the product of 3x3 matrices, however nested or flat they are written."""
-    out = np.eye(3)
+    """Return the product of 3x3 matrices, nested or flat."""
+    result = np.eye(3)
     for matrix in matrices:
-        out = out @ square(matrix)
-    return out
+        result = result @ square(matrix)
+    return result
 
 
 def square(values: Any) -> Values:  # noqa: ANN401
-    """Return a 3x3 matrix."""
+    """Return nine values as a 3x3 matrix."""
     return np.asarray(values, float).reshape(3, 3)
 
 
 def rotation(node: Node, key: str) -> Values:
-    """Return the rotation of a file's 4x4 or 3x3 transformation; the identity where it has none."""
+    """Return the rotation of a 4x4 or 3x3 transformation in a file; the identity if the key does not exist."""
     return np.asarray(node[key], float)[:3, :3] if key in node else np.eye(3)
 
 
 def axes(file: Node, name: str, letters: str = "XYZ", default: float | None = None) -> Values:
-    """Return three values by their names, in which ``{}`` is the axis."""
+    """Return the values of three axes; ``{}`` in ``name`` stands for the axis."""
     names = [name.format(letter) for letter in letters]
     return np.array([default if default is not None and n not in file else file[n] for n in names], float)
 
 
-def thermal(  # noqa: PLR0917  (what a thermal calibration of an autopilot is)
+def thermal(  # noqa: PLR0917  (the quantities of an autopilot's thermal calibration)
     file: Node,
     offset: Values,
     name: str,
@@ -211,8 +211,8 @@ def thermal(  # noqa: PLR0917  (what a thermal calibration of an autopilot is)
 ) -> Values:
     """Return ``offset + p(T)`` in powers of T - 25 degC: (3, 4) array, ``p = unit sum_k c_k (T - reference)^k``.
 
-    ``name`` names ``c_k``, with ``{order}`` and ``{axis}``; coefficients that a file lacks are 0. ``zero``: the
-    temperature at which p is defined as 0, where it is not that of the reference. ``on``: 0 where p is switched off.
+    ``name``: name of ``c_k``, with ``{order}`` and ``{axis}``; missing coefficients are 0. ``zero``: temperature at
+    which p is 0 by definition, if it is not the reference. ``on``: 0 if p is switched off.
     """
     names = [[name.format(order=k, axis=a) for k in range(4)] for a in letters]
     coefficients = unit * np.array([[float(file[n]) if n in file and on else 0.0 for n in row] for row in names])
@@ -224,11 +224,11 @@ def thermal(  # noqa: PLR0917  (what a thermal calibration of an autopilot is)
 
 
 def temperature_model(sensor: Node) -> dict[str, Values]:
-    """Return the model of an Azure Kinect's sensor: ``M(T) raw + B(T)``, of third order in T, degC, low orders first.
+    """Return the model of a sensor of an Azure Kinect: ``M(T) raw + B(T)``, of third order in T, degC.
 
-    With ``K(T) = M(T)^-1`` and ``b(T) = -K(T) B(T)`` about 25 degC, d the difference to it:
+    With ``K(T) = M(T)^-1`` and ``b(T) = -K(T) B(T)`` as power series about 25 degC:
     ``K1 = -K0 M1 K0``, ``K2 = -K0 (M1 K1 + M2 K0)``, ``b_n = -sum_k K_k B_(n-k)``. The diagonal of K1 is the change of
-    the scale factor; its other elements and K2 are in no effect.
+    the scale factor; no effect describes its other elements and K2.
     """
     mixing = sensor["MixingMatrixTemperatureModel"].reshape(3, 3, 4)
     M = np.moveaxis(shifted(mixing, 0.0, REFERENCE_TEMPERATURE), 2, 0)
@@ -244,9 +244,9 @@ def temperature_model(sensor: Node) -> dict[str, Values]:
 
 def lower(values: Any) -> Values:  # noqa: ANN401
     """Return the lower triangular matrix of six values, column by column."""
-    out = np.zeros((3, 3))
-    out[np.triu_indices(3)[::-1]] = values
-    return out
+    matrix = np.zeros((3, 3))
+    matrix[np.triu_indices(3)[::-1]] = values
+    return matrix
 
 
 FUNCTIONS: dict[str, Any] = {
