@@ -1,10 +1,10 @@
-"""The gyroscope's bias by a rest of the log itself, for ``apply --rest``.
+"""Estimate the gyroscope's bias from a rest of the log, for ``apply --rest``.
 
     b' = b + K m,    K = matrix^-1
 
-where m is the mean rate, calibrated with b, of the longest rest within a stretch of the log. Rests are found as in
-recordings by hand (``pipeline.signal.rests``). The bias b' is that of the log's own power-on. It contains Earth's
-rotation, at most 0.0042 deg/s.
+where m is the mean rate, calibrated with b, of the longest rest in an interval of the log. Rests are found as in
+recordings by hand (``pipeline.signal.rests``). b' is the bias at the power-on of the log. It includes Earth's rotation,
+at most 0.0042 deg/s.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ PARTS, K95 = 10, 2.262  # of a rest; Student's t for 95 %, two-sided, with 9 deg
 
 @dataclass
 class Stretch:
-    """The calibrated readings of a log between two times, s from its first sample, collected block by block."""
+    """The calibrated readings in an interval of a log, s from its first sample, collected block by block."""
 
     first: float
     last: float
-    begin: float = float("nan")  # time of the log's first sample, s
+    begin: float = float("nan")  # time of the first sample of the log, s
     blocks: list[tuple[Values, Values, Values]] = field(default_factory=list)  # time, specific force, rate
 
     def add(self, readings: Mapping[str, Values], time: Values | None, file: str) -> None:
         """Add a block: (n, 3) calibrated readings of each sensor, (n,) times in s."""
         if time is None or not {"accelerometer", "gyroscope"} <= set(readings):
-            message = "a rest is found by the time and the readings of both sensors; the log lacks some of these"
+            message = "--rest needs the time and the readings of both sensors; the log lacks some of these"
             raise InputError(f"{message}: leave out --rest", file)
         if not self.blocks:
             self.begin = float(time[0])
@@ -56,24 +56,24 @@ class Stretch:
         if not rests:
             message = f"no rest of 1 s or more from {self.first:g} to {self.last:g} s of the log"
             raise InputError(
-                f"{message}; --rest names seconds, from its first sample, in which the unit lies still", file
+                f"{message}; --rest states an interval with a rest, in s from the first sample of the log", file
             )
         longest = max(rests, key=lambda r: r.stop - r.start)
         still = rate[longest.start : longest.stop]
         mean = still.mean(axis=0)
         parts = np.array([part.mean(axis=0) for part in np.array_split(still, PARTS)])
-        error = parts.std(axis=0, ddof=1) / np.sqrt(PARTS)  # of the mean, where noise is correlated within a part too
+        error = parts.std(axis=0, ddof=1) / np.sqrt(PARTS)  # of the mean, also for noise correlated within a part
         words = ", ".join(f"{m:.4f} +- {K95 * e:.4f}" for m, e in zip(mean, error, strict=True))
-        at = time[[longest.start, longest.stop - 1]] - self.begin
+        start, stop = time[[longest.start, longest.stop - 1]] - self.begin
         return mean, (
-            f"mean rate of the rest from {at[0]:.1f} to {at[1]:.1f} s of the log, subtracted from all rates: {words} "
-            f"deg/s (x, y, z; +- is the 95 % interval by the scatter of {PARTS} parts of the rest)"
+            f"mean rate of the rest from {start:.1f} to {stop:.1f} s of the log, subtracted from all rates: {words} "
+            f"deg/s (x, y, z; +- is the 95 % interval from the scatter of {PARTS} parts of the rest)"
         )
 
 
 def with_bias_changed(compensation: Compensation, rate: Values) -> Compensation:
-    """Return the compensation with the gyroscope's bias of which ``rate``, deg/s, is left at rest: (3,) array."""
+    """Return the compensation with a gyroscope bias that removes the calibrated ``rate`` at rest, (3,), deg/s."""
     gyroscope = compensation.gyroscope
-    assert gyroscope is not None  # noqa: S101  (``apply`` refuses it before)
+    assert gyroscope is not None  # noqa: S101  (checked by ``compensate_log``)
     bias = gyroscope.bias + np.linalg.solve(gyroscope.matrix, rate)
     return replace(compensation, gyroscope=replace(gyroscope, bias=bias))

@@ -1,11 +1,10 @@
-"""Compensation of a log as a stream: blocks are read, compensated and written one after the other.
+"""Compensate a log as a stream: read, compensate and write it block by block.
 
-Each format of a log reads and writes its blocks (``pipeline.field_logs.text_output``, ``mcap_log``); all else is
-the same for all formats. Memory is bounded by the largest block; logs of other programs, and files that the profile
-joins, are held as a whole.
+The modules ``pipeline.field_logs.text_output`` and ``mcap_log`` read and write the blocks of each format. The largest
+block determines the memory; logs of other programs, and files that the profile joins, are read into memory.
 
-Where the user names a stretch in which the unit rests, the log is read twice: first for the gyroscope's bias by that
-rest (``pipeline.field_logs.bias_of_rest``).
+If the user states an interval with a rest, the log is read twice, first to estimate the gyroscope's bias from that rest
+(``pipeline.field_logs.bias_of_rest``).
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ if TYPE_CHECKING:
     Readings = dict[str, NDArray[Any]]
 
 
-BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take some 10 MB
-DESCRIPTOR = re.compile(r"-|/dev/stdout|(?:/dev/fd|/proc/self/fd)/(\d+)")  # files that the caller has opened already
+BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take about 10 MB
+DESCRIPTOR = re.compile(r"-|/dev/stdout|(?:/dev/fd|/proc/self/fd)/(\d+)")  # files that are already open
 KINDS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
 
 
@@ -50,10 +49,10 @@ CANONICAL_CSV = {"csv": {"columns": {c: {"column": CANONICAL[c], "unit": next(it
 
 @dataclass(frozen=True)
 class LogProfile:
-    """How the logs of a unit are laid out.
+    """The layout of the logs of a unit.
 
-    ``ingest`` is the ingest profile, the canonical one by default. ``axis_maps``: sensor to the body axis that each of
-    its reading axes points along; straight where it is not named.
+    ``ingest``: the ingest profile, by default the canonical one. ``axis_maps``: sensor to the body axes along which its
+    reading axes point, by default +x, +y, +z.
     """
 
     ingest: Mapping[str, Any] = field(default_factory=lambda: CANONICAL_CSV)
@@ -69,23 +68,22 @@ class LogProfile:
             maps = maps_of_log({"axis_map": log["axis_map"]})
             for axis_map in maps.values():
                 axis_matrix(axis_map)
-            found = cls({**log["ingest"]}, maps)
+            return cls({**log["ingest"]}, maps)
         except (KeyError, TypeError, ConfigurationError) as error:
-            told = "log is not what a run writes; expected ingest, an object, and axis_map, for example [+x, +y, +z]"
-            raise InputError(f"{told}; got {error}", file) from None
-        return found
+            expected = "log is invalid; expected ingest, an object, and axis_map, for example [+x, +y, +z]"
+            raise InputError(f"{expected}; got {error}", file) from None
 
     def to_body(self, sensor: str, readings: Values) -> Values:
-        """Return (n, 3) readings of a sensor in the body's axes."""
+        """Return (n, 3) readings of a sensor in body axes."""
         return in_body_axes(self.axis_maps.get(sensor, STRAIGHT), readings)
 
 
 @dataclass
 class Result:
-    """What was compensated with the calibration of ``unit``.
+    """The result of the compensation with the calibration of ``unit``.
 
-    ``topic``: of the calibrated messages in an MCAP log. ``notes``: facts about the output. ``warnings``: what
-    contradicts that this calibration belongs to this log.
+    ``topic``: of the calibrated messages in an MCAP log. ``notes``: facts about the output. ``warnings``: signs that
+    the calibration does not belong to the log.
     """
 
     unit: str
@@ -109,15 +107,15 @@ def compensate_log(
     block_bytes: int = BLOCK_BYTES,
     progress: Callable[[int, int], None] | None = None,
 ) -> Result:
-    """Compensate a log: MCAP by its suffix ``.mcap``, the formats of ``MESSAGE_FORMATS`` by theirs, else text.
+    """Compensate a log; its suffix states the format: ``.mcap``, one of ``MESSAGE_FORMATS``, else text.
 
-    ``profile``: by default the canonical CSV, or the only Imu topic. ``joined``: further files of a recording
-    whose profile joins several with readings, in its order. ``topic``: of the calibrated messages in an MCAP
-    log; that of the readings and ``_calibrated`` by default. ``smoothing``: memory of the line through the
-    temperature's past, s; 0 takes the temperature as it is. ``rest``: first and last second of a rest, from the first
-    sample of the log; the mean rate there is subtracted from the gyroscope. ``progress`` is called with the samples
-    done and the bytes read. ``InputError``: the log is damaged, cannot be read as the profile says, does not rest where
-    ``rest`` says, or would be overwritten; no output is left.
+    ``profile``: by default the canonical CSV, or the only Imu topic. ``joined``: the other files with readings, in the
+    order of a profile that joins several. ``topic``: of the calibrated messages in an MCAP log; by default, topic of
+    the readings with the suffix ``_calibrated``. ``smoothing``: memory of the regression line through past
+    temperatures, s; 0 uses the temperature unchanged. ``rest``: an interval with a rest, s from the first sample; its
+    mean rate is subtracted from the gyroscope. ``progress`` is called with the numbers of finished samples and of read
+    bytes. Raises ``InputError``, without an output, if the log is damaged, contradicts the profile, has no rest in the
+    interval ``rest``, or would be overwritten.
     """
     files, profile = [source, *joined], profile or LogProfile()
     for file in files:
@@ -153,7 +151,7 @@ def _write_log(  # noqa: PLR0917  (the arguments of ``compensate_log``)
     """Write a log of any format, compensated, to ``out``."""
     source, suffix = files[0], files[0].suffix.lower()
     if suffix == ".mcap":
-        from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of both)
+        from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (only for this format)
 
         return McapLog(source, out, profile, stream, topic, smoothing).compensate()
     from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
@@ -167,7 +165,7 @@ def _write_log(  # noqa: PLR0917  (the arguments of ``compensate_log``)
 
 
 class LogStream:
-    """The samples of a log as they come: compensated, checked and counted. ``stretch`` collects those within it."""
+    """Compensates, checks and counts the samples of a log block by block; ``stretch`` collects some of them."""
 
     def __init__(
         self,
@@ -185,26 +183,26 @@ class LogStream:
         """Return the calibrated readings of some samples.
 
         ``signals``: ``accelerometer`` and ``gyroscope``, (n, 3) arrays in g and deg/s, body axes; ``time``, s, and
-        ``temperature``, degC, (n,) arrays; absent signals are left out. ``file`` and, without lines, ``place`` stand in
-        messages. ``position``: bytes up to the end of these samples.
+        ``temperature``, degC, (n,) arrays; absent signals are left out. ``file`` and ``place`` are for messages.
+        ``position``: bytes up to the end of these samples.
         """
-        given = {s: signals[s] for s in SENSORS if s in signals}
+        raw = {s: signals[s] for s in SENSORS if s in signals}
         try:
-            found = self.stream.apply(**signals)
+            calibrated = self.stream.apply(**signals)
         except PipelineError as error:
             raise type(error)(error.message + place, file) from None
-        readings = {s: getattr(found, s) for s in given}
-        self.checks.add(given, readings, signals.get("time"), signals.get("temperature"))
+        readings = {s: getattr(calibrated, s) for s in raw}
+        self.checks.add(raw, readings, signals.get("time"), signals.get("temperature"))
         if self.stretch is not None:
             self.stretch.add(readings, signals.get("time"), file)
-        self.result.samples += len(next(iter(given.values())))
-        self.result.sensors = [s for s in SENSORS if s in {*self.result.sensors, *given}]
+        self.result.samples += len(next(iter(raw.values())))
+        self.result.sensors = [s for s in SENSORS if s in {*self.result.sensors, *raw}]
         if self.progress is not None:
             self.progress(self.result.samples, position)
         return readings
 
     def finish(self, notes: Sequence[str]) -> Result:
-        """Return what was compensated, with notes on the log."""
+        """Return the result with notes on the log and warnings."""
         result = self.result
         result.warnings = self.checks.warnings(self.calibrated & set(result.sensors))
         result.notes += notes
@@ -217,7 +215,7 @@ class LogStream:
 
 
 def require_apart(source: Path, target: Path) -> None:
-    """Refuse a log that is no file, and an output (``-``: stdout) that cannot be made or would overwrite it."""
+    """Refuse a log that is not a file, and an output (``-``: stdout) that cannot be written or would overwrite it."""
     if not source.exists():
         raise MissingInputError("there is no such log", str(source))
     other = not_regular(source)
@@ -243,33 +241,33 @@ def require_apart(source: Path, target: Path) -> None:
 
 
 def _descriptor(target: Path) -> int | None:
-    """Return the number of the open file that a target names; None for a path."""
-    found = DESCRIPTOR.fullmatch(str(target))
-    return int(found[1] or 1) if found else None
+    """Return the file descriptor that a target names; None for a path."""
+    match = DESCRIPTOR.fullmatch(str(target))
+    return int(match[1] or 1) if match else None
 
 
 class Output:
-    """What is written to: an ``OSError`` becomes a message that names the output."""
+    """The output: an ``OSError`` becomes a message that names it."""
 
     def __init__(self, stream: IO[bytes], target: Path) -> None:
         self.stream, self.target = stream, target
 
     def write(self, data: bytes | memoryview) -> None:
-        """Write all of it."""
-        with _named(self.target):
+        """Write the data."""
+        with _user_errors(self.target):
             self.stream.write(data)
 
 
 @contextmanager
 def replacing(target: Path) -> Iterator[Output]:
-    """Open a file that takes its name only when it is complete; what stood there before is left until then.
+    """Open an output that replaces the file of its name when it is complete.
 
-    A symbolic link stays, and the file to which it points is replaced, with its permissions kept. Standard output,
-    pipes and devices are written to as they are.
+    The target of a symbolic link is replaced, with the same permissions. Standard output, pipes and devices are written
+    directly.
     """
     descriptor, part = _descriptor(target), None
     file = target if descriptor is not None else target.resolve()
-    with _named(target):
+    with _user_errors(target):
         if descriptor is not None:
             sys.stdout.flush()
             stream = os.fdopen(os.dup(descriptor), "wb")
@@ -280,7 +278,7 @@ def replacing(target: Path) -> Iterator[Output]:
             stream = part.open("wb")
     try:
         yield Output(stream, target)
-        with _named(target):
+        with _user_errors(target):
             stream.close()
             if part is not None:
                 if file.exists():
@@ -294,7 +292,7 @@ def replacing(target: Path) -> Iterator[Output]:
 
 
 @contextmanager
-def _named(target: Path) -> Iterator[None]:
+def _user_errors(target: Path) -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:

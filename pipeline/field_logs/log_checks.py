@@ -1,13 +1,14 @@
-"""Checks whether a log suits the calibration that is applied to it. They only warn; the output is written.
+"""Check whether a log matches the calibration that is applied to it. The checks only give warnings.
 
-    rest  : a window of 100 samples whose scatter is at most twice that of the quietest tenth of the windows, and at
-            most twice that of successive differences (no slow motion); its specific force is well above its scatter
-    error : ||a| - 1 g| or |w| of a rest's mean reading, before and after compensation
+    rest  : a window of 100 samples whose scatter is at most twice the scatter of the quietest tenth of the windows, and
+            at most twice the scatter of successive differences (no slow motion); its specific force is well above its
+            scatter
+    error : ||a| - 1 g| or |w| of the mean reading of a rest, before and after compensation
 
-The right calibration brings rests nearer to 1 g and to zero rate, and some of them near. If it does not, the log was
-compensated already, belongs to another unit or sensor, or is read with other axes or units; or the sensor has changed.
-Between two rests gravity turns in the body by at most the integral of |w| (minus its value at rest): a gyroscope that
-integrates to less than half of the turn is not read in deg/s.
+The correct calibration reduces the errors of rests, and some of them become small. Otherwise the log is already
+compensated, belongs to another unit or sensor, or is read with wrong axes or units; or the sensor has changed.
+Between two rests gravity turns in the body by at most the integral of |w| (minus its value at rest). If the gyroscope
+integrates to less than half of the turn, its unit is not deg/s.
 
 ``apply`` writes numbers rounded to 12 decimals without trailing zeros: 9 of 10 cells have 12 decimals. Sensors give
 fewer digits, programs that write doubles give more.
@@ -30,40 +31,39 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Values
 
 
-DECIMALS = 12  # that ``apply`` writes: far below any sensor's resolution, above the rounding of a double
+DECIMALS = 12  # in the output of ``apply``: far below the resolution of sensors, above the rounding of a double
 RANGES = {"accelerometer": "specific_force_g", "gyroscope": "angular_rate_dps"}  # of ``calibrated_range``
-# Conventions: the bias of a low-cost sensor, some % of 1 g, adds to a reading in one direction and not in another; a
-# room, and a chip from one power-on to the next, change by 1 degC.
-STRONGER, WARMER = 0.1, 1.0  # share of the largest magnitude; degC
+# Margins of the calibrated range, by convention: the sign of the bias of a low-cost sensor, some % of 1 g, differs
+# between directions; the temperature of a room, and of a chip from one power-on to the next, changes by 1 degC.
+MARGIN, MARGIN_DEGC = 0.1, 1.0  # share of the largest magnitude; degC
 WINDOW = 100  # samples: 0.1 to 1 s at usual rates
-MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: the memory stays bounded
-QUIET, QUIETEST = 2.0, 0.1  # ratio of scatters, and share of the windows, as the module's description states
+MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: limits the memory
+QUIET, QUIETEST = 2.0, 0.1  # ratio of scatters, and share of the windows; see above
 FEWEST_RESTS = 3  # directions of gravity, for three axes
 DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is known to 0.1 / sqrt(100) rad = 0.6 deg
-# Error after over error before. Where errors of both kinds are alike, by chance: a drift as large as the bias, three
-# components each, P(F(3, 3) < 1/9) = 4 %. An accelerometer is judged in three directions or more, and where the
-# correction is at least half of the error after it.
+# Largest ratio of the errors after and before. If a drift is as large as the bias, with three components each, a ratio
+# of 3 occurs by chance with P(F(3, 3) < 1/9) = 4 %. An accelerometer is only checked with three directions or more, and
+# if the correction is at least half of the error after it.
 WORSE = {"accelerometer": 1.2, "gyroscope": 3.0}
-# g and deg/s: a larger change of the bias is unusual. By the temperature limits of the MPU-6050 (1.4 mg/degC and 0.32
-# deg/s/degC, configs/sensor/mpu6050.yaml) it takes 36 degC and 16 degC.
+# g and deg/s: larger changes of the bias are unusual. By the temperature limits of the MPU-6050 (1.4 mg/degC and 0.32
+# deg/s/degC, configs/sensor/mpu6050.yaml) they need 36 degC and 16 degC.
 CHANGED = {"accelerometer": 0.05, "gyroscope": 5.0}
-KNOWN = 5.0  # standard errors of a rest's mean that the error after is above
-APART_DEG = 30.0  # orientations that count as different; the least turn of gravity that is compared with the rate
-NEAR = 0.15  # a median |a| this near to a unit's factor is read in that unit
-STRANGE_G = (0.5, 2.0)  # median |a| of a log; walking, driving and flying stay within
-CELLS, LEAST_CELLS, SHARE = 200, 10, 0.6  # of a column; the share of cells with 12 decimals, 0.9 expected
-WHOLE = 10  # different whole numbers that are no chance
+SIGNIFICANT = 5.0  # least error after compensation, in standard errors of the mean of a rest
+APART_DEG = 30.0  # least angle between different orientations, and least turn of gravity for the check of the rate
+NEAR = 0.15  # relative difference between the median |a| and the factor of a unit that identifies the unit
+USUAL_G = (0.5, 2.0)  # median |a| of a log, also of walking, driving and flying
+CELLS, LEAST_CELLS, SHARE = 200, 10, 0.6  # of a column; least share of cells with 12 decimals, 0.9 expected
+WHOLE = 10  # least number of different integers that indicates raw counts
 
 
 class LogChecks:
-    """Statistics of a log, block by block, in bounded memory.
+    """Statistics of a log, collected block by block in limited memory.
 
-    ``compensated``: evidence that the log was compensated before; else empty. ``calibrated_range``: as the
-    calibration has it.
+    ``compensated``: evidence that the log is already compensated; else empty. ``calibrated_range``: of the calibration.
     """
 
     def __init__(self, calibrated_range: Mapping[str, Any] | None = None) -> None:
-        self.samples = self.reversed = self.repeated = self.kept = 0
+        self.samples = self.reversed = self.repeated = self.window_count = 0
         self.first_reversed = ""
         self.last_time = -np.inf
         self.windows: list[dict[str, Values]] = []
@@ -71,10 +71,10 @@ class LogChecks:
         self.compensated = ""
         self.ranges = {
             key: (low, high)
-            for key, known in (calibrated_range or {}).items()
-            for low, high in [known if isinstance(known, list) else (-np.inf, known)]
+            for key, limits in (calibrated_range or {}).items()
+            for low, high in [limits if isinstance(limits, list) else (-np.inf, limits)]
         }
-        self.extremes: dict[str, list[float]] = {}  # samples beyond, lowest and highest value
+        self.extremes: dict[str, list[float]] = {}  # beyond the range: number of samples, lowest and highest value
 
     def check_decimals(self, columns: Sequence[pa.Array], decimal: str) -> None:
         """Check whether the readings of a text log have the decimals that ``apply`` writes."""
@@ -107,10 +107,10 @@ class LogChecks:
             self.last_time = float(time[-1])
         self.samples += len(next(iter(raw.values()), ()))
         for sensor, values in raw.items():
-            known = values[np.isfinite(values)]
-            if self.whole.get(sensor, True) and len(known):
-                self.whole[sensor] = bool(np.all(known[:WINDOW] == np.round(known[:WINDOW]))) and (
-                    sensor in self.whole or len(np.unique(known[: 10 * WINDOW])) >= WHOLE
+            finite = values[np.isfinite(values)]
+            if self.whole.get(sensor, True) and len(finite):
+                self.whole[sensor] = bool(np.all(finite[:WINDOW] == np.round(finite[:WINDOW]))) and (
+                    sensor in self.whole or len(np.unique(finite[: 10 * WINDOW])) >= WHOLE
                 )
         self._add_windows(raw, calibrated, time)
 
@@ -120,18 +120,17 @@ class LogChecks:
         values |= {} if temperature is None else {"temperature_degc": temperature}
         for key in values.keys() & self.ranges.keys():
             low, high = self.ranges[key]
-            margin = WARMER if key == "temperature_degc" else STRONGER * high
+            margin = MARGIN_DEGC if key == "temperature_degc" else MARGIN * high
             beyond = values[key][(values[key] < low - margin) | (values[key] > high + margin)]
             if len(beyond):
                 count, least, most = self.extremes.get(key, [0, np.inf, -np.inf])
                 self.extremes[key] = [count + len(beyond), min(least, beyond.min()), max(most, beyond.max())]
 
     def _beyond(self, calibrated: set[str]) -> list[str]:
-        """Return what of the log lies beyond the calibrated range."""
-        found = []
+        """Return warnings about samples beyond the calibrated range."""
+        warnings = []
         for key, (count, least, most) in sorted(self.extremes.items()):
             low, high = self.ranges[key]
-            told = f"{count:.0f} of {self.samples} samples are beyond what the recordings of the calibration contain: "
             if key == "temperature_degc":
                 what = f"temperatures from {least:.1f} to {most:.1f} degC, calibrated from {low:.1f} to {high:.1f} degC"
                 todo = "record turns at these temperatures (procedure thermal_ramp)"
@@ -142,68 +141,69 @@ class LogChecks:
                 quantity, unit = ("specific force", "g") if sensor == "accelerometer" else ("angular rate", "deg/s")
                 what = f"{quantity} up to {most:.3g} {unit}, calibrated up to {high:.3g} {unit}"
                 todo = f"record motion that reaches this {quantity}"
-            found.append(
-                f"{told}{what}. There the calibration extrapolates, and its stated uncertainty does not hold: {todo} "
+            warnings.append(
+                f"{count:.0f} of {self.samples} samples are beyond what the recordings of the calibration contain: "
+                f"{what}. There the calibration extrapolates, and its stated uncertainty does not hold: {todo} "
                 "and calibrate with it, or do not rely on these samples"
             )
-        return found
+        return warnings
 
     def _add_windows(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
-        """Keep means and scatter of the windows of a block."""
-        count = min(len(next(iter(raw.values()), ())) // WINDOW, MOST_WINDOWS - self.kept)
+        """Store means and scatter of the windows of a block."""
+        count = min(len(next(iter(raw.values()), ())) // WINDOW, MOST_WINDOWS - self.window_count)
         if count <= 0:
             return
-        self.kept += count
+        self.window_count += count
         part: dict[str, Values] = {}
         for sensor, values in raw.items():
-            cut = values[: count * WINDOW].reshape(count, WINDOW, 3)
-            part[sensor] = cut.mean(axis=1)
-            part[f"{sensor} scatter"] = np.sqrt(np.sum(cut.var(axis=1), axis=1))
-            part[f"{sensor} noise"] = np.sqrt(np.sum(np.diff(cut, axis=1) ** 2, axis=2).mean(axis=1) / 2.0)
-            done = calibrated[sensor][: count * WINDOW].reshape(count, WINDOW, 3)
-            part[f"{sensor} size"] = np.linalg.norm(done, axis=2).mean(axis=1)  # a matrix may hold the factor
-            part[f"{sensor} after"] = done.mean(axis=1)
+            windows = values[: count * WINDOW].reshape(count, WINDOW, 3)
+            part[sensor] = windows.mean(axis=1)
+            part[f"{sensor} scatter"] = np.sqrt(np.sum(windows.var(axis=1), axis=1))
+            part[f"{sensor} noise"] = np.sqrt(np.sum(np.diff(windows, axis=1) ** 2, axis=2).mean(axis=1) / 2.0)
+            after = calibrated[sensor][: count * WINDOW].reshape(count, WINDOW, 3)
+            part[f"{sensor} size"] = np.linalg.norm(after, axis=2).mean(axis=1)  # the matrix may contain the unit
+            part[f"{sensor} after"] = after.mean(axis=1)
         if time is not None:
             part["time"] = time[: count * WINDOW].reshape(count, WINDOW).mean(axis=1)
         self.windows.append(part)
 
     def warnings(self, calibrated: set[str]) -> list[str]:
-        """Return what contradicts that the calibration of these sensors belongs to this log; often nothing."""
-        found = [f"{self.compensated}: the log is compensated already"] if self.compensated else []
+        """Return the warnings: signs that the calibration of these sensors does not belong to this log."""
+        warnings = [f"{self.compensated}: the log is compensated already"] if self.compensated else []
         if self.reversed:
-            found.append(
+            warnings.append(
                 f"the time runs backwards at {self.reversed} of {self.samples} samples, first at "
                 f"{self.first_reversed}: effects of the time and the smoothing of the temperature are wrong there; "
                 "sort the log by its time"
             )
         if self.repeated:
-            found.append(f"the time of {self.repeated} of {self.samples} samples is that of the sample before")
-        found += [
+            warnings.append(f"the time of {self.repeated} of {self.samples} samples is that of the sample before")
+        warnings += [
             f"all readings of the {sensor} are whole numbers: they look like raw counts, and are read in "
             f"{'g' if sensor == 'accelerometer' else 'deg/s'}; --ingest names a profile with unit: counts"
             for sensor in SENSORS
             if self.whole.get(sensor)
         ]
-        found += self._beyond(calibrated)
+        warnings += self._beyond(calibrated)
         if self.windows:
             table = {k: np.concatenate([w[k] for w in self.windows]) for k in self.windows[0]}
-            kept = np.all([np.isfinite(v.reshape(len(v), -1)).all(axis=1) for v in table.values()], axis=0)
-            table = {k: v[kept] for k, v in table.items()}
-            if kept.any():
-                found += self._units(table) + self._rests(table, calibrated)
-        return found
+            valid = np.all([np.isfinite(v.reshape(len(v), -1)).all(axis=1) for v in table.values()], axis=0)
+            table = {k: v[valid] for k, v in table.items()}
+            if valid.any():
+                warnings += self._units(table) + self._rests(table, calibrated)
+        return warnings
 
     def _units(self, table: Mapping[str, Values]) -> list[str]:
         """Compare the median of |a| with 1 g."""
         if "accelerometer" not in table or self.whole.get("accelerometer"):
             return []
         size = float(np.median(table["accelerometer size"]))
-        if STRANGE_G[0] <= size <= STRANGE_G[1]:
+        if USUAL_G[0] <= size <= USUAL_G[1]:
             return []
-        alike = [unit for unit, factor in FORCE_UNITS.items() if abs(size / factor - 1.0) < NEAR]
-        cause = f"the readings look like {alike[0]}" if alike else "another unit, another range, or no rest in the log"
-        told = f"half of the log has |a| above {size:.3g} g, expected about 1 g: {cause}"
-        return [f"{told}; --ingest names a profile with the unit of each column"]
+        near = [unit for unit, factor in FORCE_UNITS.items() if abs(size / factor - 1.0) < NEAR]
+        cause = f"the readings look like {near[0]}" if near else "another unit, another range, or no rest in the log"
+        contradiction = f"half of the log has |a| above {size:.3g} g, expected about 1 g: {cause}"
+        return [f"{contradiction}; --ingest names a profile with the unit of each column"]
 
     def _rests(self, table: Mapping[str, Values], calibrated: set[str]) -> list[str]:
         """Compare the errors of rests before and after compensation."""
@@ -217,51 +217,52 @@ class LogChecks:
             still &= table["accelerometer scatter"] < DIRECTED * size
         if np.count_nonzero(still) < FEWEST_RESTS:
             return []
-        found, worse, far = [], [], []
+        warnings, worse, far = [], [], []
         for sensor in (s for s in present if s in calibrated):
-            raw, done = table[sensor][still], table[f"{sensor} after"][still]
-            before, after = _error(sensor, raw), _error(sensor, done)
-            known = float(np.median(table[f"{sensor} scatter"][still])) / np.sqrt(WINDOW)
-            change = np.linalg.norm(done, axis=1) - np.linalg.norm(raw, axis=1)
+            raw, compensated = table[sensor][still], table[f"{sensor} after"][still]
+            before, after = _error(sensor, raw), _error(sensor, compensated)
+            standard_error = float(np.median(table[f"{sensor} scatter"][still])) / np.sqrt(WINDOW)
+            change = np.linalg.norm(compensated, axis=1) - np.linalg.norm(raw, axis=1)
             enough = len(_directions(raw)) >= FEWEST_RESTS and np.sqrt(np.mean(change**2)) > after / 2.0
             unit = "g from 1 g" if sensor == "accelerometer" else "deg/s from zero"
-            if (sensor == "gyroscope" or enough) and after > max(WORSE[sensor] * before, KNOWN * known):
+            if (sensor == "gyroscope" or enough) and after > max(WORSE[sensor] * before, SIGNIFICANT * standard_error):
                 worse.append(f"the {sensor} is {before:.2g} {unit} before and {after:.2g} after")
-            least = float(np.min(_distances(sensor, done)))
+            least = float(np.min(_distances(sensor, compensated)))
             if least > CHANGED[sensor]:
                 far.append(f"the {sensor} is at least {least:.2g} {unit}")
         if worse:
-            found.append(
+            warnings.append(
                 f"compensation takes the {np.count_nonzero(still)} quietest windows away from rest: "
                 f"{'; '.join(worse)}. The log is compensated already, or of another unit or sensor, or read with "
                 "other axes or units; or the sensor has changed since it was calibrated"
             )
         elif far:
-            found.append(
+            warnings.append(
                 f"none of the {np.count_nonzero(still)} quietest windows is at rest after compensation: "
                 f"{'; '.join(far)}. The log is of another unit or sensor, or read with another profile, axes or units; "
                 "the sensor has changed since it was calibrated; or it moves throughout the log"
             )
-        return found + self._turned(table, still)
+        return warnings + self._turned(table, still)
 
     @staticmethod
     def _turned(table: Mapping[str, Values], still: Mask) -> list[str]:
         """Compare the turns of gravity between rests with the integrated rate."""
         if not {"accelerometer", "gyroscope", "time"} <= set(table):
             return []
-        at = np.flatnonzero(still)
-        up = table["accelerometer"][at] / np.linalg.norm(table["accelerometer"][at], axis=1)[:, None]
+        up = table["accelerometer"][still] / np.linalg.norm(table["accelerometer"][still], axis=1)[:, None]
         angle = np.degrees(np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0)))
         step = np.diff(table["time"], prepend=table["time"][0])
-        rate = table["gyroscope after"] - table["gyroscope after"][at].mean(axis=0)  # whatever is subtracted as bias
-        path = np.cumsum(np.linalg.norm(rate, axis=1) * np.clip(step, 0.0, None))[at]
+        rate = table["gyroscope after"] - table["gyroscope after"][still].mean(axis=0)  # without a remaining bias
+        path = np.cumsum(np.linalg.norm(rate, axis=1) * np.clip(step, 0.0, None))[still]
         moved = angle > APART_DEG
         turned, integral = float(angle[moved].sum()), float(np.diff(path)[moved].sum())
         if turned == 0.0 or integral > turned / 2.0:
             return []
         cause = "rad/s" if abs(np.degrees(integral) / turned - 1.0) < 1.0 else "another unit or range"
-        told = f"gravity turns by {turned:.3g} deg between rests, over which the gyroscope integrates to {integral:.3g}"
-        return [f"{told} deg: its readings look like {cause}; --ingest names a profile with the unit of each column"]
+        angles = (
+            f"gravity turns by {turned:.3g} deg between rests, over which the gyroscope integrates to {integral:.3g}"
+        )
+        return [f"{angles} deg: its readings look like {cause}; --ingest names a profile with the unit of each column"]
 
 
 def _distances(sensor: str, means: Values) -> Values:
@@ -276,9 +277,9 @@ def _error(sensor: str, means: Values) -> float:
 
 
 def _directions(means: Values) -> list[Values]:
-    """Return directions of the means that are apart from each other."""
-    found: list[Values] = []
+    """Return directions of the means that differ by ``APART_DEG`` or more."""
+    directions: list[Values] = []
     for mean in means / np.linalg.norm(means, axis=1)[:, None]:
-        if all(mean @ other < np.cos(np.radians(APART_DEG)) for other in found):
-            found.append(mean)
-    return found
+        if all(mean @ other < np.cos(np.radians(APART_DEG)) for other in directions):
+            directions.append(mean)
+    return directions

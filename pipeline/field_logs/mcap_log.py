@@ -1,12 +1,11 @@
-"""An MCAP log with a topic of calibrated messages added; every message of the log is kept byte for byte.
+"""Add a topic of calibrated messages to an MCAP log, whose messages are copied byte for byte.
 
-Readings in ``sensor_msgs/Imu`` (ROS 2 or ROS 1) give copies of the originals in which readings are replaced.
-Readings that the profile maps from the fields of other messages (protobuf, JSON, own types) give ROS 2
-``sensor_msgs/Imu``. Where the calibration holds the noise of a sample, it gives the covariances of the calibrated
-sensors.
+Readings in ``sensor_msgs/Imu`` (ROS 2 or ROS 1) give copies of the messages with calibrated readings. Readings that the
+profile maps from the fields of other messages (protobuf, JSON, user types) give ROS 2 ``sensor_msgs/Imu``. If the
+calibration states the noise of a sample, it gives the covariances of the calibrated sensors.
 
-A message knows the temperatures that stand before it in the file (``pipeline.model.log_motion``), as in a
-running system. Messages before the first temperature get that one.
+As in a running system, a message is compensated with the temperatures before it in the file
+(``pipeline.model.log_motion``). Messages before the first temperature are compensated with the first temperature.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ if TYPE_CHECKING:
     from pipeline.records import Integers, Values
 
 
-LAST_ID = 0xFFFF  # ids of added definitions count down from here, those of recorders up from 0
+LAST_ID = 0xFFFF  # ids of added definitions count down from here, because recorders count up from 0
 SUFFIX = "_calibrated"
 METADATA = "imu_calibration"
 READINGS = {*ACCELEROMETER, *GYROSCOPE}
 
 
 class McapLog:
-    """An MCAP log and the log that is made of it."""
+    """An MCAP log and its compensated copy."""
 
     def __init__(  # noqa: PLR0917  (of one call)
         self, source: Path, out: Output, profile: LogProfile, stream: LogStream, topic: str | None, smoothing: float
@@ -55,25 +54,25 @@ class McapLog:
         self.covariances = stream.compensation.covariances
         self.temperatures: Temperatures | None = None
         self.readings: TopicDecoder | None = None
-        self.channels: dict[int, Channel] = {}  # of the readings' channels, those of the calibrated messages
-        self.schema: Schema | None = None  # of the calibrated messages, where it is added
+        self.channels: dict[int, Channel] = {}  # channel of readings to the channel of their calibrated messages
+        self.schema: Schema | None = None  # of the calibrated messages, if it is added
         self.origin_ns: int | None = None
 
     def compensate(self) -> Result:
         """Copy the log run by run, with the calibrated readings of each run after it."""
         topic, needed = self.settings.imu_topic, "temperature" in self.stream.stream.needs
         if self.settings.topics:
-            found = [t for t, fields in self.settings.topics.items() if READINGS & set(fields)]
-            if len(found) != 1:
+            topics = [t for t, fields in self.settings.topics.items() if READINGS & set(fields)]
+            if len(topics) != 1:
                 message = (
-                    f"the profile takes the readings from {len(found)} topics ({', '.join(found)}); apply needs both "
+                    f"the profile takes the readings from {len(topics)} topics ({', '.join(topics)}); apply needs both "
                     "sensors in the same messages"
                 )
                 raise IngestError(message, str(self.source), code="unsupported")
-            topic = found[0]
+            topic = topics[0]
         if needed:
-            beside = topic is not None and "temperature" in self.settings.topics.get(topic, ())
-            self.temperatures = Temperatures(self.settings, self.source, self.smoothing, beside_readings=beside)
+            included = topic is not None and "temperature" in self.settings.topics.get(topic, ())
+            self.temperatures = Temperatures(self.settings, self.source, self.smoothing, in_readings=included)
         with self.source.open("rb") as stream:
             self.reader = McapReader(stream, str(self.source), allow_truncated=self.settings.allow_truncated)
             for run in self.reader.runs():
@@ -92,7 +91,7 @@ class McapLog:
         return self._finish(self.readings.topic)
 
     def _add_calibrated(self, rows: Rows, decoder: TopicDecoder) -> None:
-        """Add the calibrated messages of some readings."""
+        """Add the calibrated messages for some readings."""
         self.readings = self.readings or decoder
         if decoder is not self.readings:
             both = f"{self.readings.topic}, {decoder.topic}"
@@ -104,7 +103,7 @@ class McapLog:
             self.origin_ns = int(time_ns[0]) if time_ns[0] > SINCE_1970_NS else 0
         since = time_ns - self.origin_ns
         signals = {"time": since // SECOND_NS + (since % SECOND_NS) / SECOND_NS}
-        turned: set[str] = set()  # sensors whose axes are not the body's
+        turned: set[str] = set()  # sensors whose axes differ from the body axes
         for sensor, triad in TRIADS.items():
             if triad[0] in batch.values:
                 values = np.column_stack([batch.values[c] for c in triad])
@@ -125,18 +124,18 @@ class McapLog:
             self.copy.add(copies, before, channel.id)
 
     def _channel(self, source: int) -> tuple[Channel, list[McapRecord]]:
-        """Return the channel of the calibrated messages, and the definitions that still have to be written."""
+        """Return the channel of the calibrated messages, and its definitions if they are not written yet."""
         if source in self.channels:
             return self.channels[source], []
-        known = self.reader.channels[source]
-        topic = self.topic or f"{known.topic}{SUFFIX}"
+        of_readings = self.reader.channels[source]
+        topic = self.topic or f"{of_readings.topic}{SUFFIX}"
         if any(c.topic == topic for c in self.reader.channels.values()):
             raise InputError(f"the log has a topic {topic} already; choose another by --topic", str(self.source))
         before: list[McapRecord] = []
         used = {*self.reader.channels, *(c.id for c in self.channels.values())}
         channel = Channel(
-            id=next(i for i in range(LAST_ID, 0, -1) if i not in used), topic=topic, schema_id=known.schema_id,
-            message_encoding=known.message_encoding, metadata=dict(known.metadata),
+            id=next(i for i in range(LAST_ID, 0, -1) if i not in used), topic=topic, schema_id=of_readings.schema_id,
+            message_encoding=of_readings.message_encoding, metadata=dict(of_readings.metadata),
         )  # fmt: skip
         if self.settings.topics:
             if self.schema is None:
@@ -147,7 +146,7 @@ class McapLog:
         return channel, [*before, channel]
 
     def _finish(self, topic: str) -> Result:
-        """Write what was compensated with what, and what contradicts it, as metadata; then the summary."""
+        """Write unit, topics and warnings as metadata, then the summary."""
         reader, added = self.reader, list(self.channels.values())
         made = {m.metadata.get("topic"): m.metadata.get("unit") for m in reader.metadata if m.name == METADATA}
         if topic in made:
@@ -170,32 +169,32 @@ class McapLog:
 
 
 class Temperatures:
-    """Temperatures of a log, run by run; the log is read first up to its first temperature.
+    """Reads the temperatures of a log run by run, after a search for the first temperature.
 
-    ``smoothing`` is the memory, s, of the line through the temperature's past; 0 takes the last temperature.
-    ``beside_readings``: whether the messages of the readings hold it. A log without temperature is refused.
+    ``smoothing``: memory of the regression line through past temperatures, s; 0 uses the last temperature.
+    ``in_readings``: whether the messages of the readings contain the temperature. A log without temperature is refused.
     """
 
-    def __init__(self, settings: McapFormat, path: Path, smoothing: float, *, beside_readings: bool) -> None:
-        self.settings, self.path, self.smoothing, self.beside_readings = settings, path, smoothing, beside_readings
+    def __init__(self, settings: McapFormat, path: Path, smoothing: float, *, in_readings: bool) -> None:
+        self.settings, self.path, self.smoothing, self.in_readings = settings, path, smoothing, in_readings
         self.line = ExponentialRegression(smoothing or 1.0)
         self.topics = Topics(settings, str(path))
         self.early = self.count = 0
         self.span = [np.inf, -np.inf]
         self.last = self.first = float("nan")
-        if not beside_readings:
+        if not in_readings:
             self.first = self._first()
             self.topics = Topics(settings, str(path))
 
     def _first(self) -> float:
-        """Return the first temperature of the file, for the messages that stand before it."""
+        """Return the first temperature of the file, for the messages before it."""
         with self.path.open("rb") as stream:
             reader = McapReader(stream, str(self.path), allow_truncated=self.settings.allow_truncated)
             for rows in reader.rows():
                 self.take([rows], reader)
-                known = self.values[np.isfinite(self.values)]
-                if known.size:
-                    return float(known[0])
+                finite = self.values[np.isfinite(self.values)]
+                if finite.size:
+                    return float(finite[0])
         mapped = [t for t, fields in self.settings.topics.items() if "temperature" in fields]
         topic = mapped[0] if mapped else topic_of(TEMPERATURE, self.settings) or TEMPERATURE
         message = f"the calibration has effects of temperature, but the log holds no messages of {topic}"
@@ -204,47 +203,47 @@ class Temperatures:
 
     def take(self, run: list[Rows], reader: McapReader) -> None:
         """Decode the temperatures of a run."""
-        found: list[tuple[Integers, Integers, Values]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
-        for rows in run if not self.beside_readings else []:
+        parts: list[tuple[Integers, Integers, Values]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
+        for rows in run if not self.in_readings else []:
             decoder = self.topics.decoder_of(rows, reader)
             of_temperature = [d for d in self.topics.decoders.values() if "temperature" in d.fields]
             if decoder is not None and decoder in of_temperature[:1]:
                 batch = decoder.read(rows, reader)
-                found.append((rows.starts, batch.times(rows), batch.values["temperature"]))
-        self.places, self.times, self.values = map(np.concatenate, zip(*found, strict=True))
+                parts.append((rows.starts, batch.times(rows), batch.values["temperature"]))
+        self.places, self.times, self.values = map(np.concatenate, zip(*parts, strict=True))
 
-    def at(self, starts: Integers, time: Values, beside: Values | None, origin_ns: int) -> Values:
+    def at(self, starts: Integers, time: Values, included: Values | None, origin_ns: int) -> Values:
         """Return the temperature at the readings of a run: (n,) array, degC.
 
-        ``starts`` are the places of the readings in the run, ``time`` their times, s, from ``origin_ns``, ``beside``
-        the temperatures in the readings' own messages.
+        ``starts``: positions of the readings in the run; ``time``: their times, s, from ``origin_ns``; ``included``:
+        the temperatures in the messages of the readings.
         """
-        if beside is not None:
-            return self.line.apply(time, beside) if self.smoothing > 0 else beside
-        own = (self.times - origin_ns) / 1e9
-        self.count += len(own)
-        if len(own):
-            self.span = [min(self.span[0], own.min()), max(self.span[1], own.max())]
+        if included is not None:
+            return self.line.apply(time, included) if self.smoothing > 0 else included
+        measured = (self.times - origin_ns) / 1e9  # times of the temperatures, s
+        self.count += len(measured)
+        if len(measured):
+            self.span = [min(self.span[0], measured.min()), max(self.span[1], measured.max())]
         order = np.argsort(np.concatenate([self.places, starts]), kind="stable")
-        every_time = np.concatenate([own, time])[order]
-        every_value = np.concatenate([self.values, np.full(len(time), np.nan)])[order]
-        of_readings = order >= len(own)
+        times = np.concatenate([measured, time])[order]
+        values = np.concatenate([self.values, np.full(len(time), np.nan)])[order]
+        of_readings = order >= len(measured)
         if self.smoothing > 0:
-            found = self.line.apply(every_time, every_value)
+            temperature = self.line.apply(times, values)
         else:
-            known = np.maximum.accumulate(np.where(of_readings, 0, np.arange(1, len(order) + 1)))
-            found = np.concatenate([[self.last], every_value])[known]
-            self.last = float(found[-1])
-        warmth = found[of_readings]
-        early = np.isnan(warmth)
+            latest = np.maximum.accumulate(np.where(of_readings, 0, np.arange(1, len(order) + 1)))
+            temperature = np.concatenate([[self.last], values])[latest]
+            self.last = float(temperature[-1])
+        at_readings = temperature[of_readings]
+        early = np.isnan(at_readings)
         self.early += int(early.sum())
-        return np.where(early, self.first, warmth)
+        return np.where(early, self.first, at_readings)
 
     def notes(self) -> list[str]:
         """Return remarks on the temperature."""
         notes = []
         if self.early:
-            notes.append(f"{self.early} messages stand before the first temperature; they were given that one")
+            notes.append(f"{self.early} messages come before the first temperature and are compensated with it")
         interval = (self.span[1] - self.span[0]) / max(self.count - 1, 1)
         if self.count > 1 and 0 < self.smoothing < interval:
             notes.append(

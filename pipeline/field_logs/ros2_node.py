@@ -1,11 +1,11 @@
-"""A ROS 2 node: calibrated ``sensor_msgs/Imu`` messages as they come.
+"""Run a ROS 2 node that publishes calibrated ``sensor_msgs/Imu`` messages.
 
     python -m pipeline.field_logs.ros2_node results/demo/calibrations/U1.json --topic /imu/data_raw
 
-It publishes on ``<topic>_calibrated``. A message is a copy of the original in which the calibrated vectors are
-replaced, and their covariances where the calibration holds the noise of a sample; stamp, frame and orientation stay, as
-in ``python -m pipeline apply``. ROS is imported by ``main`` alone: ``MessageCalibrator`` takes any object with the
-fields of the message.
+It publishes on ``<topic>_calibrated``. As with ``python -m pipeline apply``, a message is a copy of the original with
+calibrated vectors and, if the calibration states the noise of a sample, with their covariances; stamp, frame and
+orientation are unchanged. Only ``main`` imports ROS: ``MessageCalibrator`` accepts any object with the fields of the
+message.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from pipeline.records import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-# Field of the message, its covariance, and what one of its units is in g or deg/s.
+# Sensor to the field of the message, its covariance, and its unit in g or deg/s.
 FIELDS = {sensor: (vector, f"{vector}_covariance", 1.0 / one) for vector, (sensor, _unit, one) in VECTORS.items()}
-ABSENT = -1.0  # first element of a covariance whose field holds nothing (sensor_msgs/Imu)
-DEPTH = 10  # messages that wait for a subscriber, as in rclpy's own examples
+ABSENT = -1.0  # first element of the covariance of a field without data (sensor_msgs/Imu)
+DEPTH = 10  # of the queue of messages, as in the examples of rclpy
 
 
 class MessageCalibrator:
     """Calibrates Imu messages one by one.
 
-    ``needs_temperature``: whether an effect of the calibration follows it; messages before the first temperature are
-    then dropped, with one warning. A line through the past (memory ``SMOOTHING_S``) bridges the time between
-    temperatures. Time counts from the first message. Where stamps run backwards (a log that is played again), the
-    memory of the samples before is cleared, with a warning.
+    ``needs_temperature``: whether an effect of the calibration depends on the temperature. Messages before the first
+    temperature are then dropped, with one warning. A regression line (memory ``SMOOTHING_S``) extrapolates past
+    temperatures. Time counts from the first message. If stamps run backwards (a log is played again), the memory of
+    earlier samples is cleared, with a warning.
     """
 
     def __init__(self, file: Path, warn: Callable[[str], Any], python_effects: Sequence[str] = ()) -> None:
@@ -56,7 +56,7 @@ class MessageCalibrator:
         self._start(None)
 
     def _start(self, first: int | None) -> None:
-        """Forget the samples before; of the temperature, the last value stays."""
+        """Clear the memory of earlier samples, except the last temperature."""
         self.stream, self.line = self.compensation.stream(0.0), ExponentialRegression(SMOOTHING_S)
         self.first, self.last = first, -1
         if self.warmth is not None:
@@ -73,12 +73,12 @@ class MessageCalibrator:
         return float((self.now - self.first) / 1e9)
 
     def temperature(self, message: Any) -> None:  # noqa: ANN401  (sensor_msgs/Temperature, degC)
-        """Take a temperature."""
+        """Store a temperature."""
         self.warmth = float(message.temperature)
         self._temperature_at(self._time(message), self.warmth)
 
     def imu(self, message: Any) -> Any | None:  # noqa: ANN401  (sensor_msgs/Imu)
-        """Return the calibrated copy of a message; None where the temperature is needed and not known yet."""
+        """Return the calibrated copy of a message; None if the calibration needs a temperature and has none yet."""
         if self.needs_temperature and self.warmth is None:
             if not self.waiting:
                 self.warn("the calibration needs a temperature: messages are dropped until the first one comes")
@@ -86,7 +86,7 @@ class MessageCalibrator:
             return None
         time = self._time(message)
         if self.now < self.last:
-            self.warn(f"stamps run backwards by {(self.last - self.now) / 1e9:g} s: the past is forgotten")
+            self.warn(f"stamps run backwards by {(self.last - self.now) / 1e9:g} s: earlier samples are ignored")
             self._start(self.now)
             time = 0.0
         self.last = self.now
@@ -147,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("calibration", type=Path, help="calibrations/<unit>.json")
     add("--topic", default="/imu/data_raw", help="topic of the readings (default: %(default)s)")
-    add("--output", help="topic of the calibrated messages (default: that of the readings + _calibrated)")
+    add("--output", help="topic of the calibrated messages (default: topic of the readings with suffix _calibrated)")
     add("--temperature-topic", default="/imu/temperature", help="sensor_msgs/Temperature (default: %(default)s)")
     add("--python-effect", action="append", default=[], dest="python_effects", metavar="FILE", help="as of apply")
     return parser

@@ -1,11 +1,11 @@
-"""Calibrated readings as text.
+"""Write calibrated readings as text.
 
-In a text log, the columns that the profile names as readings are replaced by calibrated ones in g and deg/s, under the
-canonical names ``accel_x_g`` .. ``gyro_z_dps``. Every other cell, and the lines before the data, are written unchanged.
+In a text log, calibrated columns in g and deg/s with the canonical names ``accel_x_g`` .. ``gyro_z_dps`` replace the
+columns of the readings. All other cells, and the lines before the data, are unchanged.
 
-Logs of other programs (ROS bag, ULog, DataFlash, HDF5, MATLAB) and files that the profile joins are read as at ingest,
-with its checks, and are not written: the output has the columns of the canonical CSV, ``time_s, accel_x_g ..
-gyro_z_dps, temperature_degc``, in the body's axes.
+Logs of other programs (ROS bag, ULog, DataFlash, HDF5, MATLAB) and files that the profile joins are read with the
+checks of ingest. Their output has the columns of the canonical CSV, ``time_s, accel_x_g .. gyro_z_dps,
+temperature_degc``, in body axes.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ if TYPE_CHECKING:
     from pipeline.io.text_log import Head
     from pipeline.records import Integers, Values
 
-BLOCK_ROWS = 20_000  # of a log of messages, as a block of a text log
+BLOCK_ROWS = 20_000  # of a message log, like a block of a text log
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 
 
 class CsvLog:
-    """A text log and the log that is made of it."""
+    """A text log and its compensated copy."""
 
     def __init__(self, source: Path, out: Output, profile: LogProfile, stream: LogStream) -> None:
         (part,) = sensor_parts(profile.ingest)
         self.source, self.out, self.profile, self.stream = source, out, profile, stream
         self.settings = csv_formats(profile.ingest)[part]
         self.columns = {c.channel: c for c in self.settings.columns}
-        self.places: dict[str, list[int]] = {}  # of the columns of each signal
+        self.places: dict[str, list[int]] = {}  # indices of the columns of each signal
         self.origin = 0.0
 
     def compensate(self, block_bytes: int) -> Result:
@@ -87,7 +87,7 @@ class CsvLog:
             return self.stream.finish([note.detail for note in log.notes])
 
     def _replace(self, columns: list[pa.Array], signals: Readings, readings: Readings) -> None:
-        """Put calibrated numbers in the place of the raw ones; missing ones stay as they were written."""
+        """Replace raw by calibrated numbers in the columns; missing numbers keep their text."""
         for sensor, values in readings.items():
             for k, i in enumerate(self.places[sensor]):
                 text = pc.cast(to_arrow(np.round(values[:, k], DECIMALS) + 0.0), pa.string())
@@ -115,45 +115,46 @@ class CsvLog:
         self.out.write(head.text(new).encode())
 
     def _find(self, names: list[str], where: str) -> None:
+        """Find the columns of the signals by the names in the header; ``where``: its place, for messages."""
         for signal, channels in SIGNALS.items():
-            wanted = [self.columns[c] for c in channels if c in self.columns]
-            found = {str(c.column): index for c in wanted if (index := c.index(names)) is not None}
-            twice = [name for name in found if names.count(name) > 1]
+            expected = [self.columns[c] for c in channels if c in self.columns]
+            present = {str(c.column): index for c in expected if (index := c.index(names)) is not None}
+            twice = [name for name in present if names.count(name) > 1]
             if twice:
                 raise InputError(f"the header names {twice[0]} more than once", where)
-            if found and len(found) < len(wanted):
-                missing = ", ".join(str(c.column) for c in wanted if str(c.column) not in found)
-                raise InputError(f"the header names {', '.join(found)}, but not {missing}", where)
-            if found:
-                self.places[signal] = [*found.values()]
+            if present and len(present) < len(expected):
+                missing = ", ".join(str(c.column) for c in expected if str(c.column) not in present)
+                raise InputError(f"the header names {', '.join(present)}, but not {missing}", where)
+            if present:
+                self.places[signal] = [*present.values()]
         if not any(sensor in self.places for sensor in SENSORS):
-            told = "--ingest names the profile, or its file, that describes this log"
+            hint = "--ingest names the profile, or its file, that describes this log"
             if {CANONICAL[c] for c in (*ACCELEROMETER, *GYROSCOPE)} & set(names):
-                told = f"these are the columns that this command writes: the log is compensated already, else {told}"
-            expected = ", ".join(str(self.columns[c].column) for s in SENSORS for c in TRIADS[s] if c in self.columns)
+                hint = f"these are the columns that this command writes: the log is compensated already, else {hint}"
+            columns = ", ".join(str(self.columns[c].column) for s in SENSORS for c in TRIADS[s] if c in self.columns)
             got = f"{', '.join(names)[:200]}{other_separator(names)}"
-            raise InputError(f"no column of a sensor; expected {expected}, got {got}; {told}", where)
+            raise InputError(f"no column of a sensor; expected {columns}, got {got}; {hint}", where)
 
     def _refusal(self, body: bytes, lines: Integers, otherwise: str) -> InputError:
-        """Return the error that names the first line of a block with a cell that is no number."""
+        """Return the error for the first line of a block with a cell that is not a number."""
         for fault in find_faults(self.layout, body, lines, None):
             if fault.kind != "not_finite":
                 return InputError(fault.message, f"{self.source}:{fault.line}")
         return InputError(f"the log is no table of numbers: {otherwise}", f"{self.source}:{lines[0]}")
 
     def _numbers(self, cells: pa.Array) -> Values:
-        """Return a column as numbers, NaN where a cell is empty; ``ArrowInvalid`` where one is no number."""
+        """Return a column as numbers, NaN for an empty cell; raises ``ArrowInvalid`` if a cell is not a number."""
         text = cells if self.settings.decimal == "." else pc.replace_substring(cells, self.settings.decimal, ".")
         try:
-            found = pc.cast(text, pa.float64())
-        except pa.ArrowInvalid:  # blanks, empty cells, or no number
+            numbers = pc.cast(text, pa.float64())
+        except pa.ArrowInvalid:  # blanks, empty cells, or other text
             text = pc.utf8_trim_whitespace(text)
-            found = pc.cast(pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text), pa.float64())
-        return to_numpy(pc.fill_null(found, np.nan) if found.null_count else found)
+            numbers = pc.cast(pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text), pa.float64())
+        return to_numpy(pc.fill_null(numbers, np.nan) if numbers.null_count else numbers)
 
     def _signals(self, cells: list[pa.Array], rows: int) -> dict[str, Any]:
-        """Return the signals of a block, after so many rows, in g, deg/s, degC and s, the readings in body axes."""
-        out: dict[str, Any] = {}
+        """Return the signals of a block that begins at row ``rows``: g and deg/s in body axes, degC and s."""
+        signals: dict[str, Any] = {}
         for signal, where in self.places.items():
             numbers = np.column_stack([self._numbers(cells[i]) for i in where])
             for k, channel in enumerate(SIGNALS[signal]):
@@ -162,31 +163,31 @@ class CsvLog:
                     numbers[:, k] = in_house_unit(column, numbers[:, k])
                 else:
                     numbers[:, k] /= SECOND_NS / UNITS["time"][column.unit][0]
-            out[signal] = self.profile.to_body(signal, numbers) if signal in SENSORS else numbers[:, 0]
+            signals[signal] = self.profile.to_body(signal, numbers) if signal in SENSORS else numbers[:, 0]
         if self.settings.rate_hz is not None:
-            out["time"] = np.arange(rows, rows + len(cells[0])) / self.settings.rate_hz
-        if "time" in out:
-            if rows == 0 and out["time"][0] > SINCE_1970_NS / SECOND_NS:
-                self.origin = float(out["time"][0])
-            out["time"] = out["time"] - self.origin
-        return out
+            signals["time"] = np.arange(rows, rows + len(cells[0])) / self.settings.rate_hz
+        if "time" in signals:
+            if rows == 0 and signals["time"][0] > SINCE_1970_NS / SECOND_NS:
+                self.origin = float(signals["time"][0])
+            signals["time"] = signals["time"] - self.origin
+        return signals
 
 
 def sensor_parts(ingest: Mapping[str, Any]) -> list[int]:
-    """Return which files of a recording hold readings or the temperature: places in the profile's ``parts``."""
+    """Return the indices of the files with readings or the temperature in the profile's ``parts``."""
     channels = {*ACCELEROMETER, *GYROSCOPE, "temperature"}
     return [i for i, layout in enumerate(csv_formats(ingest)) if channels & {c.channel for c in layout.columns}]
 
 
 def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, stream: LogStream) -> Result:
-    """Write the readings of a log of messages, or of files that are joined on equal time, calibrated, as text."""
+    """Write the calibrated readings of a message log, or of files joined on equal time, as text."""
     source, ingest = files[0], profile.ingest
     if source.suffix.lower() in MESSAGE_FORMATS:
-        from pipeline.io.mcap import read_log  # noqa: PLC0415  (the decoder costs what a text log need not pay)
+        from pipeline.io.mcap import read_log  # noqa: PLC0415  (slow import, not for text logs)
 
         table = read_log(source, mcap_format(ingest))
     else:
-        from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (one text log needs it not)
+        from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (only for joined files)
 
         layouts = csv_formats(ingest)
         table = read_csv(files, [layouts[part] for part in sensor_parts(ingest)], checks_of(ingest))
@@ -215,7 +216,7 @@ def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, st
 
 
 def _lines_of(columns: list[pa.Array], delimiter: str, *, quoted: bool) -> memoryview:
-    """Return the rows as the lines of a text file; ``quoted``: cells may have to be quoted."""
+    """Return the rows as lines of text; ``quoted``: whether cells may need quotes."""
     cells = [_quoted(column, delimiter) for column in columns] if quoted else list(columns)
     cells[-1] = pc.binary_join_element_wise(cells[-1], text_scalar("\n"), text_scalar(""))
     lines = pc.binary_join_element_wise(*cells, text_scalar(delimiter)) if len(cells) > 1 else cells[0]
@@ -224,7 +225,7 @@ def _lines_of(columns: list[pa.Array], delimiter: str, *, quoted: bool) -> memor
 
 
 def _quoted(column: pa.Array, delimiter: str) -> pa.Array:
-    """Quote the cells that would not read back as one cell."""
+    """Quote the cells that contain a delimiter, a quote or a line end."""
     special = pc.match_substring_regex(column, f'["{delimiter}\r\n]')
     if not pc.any(special).as_py():
         return column

@@ -215,7 +215,7 @@ def test_messages_of_varying_length_are_compensated_alike(calibration: Path, tmp
 def test_a_temperature_topic_is_followed_causally(calibration: Path, tmp_path: Path) -> None:
     log, out = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap"
     done = compensate_log(load(calibration), log, out)
-    assert done.notes == ["11 messages stand before the first temperature; they were given that one"]
+    assert done.notes == ["11 messages come before the first temperature and are compensated with it"]
     stamps, _, _ = signals()
     force, rate = in_house_units(decoded(out, "/imu/data"))
     ramp = 25.0 + 1e-3 * ((stamps - EPOCH_NS - 100) / 1e7)  # the line through a ramp is the ramp
