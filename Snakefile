@@ -6,7 +6,7 @@
 #
 # ingest -> filter -> fit/{sensor}/{stage} ... -> validate, diagnose, calibration -> export -> report -> summary -> gather -> verdict
 #
-# One job handles a batch of units; each writes one file, results/<campaign>/batches/<batch>/<stage>.zip.
+# A job handles a batch of units and writes one file, results/<campaign>/batches/<batch>/<stage>.zip.
 
 
 include: "workflow/rules/common.smk"
@@ -14,7 +14,7 @@ include: "workflow/rules/common.smk"
 
 if DEPLOYED:
 
-    # With `--software-deployment-method apptainer` each job runs in it (Containerfile).
+    # With `--software-deployment-method apptainer` each job runs in this image (Containerfile).
     container: "imu-calibration.sif"
 
 
@@ -52,8 +52,8 @@ localrules:
 onstart:
     begin_run()
     if workflow.local_exec:
-        # Snakemake's limit of jobs a second wakes its scheduler once a second for every job that has run: in a fleet,
-        # a hundred times a second (snakemake/snakemake, issue 2967).
+        # Snakemake's limit of jobs per second wakes its scheduler once a second for every finished job: in a fleet, a
+        # hundred times a second (snakemake/snakemake, issue 2967).
         workflow.scheduler.job_rate_limiter = None
 
 

@@ -1,4 +1,4 @@
-# Both sensors' fits, the inputs and the software in one document.
+# Writes the calibration of both sensors, the inputs and the software versions in one document.
 rule calibration:
     input:
         settings=settings_of("calibration"),

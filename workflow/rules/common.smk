@@ -1,4 +1,4 @@
-# The campaign, resolved and checked before any job; and what every rule uses.
+# Loads and checks the campaign before any job, and defines the names that all rules use.
 import atexit
 import gc
 import hashlib
@@ -14,10 +14,10 @@ from snakemake.logging import logger
 from snakemake.settings.types import Quietness
 
 if Path(workflow.basedir, "pipeline").is_dir():
-    # A clone: jobs run this copy of the package from any working directory, and keep the user's own path.
+    # A clone: jobs run this copy of the package from any working directory; the user's path is kept.
     sys.path.insert(0, workflow.basedir)
-    own = [workflow.basedir, os.getenv("PYTHONPATH", "")]
-    os.environ.update(PYTHONPATH=os.pathsep.join(filter(None, own)))
+    paths = [workflow.basedir, os.getenv("PYTHONPATH", "")]
+    os.environ.update(PYTHONPATH=os.pathsep.join(filter(None, paths)))
 
 from pipeline.config import code_digest, load_campaign, settings_of_jobs
 from pipeline.errors import PipelineError
@@ -34,7 +34,7 @@ RUNNING = not workflow.is_main_process
 
 
 def without_braces(path):
-    """Return a path for Snakemake, which takes {name} for a wildcard: instead of one with braces, a link to it."""
+    """Return a path, or for a path with braces a link to it, because Snakemake reads {name} as a wildcard."""
     if "{" not in str(path):
         return str(path)
     link = Path(
@@ -47,7 +47,7 @@ def without_braces(path):
 
 
 def again(output):
-    """Return how often an output is repeated because files of it were edited."""
+    """Return the number of repetitions of an output because its files were edited."""
     number, edited = repetitions(CAMPAIGN.results, output)
     EDITED.extend(edited)
     return number
@@ -59,14 +59,14 @@ PLAN_FILE = Path(
     f"{hashlib.sha256(repr(sorted(config.items())).encode()).hexdigest()[:16]}.json",
 )
 if RUNNING:
-    # A job on another machine: the main process has resolved the campaign and looked at the results.
+    # A job on another machine: the main process has loaded the campaign and checked the results.
     PLAN = json.loads(PLAN_FILE.read_text())
 else:
     try:
         CAMPAIGN = load_campaign(config)
     except PipelineError as error:
         raise WorkflowError(str(error)) from None
-    gc.freeze()  # the campaign stays: looking for garbage in thousands of configurations takes seconds
+    gc.freeze()  # the campaign stays in memory: garbage collection of thousands of configurations takes seconds
     if "{" in str(CAMPAIGN.results):
         CAMPAIGN.results.mkdir(parents=True, exist_ok=True)
     EDITED = []  # files and folders of the results that were edited
@@ -94,7 +94,7 @@ else:
         ),
         logger,
     )
-# In a container the interpreter of this machine does not exist; elsewhere each machine parses this file with its own.
+# A container does not have the interpreter of this machine; otherwise each machine parses this file with its interpreter.
 DEPLOYED = workflow.deployment_settings.deployment_method
 RUN = "python -m pipeline" if DEPLOYED else shlex.join(COMMAND)
 RESULTS = PLAN["results"]
@@ -111,12 +111,12 @@ wildcard_constraints:
 
 
 def settings_of(output):
-    """Return the input function that names the settings file of what a rule writes for a batch."""
+    """Return the input function for the settings file of an output."""
     return lambda wildcards: settings_file(wildcards.batch, output.format(**wildcards))
 
 
 def settings_file(batch, output):
-    """Return the settings file of a job; it exists but for a dry run, which writes nothing."""
+    """Write the settings file of a job, except in a dry run, and return its path."""
     path = f"{RESULTS}/configs/{PLAN['settings'][batch][output]}"
     if RUNNING:
         return path
@@ -133,7 +133,7 @@ def settings_file(batch, output):
             write_atomically(Path(path), SETTINGS[batch][output].content)
         except OSError as error:
             MONITOR.refused = (
-                "ProtectedOutputException"  # as Snakemake says of its own files
+                "ProtectedOutputException"  # Snakemake's error for such files
             )
             raise WorkflowError(
                 f"{CAMPAIGN.results} cannot be written: {error}"
@@ -145,7 +145,7 @@ def settings_file(batch, output):
 
 
 def begin_run():
-    """Hold the results, start to print the progress, and write the settings files of the jobs."""
+    """Lock the results, start to print the progress, and complete an interrupted publication."""
     global RUNNING
     if RUNNING:
         return
@@ -170,7 +170,7 @@ def begin_run():
 
 
 def last_fit(sensor):
-    """Return the input function that names the output of a sensor's last stage."""
+    """Return the input function for the output of the last stage of a sensor."""
     return (
         lambda wildcards: f"{BATCH}/fit/{sensor}/{PLAN['chains'][wildcards.batch][sensor][-1]}.zip"
     )
@@ -209,12 +209,12 @@ def pages(wildcards):
 
 
 def of_batches(stage):
-    """Return a stage's output for every batch."""
+    """Return the output of a stage for every batch."""
     return [f"{RESULTS}/batches/{batch}/{stage}.zip" for batch in PLAN["chains"]]
 
 
 def print_at_the_end(text):
-    """Print after Snakemake's last message."""
+    """Print a text after Snakemake's last message."""
     MONITOR.ended.set()
     atexit.register(print, f"\n{text}", file=sys.stderr, end="")
 
@@ -225,7 +225,7 @@ def written_in_this_run(path):
 
 
 def print_outcome(failures=""):
-    """Print at the end of the terminal output what was found, how to continue, and which units have failed."""
+    """Print the outcome of the run, the commands to continue, and the failed units at the end of the output."""
     if not os.path.exists(f"{RESULTS}/summary.csv"):
         return
     try:
@@ -241,7 +241,7 @@ def print_outcome(failures=""):
 
 
 def print_verdict():
-    """Print what was found where units have failed; a run that stopped before its end has no outcome."""
+    """Print the outcome of a run with failed units; a run that stopped before its end has none."""
     log = f"{RESULTS}/logs/verdict.log"
     if written_in_this_run(log):
         with open(log) as stream:
@@ -250,5 +250,5 @@ def print_verdict():
 
 if not RUNNING:
     MONITOR.nothing_to_do = (
-        print_outcome  # Snakemake calls no handler where nothing is to be done
+        print_outcome  # Snakemake calls no handler if there is nothing to do
     )

@@ -1,4 +1,4 @@
-# Which physical effect is missing.
+# Diagnoses which physical effects the model lacks.
 rule diagnose:
     input:
         settings=settings_of("diagnose"),

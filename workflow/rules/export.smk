@@ -1,4 +1,4 @@
-# The calibration in the formats of those who use it.
+# Writes the calibration in the formats of other programs.
 rule export:
     input:
         settings=settings_of("export"),

@@ -1,4 +1,4 @@
-# The readings of every recording through the configured filter.
+# Applies the configured filter to all recordings, and estimates the noise.
 rule filter:
     input:
         settings=settings_of("filter"),

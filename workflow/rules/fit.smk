@@ -1,4 +1,4 @@
-# One stage of one sensor's method, on the result of the stage before it.
+# Runs one stage of the method of one sensor on the result of the stage before it.
 
 
 rule fit:

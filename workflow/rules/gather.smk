@@ -1,7 +1,7 @@
-# Every unit's files under their stable paths, the summary and the campaign page; `snakemake --report` shows the pages.
+# Publishes the files of all units, the summary and the campaign page; `snakemake --report` shows the pages.
 #
-# The published files are no output of the rule: Snakemake would delete them before the job, and when it fails. The stage
-# replaces them by a complete new set; what is changed or deleted by hand is found by `pipeline.results_folder`.
+# The published files are not an output of the rule, because Snakemake would delete them before the job and after a
+# failure. The stage replaces them by a complete new set; `pipeline.results_folder` detects edited or deleted files.
 rule gather:
     input:
         settings=lambda wildcards: local(settings_file("campaign", "gather")),

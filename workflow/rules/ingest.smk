@@ -1,11 +1,11 @@
-# A unit's files -> one Parquet file. Names, sizes and times of the recordings are part of the settings; those that do not
-# exist are no input: their unit fails, the others go on.
+# Converts the recordings of each unit to one Parquet file. The settings contain names, sizes and times of the recordings.
+# They are not inputs of the rule, so a missing recording fails only its unit.
 SIMULATED_INPUT = local(SIMULATED) if PLAN["simulation"] else []
 
 if PLAN["apart"]:
 
-    # Machines that do not share a disk with this one get the recordings of a batch in one file, as Snakemake takes 0.1 ms
-    # for each input at each start.
+    # Machines without a shared disk get the recordings of a batch in one file, because Snakemake takes 0.1 ms for each
+    # input at each start.
     localrules:
         collect,
 

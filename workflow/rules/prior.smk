@@ -1,4 +1,4 @@
-# The priors of all lots, from the summaries of all batches, and what they change of each unit (combine=lot).
+# Computes the priors of all lots from the summaries of all batches, and updates each unit (combine=lot).
 LOTS = f"{RESULTS}/batches/lots.zip"
 
 if PLAN["combine"] == "lot":

@@ -1,4 +1,4 @@
-# One page a unit, those that failed included.
+# Writes the page of each unit, also of failed units.
 rule report:
     input:
         settings=settings_of("report"),

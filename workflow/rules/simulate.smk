@@ -1,4 +1,4 @@
-# The recordings of a simulated campaign (simulate: true in its campaign.yaml).
+# Simulates the recordings of a campaign (simulate: true in its campaign.yaml).
 SIMULATED = f"{RESULTS}/simulated"
 
 if PLAN["simulation"]:

@@ -1,4 +1,4 @@
-# What each unit of a batch adds to the files about all units.
+# Collects the data of each unit for the files about all units.
 rule summary:
     input:
         settings=settings_of("summary"),

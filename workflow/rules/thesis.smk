@@ -1,4 +1,4 @@
-# The results of the thesis's campaign compared with what it printed (page: thesis in campaign.yaml).
+# Compares the results of the thesis's campaign with its printed figures (page: thesis in campaign.yaml).
 if PLAN["page"] == "thesis":
 
     rule thesis:

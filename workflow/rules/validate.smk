@@ -1,4 +1,4 @@
-# The error on held-out motion after each step.
+# Computes the error on held-out motion after each step.
 rule validate:
     input:
         settings=settings_of("validate"),

@@ -1,4 +1,4 @@
-# The exit code of the run: fails, and names every failed unit with its cause, unless all units are calibrated.
+# Sets the exit code of the run: fails, and names each failed unit with its cause, unless all units are calibrated.
 rule verdict:
     input:
         failures=f"{RESULTS}/batches/gathered.json",
