@@ -110,9 +110,9 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
         raise IngestError(message, log.path, code="no_sync", hint=hint)
     if len(order) > 1 and residuals[order[1]] < AMBIGUOUS * residuals[order[0]]:
         message = (
-            f"the motion repeats itself: the table's log fits at {best:.3f} and {places[int(order[1])]:.3f} s alike"
+            f"the motion repeats itself: the offsets {best:.3f} and {places[int(order[1])]:.3f} s fit equally well"
         )
-        hint = "let it cover the whole recording, or begin and end the recording with a turn of its own"
+        hint = "log the table during the whole recording, or begin and end it with a turn unlike the others"
         raise IngestError(message, log.path, code="no_sync", hint=hint)
     return fit
 

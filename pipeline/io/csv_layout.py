@@ -51,7 +51,7 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
     are searched for a header at another place.
     """
     twice = sorted({n for n in names if n and names.count(n) > 1})
-    others = [f"column name {', '.join(twice)} stands more than once in the header"] if twice else []
+    others = [f"column name {', '.join(twice)} occurs more than once in the header"] if twice else []
     found: list[tuple[Column, int]] = []
     lacking: list[Column] = []
     for column in settings.columns:
@@ -83,7 +83,7 @@ def column_notes(names: list[str], columns: list[tuple[Column, int]], line: int)
     place = {column.channel: index for column, index in columns if isinstance(column.column, str)}
     turned = [t for t in TRIADS.values() if set(t) <= place.keys() and sorted(t, key=lambda c: place[c]) != list(t)]
     listed = [names[i] for i in sorted(place[c] for t in turned for c in t)]
-    detail = f"axes stand in the order {', '.join(listed)} and were taken by their names"
+    detail = f"axes are in the order {', '.join(listed)} and were assigned by their names"
     notes = [Note("N-ORDER", len(listed), line, line, detail)] if turned else []
     used = {index for _, index in columns}
     ignored = [n for i, n in enumerate(names) if i not in used]
@@ -243,7 +243,7 @@ def _fault(layout: Layout, line: int, text: str) -> Fault | None:
         return Fault(line, "bad_row", f"the line cannot be split into fields ({error}): {text[:120]!r}", text)
     if [cell.strip() for cell in cells] == layout.names:
         said = _fault_of_cell(layout, layout.columns[0], cells, [])[1]
-        return Fault(line, "restarted", f"{said}: a header again", text)
+        return Fault(line, "restarted", f"{said}: a repeated header", text)
     width = len(layout.names)
     if len(cells) != width:
         message = f"the line has {len(cells)} fields where {width} are expected: {text[:120]!r}"

@@ -214,7 +214,7 @@ class Rows:
         numbers = layout.numbers(body, len(lines)) if len(lines) else {}
         if not bad.any() or numbers is None:
             place = f"{self.path}:{lines[0]}"
-            raise IngestError("cannot be read as numbers: its rows cannot be told apart", place, code="not_a_number")
+            raise IngestError("cannot be read as numbers: its rows cannot be separated", place, code="not_a_number")
         return body, lines, numbers
 
     def _exact_times(self, layout: Layout, body: bytes, numbers: dict[int, Values]) -> dict[int, Integers]:

@@ -162,7 +162,7 @@ def in_order(table: ChannelTable, rows: Rows, checks: Checks) -> ChannelTable:
             moved,
             f"rows out of order were sorted by their times, displaced by {displaced.max()} rows at most",
         ),
-        ("N-DUP", twice, "rows that repeat the one before them, time and all, were dropped"),
+        ("N-DUP", twice, "rows that repeat the row before them, including the time, were dropped"),
     ):
         if places.size:
             note = table.note(code, places, detail)
@@ -233,7 +233,7 @@ def _once(table: ChannelTable) -> ChannelTable:
             keep[rows] = False
             twin, note = table.note("", rows - count, ""), table.note("N-REPEAT", rows, "")
             lines = f"lines {note.first} to {note.last} repeat lines {twin.first} to {twin.last} exactly"
-            detail = f"{lines}, time and all, and were dropped"
+            detail = f"{lines}, including the time, and were dropped"
             notes.append(replace(note, detail=detail))
     return table.select(np.flatnonzero(keep), *notes) if notes else table
 
@@ -253,7 +253,7 @@ def _counted_on(table: ChannelTable, tick_ns: float) -> ChannelTable:
         return table
     modulus = wraps[0][1]
     bits = next((b for b in (16, 24, 32) if round(2**b * tick_ns) == modulus), 32)
-    what = f"the time counter of {bits} bits started again at 0 (every {modulus / 1e9:.9g} s) and was counted on"
+    what = f"the time counter of {bits} bits restarted at 0 (every {modulus / 1e9:.9g} s) and was continued"
     note = replace(table.note("N-WRAP", np.array([row for row, _ in wraps]), what), start_s=None, end_s=None)
     return replace(table, time_ns=time_ns, notes=(*table.notes, note))
 

@@ -90,7 +90,7 @@ def unwrapped(table: ChannelTable) -> ChannelTable:
     if not rows.size:
         return table
     values = {**table.values, "table_angle": np.asarray(np.unwrap(angle, period=360.0))}
-    note = table.note("N-UNWRAP", rows, "the table's angle started again at a full turn and was counted on")
+    note = table.note("N-UNWRAP", rows, "the table's angle restarted at a full turn and was continued")
     return replace(table, values=values, notes=(*table.notes, note))
 
 

@@ -112,7 +112,7 @@ def _step(value: Any, step: str | int, path: FieldPath) -> Any:  # noqa: ANN401
         if known is None:
             raise ValueError(f"it has no field {path.text}; there are {', '.join(descriptor.fields_by_name)}")
         if known.has_presence and not value.HasField(step):
-            raise ValueError(f"it does not say {step} of {path.text}")
+            raise ValueError(f"it has no value of {step} for {path.text}")
         return getattr(value, step)
     try:
         return value[step]

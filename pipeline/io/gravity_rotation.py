@@ -148,6 +148,6 @@ def declared_scale(table: ChannelTable) -> tuple[float, str] | None:
     if misfits[0] < FAILS_DEG or misfits[best] > FITS_DEG:
         return None
     return 1 / scales[best], (
-        f"in {len(moves)} moves between rests gravity turns as the rates do if they are multiplied by "
-        f"{scales[best]:.4g} ({misfits[best]:.1f} deg are left, {misfits[0]:.0f} deg as declared)"
+        f"in {len(moves)} moves between rests gravity turns by the angle of the rates if they are multiplied by "
+        f"{scales[best]:.4g} ({misfits[best]:.1f} deg error, {misfits[0]:.0f} deg as declared)"
     )

@@ -226,7 +226,7 @@ def _once(where: str, groups: Iterable[Iterable[str]], what: str) -> set[str]:
     for channels in groups:
         twice = seen & set(channels) - {TIME}
         if twice:
-            raise ConfigurationError(f"{where}: {', '.join(sorted(twice))} stands in two {what}")
+            raise ConfigurationError(f"{where}: {', '.join(sorted(twice))} is in two {what}")
         seen |= set(channels)
     return seen
 

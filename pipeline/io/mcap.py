@@ -84,7 +84,7 @@ class _Topic:
         recorded = np.concatenate(self.recorded)
         time = np.concatenate(self.times) if self.times else recorded
         if not self.times and not recorder:
-            message = f"topic {topic}: the format has no times of a recorder, which ingest.mcap.time_source asks for"
+            message = f"topic {topic}: the format has no recorder's times, which ingest.mcap.time_source=log_time needs"
             raise IngestError(message, path, code="bad_time", hint="name the field of the time")
         if self.times:
             if not time.any() and len(time) > 1:
@@ -225,7 +225,7 @@ class _Log:
         unmatched = np.flatnonzero((series.time_ns[index] != base.time_ns) & (base.time_ns <= self.end_ns))
         if unmatched.size:
             sensor = next((n for n, triad in TRIADS.items() if triad[0] in series.values), "")
-            what = f"both sensors have to bear the same stamps, and the {sensor} has its own"
+            what = f"both sensors need the same stamps, and the {sensor} has others"
             what = what if sensor else "the table has to be logged with the Imu's stamps"
             message = (
                 f"{unmatched.size} of {len(index)} Imu messages have no message of equal stamp on {topic}, the first "
@@ -244,7 +244,7 @@ class _Log:
     def _note_container(self) -> None:
         self.notes += self.reader.notes
         if not self.reader.verified:
-            detail = "integrity: not_verifiable; written without checksums: damage cannot be told from data"
+            detail = "integrity: not_verifiable; written without checksums: damage cannot be detected"
             self.notes.append(Note("N-NOCRC", 1, 0, 0, detail))
         if self.reader.truncated:
             self.notes.append(Note("N-TRUNCATED", 1, 0, 0, f"{self.reader.truncated}, and were used"))

@@ -156,7 +156,7 @@ class McapReader(MessageReader):
             what = f"a record of kind {opcode} claims {length} bytes where {available} are left"
             raise _TruncatedError(what) if opcode in _KINDS else ValueError(what)
         if opcode == 0:
-            raise ValueError("a record has the kind 0, which none has")
+            raise ValueError("a record has the invalid kind 0")
         return opcode, head, self._take(length)
 
     def _data(self) -> Iterator[Run]:
@@ -299,7 +299,7 @@ class McapReader(MessageReader):
         lost = set(self._chunk_index) - set(self.chunks)
         if lost or (self._chunk_index and not self.truncated and sorted(self._chunk_index) != self.chunks):
             what = f"the summary lists {len(self._chunk_index)} chunks, and the file holds {len(self.chunks)}"
-            raise ValueError(f"{what} where it may look for them: a part is missing")
+            raise ValueError(f"{what} at the stated places: a part is missing")
         stated = self._statistics
         if stated is None:
             return

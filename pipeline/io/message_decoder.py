@@ -174,7 +174,7 @@ class TopicDecoder:
         recorded = rows.heads["log_time"]
         if (recorded > LARGEST).any():
             number = self.count + int(np.argmax(recorded > LARGEST)) + 1
-            message = f"message {number} on {self.topic}: the recorder's time of {recorded.max()} ns is none"
+            message = f"message {number} on {self.topic}: the recorder's time of {recorded.max()} ns is out of range"
             raise IngestError(message, self.path, code="bad_time")
         if rows.channel not in self._channels:
             self._channels[rows.channel] = self._open(reader, rows.channel)

@@ -250,7 +250,7 @@ class _LayoutFinder:
 
     def message(self, key: str, prefix: str, depth: int) -> None:
         if depth > DEEPEST:
-            raise ValueError(f"{key} is defined by itself")
+            raise ValueError(f"{key} contains itself")
         self.count()
         fields = self.definitions[key]
         if not fields and self.cdr:

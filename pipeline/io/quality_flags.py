@@ -272,7 +272,7 @@ def _check_rate(table: ChannelTable, checks: Checks) -> None:
         if abs(ratio * factor - 1.0) <= RATE_TOLERANCE:
             unit = f"; the numbers look like {times}"
     message = (
-        f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz asks for "
+        f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz expects "
         f"{1e6 / checks.rate_hz:g} us{unit}"
     )
     hint = "correct ingest.csv.columns.time.unit or ingest.checks.rate_hz"

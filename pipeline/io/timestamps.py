@@ -51,7 +51,7 @@ def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
     else:
         found = int((Decimal(moment) * int(UNITS["time"][unit][0])).to_integral_value())
     if abs(found) > LARGEST:
-        raise ValueError(f"its stamp of {found} ns is none")
+        raise ValueError(f"its stamp of {found} ns is out of range")
     return found
 
 
@@ -71,12 +71,12 @@ def of_number(values: NDArray[Any], unit: str) -> Integers:
     scale = int(UNITS["time"][unit][0])
     if values.dtype.kind in "iu":
         if values.size and int(max(values.max(), -int(values.min()))) > LARGEST // scale:
-            raise ValueError(f"a stamp of {values.max()} {unit} is none")
+            raise ValueError(f"a stamp of {values.max()} {unit} is out of range")
         counted: Integers = values.astype(np.int64) * scale
         return counted
     numbers = values.astype(np.float64)
     if not (np.abs(numbers) < LARGEST / scale).all():
-        raise ValueError("a stamp is no finite number, or beyond all times")
+        raise ValueError("a stamp is not finite, or out of range")
     whole = np.floor(numbers)
     parts: Integers = whole.astype(np.int64) * scale + np.rint((numbers - whole) * scale).astype(np.int64)
     return parts
@@ -226,7 +226,7 @@ def rows_covered(slow: Integers, fast: Integers, topic: str, path: str) -> Index
         found = np.flatnonzero(inside & (begun == ended)) + 1
     if len(found) < FEWEST:
         message = f"the messages on {topic} do not cover those of the other sensor in time"
-        raise IngestError(message, path, code="bad_time", hint="both topics have to bear stamps of one clock")
+        raise IngestError(message, path, code="bad_time", hint="both topics need stamps of one clock")
     return found
 
 

@@ -161,7 +161,7 @@ def parse(text: str) -> Formula:
     strange = STRANGE.search(line)
     if strange:
         found = strange.group()
-        raise _refusal(line, strange.start(), f"{found!r} has no place in a formula{HINTS.get(found, '')}")
+        raise _refusal(line, strange.start(), f"{found!r} is not allowed in a formula{HINTS.get(found, '')}")
     depth = accumulate((character == "(") - (character == ")") for character in line)
     if max(depth) > DEEPEST:
         raise ConfigurationError(f"a formula with brackets {DEEPEST} deep; use several terms")
@@ -207,11 +207,11 @@ class _Reader:
             c = f"({c_left} {sign} {c_right})"
             return _applied(function, left, right), IN_C_ONCE.get(c, c)
         known = "numbers, signals, functions and + - * / **"
-        raise self._refused(node, f"{ast.unparse(node)!r:.40} has no place in a formula; it holds {known}")
+        raise self._refused(node, f"{ast.unparse(node)!r:.40} is not allowed in a formula; it consists of {known}")
 
     def _value(self, node: ast.Constant) -> float:
         if isinstance(node.value, bool) or not isinstance(node.value, (int, float)):
-            raise self._refused(node, f"{node.value!r} has no place in a formula")
+            raise self._refused(node, f"{node.value!r} is not allowed in a formula")
         try:
             value = float(node.value)
         except OverflowError:

@@ -172,7 +172,7 @@ class ExponentialRegression:
         if not abs(step) > 0.0 or not self._sums[0]:  # NaN: no stretch yet
             return
         if step < -FARTHEST * self.memory:
-            raise InputError(f"time goes back by {-step:.6g} s or so to {time:.6f} s; sort the log, or cut it there")
+            raise InputError(f"time goes back by about {-step:.6g} s to {time:.6f} s; sort the log, or cut it there")
         s0, s1, s2, r0, r1 = self._sums
         moved = (s0, s1 - step * s0, s2 - 2.0 * step * s1 + step * step * s0, r0, r1 - step * r0)
         self._sums = np.exp(-step / self.memory) * np.array(moved)

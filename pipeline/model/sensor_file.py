@@ -55,7 +55,7 @@ def settings_of_ranges(sensor: Mapping[str, Any], wanted: Sequence[float | None]
     """
     parts = [part for part in SENSORS if sensor.get(part)]
     if len(wanted) > len(parts) or not all(value is None or value > 0.0 for value in wanted):
-        raise ConfigurationError("--range takes that of the accelerometer in g, then that of the gyroscope in deg/s")
+        raise ConfigurationError("--range takes the range of the accelerometer in g, then of the gyroscope in deg/s")
     found = []
     for part, value in zip(parts, wanted, strict=False):
         sensor_config = sensor[part]

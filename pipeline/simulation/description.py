@@ -111,7 +111,7 @@ class UnitDescription:
         _refuse_unknown(self.table_log, {f.name for f in fields(TableLog)}, "table_log")
         log = self.log.kind
         if log != "rows" and self.format != "csv":
-            raise ConfigurationError(f"unit {self.unit}: a table_log of its own is written in csv only")
+            raise ConfigurationError(f"unit {self.unit}: a separate table_log is written in csv only")
         if log != "rows" and self.procedure not in TABLE_PROCEDURES:
             raise ConfigurationError(f"unit {self.unit}: procedure {self.procedure} has no table to log")
         if log == PROGRAM and self.procedure == ONE_RECORDING:
@@ -165,7 +165,7 @@ def description_from(data: dict[str, Any], origin: str) -> Description:
         units += _units_of_entry(merged)
     names = [u.unit for u in units]
     if not names or len(set(names)) < len(names):
-        raise ConfigurationError(f"{origin}: there must be at least one unit, and each needs a name of its own")
+        raise ConfigurationError(f"{origin}: there must be at least one unit, and each needs a unique name")
     variants = tuple(data.get("variants") or ())
     for variant in variants:
         _refuse_unknown(variant, {"suffix", "columns"}, f"{origin}: variants")
@@ -230,10 +230,10 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--sensor", metavar="NAME", help="configs/sensor (mpu6050)")
     add("--table", metavar="NAME", help="configs/table (acutronic; hand for procedures without a table)")
     add("--procedure", metavar="NAME", help="configs/procedure (three_axis_turns)")
-    add("--samples", type=int, metavar="N", help="about so many rows a unit: dwells, rests, held-out motion follow")
+    add("--samples", type=int, metavar="N", help="approximate rows of a unit; scales rests and held-out motion")
     add("--interval", dest="interval_s", type=float, metavar="S", help="sampling interval in s (0.12)")
     add("--table-log", choices=KINDS, help="where the table is logged: in the sensor's rows (the default), in a file "
-        "with a clock of its own, or not at all: then its program is known")  # fmt: skip
+        "with a separate clock, or not at all: then its program is known")  # fmt: skip
     add("--lost", type=float, metavar="SHARE", help="share of the samples that the radio link loses (0)")
     add = parser.add_argument_group("how the procedure is run").add_argument
     add("--dwell", dest="dwell_s", type=float, metavar="S", help="rest at each stop (1; without a table 4)")

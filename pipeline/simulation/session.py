@@ -342,7 +342,7 @@ def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
             if found.setdefault(columns_of(unit)["procedure"], text) != text:
                 raise ConfigurationError(
                     f"unit {unit.unit}: its table follows another program than those of the units before; simulate it "
-                    "as a campaign of its own"
+                    "as a separate campaign"
                 )
     return found
 

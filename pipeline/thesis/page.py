@@ -234,8 +234,8 @@ def _speed(rows: pd.DataFrame) -> Figure:
             low, high = (v / 1000.0 for v in mean.interval)
             points.append(Point(rate, mean.value / 1000.0, interval=(low, high), x=float(rate), series=name))
     caption = (
-        "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter is on the turns and on "
-        "the held-out motion, so without one more noise is left there; how an error grows with the rate is its own."
+        "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter also acts on the "
+        "held-out motion, so the level without filter contains more noise: compare how the errors grow with the rate."
     )
     finding = "With the filter's gain the error grows at 30 deg/s, and more where it runs twice"
     figure = Figure("speed", finding, caption, _legend(FILTERS.values()))

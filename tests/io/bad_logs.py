@@ -265,7 +265,7 @@ def cases() -> dict[str, Case]:
         "18": one(
             whole.replace(b"gyro_y", b"gyro_x"),
             fault="duplicate_column",
-            says="gyro_x_dps stands more than once",
+            says="gyro_x_dps occurs more than once",
             line=1,
         ),
         "19": one(
@@ -344,7 +344,7 @@ def cases() -> dict[str, Case]:
         "30": one(
             whole,
             fault="wrong_rate",
-            says="the median interval is 10 us, .* asks for 10000 us; .* a thousand times longer",
+            says="the median interval is 10 us, .* expects 10000 us; .* a thousand times longer",
             settings={"csv/columns/time/unit": "ms", "checks/rate_hz": 100.0},
         ),
         "31": one(times(unix), fault="coarse_time", says="256 ns apart", settings={"csv/columns/time/unit": "ns"}),

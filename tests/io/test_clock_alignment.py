@@ -101,7 +101,7 @@ def test_rows_that_the_tables_log_does_not_cover_are_left_out_and_noted() -> Non
 def test_equal_steps_of_which_the_log_lacks_some_are_refused() -> None:
     recordings, _ = beside_a_table(0)
     log = recordings["accel_x_table"]
-    with pytest.raises(IngestError, match="let it cover the whole recording"):
+    with pytest.raises(IngestError, match="log the table during the whole recording"):
         align(as_table(recordings["accel_x"]), as_table(log.select(slice(log.samples // 4, None))))
 
 

@@ -169,7 +169,7 @@ def test_columns_are_found_by_name_in_any_order_and_others_are_noted(tmp_path: P
     assert read.gyroscope[0].tolist() == [4.0, 5.0, 6.0]
     order = "gyro_z_dps, gyro_y_dps, gyro_x_dps, accel_z_g, accel_y_g, accel_x_g"
     assert [(n.code, n.count, n.detail) for n in read.notes] == [
-        ("N-ORDER", 6, f"axes stand in the order {order} and were taken by their names"),
+        ("N-ORDER", 6, f"axes are in the order {order} and were assigned by their names"),
         ("N-IGNORED", 1, "columns not used: comment"),
     ]
 

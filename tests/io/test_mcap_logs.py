@@ -253,7 +253,7 @@ def test_chunk_that_claims_to_be_huge_is_refused_before_it_is_unpacked(tmp_path:
     ("lost", "message"),
     [
         (0, r"messages of channel 1, which no record before them defines: a part is missing"),
-        (1, r"the summary lists \d+ chunks, and the file holds \d+ where it may look for them: a part is missing"),
+        (1, r"the summary lists \d+ chunks, and the file holds \d+ at the stated places: a part is missing"),
     ],
 )
 def test_lost_chunk_is_missed_by_the_summary(tmp_path: Path, lost: int, message: str) -> None:

@@ -273,7 +273,7 @@ def test_arrays_of_several_lengths_are_topics_by_their_first_array(tmp_path: Pat
         "/gyr": {"time": {"field": "gyr_t", "unit": "us"}, **gyro},
     }
     assert read(path, "array_file", topics=topics, sensor_clock="own").values["gyro_z"].shape == (293,)
-    with pytest.raises(IngestError, match="both sensors have to bear the same stamps, and the gyroscope has its own"):
+    with pytest.raises(IngestError, match="both sensors need the same stamps, and the gyroscope has others"):
         read(path, "array_file", topics=topics)
-    with pytest.raises(IngestError, match="has no times of a recorder"):
+    with pytest.raises(IngestError, match="has no recorder's times"):
         read(path, "array_file", topics={"/table": axes}, time_source="log_time")

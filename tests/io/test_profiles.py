@@ -110,7 +110,7 @@ def test_parts_that_do_not_suit_the_procedure_are_refused() -> None:
         (
             1,
             {"columns": {c: {"column": 0, "unit": u} for c, u in (("time", "s"), ("accel_x", "g"))}},
-            "accel_x stands in two parts",
+            "accel_x is in two parts",
         ),
     ],
 )

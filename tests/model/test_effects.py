@@ -64,7 +64,7 @@ def test_temperature_effects_vanish_at_25_degrees() -> None:
 
 
 def test_an_effect_of_temperature_says_so_where_the_recording_holds_none() -> None:
-    with pytest.raises(InputError, match="looks at the temperature, but the recording turn holds none"):
+    with pytest.raises(InputError, match="depends on the temperature, but the recording turn holds none"):
         effect("bias_temperature").reading("gyroscope", reference_motion(turn()), ONE, np.ones(3))
 
 

@@ -96,7 +96,7 @@ def test_what_is_no_formula_is_refused_with_its_place(
     [
         ("cos(5 * radian(angle))", r"position 9: no function is called 'radian'; functions: sin, .*; signals: u, fx"),
         ("2 * temprature", r"position 5: no signal is called 'temprature'; signals: u, .*; functions: sin"),
-        ("fx^2", r"position 3: '\^' has no place in a formula; write \*\* for a power"),
+        ("fx^2", r"position 3: '\^' is not allowed in a formula; write \*\* for a power"),
         ("maximum(fx)", r"position 1: maximum takes 2 values in brackets"),
         ("fx ** fy", r"position 7: an exponent is a number from -20 to 20"),
     ],

@@ -140,7 +140,9 @@ def test_a_formula_without_a_value_names_effect_and_recording(
 
 def test_a_missing_temperature_is_named(motions: list[Motion]) -> None:
     made = effect_from(own("mine", "accelerometer", {"a": "temperature"}), "mine.yaml")
-    with pytest.raises(InputError, match="effect mine looks at the temperature, but the recording accel_x holds none"):
+    with pytest.raises(
+        InputError, match="effect mine depends on the temperature, but the recording accel_x holds none"
+    ):
         made.reading("accelerometer", replace(motions[0], temperature=None), K["accelerometer"], np.ones(3))
 
 
@@ -175,7 +177,7 @@ WRONG = {
     ],
     "owner: table": [
         ("owner: bench", 2, "owner: one of 'sensor', 'recording', 'mounting' or 'table' is expected, not"),
-        ("owner: sensor", 6, "owner is sensor, but angle is the table's"),
+        ("owner: sensor", 6, "owner is sensor, but field logs do not have angle"),
     ],
     "sensors: [gyroscope]": [
         ("sensors: gyroscope", 3, "a list of some of accelerometer, gyroscope"),
@@ -190,7 +192,7 @@ WRONG = {
     ],
     '  A: {formula: "cos(5 * radians(angle))", unit: deg/s}': [
         ('  A: {formula: "cos(5 * radians(angel))", unit: deg/s}', 6, "position 17: no signal is called 'angel'"),
-        ("  A: {formula: \"__import__('os')\", unit: deg/s}", 6, "has no place in a formula"),
+        ("  A: {formula: \"__import__('os')\", unit: deg/s}", 6, "is not allowed in a formula"),
         ('  A: {formula: "cos(angle)"}', 6, "unit is missing"),
         ('  A: {formula: "cos(angle)", unit: 3}', 6, "a text of 1 to 30 characters"),
         ('  A: {formula: "cos(angle)", unit: deg/s, size: 3}', 6, "unknown key"),
@@ -252,7 +254,7 @@ def test_registered_effects_stand_beside_the_built_in_ones_and_never_for_one() -
     register_user_effects({"formulas": [read(GEAR)]})
     assert list(catalogue()) == [*built_in(), "gear_mesh"]
     assert effect("gear_mesh").definition == read(GEAR)
-    with pytest.raises(ConfigurationError, match="a built-in effect is called so"):
+    with pytest.raises(ConfigurationError, match="a built-in effect has this name"):
         register(effect("warm_up"))
 
 
@@ -293,7 +295,7 @@ def test_two_calibrations_keep_their_own_formulas_of_one_name() -> None:
 
 def test_a_calibration_with_a_harmful_definition_is_refused(tmp_path: Path) -> None:
     file = written(tmp_path, calibration(own("loose_part", "accelerometer", {"d": "__import__('os')"})))
-    with pytest.raises(ConfigurationError, match="has no place in a formula") as caught:
+    with pytest.raises(ConfigurationError, match="is not allowed in a formula") as caught:
         load_calibration(file)
     assert caught.value.file == str(file)
 

@@ -249,7 +249,7 @@ def test_descriptions_are_refused_where_they_are_wrong(tmp_path: Path) -> None:
         ({"unit": []}, "unit is not known"),
         ({"units": []}, "at least one unit"),
         ({"units": [{"sensor": "mpu6050"}]}, "a unit has no name"),
-        ({"units": [{"unit": "A"}, {"unit": "A"}]}, "a name of its own"),
+        ({"units": [{"unit": "A"}, {"unit": "A"}]}, "a unique name"),
         ({"units": [{"unit": "A", "speed": 1}]}, "unit A: speed is not known"),
     ):
         with pytest.raises(ConfigurationError, match=message):

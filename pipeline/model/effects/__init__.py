@@ -83,7 +83,7 @@ def register(effect: Effect) -> None:
     Raises ``ConfigurationError`` if a built-in effect has that name.
     """
     if effect.name in built_in_files():
-        raise ConfigurationError(f"effect {effect.name}: a built-in effect is called so; give yours another name")
+        raise ConfigurationError(f"effect {effect.name}: a built-in effect has this name; choose another name")
     _registered[effect.name] = effect
 
 
@@ -221,7 +221,7 @@ def effect_from(
         return made
     if declared.name in built_in_files():
         place = f"{where}:{line}" if (line := lines().get(("name",))) else where
-        raise ConfigurationError(f"name: a built-in effect is called {declared.name}; give yours another name", place)
+        raise ConfigurationError(f"name: a built-in effect is called {declared.name}; choose another name", place)
     with_source = replace(declared, source=declared.source or f"the user's own, {where}")
     source = {**definition, "sensors": list(declared.sensors)}
     return FormulaEffect(with_source, source | ({"axes": list(declared.axes)} if "axes" in definition else {}))
@@ -280,7 +280,7 @@ def _problem_of(found: object, name: str) -> str:
     if found.name != name:
         return f"its EFFECT is called {found.name!r}; give it the file's name, {name}"
     if found.name in built_in_files():
-        return f"a built-in effect is called {found.name}; give yours another name"
+        return f"a built-in effect is called {found.name}; choose another name"
     return ""
 
 

@@ -235,7 +235,7 @@ def _check_consistency(declared: Declaration) -> None:
     names = [n for term in terms for _, n in declared.coefficients(term)]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
-        raise WrongValueError(f"two coefficients would be called {twice[0]}; name the terms otherwise", "terms")
+        raise WrongValueError(f"two coefficients would be called {twice[0]}; rename a term", "terms")
     if declared.limits and set(declared.limits) != set(terms):
         raise WrongValueError(f"a limit for each term is expected ({', '.join(terms)}), or none at all", "limits")
     for name, size in declared.limits.items():
@@ -255,7 +255,7 @@ def _wrong_term(declared: Declaration, name: str, term: Term) -> str:
     not_in_a_log = sorted(s for s in term.signals if not SIGNALS[s].c)
     if declared.owner == Owner.SENSOR and not_in_a_log:
         found = " and ".join(not_in_a_log)
-        return f"owner is sensor, but {found} is the table's and no field log holds it; write owner: table"
+        return f"owner is sensor, but field logs do not have {found}; write owner: table"
     if term.shared and "*" in name:
         return "a vector has one coefficient: its name has no star"
     if declared.adds_to == "truth" and not term.shared:

@@ -139,8 +139,8 @@ class FormulaEffect(DeclaredEffect):
         if name in OF_THE_TURN:
             return None
         raise InputError(
-            f"effect {self.name} looks at the {name}, but the recording{_of(motion, '')} holds none; "
-            "record one, or take the effect out of the configuration"
+            f"effect {self.name} depends on the {name}, but the recording{_of(motion, '')} holds none; "
+            "record it, or remove the effect from the configuration"
         )
 
     def _check_finite(self, signals: dict[str, Any], motion: Motion) -> None:
