@@ -1,4 +1,4 @@
-"""The effects that a fit can hold: which are possible, plausible and available, and where their parameters start."""
+"""Select the effects that a fit can include: possible, plausible and available; and the start of their parameters."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def parameter_names(sensor: str, effects: Sequence[Effect]) -> list[str]:
 
 
 def configured_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
-    """Return the effects in the model: those of the bench, and those that are listed."""
+    """Return the effects in the model: effects of the bench, and listed effects."""
     wanted = settings["effects"][sensor]
     listed = [] if wanted == AUTO else list(wanted)
     return [*(name for name in bench_effects(sensor, settings, recordings) if name not in listed), *listed]
 
 
 def bench_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
-    """Return the effects of the bench: those that the table's config states, and zeros that were found."""
+    """Return the effects of the bench: errors that the table's config states, and found zeros of the angle."""
     table = settings["table"]
     stated = stated_priors(table) if table.get("motion") != "none" else {}
     own_clocks = not all(recording.clock_shared for recording in recordings)
@@ -103,7 +103,7 @@ def turns_of(observations: Observations) -> dict[str, str]:
 def prior_of(
     this: Effect, observed: Observations, accelerometer: SensorCalibration | None, beside: Sequence[str] = ()
 ) -> NormalPrior | None:
-    """Return what is known of an effect of the bench before the fit; None for other effects.
+    """Return the prior of an effect of the bench; None for other effects.
 
     Each parameter is ``N(0, s^2)``, s as the table's config states it. For the rotations of the unit, where the
     accelerometer was fitted with them, its estimate: both sensors share the frame of the mean of the mountings. For the
@@ -140,11 +140,11 @@ def prior_of(
 
 
 def tilt_like_zeros(motions: Sequence[Motion], beside: Sequence[str]) -> Values | None:
-    """Return the direction, of (d_x, d_y), in which a tilt is the same as a rotation of the unit in every turn.
+    """Return the direction of (d_x, d_y) in which a tilt is equivalent to a rotation of the unit in every turn.
 
-    It is the direction of the shaft, where one level shaft makes all turns and each has a mounting or a zero of its
-    own: readings do not determine this part of the tilt, whose prior is the table's levelling, or which is held at 0.
-    None: readings determine both parts.
+    It is the direction of the shaft, if one level shaft makes all turns and each has a separate mounting or zero. The
+    readings do not determine this part of the tilt: its prior is the table's levelling, or it is fixed at 0. None:
+    readings determine both parts.
     """
     owner = next((effect(name) for name in (MOUNTING, ZERO) if name in beside), None)
     if owner is None or any(m.axis is None or m.level is None for m in motions):
@@ -157,7 +157,7 @@ def tilt_like_zeros(motions: Sequence[Motion], beside: Sequence[str]) -> Values 
 
 
 def is_held(name: str, parameter: Mapping[str, Any]) -> bool:
-    """Return whether a parameter is a tilt that was held at 0, by its ``value, standard_uncertainty``."""
+    """Return whether a parameter is a tilt that was fixed at 0, by its ``value, standard_uncertainty``."""
     u = parameter.get("standard_uncertainty") or 0.0
     is_tilt = name.rpartition(".")[2] in TILTS and parameter.get("unit") == "deg"
     return is_tilt and u < 10.0 * HELD_DEG and abs(parameter["value"]) < 0.01 * HELD_DEG
@@ -175,7 +175,7 @@ def limits_of(sensor: str, sensor_config: Mapping[str, Any]) -> dict[str, Values
 
 
 def candidates_for(observations: Observations, configured: Sequence[str]) -> list[Effect]:
-    """Return the effects that could be missing and whose needs the recordings meet."""
+    """Return the effects that could be missing in the model and that the recordings can show."""
     found = []
     recordings = turns_of(observations)
     for name, listed in catalogue().items():
@@ -198,10 +198,7 @@ def candidates_for(observations: Observations, configured: Sequence[str]) -> lis
 
 
 def require_available(observations: Observations, names: Sequence[str]) -> None:
-    """Refuse effects whose needs the recordings do not meet.
-
-    Raises ``NotObservableError`` naming the effect and what to record.
-    """
+    """Raise ``NotObservableError``, with advice, for an effect that needs signals which the recordings lack."""
     setups = {part.motion.setup for part in observations.parts}
     for own in OWN:
         if setups <= {name.partition("@")[2] for name in names if name.startswith(f"{own}@")}:
@@ -230,7 +227,7 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
 def time_constants(
     this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None, *, between: bool = True
 ) -> list[tuple[Term, float]]:
-    """Return an effect at some time constants or widths, with log weights of their prior; the fitted one first.
+    """Return an effect at several time constants or widths, with log weights of their prior; the fitted one first.
 
     ``between``: whether there is one between each two of the effect's starts, in equal ratios.
     ``width``: standard uncertainty of the fitted value's logarithm; None: as wide as the steps between the others.

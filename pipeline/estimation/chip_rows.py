@@ -1,7 +1,8 @@
-"""The chips of a board, and rows of their readings at the same times, from which ``chips`` estimates how they sit.
+"""Compute rows of the readings of two chips of a board at the same times, from which ``chips`` estimates the mounting.
 
 A row is a mean over 0.1 s of calibrated specific force f, g, and rate w, deg/s, of their derivatives by a quintic
-spline, and of omega omega^T. Left out are samples without a reading, and those between which the rate changes too fast.
+spline, and of omega omega^T. Samples without a reading, and samples between which the rate changes too fast, are not
+used.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class Shared:
 
 
 def shared(reference: Chip, other: Chip, sensors: Sequence[str]) -> list[Shared]:
-    """Return the recordings of the same name that overlap in time and hold all sensors."""
+    """Return the recordings of the same name that overlap in time and have all sensors."""
     found = []
     for recording in reference.recordings:
         twin = next((r for r in other.recordings if r.name == recording.name), None)
@@ -97,7 +98,7 @@ def shared(reference: Chip, other: Chip, sensors: Sequence[str]) -> list[Shared]
 
 
 def _truth(chip: Chip, recording: Recording, sensors: Sequence[str]) -> tuple[Means, Mask]:
-    """Return what the readings of a chip say is true, and which samples are valid."""
+    """Return the calibrated readings of a chip, and which samples are valid."""
     readings = {s: np.asarray(recording.reading(s)) for s in sensors}
     valid = recording.valid & np.all([np.isfinite(v).all(axis=1) for v in readings.values()], axis=0)
     given: dict[str, Any] = {s: np.where(valid[:, None], v, 0.0) for s, v in readings.items()}
@@ -125,7 +126,7 @@ def rows_of(
 
 
 def _followed(rate: Values) -> Mask:
-    """Return at which samples the sampling follows the motion, by the fourth difference: (n,) array of bool."""
+    """Return at which samples the sampling is fast enough for the motion, by the fourth difference: (n,) array."""
     if len(rate) < 2 * EDGE + 1:
         return np.zeros(len(rate), bool)
     fourth = np.abs(np.diff(rate, 4, axis=0))
@@ -168,9 +169,9 @@ def joined(pairs: Sequence[tuple[Means, Means]]) -> tuple[Means, Means]:
 
 
 def clear_of(a: Means, b: Means, R: Values) -> dict[str, Values]:
-    """Return where components exceed their noise, as 0 and 1: rows of noise tell nothing.
+    """Return where components exceed their noise, as 0 and 1; rows of noise alone are not used.
 
-    Of the specific force it is the deviation from its mean, as a bias passes for the mean.
+    For the specific force the deviation from its mean is used, because a bias cannot be distinguished from the mean.
     """
     found = {}
     for name in set(a) & {*SENSORS, *(f"{s}'" for s in SENSORS)}:
@@ -193,7 +194,7 @@ def lever(turn: Values, alpha: Values) -> Values:
 
 
 def columns_of(sensor: str, x: Means) -> list[tuple[str, Values]]:
-    """Return the columns of a sensor's fit by the signals of one chip: kind and (n, 3, p) array."""
+    """Return the columns of a sensor's fit from the signals of one chip: kind and (n, 3, p) array."""
     n = len(x["time"])
     columns = [("rotation", -skew(x[sensor]))]
     if sensor == "accelerometer" and "turn" in x:

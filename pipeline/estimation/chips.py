@@ -1,17 +1,19 @@
-"""How the chips of one board sit to each other: rotation, lever arm and time offset, from readings at the same times.
+"""Estimate rotation, lever arm and time offset between the chips of one board, from readings at the same times.
 
     w_b = R (w_a + alpha tau_w) + d_w
     f_b = R (f_a + [omega x (omega x r) + alpha x r] / 9.80665 + f' tau_f) + d_f
 
 a is the reference chip, b another one: calibrated specific force f, g, and angular rate w, deg/s (omega in rad/s). R
-rotates vectors of a into the axes of b, r, m, is the place of b in the axes of a, a reading of b at t shows the motion
-at t + tau, and d are differences of the biases. Rows are means over 0.1 s. The noise of one chip is independent of that
-of the other, so the signals of b are instruments for those of a: regressors with noise bias nothing (Durbin, Rev. Inst.
-Int. Stat. 22, 1954, 23).
-Accelerometers and gyroscopes each give R; the result is their best linear combination. More than two chips: with the
-same regressors in each pair, pairs with the reference chip alone give the joint estimate (Zellner, JASA 57, 1962, 348).
+rotates vectors of a into the axes of b; r, m, is the position of b in the axes of a; a reading of b at t shows the
+motion at t + tau; d are differences of the biases. Rows are means over 0.1 s. The noise of the two chips is
+independent, so that the signals of b are instrumental variables for the signals of a: the noise of the regressors
+causes no bias (Durbin, Rev. Inst. Int. Stat. 22, 1954, 23).
 
-Errors of both calibrations act on the readings. Those that the table causes are the same rotation, shear and scale of
+Accelerometers and gyroscopes each give R; the result is their best linear combination. With more than two chips, each
+pair has the same regressors, so that the pairs with the reference chip give the joint estimate (Zellner, JASA 57, 1962,
+348).
+
+Errors of both calibrations change the readings. Errors that the table causes are the same rotation, shear and scale of
 both chips, so that they cancel as far as the chips' axes agree.
 """
 
@@ -70,7 +72,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Error:
-    """One source of error: its covariance (k, k), and what it does to the fits (q, k) and to the chips' axes (3, k)."""
+    """One source of error: its covariance (k, k), and its effect on the fits (q, k) and on the chips' axes (3, k)."""
 
     source: str
     kind: str
@@ -102,7 +104,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Found:
-    """What two chips' readings tell: rotation, estimate, fits, which rows are in motion, and the held-out rows."""
+    """The result for two chips: rotation, estimate, fits, which rows are in motion, and the held-out rows."""
 
     R: Values
     estimate: Estimate
@@ -112,7 +114,7 @@ class Found:
 
 
 def place_of(reference: Chip, other: Chip) -> Found:
-    """Return how a chip sits to the reference chip of its board.
+    """Return the mounting of a chip relative to the reference chip of its board.
 
     Raises ``NotObservableError`` if the chips share no calibrated sensor, or too little time.
     """
@@ -258,7 +260,7 @@ def _change(  # noqa: PLR0917  (as above)
     clear: Mapping[str, Values],
     who: Sequence[int],
 ) -> Values:
-    """Return the change of what a fit explains, (n, 3), by wrong truths of a sensor of one chip, or of both."""
+    """Return the change of a fit's readings, (n, 3), by errors of the truth of a sensor of one chip, or of both."""
     a, b = signals
     change = np.zeros_like(fit.residual)
     if of == fit.sensor:
@@ -305,10 +307,10 @@ def _axes_change(chips: Sequence[Chip], R: Values, E: Values, who: Sequence[int]
 
 
 def _combined(fits: Sequence[Fit], errors: Sequence[Error], *, on_table: bool) -> Estimate:
-    """Return the best linear estimate by both sensors: one rotation, all other parameters of their own.
+    """Return the best linear estimate by both sensors: one common rotation, and all other parameters.
 
-    By hand the axes of a gyroscope are found by those of its accelerometer, so that the errors of both rotations are
-    correlated. There the gyroscopes' rotation counts only in directions that the accelerometers hardly show.
+    By hand the axes of a gyroscope are determined by those of its accelerometer, so that the errors of both rotations
+    are correlated. So the gyroscopes' rotation is used only in directions that the accelerometers hardly show.
     """
     names, values, columns = [f"rotation_{a}" for a in AXES], [], []
     for fit in fits:

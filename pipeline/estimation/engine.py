@@ -1,24 +1,24 @@
-"""From the residuals of a fit to the uncertainty of its estimate: one rule for every fit.
+"""Compute the uncertainty of an estimate from the residuals of its fit, in the same way for every fit.
 
 Every fit is linear in the readings near its solution, ``d beta = sum over channels c of J_c A_c dy_c`` (``LinearMap``).
 Under one hypothesis about the noise (``pipeline.estimation.gauss_markov``) the estimate has the covariance
 
     V = sum_c s_c^2 J_c (A_c diag(1/n) A_c^T + q a_c B(tau) a_c^T) J_c^T
 
-where ``a`` holds the columns of A summed over each block, and n the samples of each row. One calibration does not
+where ``a`` has the columns of A summed over each block, and n the samples of each row. One calibration does not
 determine q and tau well. So each hypothesis of the prior's grid has the weight of its restricted likelihood times its
-prior (Patterson & Thompson, Biometrika 58, 1971), and the error of a parameter is distributed as a mixture over all of
-them (``Posterior``). The mixture is stated as a scaled Student's t that holds as much of it within one and within two
-standard uncertainties:
+prior (Patterson & Thompson, Biometrika 58, 1971), and the error of a parameter is distributed as a mixture over all
+hypotheses (``Posterior``). The mixture is approximated by a scaled Student's t with the same probabilities within one
+and within two standard uncertainties:
 
     P(|e| < x) = sum_i p_i (2 Phi(x / sigma_i) - 1),    x_P: P(|e| < x_P) = P
     t_95(nu) / t_68(nu) = x_95 / x_68,    u = x_95 / t_95(nu)
 
-A match of variance and kurtosis fails where "no bias instability" has nine tenths of the weight: a large one of little
-weight then decides both, and neither end of the interval.
+To match variance and kurtosis instead fails if the hypothesis without bias instability has nine tenths of the weight: a
+hypothesis with a large instability and little weight then determines both, but not the ends of the interval.
 
-Stated accuracies of the bench (type B) act through the same map. They are nuisance parameters with a normal prior that
-the estimator does not fit (consider parameters; Schmidt 1966), and so add ``J A Z diag(u^2) Z^T A^T J^T`` once.
+Stated accuracies of the bench (type B) are propagated by the same map. They are nuisance parameters with a normal prior
+that the estimator does not fit (consider parameters; Schmidt 1966), and add ``J A Z diag(u^2) Z^T A^T J^T``.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it d
 
 @dataclass(frozen=True)
 class LinearMap:
-    """What small changes of the readings do to the parameters of a solved fit."""
+    """The linear map from small changes of the readings to the parameters of a solved fit."""
 
     # each (q, n): A, weights of the readings of a channel in what is fitted of it; may be one array for all
     weights: tuple[Values, Values, Values]
@@ -156,7 +156,7 @@ def root_of(covariance: Values) -> Values:
 
 
 def _within(weight: Values, sigma: Values, probability: float) -> Values:
-    """Return what so much of each mixture lies within, both signs: (p,) array.
+    """Return the bound of the absolute value that each mixture is within with ``probability``: (p,) array.
 
     The probability is concave in x, so that Newton's method from below stays below.
     """
@@ -272,8 +272,8 @@ def assess_noise(
 ) -> ResidualNoise:
     """Weight the hypotheses of a prior by the residuals of a fit, one sample a row.
 
-    Where the table's stated accuracies are worse than the noise, the residuals show its errors, which have lines of
-    their own in the budget. Then the directions in which these exceed white noise are projected out of all channels.
+    Where the table's stated accuracies are worse than the noise, the residuals contain its errors, which have separate
+    lines in the budget. Then the directions in which these exceed white noise are projected out of all channels.
 
     ``residuals``: (n, 3). ``design``: (n, p), columns that were fitted; those of one channel may be more than its own.
     ``disturbance``: (3 m, 3 m), covariance that the table's stated errors give the sums over the blocks, channel by
@@ -312,7 +312,7 @@ def noise_beside(  # noqa: PLR0917  (what a restricted likelihood beside known e
     disturbance: Values,
     row_weight: Values | None = None,
 ) -> ResidualNoise:
-    """Weight hypotheses about the noise by the residuals' block means in the directions that known errors leave free.
+    """Weight hypotheses about the noise by the residuals' block means, in directions without known errors.
 
     ``columns``: (3, m, p), those that were fitted, in means times ``sqrt(samples) / white``, over the norm of the
     samples. ``means``: (m, 3). ``white``: (3,), noise of a sample. ``disturbance``: see ``assess_noise``; directions in

@@ -1,4 +1,4 @@
-"""White noise plus a Gauss-Markov bias: the noise model of every fit, with likelihoods in O(n).
+"""The noise model of every fit, white noise plus a Gauss-Markov bias, with likelihoods in O(n).
 
 The readings of a channel are cut into m blocks of consecutive samples. Their means have the covariance
 
@@ -68,7 +68,7 @@ WHITE = Setting(0.0, 1.0)
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the bias instability before the residuals are seen."""
+    """The prior of the bias instability."""
 
     wander: float = 0.0  # unit of the sensor; its standard deviation; 0 where nothing is known
     time: float = DEFAULT_TIME_S  # s; its correlation time
@@ -107,8 +107,8 @@ def selection_grid(
 ) -> list[Setting]:
     """Return the hypotheses over which the likelihoods of models are maximised.
 
-    A static recording pins them: its ratio, its half, double and fourfold with a log-normal weight, and random walks
-    that look alike over the recording and keep growing after it. Otherwise they span the sensors of the field.
+    With a static recording they are its ratio, the half, double and fourfold of it with a log-normal weight, and random
+    walks that cannot be distinguished in the recording and grow after it. Otherwise they cover the usual sensors.
     """
     pinned = noise is not None and noise.source == "static" and not fast(noise)
     if noise is not None and pinned and np.any(noise.wander > 0) and np.all(noise.white > 0):
@@ -135,7 +135,7 @@ def random_walks(settings: Iterable[Setting]) -> dict[Setting, Setting]:
 
 
 def fast(noise: Noise | None) -> bool:
-    """Return whether a static recording shows noise correlated over seconds: it then counts as fewer samples."""
+    """Return whether a static recording shows noise correlated over seconds: fewer samples are then independent."""
     return noise is not None and noise.source == "static" and noise.correlation_time < FAST_S
 
 
@@ -151,7 +151,7 @@ def information(noise: Noise | None, interval: float) -> float:
 
 
 def steady_s(noise: Noise | None, interval: float) -> float:
-    """Return how long a bias may be taken as constant, s: L with ``2 q L^2 / (pi^2 tau) = SLOW dt``.
+    """Return the time over which a bias is assumed constant, s: L with ``2 q L^2 / (pi^2 tau) = SLOW dt``.
 
     At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is ``SLOW`` times that of white noise, dt.
     Above, white noise hides it. Without a static recording that shows slow wander, there is no bound. ``interval``:
@@ -201,7 +201,7 @@ class Blocks:
 
     @classmethod
     def of_rows(cls, rows: Sequence[tuple[Values, Values]], clocks: Sequence[int], length: float) -> Blocks:
-        """Return stretches of time in which the bias is taken as constant, new ones for each recording.
+        """Return stretches of time in which the bias is assumed constant, separate for each recording.
 
         ``rows``: times (n,), s, and samples (n,) of the rows of each recording. ``clocks``: of each recording.
         ``length``: s.
@@ -293,7 +293,7 @@ class GaussMarkov:
         return found
 
     def restricted(self, design: Values, values: Values) -> tuple[Values, Values]:
-        """Return the terms of the restricted likelihood of (m, c) values beside the columns of a design.
+        """Return the terms of the restricted likelihood of (m, c) values given the columns of a design.
 
         ``design``: (m, p), of full rank, see ``orthonormal``. ``values``: (m, c). Returns ``log_determinant`` (g,):
         ``log det C + log det(X^T C^-1 X)``; ``squares`` (g, c): ``y^T P y``, the weighted sum of squared residuals of

@@ -1,14 +1,15 @@
-"""The lot of a unit as a prior of its parameters: estimated from the other units, applied after the fits.
+"""Estimate a prior of a unit's parameters from the other units of its lot, and apply it after the fits.
 
     x_i = theta_i + b + e_i,    cov(e_i) = A_i,    theta_i ~ N(mu, diag(tau^2)) within a lot
     theta_i = x_i - G (x_i - m),    G = A_i (A_i + V)^-1,    cov = (1 - G) A_i (1 - G)^T + G V G^T + cov(b)
 
-x_i is the published estimate of unit i, A_i its covariance by its own noise. b is the error of the table, which the
-units of a lot share: m contains it as x_i does, so that no G reduces it, and cov(b) is added as it is. Where b is not
-shared, the spread of the estimates contains it, and the result is wider than necessary (docs/uncertainty.md).
-m and V (diagonal) are mean and variance of the prediction of a further unit from its siblings, the unit itself left
-out: mu and tau have flat densities (Gelman, Bayesian Analysis 1 (2006) 515), mu is integrated out in closed form and
-tau on a grid. The degrees of freedom of V are those of Student's t with the kurtosis of the prediction.
+x_i is the published estimate of unit i, A_i its covariance by the noise of the unit. b is the error of the table, which
+the units of a lot share: both m and x_i contain it, so that no G reduces it, and cov(b) is added. If b is not shared,
+the spread of the estimates contains it, and the result is wider than necessary (docs/uncertainty.md).
+
+m and V (diagonal) are mean and variance of the prediction of a unit from the other units of the lot, its siblings. mu
+and tau have flat densities (Gelman, Bayesian Analysis 1 (2006) 515); mu is integrated in closed form, tau on a grid.
+The degrees of freedom of V are those of Student's t with the kurtosis of the prediction.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ ROUNDS = 20  # at most, until the siblings stay the same; two sets that alternat
 
 
 class Prediction(NamedTuple):
-    """Mean, variance and degrees of freedom of parameters as their siblings predict them: (p,) or (n, p) arrays."""
+    """Mean, variance and degrees of freedom of parameters, predicted from siblings: (p,) or (n, p) arrays."""
 
     mean: Values
     variance: Values
@@ -60,7 +61,7 @@ class LotPrior(NamedTuple):
 
 
 class WithPrior(NamedTuple):
-    """An estimate with its prior: values (p,), and what the readings and the lot contribute to its covariance.
+    """An estimate with its prior: values (p,), and the contributions of readings and lot to its covariance.
 
     ``lot_freedom``: (p,), degrees of freedom of the lot's part; ``share``: (p,), of the prior in each value.
     """
@@ -135,12 +136,12 @@ def _given_tau(y: Values, v: Values, siblings: Mask, itself: Index, tau2: Values
 
 
 def _normalized(log: Values) -> Values:
-    """Return what is proportional to exp(log), with the largest of each row 1."""
+    """Return values proportional to exp(log), with a maximum of 1 in each row."""
     return np.asarray(np.exp(log - np.max(log, axis=-1, keepdims=True)))
 
 
 def _tested(x: Values, own: Values, own_freedom: Values, predicted: Prediction) -> tuple[Values, Values]:
-    """Return the deviations of each unit, and the probability of such: the smaller p of two tests, times two.
+    """Return the deviations of each unit, and their probability: the smaller p of two tests, times two.
 
     The largest deviation by Student's t, times the number of parameters; all together by Hotelling's form of F.
     """

@@ -1,17 +1,16 @@
-"""The noise of a sensor at rest, identified: the part ``noise`` of ``calibrations/<unit>.json``.
+"""Identify the noise of a sensor at rest, for the part ``noise`` of ``calibrations/<unit>.json``.
 
 The part states for each axis
 
-- each term of ``noise_terms`` with its 95 % interval; null with a reason and an upper limit where the recording does
-not
-  show it,
+- each term of ``noise_terms`` with its 95 % interval, or null with a reason and an upper limit if the recording does
+  not show it,
 - the sets of terms by probability (``noise_search``),
-- how well the most probable set fits.
+- the quality of the fit of the most probable set.
 
-The readings are those of the static recording before any filter, else those of the rests. A ramp, sinusoids and the
-temperature, where it changed, are regressed out (``noise_regression``).
+The readings are from the static recording before any filter, else from the rests. A ramp, sinusoids and a changing
+temperature are regressed out (``noise_regression``).
 
-A fit is in doubt where the power of its spectrum in bins of frequency departs from the model: the cube root of a
+A fit is in doubt if the power of its spectrum in bins of frequency differs from the model: the cube root of a
 chi-square variable over its degrees of freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty,
 PNAS 17, 1931).
 """
@@ -72,7 +71,7 @@ OF_RESTS = "no static recording: what is slower than a rest is not seen, and in 
 def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
     """Return the noise of each sensor, from its recordings before any filter: see the schema of calibrations.
 
-    Axes whose readings have the same sampling are fitted side by side.
+    Axes whose readings have the same sampling are fitted together.
     """
     found = {sensor: _source(sensor, recordings) for sensor in SENSORS}
     alike: dict[tuple[Any, ...], list[tuple[str, Regression]]] = {}
@@ -95,7 +94,7 @@ def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
 
 
 def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[Stretch]]:
-    """Return what the noise of a sensor is identified from, and its stretches: none, with the reason, or some."""
+    """Return the source of a sensor's noise and its stretches, or no stretches with the reason."""
     known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
     if not known:
@@ -165,7 +164,7 @@ def _rests(sensor: str, recording: Recording) -> list[Stretch]:
 
 
 def _axes(regressions: Sequence[Regression]) -> list[JSON]:
-    """Return the noise of axes of the same sampling, which are fitted side by side."""
+    """Return the noise of axes with the same sampling, which are fitted together."""
     columns = [[r.columns(r.stretches[i]) for r in regressions] for i in range(len(regressions[0].stretches))]
     most = max(values.shape[1] for values in columns[0])  # an axis with fewer sinusoids has columns of zeros
     padded = [np.stack([np.pad(v, ((0, 0), (0, most - v.shape[1]))) for v in of_axes]) for of_axes in columns]
@@ -253,7 +252,7 @@ def _short(values: Values) -> list[float]:
 
 
 def _p_value(spectrum: Spectrum, fit: Fits) -> float:
-    """Return the probability of a spectrum that departs as much from the fit."""
+    """Return the probability of a spectrum that differs from the fit by at least as much."""
     spread = 2.0 / (9.0 * spectrum.count)
     z = (np.cbrt(fit.power[0] / fit.total[0] / spectrum.count) - 1.0 + spread) / np.sqrt(spread)
     return float(scipy.special.chdtrc(max(len(z) - int(np.sum(fit.kinds >= 0)), 1), float(z @ z)))

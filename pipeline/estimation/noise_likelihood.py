@@ -1,14 +1,15 @@
-"""The likelihood of a sum of noise terms (``noise_terms``), from the cosine transform of evenly sampled rest readings.
+"""Compute the likelihood of a sum of noise terms (``noise_terms``) by the cosine transform of evenly sampled readings.
 
 The orthonormal cosine transform (DCT-II) of n samples diagonalises the covariance of white noise plus a random walk of
-unknown start exactly, and that of the other terms up to the ends of the recording. With the coefficients y_k, k > 0,
+unknown start exactly. For the other terms it does so approximately, with errors from the ends of the recording. With
+the coefficients y_k, k > 0,
 
     y_k = sum_d beta_d z_dk + sqrt(S(w_k)) e_k,   w_k = pi k / n,   S = sum_j exp(theta_j) s_j(w)
     -2 log L = sum_k (log S_k + (y_k - z_k beta)^2 / S_k) + log det(sum_k z_k z_k^T / S_k)
 
 where s_j is the spectrum of term j, exp(theta_j) its squared coefficient, e unit white noise, and z the transforms of
-what is deterministic (ramp, sinusoids, temperature). beta follows by generalised least squares, and the last term makes
-the likelihood a restricted one. k = 0 is the mean, which is left out. Sums over the coefficients are formed once, in
+the deterministic columns (ramp, sinusoids, temperature). beta follows by generalised least squares, and the last term
+makes the likelihood a restricted one. k = 0, the mean, is not used. Sums over the coefficients are computed once, in
 bins whose edges have the ratio ``BIN_RATIO``.
 
 A *composition* is a set of terms. Fits of all axes, compositions and columns run together, by Fisher scoring with the
@@ -98,7 +99,7 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True)
 class Fits:
-    """g sums of up to J terms, fitted side by side."""
+    """g sums of up to J terms, fitted together."""
 
     axis: Integers  # (g,)
     kinds: Integers  # (g, J); of ``noise_terms.STOCHASTIC``, -1 for none
@@ -148,12 +149,12 @@ if TYPE_CHECKING:
 
 
 def active(kinds: Integers) -> Mask:
-    """Return which parameters of (g, J) terms there are: (g, 2 J) array."""
+    """Return which parameters (g, J) terms have: (g, 2 J) array."""
     return np.concatenate([kinds >= 0, kinds == MARKOV], axis=1)
 
 
 def at_once(works: Sequence[Work[Result]]) -> Work[list[Result]]:
-    """Yield the trials of several generators together; return their results."""
+    """Join the trials of several generators and yield them; return the results of the generators."""
     results: dict[int, Result] = {}
     replies: dict[int, Reply | None] = dict.fromkeys(range(len(works)))
     while True:

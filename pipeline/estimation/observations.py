@@ -1,14 +1,14 @@
-"""The samples that a fit against a table's motion uses, of every recording of a unit.
+"""Select the samples of every recording of a unit for a fit against a table's motion.
 
-Kept are, where readings and log are valid,
+If readings and log are valid, these are used:
 
-* rests that have settled, as means over at most 1 s: within one the motion does not change, so nothing but white noise
-  is lost, and its sum of squares is kept;
-* samples at which the log follows the motion. Where it is too coarse for a ramp or a step, the angular acceleration,
-  and with it a lever arm or a delay, would be the log's and not the table's; those samples are left out.
+* settled rests, as means over at most 1 s. The motion does not change in a rest, so that only white noise is averaged;
+  its sum of squares is stored.
+* samples at which the log describes the motion. Where the log is too coarse for a ramp or a step, its angular
+  acceleration is wrong, which would bias a lever arm or a delay; such samples are not used.
 
-Where the readings went through a filter, the motion goes through it too, and a gyroscope's samples are left out while
-the filter still holds rates that a log without them does not tell.
+If the readings were filtered, the motion is filtered, too. If the log has no rate, samples of a gyroscope are not used
+while the output of the filter depends on unknown rates.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Observations:
-    """What a fit sees of one sensor."""
+    """The data of one sensor for a fit."""
 
     sensor: str
     parts: tuple[Part, ...]  # in the order of time where the clock is shared
@@ -157,7 +157,7 @@ def _follows(before: Part | None, part: Part) -> bool:
 
 
 def without_rows(observations: Observations, left_out: Sequence[Mask]) -> Observations:
-    """Return observations without the information of some rows, one array a recording; the rows stay."""
+    """Return observations with zero weight for rows, one mask for each recording."""
     parts = []
     for part, out in zip(observations.parts, left_out, strict=True):
         weight = np.where(out, LEFT_OUT, 1.0) * part.weight
@@ -167,16 +167,16 @@ def without_rows(observations: Observations, left_out: Sequence[Mask]) -> Observ
 
 
 def without_each_recording(observations: Observations) -> Iterator[Observations]:
-    """Yield observations without the information of each recording; nothing where there is only one."""
+    """Yield observations with zero weight for each recording in turn; none if there is only one recording."""
     lengths = [len(part.weight) for part in observations.parts]
     for out in range(len(lengths) if len(lengths) > 1 else 0):
         yield without_rows(observations, [np.full(n, k == out) for k, n in enumerate(lengths)])
 
 
 def weighted(observations: Observations, noise: Noise | None) -> Observations:
-    """Return observations whose weights say how much correlated noise leaves of their information.
+    """Return observations with weights reduced for correlated noise.
 
-    Errors of the angle are left aside where noise hides them.
+    Errors of the angle are not considered if they are small against the noise.
     """
     parts, white = [], 0.0 if noise is None else float(np.mean(noise.white))
     for part in observations.parts:
@@ -207,10 +207,10 @@ def _lost_at_stops(part: Part, observations: Observations) -> Values:
 
 
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
-    """Return what a fit sees of one sensor: every recording with its readings and a table's motion.
+    """Return the data of one sensor for a fit: every recording with its readings and a table's motion.
 
-    ``recordings``: those held out are left aside. ``table``: ``gravity_g``, ``latitude_deg``, ``azimuth_deg``, those of
-    ``bench_priors``.
+    ``recordings``: held-out ones are not used. ``table``: ``gravity_g``, ``latitude_deg``, ``azimuth_deg``, and the
+    settings of ``bench_priors``.
     """
     parts = []
     for recording in recordings:
@@ -227,7 +227,7 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
 
 
 def _in_time(part: Part) -> tuple[bool, str, float]:
-    """Return what orders recordings in time, as far as that is known: in all, else in their setup."""
+    """Return a key that orders recordings in time, within the unit or else within their setup."""
     setup = "" if part.clock_shared else part.motion.setup
     return not part.clock_shared, setup, float(part.motion.time[0]) if part.clock_shared or setup else 0.0
 
@@ -300,11 +300,11 @@ def filtered_motion(motion: Motion, recording: Recording) -> Motion:
 
 
 def _filter_settled(motion: Motion, recording: Recording) -> Mask:
-    """Return at which samples the log says what a filtered rate is: (n,) array of bool.
+    """Return at which samples the filtered rate is known from the log: (n,) array of bool.
 
-    Where no rate is logged, that of a sample at which the log does not follow the table is wrong by up to half of the
-    rate's bend there, and a filter holds on to it: where the bends, through the filter's absolute impulse response,
-    leave more than 1e-5 of the largest rate, the sample is left out.
+    If no rate is logged, the rate of a sample at which the log does not describe the motion is wrong by up to half of
+    the rate's bend there, and the filter propagates this error to later samples. A sample is not used if the bends,
+    convolved with the filter's absolute impulse response, exceed 1e-5 of the largest rate.
     """
     sure = reference_valid(motion)
     if (recording.table_rate is not None and motion.axis is not None) or sure.all():

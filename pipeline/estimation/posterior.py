@@ -1,12 +1,12 @@
-"""How sure each effect is: Bayesian model averaging over sets of effects, their sizes and the noise.
+"""Compute the probability of each effect by Bayesian model averaging over sets of effects, their sizes and the noise.
 
-Every effect is in a set with the prior probability ``INCLUSION``; the evidence of a set is that of
-``pipeline.estimation.evidence``, averaged over its scales by the product of their conditionals at the best ones (Chib,
-JASA 90, 1995). Sets are found by a beam, then by exchange of each member.
+Every effect is in a set with the prior probability ``INCLUSION``. ``pipeline.estimation.evidence`` gives the evidence
+of a set, which is averaged over its scales by the product of their conditionals at the best scales (Chib, JASA 90,
+1995). Sets are found by a beam search, then by exchange of each member.
 
-An upper limit is the ``BELOW`` quantile of a parameter's absolute value, given that its effect is there, over sets,
-scales and noises, whatever was selected. It is stated where the effect was not found: at the detection size in two of
-three units (26 of 40 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones.
+An upper limit is the ``BELOW`` quantile of a parameter's absolute value, given that its effect is present, over sets,
+scales and noises, whatever was selected. It is stated only for effects that were not selected. At the detection size
+these are two of three units (26 of 40 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones.
 Source: Hoeting et al., Statistical Science 14 (1999), 382-417; conjugate prior of Zellner.
 """
 
@@ -55,25 +55,25 @@ class Found:
 
 @dataclass(frozen=True)
 class Answers:
-    """What the posterior says."""
+    """The results of the posterior."""
 
     sets: list[tuple[tuple[str, ...], float]]  # sets and their probability, the most probable first
     upper_limit: dict[str, Values]  # (k,), of the parameters in which the reading is linear
 
     def probability(self, name: str) -> float:
-        """Return the probability that an effect is there."""
+        """Return the probability that an effect is present."""
         return float(sum(weight for names, weight in self.sets if name in names))
 
     def answer_set(self) -> list[tuple[tuple[str, ...], float]]:
-        """Return the fewest sets that hold 95 % of the probability."""
+        """Return the smallest number of sets with 95 % of the probability."""
         total = np.cumsum([weight for _, weight in self.sets])
         return self.sets[: int(np.searchsorted(total, ENOUGH * total[-1])) + 1]
 
 
 class Search:
-    """The sets of effects of a problem that have probability.
+    """Search for the probable sets of effects of a problem.
 
-    ``required``: effects that are in every set. ``seeds``: sets to begin with.
+    ``required``: effects that are in every set. ``seeds``: sets from which the search begins.
     """
 
     def __init__(self, problem: Problem, required: Iterable[str] = (), seeds: Iterable[Iterable[str]] = ()) -> None:
@@ -94,11 +94,11 @@ class Search:
         return max(among or self.pool, key=lambda names: self.pool[names].score)
 
     def given(self, names: Set, but: Set = frozenset()) -> Given:
-        """Return the problem beside a set without some of its members."""
+        """Return the problem given a set without some of its members."""
         return Given(self.problem, [{n: pick for n, pick in self.pool[names].picks.items() if n not in but}])
 
     def _prune(self, seeds: Sequence[Set]) -> None:
-        """Leave out hypotheses that have no weight beside any of some sets."""
+        """Remove hypotheses without weight, given any of the sets ``seeds``."""
         kept = np.zeros(len(self.problem.prior), bool)
         for names in seeds:
             found = Given(self.problem, [dict.fromkeys(sorted(names), FIRST)])
@@ -189,10 +189,10 @@ def _largest(each: Values) -> tuple[float, Pick]:
 
 
 def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], names: Iterable[str]) -> Answers:
-    """Return what some searches of the same readings say together.
+    """Combine the results of several searches of the same readings.
 
-    ``searches``: None where none of the sets is possible. ``owner``: which of them a set belongs to. ``names``: effects
-    whose upper limits are asked for. Both forms of a free curve count as one.
+    ``searches``: None if none of its sets is possible. ``owner``: index of the search to which a set belongs.
+    ``names``: effects whose upper limits are computed. Both forms of a free curve count as one.
     """
     pool = {
         key: (search, found)

@@ -1,10 +1,10 @@
-"""How much each effect would improve a fit: the whitened profile likelihood of every candidate.
+"""Rank the effects by the improvement of a fit: the whitened profile likelihood of every candidate.
 
     log L(theta) = -N/2 log RSS(theta) - 1/2 log det C(theta),    delta BIC = 2 (max log L' - max log L) - k log N
 
-where theta is the noise setting, over which each candidate is maximised by itself, RSS the whitened residual sum of
-squares, N the number of readings and k the parameters that are added. Base and chosen effects are taken out of the
-candidates' columns first, so that a candidate is a small linear problem of its own.
+where theta is the noise setting, over which the likelihood of each candidate is maximised separately, RSS the whitened
+residual sum of squares, N the number of readings and k the number of added parameters. Base and selected effects are
+projected out of the candidates' columns first, so that each candidate is a separate small linear problem.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LEFT = 1e-10  # share of a column's square, which is ten times the ridge's: what
 
 @dataclass(frozen=True)
 class Score:
-    """What one candidate would bring."""
+    """The improvement by one candidate."""
 
     name: str
     # against the model without it; p of the likelihood ratio
@@ -49,7 +49,7 @@ class Score:
 
 
 class Ranking:
-    """Every candidate as a small linear problem beside base and configured effects, at a fit.
+    """Every candidate as a small linear problem given base and configured effects, at a fit.
 
     Fitted effects are at their values, others at each of their starts: one effect may be there several times.
 
@@ -84,7 +84,7 @@ class Ranking:
         self._reduce(products, design.sizes()[known:], [s.start - known for s in design.slices[len(configured) :]])
 
     def _reduce(self, products: Values, sizes: Values, starts: Sequence[int]) -> None:
-        """Keep of each candidate the directions that the motion excites, scaled to unit norm under white noise."""
+        """Reduce each candidate to the directions that the motion excites, scaled to unit norm under white noise."""
         ends = [*starts[1:], len(sizes) - 1]
         size = np.where(sizes > 0, sizes, 1.0)
         self.places: list[Index] = []
@@ -132,7 +132,7 @@ class Ranking:
         return float(found[1:].max()), int(np.argmax(found[1:])) + 1
 
     def scores(self, selected: Sequence[int], limits: dict[str, Values]) -> list[Score]:
-        """Return what each candidate brings beside the selected ones, best first.
+        """Return the score of each candidate given the selected ones, best first.
 
         ``selected``: indices of candidates. ``limits``: effect to (p,) array, limits of plausibility of the parameters'
         absolute values.
@@ -155,7 +155,7 @@ class Ranking:
     def _scored(
         self, members: Sequence[int], products: Values, before: float, limits: dict[str, Values]
     ) -> Iterator[tuple[int, Score]]:
-        """Yield the scores of candidates that have as many directions."""
+        """Yield the scores of candidates with equal numbers of directions."""
         places = [slice(self.places[j][0], self.places[j][-1] + 1) for j in members]
         inner = np.stack([products[:, at, at] for at in places])
         cross = np.stack([products[:, at, -1] for at in places])
@@ -201,7 +201,7 @@ class Ranking:
         return values, uncertainty
 
     def pair(self, j: int, k: int) -> tuple[float, int]:
-        """Return log L of base and two candidates, and how many parameters they have."""
+        """Return log L of base and two candidates, and their number of parameters."""
         place = np.concatenate([self.places[j], self.places[k]])
         inner, cross = self.products[:, place[:, None], place], self.products[:, place, -1]
         ridge = RIDGE * np.einsum("tii->ti", inner)
@@ -210,7 +210,7 @@ class Ranking:
         return float(found[1:].max()), len(place)
 
     def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:
-        """Return which share of a candidate's fitted signal each other effect reproduces.
+        """Return the share of a candidate's fitted signal that each other effect reproduces.
 
         ``j``: the candidate. ``selected``: other candidates that the model holds. ``setting``: index of the noise
         setting.
@@ -234,7 +234,7 @@ class Ranking:
         return found
 
     def same_as(self, j: int) -> set[str]:
-        """Return the effects all of whose signals a candidate reproduces beside the base."""
+        """Return the effects whose signals a candidate reproduces completely, together with the base."""
         left = self.chosen([j])[0]
         return {
             term.effect.name
@@ -277,7 +277,7 @@ def without(products: Values, index: Index) -> Values:
 
 
 def projection(products: Values, index: Index) -> Values:
-    """Return the coefficients by which some of the columns come closest to each column: (t, q, p) array.
+    """Return the coefficients of the projection of each column onto some of the columns: (t, q, p) array.
 
     ``products``: (t, p, p). ``index``: (q,).
     """

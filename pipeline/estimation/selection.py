@@ -1,19 +1,19 @@
-"""Which effects the recordings ask for: forward selection with backward drop.
+"""Select the effects that the recordings show: forward selection with backward drop.
 
-In each round every candidate competes at its own best noise setting. The best one is accepted if
+In each round every candidate is scored at its best noise setting. The best candidate is accepted if
 
     delta BIC > 10   and   m p < 0.01
 
-where p is that of the likelihood ratio and m the number of candidates (Bonferroni). A bias that follows time or
-temperature needs 16: wander of another kind than the model's looks like it. Beside what is selected, whose
-equations are of first order, it must bring 1/5000 of what that has brought, or 30. Where the residual stays above
-twice the noise, an effect must also explain 5 % of the excess: where a model lacks something large, anything small
-improves it a little.
+where p is the p-value of the likelihood ratio and m the number of candidates (Bonferroni). A bias that depends on time
+or temperature needs a delta BIC of 16, because wander of another kind than the model's has a similar signal. The
+equations of selected effects are of first order: a further effect must gain 1/5000 of their gain, or 30. While the
+residual exceeds twice the noise, an effect must also explain 5 % of the excess, because any small effect slightly
+improves a model that lacks a large one.
 
-After an effect of timing or with a time constant, the model is fitted anew and all columns are rebuilt there. Selected
-effects whose own delta BIC has become negative are dropped. One that a rival replaces with delta BIC > 10 is exchanged.
-If nothing passes although the wander seems three times that of a static recording or of the sensor file, two effects
-may hide each other: then all pairs are tried once.
+After an effect of timing or with a time constant, the model is fitted and all columns are computed again. A selected
+effect whose delta BIC has become negative is dropped. A selected effect that another one replaces with delta BIC > 10
+is exchanged. If no candidate passes although the wander seems three times that of a static recording or of the sensor
+file, two effects may mask each other: then all pairs are tried once.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def select(
 
 @dataclass
 class Selection:
-    """What was selected, how every candidate did, and the search for it."""
+    """The selected effects, the scores of every candidate, and the search."""
 
     observations: Observations
     noise: Noise | None
@@ -156,11 +156,11 @@ class Selection:
             self._merge()
 
     def _beside(self, names: Sequence[str]) -> dict[str, Score]:
-        """Return what each candidate brings beside some of the selected effects, best first."""
+        """Return the score of each candidate given some of the selected effects, best first."""
         return {s.name: s for s in self.ranking.scores(self.ranking.of_effects(names), self.limits)}
 
     def _scores(self) -> list[Score]:
-        """Score all candidates; those of timing or with a time constant that compete are fitted to their optimum."""
+        """Score all candidates; fit competing ones of timing or with a time constant to their optimum."""
         scores = self._beside(self.names).values()
         top = max((s.delta_bic for s in scores if s.admissible), default=0.0)
         found = []
@@ -194,7 +194,7 @@ class Selection:
         )
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
-        """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
+        """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
         worth = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in scores if self._passes(s)}
         if not worth:
             return None
@@ -223,13 +223,13 @@ class Selection:
         return any(name in effect(other).contains or other in effect(name).contains for other in held)
 
     def _gate(self, name: str) -> float:
-        """Return the delta BIC to pass: beside large effects, what their equations leave may not pass for another."""
+        """Return the delta BIC to pass; after large effects, it exceeds the residual of their first-order equations."""
         left = SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
         slow = effect(name).of_the_room(self.observations.sensor)
         return float(np.clip(left, SLOW_GATE_BIC if slow else GATE_BIC, HIGHEST_GATE))
 
     def _matters(self, score: Score, beside: Sequence[int] = ()) -> bool:
-        """Return whether an effect explains a part worth naming of an excess that is far above the noise."""
+        """Return whether an effect explains a significant part of a residual that is far above the noise."""
         if self.noise is None:
             return True
         selected = [*self.ranking.of_effects(self.names), *beside]
@@ -256,7 +256,7 @@ class Selection:
         return [held.get(n) or replace(self.candidates[n], values=self.steps[n].values) for n in self.names]
 
     def _forget(self, gone: Sequence[str]) -> None:
-        """Take effects out of what is selected and fitted."""
+        """Remove effects from the selected and fitted ones."""
         self.names = [name for name in self.names if name not in gone]
         for name in gone:
             del self.steps[name]
@@ -271,7 +271,7 @@ class Selection:
                     self._refit()
 
     def _drop_refuted(self) -> None:
-        """Drop what the full fit does not need: the columns of the last ranking were those of another matrix."""
+        """Drop effects that the full fit does not need; the last ranking had columns of an earlier matrix."""
         refuted = []
         for name, (term, block) in placed(self.fit.terms).items():
             if name not in self.names or term.effect.moves:
@@ -285,7 +285,7 @@ class Selection:
             self._refit()
 
     def _merge(self) -> None:
-        """Replace two selected effects by one that contains the first, where that explains about as much."""
+        """Replace two selected effects by one that contains the first, if it explains about as much."""
         for general, term in self.candidates.items():
             part = next((n for n in self.names if n in term.effect.contains), None)
             if part is None or general in self.names or not self.ranking.indices(general):
@@ -306,7 +306,7 @@ class Selection:
         return 2.0 * found - count * float(np.log(self.ranking.samples))
 
     def _exchange(self) -> bool:
-        """Replace a selected effect by one that explains clearly more in its place."""
+        """Replace a selected effect by another one that explains significantly more."""
         for name in [n for n in self.names if not effect(n).moves]:
             others = [n for n in self.names if n != name]
             scores = self._beside(others)
@@ -323,7 +323,7 @@ class Selection:
         return False
 
     def _other_delay(self) -> bool:
-        """Take a lag for a delay, or the reverse, if it is clearly better beside all that was selected."""
+        """Replace a delay by a lag, or the reverse, if it is significantly better with all selected effects."""
         name = next((n for n in self.names if n in DELAYS), None)
         other = next((n for n in DELAYS if n != name), "")
         if name is None or len(self.names) == 1 or other not in self.candidates:

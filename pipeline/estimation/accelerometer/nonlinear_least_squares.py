@@ -1,15 +1,15 @@
-"""Nine parameters of the accelerometer from the length of gravity (paper eqs 1 and 4; Sudsanguan 2019, 5.5-5.6).
+"""Fit nine parameters of the accelerometer to the length of gravity (paper eqs 1 and 4; Sudsanguan 2019, 5.5-5.6).
 
     u = L (y - b),   L = T S,   |u| = G
 
 with the bias b, the scale factors S and the unit lower triangular misalignment T: x of the sensor is x of the body, and
-its y lies in the plane of x and y, since the length of gravity says nothing of how the sensor is mounted. The
-orientations need not be known. Equations and fit are those of ``pipeline.estimation.multi_position``; the rows are
+its y is in the plane of x and y, because the length of gravity does not determine the mounting of the sensor. The
+orientations need not be known. ``pipeline.estimation.multi_position`` has the equations and the fit; the rows are
 hand-held rests, the dwells of a table's stop-and-go turns, or the single samples of its continuous turns.
 
-A misalignment of which the orientations say less than the sensor file, as in six positions, is a pseudo-observation by
-the file's limit, and the result says so. On a table the errors of the rows are correlated by the bias wander, whose
-covariance is that of ``pipeline.estimation.engine``.
+A misalignment that the orientations determine less than the sensor file, as in six positions, has a pseudo-observation
+by the file's limit, which the result states. On a table the bias wander correlates the errors of the rows;
+``pipeline.estimation.engine`` gives the covariance.
 
 The start is the ellipsoid ``p . (x^2, y^2, z^2, 2xy, 2xz, 2yz, 2x, 2y, 2z) = 1``, that is ``y^T Q y + 2 h^T y = 1``. It
 is linear in p; its centre is ``b = -Q^-1 h``, and ``L^T L = Q G^2 / (1 + b^T Q b)``.
@@ -250,7 +250,7 @@ def _fitted(rows: Orientations, gravity_g: float, prior: Prior, by_limit: Mask, 
 
 
 def _start(y: Values, gravity_g: float, *, tilted: bool) -> Values:
-    """Return the values of the ellipsoid through the readings, or those of an ideal sensor where they draw none."""
+    """Return the values of the ellipsoid through the readings, or of an ideal sensor if there is no ellipsoid."""
     products = 2.0 * y[:, [0, 0, 1]] * y[:, [1, 2, 2]]
     columns = [y**2, products, 2.0 * y] if tilted else [y**2, 2.0 * y]
     factors = ScaledColumns.of(np.concatenate(columns, axis=1))
@@ -298,7 +298,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     prior: Prior,
     settings: Mapping[str, Any],
 ) -> SensorCalibration:
-    """Return the calibration under white noise and bias wander, as the residuals of ``y = b + K u`` tell them.
+    """Return the calibration under white noise and bias wander, estimated from the residuals of ``y = b + K u``.
 
     The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
     in the readings of each channel c with the weights ``J^+ (n^T L)_c``.

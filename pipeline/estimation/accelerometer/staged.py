@@ -1,7 +1,7 @@
-"""The staged method of the accelerometer, equation by equation (Sudsanguan 2019, eqs 3.15-3.43).
+"""Fit the accelerometer by the staged method, equation by equation (Sudsanguan 2019, eqs 3.15-3.43).
 
-Each stage works on the extremes of the turns (``pipeline.estimation.accelerometer.turn_extremes``) in the output of the
-stage before it, finds its own factors or offsets, and corrects the readings by them for the next:
+The input of each stage is the extremes of the turns (``pipeline.estimation.accelerometer.turn_extremes``) in the output
+of the stage before. It estimates its factors or offsets, and corrects the readings for the next stage:
 
     orthogonality -> misalignment -> bias -> scale_factor
 
@@ -69,7 +69,7 @@ ASYMMETRY = "scale_factor_asymmetry"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one stage found."""
+    """The result of one stage."""
 
     steps: list[dict[str, Any]]  # its steps of the correction, see ``pipeline.estimation.stages``
     values: Quantities  # value and unit of each of its parameters
@@ -300,9 +300,9 @@ def fit(
 
 
 def _noise(turns: Sequence[Turn], prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
-    """Return the noise that all turns together show, by the residuals of ``y = b + K u + C |u|``.
+    """Return the noise from the residuals of ``y = b + K u + C |u|`` of all turns together.
 
-    A sinusoid of its own for each turn and channel would take up the bias from turn to turn.
+    A separate sinusoid for each turn and channel would absorb the changes of the bias from turn to turn.
     """
     motions = [motion for turn in turns for motion in turn.motions]
     u = np.concatenate([motion.specific_force for motion in motions])
@@ -332,7 +332,7 @@ def _resampled(
     gravity_g: float,
     names: Sequence[str],
 ) -> Contribution:
-    """Return the scatter of what some stages find over synthetic turns."""
+    """Return the scatter of the stages' parameters over synthetic turns."""
     pairs = list(zip(turns, sinusoids, strict=True))
     means = [turn.reading - np.column_stack([s.residuals for s in fits]) for turn, fits in pairs]
     cuts = np.cumsum([len(turn.angle) for turn in turns])[:-1]

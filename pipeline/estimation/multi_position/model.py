@@ -1,22 +1,22 @@
-"""The model of one sensor in rests and moves, and its linear form at some parameters.
+"""The model of one sensor in rests and moves, and its linearised equations at given parameters.
 
     r = X d + e,    cov e = k C,    C = I + S + sum_j a_j^2 diag(g_j) + c^2 D + q^2 H R H^T
 
 where
 
-r   : (n,) residuals, each over the standard deviation that white noise gives it
+r   : (n,) residuals, each over its standard deviation by white noise
 X   : (n, p) derivatives of the model with respect to its parameters, d their step
 S   : (n, n) errors of the accelerometer that equations of the gyroscope share
 g_j : (n,) variance of the scatter of the rests, or of the moves, beyond white noise (tremor), in units of the median
       white error; a_j is its size
 D   : (n, n) errors of the direction of gravity at each rest, which two moves share, for errors of the size of the
-      median white error of a move; c is their size (a seat that gives way, a hand that leans)
+      median white error of a move; c is their size (a support that yields, a hand that drifts)
 H   : (n, 3 t) derivatives with respect to the bias of each axis in each of t stretches of time, over its white noise
 R   : (t, t) covariance of a Gauss-Markov bias of unit variance, averaged over each stretch
 q   : standard deviation of that bias over white noise
-k   : at least 1: scatter that the hypotheses of a grid leave
+k   : at least 1: scatter beyond the hypotheses of a grid
 
-Nobody states how firmly a unit rests by hand: a, c, q and k are free in all comparisons (``likelihood``).
+The steadiness of a unit by hand is unknown: a, c, q and k are free in all comparisons (``likelihood``).
 
 Both sensors' models have: ``kinds`` of scatter (1: rests; 2: rests and moves), ``rests_equations`` (they come first),
 ``white`` noise of a raw sample, and ``directions``, (12, b): change of bias and matrix by each base parameter.
@@ -64,7 +64,7 @@ class State:
 
 @dataclass(frozen=True)
 class Equations:
-    """The linear form at some parameters; see the module."""
+    """The linearised equations at given parameters; see the module."""
 
     residual: Values  # (n,)
     base: Values  # (n, b); columns of bias and matrix
@@ -179,7 +179,7 @@ def stacked(blocks: Sequence[Block], model: Model, state: State, candidates: Seq
 
 
 def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
-    """Return the parameters after a step, and the part of it that was taken: effects may refuse some."""
+    """Return the parameters after a step, and the step taken, which effects may limit."""
     count = model.directions.shape[1]
     change = model.directions @ step[:count]
     terms, taken = design.stepped(state.terms, step[count:])
@@ -188,7 +188,7 @@ def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
 
 
 def motion_of(time: Values, force: Values, rate: Values, temperature: Values, *, still: bool) -> Motion:
-    """Return the motion that the unit's own calibrated signals show; derivatives are zero."""
+    """Return the motion by the unit's calibrated signals; derivatives are zero."""
     nothing = np.zeros_like(force)
     return Motion(
         time=time,
@@ -214,7 +214,7 @@ def effect_readings(sensor: str, terms: Sequence[Term], motion: Motion, K: Value
 
 
 def refusal(this: Effect, sensor: str, rests: Rests) -> str:
-    """Return why an effect can be no part of a model without a table; empty where it can."""
+    """Return why an effect cannot be in a model without a table; empty if it can."""
     unknown = [need for need in this.needs if need != "temperature"]
     checks = [
         (sensor not in this.sensors, f"{this.name} is no effect of the {sensor}"),
@@ -229,12 +229,12 @@ def refusal(this: Effect, sensor: str, rests: Rests) -> str:
 
 
 def candidates_for(sensor: str, rests: Rests, configured: Sequence[str]) -> list[Effect]:
-    """Return the effects that could be missing and that rests and moves can show."""
+    """Return the effects that could be missing in the model and that rests and moves can show."""
     return [e for name, e in catalogue().items() if name not in configured and not refusal(e, sensor, rests)]
 
 
 def parameter_places(model: Model, count: int) -> Values:
-    """Return what base and effect parameters do to bias, matrix and effect parameters: (12 + p, b + p) array."""
+    """Return the map from base and effect parameters to bias, matrix and effect parameters: (12 + p, b + p) array."""
     base = model.directions.shape[1]
     place = np.zeros((12 + count - base, count))
     place[:12, :base], place[12:, base:] = model.directions, np.eye(count - base)

@@ -1,11 +1,11 @@
-"""A fit to rests and moves as a calibration, with its uncertainty budget; and the stage ``effects`` of a fit.
+"""Convert a fit to rests and moves to a calibration with its uncertainty budget; run the stage ``effects`` of a fit.
 
 The Monte Carlo run of the budget is to second order of the model. The errors of the equations are drawn under every
-hypothesis of the noise by its weight, and solved for with the weights of that hypothesis, as the fit averages over
-them; the prior of the parameters is added as equations ``sqrt(P) p = 0 +- 1``.
+hypothesis of the noise by its weight, and solved with the weights of that hypothesis, because the fit averages over the
+hypotheses. The prior of the parameters is added as equations ``sqrt(P) p = 0 +- 1``.
 
-Where the procedure states faces, bias and full matrix of the accelerometer are fitted after the nine parameters of
-gravity's length, by the equations of ``accelerometer`` and ``faces_and_turns``. The matrix refers to the case.
+If the procedure states faces, bias and full matrix of the accelerometer are fitted after the nine parameters of
+gravity's length, with the equations of ``accelerometer`` and ``faces_and_turns``. The matrix refers to the case.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def model_of(
     settings: Mapping[str, Any],
     other: SensorCalibration | None = None,
 ) -> Model | None:
-    """Return the model of the sensor of a calibration, or None where its recordings hold no rest.
+    """Return the model of the sensor of a calibration, or None if its recordings have no rest.
 
     ``calibration``: of the sensor's method. ``settings``: sections ``table`` and ``procedure``. ``other``: of the
     accelerometer, where the sensor is the gyroscope; without it, it is calibrated here.
@@ -113,7 +113,7 @@ def fit_effects_by_rests(
 def calibration_of(
     model: Model, found: Fit, before: SensorCalibration, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Return a fit as a calibration with the stage ``effects``."""
+    """Convert a fit to a calibration with the stage ``effects``."""
     details = {
         "samples": round(model.samples()),
         "rests": len(model.rests.time),
@@ -136,7 +136,7 @@ def with_stage(  # noqa: PLR0917  (what a fit by hand is)
     correction: dict[str, Any] | None,
     parameters: dict[str, dict[str, Any]],
 ) -> SensorCalibration:
-    """Return a calibration after one more stage, without its uncertainty."""
+    """Return a calibration after an additional stage, without its uncertainty."""
     at_rest = slice(0, model.rests_equations)
     rms = float(np.sqrt(np.mean((found.residual[at_rest] * found.error[at_rest]) ** 2)))
     return replace(
@@ -164,7 +164,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     white: Values | None = None,
     not_included: Mapping[str, str] | None = None,
 ) -> SensorCalibration:
-    """Return a fit as a calibration after one more stage, with its uncertainty budget by the residuals.
+    """Convert a fit to a calibration after an additional stage, with its uncertainty budget by the residuals.
 
     ``settings``: sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``), ``uncertainty``.
     ``parameters``: of the stage, where they are not bias and matrix. ``white``: (12,), variance by white noise, where
@@ -216,7 +216,7 @@ def _limit_contribution(model: Model, found: Fit, place: Values) -> tuple[list[C
 def _with_monte_carlo(
     calibration: SensorCalibration, model: Model, found: Fit, trials: int, direct: Sequence[Contribution]
 ) -> SensorCalibration:
-    """Return a calibration whose budget also holds a Monte Carlo run; ``direct`` are its sources of type B."""
+    """Return a calibration whose budget also has a Monte Carlo run; ``direct``: its sources of type B."""
     equations = model.equations(found.state)
     X = equations.columns
     n, p = X.shape
@@ -258,7 +258,7 @@ def curvature(model: Model, found: Fit, parameters: int) -> Values:
 
 
 def require_faces(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> None:
-    """Raise ``NotObservableError`` that names the faces without a rest, by the readings as they are."""
+    """Raise ``NotObservableError``, with the faces without a rest, by the raw readings."""
     rests = rests_of("accelerometer", recordings, settings)
     if rests is not None:
         used = rests.select(~rests.held_out)

@@ -1,14 +1,14 @@
-"""Which effects rests and moves ask for: forward selection with backward drop, as ``pipeline.estimation.selection``.
+"""Select effects by rests and moves: forward selection with backward drop, as in ``pipeline.estimation.selection``.
 
     delta BIC > 10   and   m p < 0.01
 
 with the gain, delta BIC and p of ``likelihood`` and m the number of candidates. After each acceptance all parameters
-are fitted anew and every column is rebuilt. An effect that would need ten times its limit in the sensor file is no
-explanation of a few rests. Selected effects whose own delta BIC has become negative are dropped; one that a rival
-replaces with delta BIC > 10 is exchanged.
+are fitted and every column is computed again. An effect that would need more than ten times its limit in the sensor
+file is not accepted as an explanation of a few rests. A selected effect whose delta BIC has become negative is dropped.
+A selected effect that another one replaces with delta BIC > 10 is exchanged.
 
-The posterior over effects is that of the linear problem of ``pipeline.estimation.evidence``: columns are taken at the
-fit of what was selected, with its values put back into the residual, ``y = r + Z p``. As in the likelihood of the
+The posterior over effects is computed for the linear problem of ``pipeline.estimation.evidence``: columns at the fit of
+the selected effects, and readings ``y = r + Z p`` with the residual r and their values p. As in the likelihood of the
 selection, white noise is known and a scatter only adds to it: sigma is at least 1.
 """
 
@@ -80,7 +80,7 @@ def fit_configured(
 
 
 class Selection:
-    """What was selected, and how every candidate did: ``first`` and ``last`` before and after the search.
+    """The selected effects, and the scores of every candidate: ``first`` and ``last`` before and after the search.
 
     ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sensor_config``: the
     sensor's section of the configuration. ``names``: in order. ``steps``: score of each when it was accepted. ``fits``:
@@ -186,7 +186,7 @@ class Selection:
         return factor * len(raw) * float(np.log1p(power / len(raw)))
 
     def _refine(self, scored: Scored, names: Sequence[str], before: float) -> None:
-        """Take those that compete to their optimum, where one linear step may not lead there."""
+        """Fit the competing nonlinear candidates to their optimum, which one linear step may not reach."""
         top = max((s.delta_bic for s in scored.scores.values()), default=0.0)
         for score in list(scored.scores.values()):
             curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > GATE_BIC)
@@ -212,7 +212,7 @@ class Selection:
         return fit(self.model, state, self.hypotheses, self.kept_near)
 
     def _best(self, scored: Scored) -> Score | None:
-        """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
+        """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
         passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s)]
         worth = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in passing}
         return max(passing, key=lambda s: worth[s.name], default=None)
@@ -249,7 +249,7 @@ class Selection:
                 self._remove(name)
 
     def _exchange(self) -> bool:
-        """Replace a selected effect by one that explains clearly more in its place."""
+        """Replace a selected effect by another one that explains significantly more."""
         for name in self.names:
             scores = self._own(name).scores
             own = scores[name].delta_bic if name in scores else float("-inf")
