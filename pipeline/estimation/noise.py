@@ -10,7 +10,9 @@ the noise:
 2. ``rests``: the rests of the other recordings, each with a separate mean. In recordings by hand the unit creeps
    (``pipeline.signal.quiet_motion``): gravity moves from one axis to another, which is not wander of a bias. The
    accelerometer's wander is then estimated from the component along gravity, and its white noise from the scatter about
-   a parabola in time.
+   a parabola in time. A hand trembles, but it stays in place: the integral of its rate is bounded. The correlation time
+   of what fluctuates within rests by hand is therefore at most the length of a rest. With the sensor file's 100 s, a
+   tremor of 0.4 deg/s would be taken for a wander of 1 deg/s.
 3. ``residual``: scatter of windows of 16 samples in turns about a local polynomial: white noise only. With P the
    projection that removes the polynomial and R the autocovariance of the filter, ``median(|P y|^2) = white^2 tr(P R)
    (1 - 2/(9 nu))^3``, where ``nu = tr(P R)^2 / tr(P R P R)`` (Satterthwaite 1946; the median is robust against windows
@@ -68,6 +70,7 @@ if TYPE_CHECKING:
     from pipeline.records import Integers, Mask, Values
 
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in units of that of the sensor file
+OF_A_HAND = np.exp2(np.arange(-11.0, 4.0))  # the same by hand: from 0.05 s at 100 s; a tremor has 8 to 12 Hz
 SHORTEST_BLOCK = 8  # samples of a block
 FEWEST_SAMPLES = 60  # which determine the white noise to a tenth
 WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0
@@ -153,7 +156,11 @@ def _noise_of_rests(
     if informative.sum() - len(np.unique(blocks.rest[informative])) < 3 or not passes_wander:
         expected = np.sum(blocks.count * (covariance[0] - variance_of_mean(covariance, blocks.count)))
         return _with_stated_wander(np.sqrt(blocks.scatter / max(float(expected), 1e-300)), sensor_file, source)
-    return _most_likely(blocks, _nuisance(blocks, recordings, source, creeping), covariance, sensor_file, source)
+    design, lengths = _nuisance(blocks, recordings, source, creeping), [float(r.time[-1] - r.time[0]) for r in rests]
+    by_hand = source == "rests" and _by_hand(recordings)
+    longest = max(lengths) if by_hand else float("inf")
+    noise = _most_likely(blocks, design, covariance, sensor_file, source, longest=longest)
+    return replace(noise, length=sum(lengths)) if by_hand and noise.wander_source == "rests" else noise
 
 
 def _nuisance(blocks: _RestBlocks, recordings: list[Recording], source: str, creeping: Sequence[int] = ()) -> Values:
@@ -173,16 +180,26 @@ def _nuisance(blocks: _RestBlocks, recordings: list[Recording], source: str, cre
 
 
 def _most_likely(
-    blocks: _RestBlocks, design: Values, covariance: Values, sensor_file: dict[str, Any], source: str
+    blocks: _RestBlocks,
+    design: Values,
+    covariance: Values,
+    sensor_file: dict[str, Any],
+    source: str,
+    *,
+    longest: float,
 ) -> Noise:
-    """Return the most likely noise; one ratio of wander to white noise for all axes unless they differ."""
-    times = TIMES * stated_time(sensor_file)
+    """Return the most likely noise; one ratio of wander to white noise for all axes unless they differ.
+
+    ``longest``: largest correlation time, s, that is possible.
+    """
+    times = (TIMES if np.isinf(longest) else OF_A_HAND) * stated_time(sensor_file)
     log_likelihood, white = likelihood(blocks, design, covariance, times)
     gain = 2.0 * (log_likelihood - log_likelihood[:, :1])
     pooled = gain.sum(axis=2).max(axis=1)
-    row, time_source = int(np.argmax(pooled)), source
-    stated_row = int(np.argmin(np.abs(TIMES - 1.0)))
-    if pooled[row] < max(pooled[stated_row] + AGREEMENT_LOSS, DETECTION_GAIN):
+    possible = max(np.count_nonzero(times <= longest), 1)
+    row, time_source = int(np.argmax(pooled[:possible])), source
+    stated_row = int(np.argmin(np.abs(times - stated_time(sensor_file))))
+    if np.isinf(longest) and pooled[row] < max(pooled[stated_row] + AGREEMENT_LOSS, DETECTION_GAIN):
         row, time_source = stated_row, "data_sheet"
     if pooled[row] < DETECTION_GAIN:
         noise = _without_detected_wander(gain[stated_row], white[stated_row, 0], sensor_file, source)
@@ -195,7 +212,7 @@ def _most_likely(
         noise = Noise(own, own * ratio, float(times[row]), source, source, time_source)
     if source != "static":
         return noise
-    near = np.clip(row + np.log2(TIME_FACTORS).astype(int), 0, len(TIMES) - 1)
+    near = np.clip(row + np.log2(TIME_FACTORS).astype(int), 0, len(times) - 1)
     tried = RATIOS * float(np.sqrt(np.mean(noise.white**2)))
     return replace(noise, likelihood=WanderLikelihood(times[near], tried, 0.5 * gain[near].sum(axis=2)))
 

@@ -164,9 +164,9 @@ class Noise:
 
     ``source``, ``wander_source`` and ``time_source`` name the source of the white noise, the wander and its correlation
     time: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in
-    turns about a local polynomial) or ``sensor_file``. ``length`` is the duration of the static rest, s, else 0; the
-    relative uncertainty of its wander is about ``sqrt(correlation_time / length)``. ``likelihood`` is None without a
-    static recording.
+    turns about a local polynomial) or ``sensor_file``. ``length`` is the duration, s, of the static rest, or of all
+    rests by hand that show the wander, else 0; the relative uncertainty of the wander is about
+    ``sqrt(correlation_time / length)``. ``likelihood`` is None without a static recording.
     """
 
     white: Values

@@ -221,6 +221,25 @@ def test_without_rest_turns_and_data_sheet_the_user_is_told_what_to_give() -> No
         estimate_noise("accelerometer", [fast], {})
 
 
+def held_in_a_hand(tremor: float, seed: int = 5) -> Recording:
+    """Return ten rests of 2.5 s at 100 Hz whose rate trembles for about 0.07 s, with moves of 1 s between them."""
+    rng = np.random.default_rng(seed)
+    n, moving = 3500, np.arange(3500) % 350 >= 250
+    force = np.tile([0.0, 0.0, 1.0], (n, 1)) + 3e-3 * rng.standard_normal((n, 3))
+    force[moving] += 0.5 * rng.standard_normal((moving.sum(), 3))
+    rate = tremor * gauss_markov(n, DT * 0.07 / 0.01, rng) + 0.07 * rng.standard_normal((n, 3))
+    rate[moving] += 60.0 * np.sin(2.0 * np.pi * (np.arange(n) % 350 - 250)[moving] / 100.0)[:, None]
+    return Recording("by_hand", "rests", None, np.arange(n) * 10_000_000, force, rate)
+
+
+def test_the_tremor_of_a_hand_is_no_slow_wander() -> None:
+    tremor, length = 0.44, 100.0
+    noise = estimate_noise("gyroscope", [held_in_a_hand(tremor)], {**SHEET, "bias_wander": 3e-3})
+    true = tremor * np.sqrt(2.0 * 0.07 / length)  # of the mean of a long rest, after the white noise
+    said = noise.wander * np.sqrt(variance_of_average(np.array(length), noise.correlation_time))
+    assert np.all((said > true / 1.5) & (said < 1.5 * true))
+
+
 def test_held_out_recording_is_not_looked_at() -> None:
     loud = rest(2000, 0.0, 1, role="validation")
     loud = replace(loud, accelerometer=loud.accelerometer * 50.0, table_rate=np.zeros(2000))
