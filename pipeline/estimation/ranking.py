@@ -110,8 +110,12 @@ class Ranking:
         return [j for j, term in enumerate(self.candidates) if term.effect.name == name and len(self.places[j]) > 0]
 
     def of_effects(self, names: Sequence[str]) -> list[int]:
-        """Return the index of the first candidate that is each effect."""
-        return [self.indices(name)[0] for name in names]
+        """Return the index of the first candidate that is each effect, if possible of those that the motion excites.
+
+        A fit may take an effect to where the motion does not excite it, as a time constant of many recordings.
+        """
+        first = {term.effect.name: j for j, term in reversed([*enumerate(self.candidates)])}
+        return [next(iter(self.indices(name)), first[name]) for name in names]
 
     def chosen(self, selected: Sequence[int]) -> Values:
         """Return the products without what base and selected candidates explain: (t, q + 1, q + 1) array."""

@@ -11,11 +11,13 @@ from bench_session import BIAS, CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, 
 from scipy.special import stdtrit
 
 from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.design import Term, ordinary_base
 from pipeline.estimation.effects import fit as fit_effects
-from pipeline.estimation.gauss_markov import Products, Setting
+from pipeline.estimation.gauss_markov import Products, Setting, selection_grid
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
+from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import select
 from pipeline.model.effects import effect
 from pipeline.records import SensorCalibration
@@ -110,6 +112,19 @@ def test_an_effect_that_contains_a_configured_one_is_not_added_to_it() -> None:
     assert score.delta_bic > 50.0
     assert score.admissible
     assert found.names == []
+
+
+def test_a_fit_may_take_a_selected_effect_to_where_the_motion_does_not_excite_it() -> None:
+    """As the time constant of a warm-up, in a unit whose thermometer lagged."""
+    recordings, sheet = record(Session(1)), read_config("sensor", "mpu6050")["gyroscope"]
+    noise = estimate_noise("gyroscope", recordings, sheet)
+    observations = observe("gyroscope", recordings, TABLE)
+    start, warm_up = ordinary_base(observations, noise), effect("warm_up")
+    fitted = replace(start, terms=[Term(warm_up, np.array([300.0, -900.0, 100.0, 1e9]))])
+    ranking = Ranking(observations, start, fitted, {"warm_up": Term(warm_up, np.zeros(4))}, selection_grid(noise))
+    assert ranking.indices("warm_up") == []
+    chosen = ranking.of_effects(["warm_up"])
+    assert np.array_equal(ranking.log_likelihoods(chosen), ranking.log_likelihoods([]))
 
 
 def test_a_lever_arm_is_refused_where_the_table_only_stops_and_goes() -> None:
