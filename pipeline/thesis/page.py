@@ -80,7 +80,7 @@ def _difference(estimate: Estimate) -> tuple[str, str]:
     """Format a difference and its interval, rounded to two digits of half the interval."""
     half = estimate.expanded_uncertainty or 0.0
     decimals = max(0, 1 - math.floor(math.log10(half))) if half > 0.0 else 3
-    value, low, high = (f"{v:+.{decimals}f}".replace("-", MINUS) for v in (estimate.value, *estimate.interval))
+    value, low, high = (f"{v:+z.{decimals}f}".replace("-", MINUS) for v in (estimate.value, *estimate.interval))
     return value, f"{low} to {high}"
 
 
