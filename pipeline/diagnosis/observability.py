@@ -148,7 +148,7 @@ def _faint(this: Effect, selection: Selection) -> str:
     ranking, held = selection.ranking, selection.chosen()
     gate = score.parameters * float(np.log(ranking.samples)) + GATE_BIC
     for j in ranking.indices(this.name):
-        seen = np.array([ranking.visibility(j, limits, t) for t in range(1, len(ranking.settings))]) >= gate
+        seen = ranking.visibility(j, limits)[1:] >= gate
         if seen.any():
             likely = ranking.log_likelihoods([*held, j])[1:]
             if likely[seen].max() > likely.max() + LEAST_WEIGHT:

@@ -128,7 +128,8 @@ class Ranking:
 
     def log_likelihoods(self, selected: Sequence[int]) -> Values:
         """Return log L of base and selected candidates at each noise setting, the first white noise alone."""
-        return self.log_likelihood(self.chosen(selected)[:, -1, -1])
+        place = np.concatenate([*[self.places[j] for j in selected], [-1]]).astype(int)
+        return self.log_likelihood(without(self.products[:, place[:, None], place], np.arange(len(place) - 1))[:, -1, -1])
 
     def of_model(self, selected: Sequence[int]) -> tuple[float, int]:
         """Return the log likelihood of base and selected candidates, and its best noise setting."""
@@ -204,15 +205,6 @@ class Ranking:
         uncertainty[linear] = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         return values, uncertainty
 
-    def pair(self, j: int, k: int) -> tuple[float, int]:
-        """Return log L of base and two candidates, and their number of parameters."""
-        place = np.concatenate([self.places[j], self.places[k]])
-        inner, cross = self.products[:, place[:, None], place], self.products[:, place, -1]
-        ridge = RIDGE * np.einsum("tii->ti", inner)
-        solved = np.linalg.solve(inner + ridge[:, :, None] * np.eye(len(place)), cross[:, :, None])[:, :, 0]
-        found = self.log_likelihood(self.products[:, -1, -1] - np.sum(cross * solved, axis=1))
-        return float(found[1:].max()), len(place)
-
     def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:
         """Return the share of a candidate's fitted signal that each other effect reproduces.
 
@@ -256,11 +248,11 @@ class Ranking:
                 out[j] = float(products[place, -1] @ np.linalg.solve(inner, products[place, -1]))
         return out
 
-    def visibility(self, j: int, limits: Values, setting: int) -> float:
-        """Return the expected gain in 2 log L of an effect whose parameters are all at their limits."""
+    def visibility(self, j: int, limits: Values) -> Values:
+        """Return the expected gain in 2 log L of an effect whose parameters are all at their limits: (t,) array."""
         block = self.spans[j]
-        count = block.stop - block.start
-        return float(np.sum(limits[:count] ** 2 * np.diag(self.beside[setting, block, block])))
+        squares = np.einsum("tii->ti", self.beside[:, block, block])
+        return np.asarray(np.sum(limits[: squares.shape[1]] ** 2 * squares, axis=1))
 
 
 def without(products: Values, index: Index) -> Values:

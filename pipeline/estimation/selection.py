@@ -369,7 +369,8 @@ class Selection:
         for j, k in combinations(able, 2):
             if self.ranking.candidates[j].effect.name == self.ranking.candidates[k].effect.name:
                 continue
-            found, count = self.ranking.pair(j, k)
+            found, _ = self.ranking.of_model([j, k])
+            count = len(self.ranking.places[j]) + len(self.ranking.places[k])
             best = max(best, (2.0 * (found - before) - count * logarithm, j, k))
         if best[1] < 0:
             return

@@ -90,6 +90,7 @@ def formats() -> dict[str, tuple[Format, Template]]:
                 f"{template}: file: {declared.file} is also the file of {same[0]}.j2. Name another file"
             )
         formats_by_name[template.stem] = declared, _environment().from_string(text)
+    _environment().get_template("remarks.txt")  # compiled with the formats, whose texts hold it
     return formats_by_name
 
 
