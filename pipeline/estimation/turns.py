@@ -78,7 +78,8 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
     own = [r for r in recordings if r.role == sensor and r.reading(sensor) is not None]
     parts = []
     for recording in own:
-        motion = table_motion(replace(recording, temperature=None), table)  # bias and matrix do not ask for it
+        without = recording if recording.cache else replace(recording, temperature=None)  # no fit here asks for it
+        motion = table_motion(without, table)
         if motion is not None:
             parts.append(Part(recording, motion, recording.valid))
     if not parts:

@@ -23,15 +23,15 @@ from pipeline.estimation import reference_least_squares
 from pipeline.estimation.uncertainty_budget import covariance_beside_reference
 from pipeline.io.quality_flags import STUCK
 from pipeline.model.effects import bench_priors, effect_of
-from pipeline.records import AXES
+from pipeline.records import AXES, Motion
 from pipeline.validation.error_breakdown import direction_known, last_step
 from pipeline.validation.expected_error import linearized
-from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.validation.samples import Samples
 
 SLOPES = slice(3, 12)  # of bias and matrix: the elements of the matrix
 
@@ -39,6 +39,7 @@ SLOPES = slice(3, 12)  # of bias and matrix: the elements of the matrix
 def agreement(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
+    held_out: Sequence[Samples],
     noise: Noise,
     settings: Mapping[str, Any],
     other: SensorCalibration | None,
@@ -46,7 +47,8 @@ def agreement(
     """Return ``p_value``, and of the element that differs most ``reads``, ``of``, ``error`` and its U.
 
     None where no held-out motion has a vector reference, the method holds elements of the matrix fixed, a filter was
-    applied, or an effect moves the motion in time. ``settings``: sections ``table`` and ``sensor``.
+    applied, or an effect moves the motion in time. ``held_out``: the samples of the held-out recordings. ``settings``:
+    sections ``table`` and ``sensor``.
     """
     sensor, table = calibration.sensor, settings["table"]
     of_method = any(stage.name == reference_least_squares.NAME for stage in calibration.stages)
@@ -55,11 +57,12 @@ def agreement(
     moved = any(effect_of(fitted).moves for fitted in calibration.effects)
     if not (of_method and held and vectors and calibration.covariance is not None) or moved:
         return None
+    if len(held_out) < len(held) or any(samples.resting for samples in held_out):
+        return None
     calibrated, slopes, count = [], np.zeros((9, len(calibration.covariance))), 0
-    for recording in held:
-        samples = samples_of_motion(sensor, recording, noise, table)
-        found = None if samples is None else last_step(calibration, samples, other)
-        if samples is None or found is None or found[2] is None or not direction_known(calibration, samples):
+    for recording, samples in zip(held, held_out, strict=True):
+        found = last_step(calibration, samples, other)
+        if found is None or found[2] is None or not direction_known(calibration, samples):
             return None
         part = linearized(calibration, samples, found[2], other)
         if part is None:
@@ -74,6 +77,7 @@ def agreement(
         flags = np.where(known, flags, flags | STUCK)
         values: dict[str, Any] = {"role": sensor, "flags": flags, sensor: np.nan_to_num(found[0])}
         calibrated.append(replace(recording, **values))
+        calibrated[-1].cache.update({key: at for key, at in recording.cache.items() if isinstance(at, Motion)})
     rest = [r for r in recordings if r.role == "static"]
     plain = {"table": {**table, **dict.fromkeys(bench_priors().values())}, "sensor": settings.get("sensor") or {}}
     try:

@@ -100,7 +100,7 @@ def validate(
         part["expected_rms_error"] = expected
         part["notes"] += notes
         if part["held_out"] and expected is not None:
-            part["agreement"] = agreement(calibration, recordings, noise, settings, other)
+            part["agreement"] = agreement(calibration, recordings, samples, noise, settings, other)
             part["worse_than_raw"] = _worse_than_raw(
                 calibration, samples, expected[1], other, on_table=settings["table"].get("motion") != "none"
             )
