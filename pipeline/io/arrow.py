@@ -45,7 +45,7 @@ ROW_GROUP = 1_000_000  # samples
 KEY = b"recordings"
 PLAIN = ("name", "role", "axis", "setup", "up", "sense", "source", "filter", "clock_shared")  # fields stored as JSON
 TYPES = {"time_ns": "int64", **dict.fromkeys(CHANNELS, "float64"), "flags": "uint16"}
-PAGE_ENCODINGS = {"int64": "DELTA_BINARY_PACKED", "float64": "BYTE_STREAM_SPLIT", "uint16": "PLAIN"}
+PAGE_ENCODINGS = {"int64": "DELTA_BINARY_PACKED", "float64": "PLAIN", "uint16": "PLAIN"}
 
 
 def to_numpy(column: Any) -> NDArray[Any]:  # noqa: ANN401  (pyarrow has no types)

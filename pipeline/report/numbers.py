@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ def probability(value: object) -> str:
     return "< 1e\N{MINUS SIGN}12" if value < 1e-12 else number(value, 2)
 
 
+@lru_cache(4096)  # ticks, units and names of effects are the same on many charts and pages
 def typeset(sentence: str) -> str:
     """Return a sentence or a unit as a terminal prints it with the signs of print: ``±``, ``−``, ``ΔBIC``, ``°C``."""
     signs = sentence
