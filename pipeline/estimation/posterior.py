@@ -80,7 +80,7 @@ class Search:
         self.problem, self.required = problem, frozenset(required)
         self.pool: dict[Set, Found] = {}
         self._extended: set[Set] = set()
-        first = [self.required, *(frozenset(seed) | self.required for seed in seeds)]
+        first = [*dict.fromkeys([self.required, *(frozenset(seed) | self.required for seed in seeds)])]
         self._prune(first)
         for names in first:
             self._finish(names)

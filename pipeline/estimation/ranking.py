@@ -129,7 +129,8 @@ class Ranking:
     def log_likelihoods(self, selected: Sequence[int]) -> Values:
         """Return log L of base and selected candidates at each noise setting, the first white noise alone."""
         place = np.concatenate([*[self.places[j] for j in selected], [-1]]).astype(int)
-        return self.log_likelihood(without(self.products[:, place[:, None], place], np.arange(len(place) - 1))[:, -1, -1])
+        left = without(self.products[:, place[:, None], place], np.arange(len(place) - 1))
+        return self.log_likelihood(left[:, -1, -1])
 
     def of_model(self, selected: Sequence[int]) -> tuple[float, int]:
         """Return the log likelihood of base and selected candidates, and its best noise setting."""

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 SLOPES = slice(3, 12)  # of bias and matrix: the elements of the matrix
 
 
-def agreement(
+def agreement(  # noqa: PLR0917  (as ``validate``)
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
     held_out: Sequence[Samples],
