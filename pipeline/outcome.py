@@ -37,6 +37,7 @@ SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
 EFFECTS = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
+NOT_CALIBRATED = "not_calibrated"  # in a calibration document, why a sensor has none
 RESULTS = "results"  # the default folder of results
 
 
@@ -142,7 +143,11 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         *lines_of(verdict_groups(findings)),
     ]
     units = [row["unit"] for row in rows]
-    for documents, key in (("validations", "reason"), ("calibrations", "not_determined")):
+    for documents, key in (
+        ("calibrations", NOT_CALIBRATED),
+        ("validations", "reason"),
+        ("calibrations", "not_determined"),
+    ):
         lines += first(_reasons(results / documents, key, units), NAMED, "reasons")
     lines += lines_of(_not_in_uncertainty(rows).items())
     lines += first([f"{r['unit']}, left out: {what}" for r in rows if (what := r.get("left_out"))], NAMED, "units")
@@ -166,8 +171,13 @@ def _reasons(documents: Path, key: str, units: Sequence[str]) -> list[str]:
         file = documents / f"{unit}.json"
         document = read_json(file) if file.is_file() else {}
         for sensor in SENSORS:
-            if reason := (document.get(sensor) or {}).get(key):
-                groups.setdefault(f"{sensor}, {reason}", []).append(unit)
+            if key == NOT_CALIBRATED:
+                reason = (document.get(key) or {}).get(sensor)
+            else:
+                reason = (document.get(sensor) or {}).get(key)
+            if reason:
+                what = f"not calibrated: {reason}" if key == NOT_CALIBRATED else reason
+                groups.setdefault(f"{sensor}, {what}", []).append(unit)
     return lines_of(groups.items())
 
 

@@ -1,14 +1,16 @@
 """Commands that a user pastes: bash hands over what was meant, and Snakemake reads it so."""
 
+import json
 import shlex
 import subprocess
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from snakemake.cli import parse_config
 
-from pipeline.outcome import add_command, once_command, run_command
+from pipeline.outcome import NOT_CALIBRATED, _reasons, add_command, once_command, run_command
 
 TEXT = st.text(
     st.characters(codec="utf-8", exclude_characters="\0\n\r\x85\u2028\u2029", exclude_categories=("Cc", "Cs"))
@@ -55,3 +57,9 @@ def test_effects_that_one_run_had_are_kept_by_the_command_that_adds_more() -> No
     assert parse_config(command[11:]) == {"unit_overrides": {"U2": ["filter.order=3"], "U1": ["filter.order=1"]}}
     once = words(once_command(settings, "U1", "effects.gyroscope=[a,b,c]"))
     assert parse_config(once[3:])["unit_overrides"]["U1"] == ["filter.order=1", "effects.gyroscope=[a,b,c]"]
+
+
+def test_the_closing_lines_name_a_sensor_that_has_no_calibration(tmp_path: Path) -> None:
+    document = {"accelerometer": {}, "gyroscope": None, "not_calibrated": {"gyroscope": "6 moves are needed"}}
+    (tmp_path / "U1.json").write_text(json.dumps(document))
+    assert _reasons(tmp_path, NOT_CALIBRATED, ["U1", "U2"]) == ["gyroscope, not calibrated: 6 moves are needed: U1"]

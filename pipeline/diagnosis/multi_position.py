@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 NEEDED = MORE
 FAR_ABOVE = 10.0  # times the noise: no unit that somebody sets down or holds rests so badly
+BESIDE_FACES = ", beside those on the six faces: bias and matrix need the faces and turns alone, an effect needs more"
 FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
 SPARE = 2  # equations beyond the parameters, from which on a fold is judged
 LEAST_SPAN = 1.0  # s or degC: of a covariate
@@ -67,7 +68,7 @@ def findings(case: Case) -> Findings:
     chi = [_chi(selection, fit, expected) for fit in selection.fits]
     over, left_over = (_over_noise(selection, selection.fits[k], expected) for k in (0, -1))
     verdict = "missing_effect" if selection.names else "nothing_missing"
-    if (unknown and not selection.names) or left_over > FAR_ABOVE:
+    if (unknown and not selection.names) or (left_over or 0.0) > FAR_ABOVE:
         verdict = "unexplained"
     likely = project_out(model.equations(selection.fits[-1].state), selection.hypotheses).scores()
     best = selection.hypotheses[int(np.argmax(likely))]
@@ -78,8 +79,8 @@ def findings(case: Case) -> Findings:
 
     def advice(verdict: str) -> str:
         if verdict == "not_enough_data":
-            return MORE
-        if left_over > FIRM or verdict == "unexplained":
+            return f"{MORE}{BESIDE_FACES if case.settings['procedure'].get('faces') else ''}"
+        if left_over is not None and (left_over > FIRM or verdict == "unexplained"):
             return _of_scatter(_suspects(selection, hidden), left_over)
         warmth = catalogue()["bias_temperature"]
         return f"to make bias temperature observable: record {warmth.excitation}" if warmth.name in hidden else ""
@@ -210,14 +211,14 @@ def _chi(selection: Selection, fit: Fit, noise: Noise | None) -> float:
     return float(np.sum(found.residual**2))
 
 
-def _over_noise(selection: Selection, fit: Fit, noise: Noise | None) -> float:
-    """Return the rms residual of the rests, of a fit, over that of noise alone."""
+def _over_noise(selection: Selection, fit: Fit, noise: Noise | None) -> float | None:
+    """Return the rms residual of the rests, of a fit, over that of noise alone; None without a degree of freedom."""
     equations, rests = selection.model.equations(fit.state), slice(selection.model.rests_equations)
     L = np.linalg.cholesky(equations.covariance(_expected(selection, noise))[rests, rests])
     columns, residual = (np.linalg.solve(L, v[rests]) for v in (equations.columns, equations.residual))
     factors = ScaledColumns.of(columns, NEW)
     left = residual - columns @ factors.solve(residual)
-    return float(np.sqrt(left @ left / max(len(left) - factors.rank, 1)))
+    return float(np.sqrt(left @ left / (len(left) - factors.rank))) if len(left) > factors.rank else None
 
 
 def _held_out_errors(selection: Selection) -> list[float | None]:

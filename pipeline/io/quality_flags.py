@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.timestamps import blocks_error
-from pipeline.io.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TRIADS
+from pipeline.io.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.records import SENSOR_UNITS
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ BEYOND = 1e-3  # relative; with nominal counts per unit the largest code may be 
 WINDOW = 64  # samples in which the share of equal neighbours is counted
 BY_CHANCE = 1e-6  # expected number of such runs in the recording
 SHORTEST_RUN = 20  # samples; the estimate of p from windows of 64 is too coarse for less
+FEWEST_STEPS = 64  # of the resolution: a channel with a smaller span shows noise alone
 QUIET = 0.5  # share of equal neighbours at which noise is below the resolution
 MOST_STRETCHES = 10  # of stuck rows that have a note each; more are one note: ``check`` lists 20 notes of a file
 DEAD_ROWS = 1000  # shorter recordings may be constant by their resolution
@@ -119,6 +120,39 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
         if rows.size:
             flags[rows] |= CLIPPED
             detail = f"{channel} reaches the full scale of {full_scale:g} {SENSOR_UNITS[sensor]} and may be clipped"
+            notes.append(table.note("N-CLIP", rows, detail))
+    return notes
+
+
+def flag_flat_tops(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> list[Note]:
+    """Flag readings that repeat the largest or the smallest value of their channel more often than noise allows.
+
+    The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
+    chance, with p as for stuck readings, of the other values. Logs with the motion of a table are not searched: a table
+    may keep its largest rate, and its log contradicts a clipped reading.
+    """
+    notes: list[Note] = []
+    if set(TABLE_CHANNELS) & table.values.keys():
+        return notes
+    for channel in TRIADS[sensor]:
+        if (values := table.values.get(channel)) is None:
+            continue
+        steps, ends = np.abs(np.diff(values)), (values.min(), values.max())
+        same = steps == 0.0
+        if ends[1] - ends[0] < FEWEST_STEPS * np.min(steps, where=~same, initial=np.inf):
+            continue
+        share = max(equal_share(same & (values[1:] != ends[0]) & (values[1:] != ends[1])), 1.0 / WINDOW)
+        for end in ends:
+            at_end = values == end
+            rows = np.flatnonzero(at_end & ((flags & CLIPPED) == 0))
+            by_chance = len(values) * share ** np.count_nonzero(same & at_end[1:])
+            if not rows.size or share > QUIET or by_chance > BY_CHANCE:
+                continue
+            flags[rows] |= CLIPPED
+            detail = (
+                f"{channel} repeats {end:.6g} {SENSOR_UNITS[sensor]}, the end of its readings, more often than noise "
+                f"allows: clipped below the stated sensor.{sensor}.full_scale, and left out of every fit"
+            )
             notes.append(table.note("N-CLIP", rows, detail))
     return notes
 
@@ -254,6 +288,7 @@ def examine(
         full_scale = (sensor.get(name) or {}).get("full_scale")
         if full_scale is not None:
             notes += flag_clipped(table, name, float(full_scale), flags)
+        notes += flag_flat_tops(table, name, flags)
         stuck |= find_stuck(table, name, flags)
     notes += flag_stuck(table, stuck, flags)
     _check_turn_rate(table)

@@ -55,7 +55,7 @@ FAST_S = 0.1  # estimators average over longer times, between two images or scan
 WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
 LEFT_OUT = {
     "N-STUCK": "stuck",
-    "N-CLIP": "at full scale",
+    "N-CLIP": "clipped",
     "N-DISTURBED": "glitches or knocks",
     "N-SHAKEN": "shaken at rest",
     "N-MOVED": "moving",

@@ -8,7 +8,9 @@ where
 
     J_i : (9,) derivative of the length of gravity at rest i (``derivative_of``)
     s_i : g; standard deviation of that length: white noise of the mean, and the scatter between rests
-    P   : precision by the sensor file's limits, taken for two standard deviations; F is regular by it from the start
+    P   : precision by the sensor file's limits, of a misalignment as in the fit, of the others taken for two standard
+          deviations; F is regular by it from the start. While the fit knows a misalignment by its limit alone, F is the
+          inverse of the fit's covariance
     g_p : variance of the fit over ``(F^-1)_pp``: bias wander, and a scatter that a few rests show only roughly; 1
           before there is a fit
     k_p : coverage factor, with one more degree of freedom for each further rest
@@ -51,7 +53,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import COLUMNS, IDEAL, PLACE, ROWS, triangle
-from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
+from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, limit_of_misalignment
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
 from pipeline.records import AXES, Recording, SensorCalibration, Values, coverage_factor
@@ -156,7 +158,7 @@ def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dw
     if fitted is not None:
         values = np.concatenate([fitted.bias, fitted.matrix.ravel()])[PLACE]
         reason = _open(fitted)
-        scatter = 0.0 if reason else float(fitted.stages[-1].details["scatter_between_rests"])
+        scatter = float(fitted.stages[-1].details["scatter_between_rests"])
     sensor_config, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
     rests, white = orientations.rests, _white_of_rest(orientations, sensor_config, dwell)
     error = float(np.hypot(white, scatter))
@@ -165,11 +167,14 @@ def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dw
         J = derivative_of(rests.reading, values)
         F = F + (J / (np.mean(orientations.white**2) * rests.share + scatter**2)[:, None]).T @ J
     inflation, freedom, expanded = np.ones(9), np.full(9, np.inf), np.inf
-    if fitted is not None and not reason:
+    if fitted is not None:
         assert fitted.covariance is not None  # noqa: S101
-        own = np.diag(fitted.covariance)[PLACE]
-        freedom, inflation = fitted.effective_freedom()[PLACE], own / np.diag(np.linalg.inv(F))
-        expanded = float(np.max(coverage_factor(freedom) * np.sqrt(own)))
+        covariance = fitted.covariance[np.ix_(PLACE, PLACE)]
+        if fitted.stages[-1].details[KNOWN_BY_LIMIT]:
+            F = np.linalg.inv(covariance)
+        else:
+            freedom, inflation = fitted.effective_freedom()[PLACE], np.diag(covariance) / np.diag(np.linalg.inv(F))
+        expanded = np.inf if reason else float(np.max(coverage_factor(freedom) * np.sqrt(np.diag(covariance))))
     of_both = [(pair, False) for pair in orientations.used] + [(pair, True) for pair in orientations.held_out]
     of_both.sort(key=lambda entry: (recordings.index(entry[0][0]), entry[0][1].start))
     pairs = [pair for pair, _ in of_both]
@@ -236,9 +241,9 @@ def _white_of_rest(orientations: Orientations, sensor_config: Mapping[str, Any],
 
 def _precision(sensor_config: Mapping[str, Any], gravity: float) -> Values:
     """Return P: (9, 9) array."""
-    limits = {True: float(sensor_config["scale_factor"]), False: float(sensor_config["cross_axis"])}
-    matrix = [limits[bool(i == j)] for i, j in zip(ROWS, COLUMNS, strict=True)]
-    return np.diag(np.square(2.0 / np.array([float(sensor_config["bias"]) / gravity] * 3 + matrix)))
+    u = {True: 0.5 * float(sensor_config["scale_factor"]), False: limit_of_misalignment(sensor_config)}
+    matrix = [u[bool(i == j)] for i, j in zip(ROWS, COLUMNS, strict=True)]
+    return np.diag(1.0 / np.square([0.5 * float(sensor_config["bias"]) / gravity] * 3 + matrix))
 
 
 def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Values:

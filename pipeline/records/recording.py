@@ -146,7 +146,8 @@ class Recording:
 
 def files_of_readings(source: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the files with readings of a recording: ``source`` and the joined files, without logs of a table."""
-    return [file for file in (source, *source.get("joined", [])) if not file.get("table_only")]
+    entries = (source, *source.get("joined", []))  # a joined topic of the same file has no hash
+    return [entry for entry in entries if "sha256" in entry and not entry.get("table_only")]
 
 
 @dataclass(frozen=True)

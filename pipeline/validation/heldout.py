@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
+from pipeline.estimation.accelerometer.nonlinear_least_squares import NAMES
+from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.rest_means import count_of_rests, held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
@@ -68,6 +70,10 @@ def validate(
     """
     sensor = calibration.sensor
     samples, reason = _choose(sensor, recordings, noise, settings)
+    if reason and (count := _fitted_exactly(calibration)):
+        samples = []
+        reason = reason.partition("; judged")[0]
+        reason += f"; the fit passes through its {count} rests exactly, so that their error says nothing: record more"
     count = int(sum(s.known.sum() for s in samples))
     no_figures: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
     part: dict[str, Any] = {
@@ -310,6 +316,14 @@ def _choose(
         reason += f" ({count} rests all go to the fit; of {fewest} and more, one of {every} is held out)"
     fitted = moving(sensor) or resting(rests_of("rests")) or resting(rests_of(sensor))
     return fitted, reason + ("; judged on the samples of the fit" if fitted else "")
+
+
+def _fitted_exactly(calibration: SensorCalibration) -> int:
+    """Return the number of rests by hand that a fit passes through, as it has a parameter for each; 0 for others."""
+    for details in (stage.details for stage in calibration.stages if stage.details.get("rests_used")):
+        if details["orientations_used"] + len(details[KNOWN_BY_LIMIT]) <= len(NAMES):
+            return int(details["orientations_used"])
+    return 0
 
 
 def _worse_than_raw(

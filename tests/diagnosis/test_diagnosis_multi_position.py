@@ -17,6 +17,7 @@ from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.noise import estimate_noise
+from pipeline.validation.heldout import validate
 
 NAMED = [
     ("mpu6050", "accelerometer", "scale_factor_asymmetry"),
@@ -141,11 +142,19 @@ def test_without_a_temperature_nothing_is_said_of_it() -> None:
 
 
 def test_six_positions_are_not_enough_and_the_advice_says_what_is() -> None:
-    part = hand_held("mpu6050", 17, procedure="six_positions", holdout_every=0).diagnosed("accelerometer")
+    unit = hand_held("mpu6050", 17, procedure="six_positions", holdout_every=0)
+    part = unit.diagnosed("accelerometer")
     assert part["verdict"] == "not_enough_data"
+    assert part["residual_over_noise"] is None  # six rests, six parameters
     assert part["ranking"] == []
     assert "6 rests are too few" in reasons(part)["quadratic_nonlinearity"]
     assert "record 40 rests" in part["next_experiment"]
+    noise = estimate_noise("accelerometer", unit.recordings, unit.settings["sensor"]["accelerometer"])
+    judged = validate(unit.calibrated("accelerometer"), unit.recordings, noise, unit.settings)
+    assert judged["reason"].endswith("through its 6 rests exactly, so that their error says nothing: record more")
+    assert all(step["rms_error"] is None for step in judged["steps"])
+    unit.settings["procedure"]["faces"] = {"accuracy_deg": 1.0}
+    assert "beside those on the six faces" in unit.diagnosed("accelerometer")["next_experiment"]
 
 
 def test_twenty_four_orientations_select_nothing_where_nothing_is_hidden() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.planning.guide import (
     TURNS_DEG,
     Turn,
@@ -116,6 +117,16 @@ def test_the_number_of_rests_and_the_uncertainty_come_true() -> None:
     assert progress.expanded <= goal
     assert abs(len(done) - 10 - promised.further) <= 4
     assert propose(progress, goal).further == 0
+
+
+def test_the_plan_starts_from_the_covariance_of_the_fit_while_a_misalignment_is_known_by_its_limit() -> None:
+    for seed in range(3):
+        log = [recorded(attitudes()[:10], np.random.default_rng(seed))]
+        progress, found = progress_of(log, SETTINGS, DWELL), nonlinear_least_squares.fit(log, None, SETTINGS)
+        assert progress.reason == "10 orientations leave misalignment_zy open"
+        assert found.covariance is not None
+        published = np.sqrt(np.diag(found.covariance))[nonlinear_least_squares.PLACE]
+        assert np.sqrt(np.diag(np.linalg.inv(progress.information))) == pytest.approx(published, rel=1e-6)
 
 
 def test_the_rest_that_is_held_out_is_far_from_the_others() -> None:

@@ -21,9 +21,10 @@ from pipeline.estimation.multi_position.fit import fit_robustly
 from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, model_of
 from pipeline.estimation.multi_position.likelihood import NEW, prior_hypotheses
 from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise_prior import noise_of, prior_of
-from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position
+from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
 from pipeline.records import Recording, SensorCalibration, Values
 
 if TYPE_CHECKING:
@@ -41,8 +42,18 @@ def fit(
 ) -> SensorCalibration:
     """Fit bias and matrix of the gyroscope (``pipeline.estimation.stages``).
 
-    Role ``rests``, with the readings of the accelerometer, which is calibrated on the way.
+    Role ``rests``, with the readings of the accelerometer, which is calibrated on the way. Raises
+    ``CannotCalibrateError`` also where the moves are too few or too much alike, and the accelerometer keeps its fit.
     """
+    try:
+        return _fit(recordings, previous, settings)
+    except NotObservableError as lack:
+        raise CannotCalibrateError(lack.message, lack.file) from lack
+
+
+def _fit(
+    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
     if not is_multi_position("gyroscope", recordings):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
     if not any(r.role == ROLE and r.accelerometer is not None for r in recordings):
@@ -53,9 +64,10 @@ def fit(
     noise, advice = noise_of("gyroscope", recordings, settings), ADVICE + advice_on_held_out(recordings, settings)
     model = model_of(recordings, None, noise, settings)
     if model is None or (model.moves is None and model.turns is None):
+        rests = rests_of("gyroscope", recordings, settings)
         raise NotObservableError(
             f"the gyroscope's matrix needs at least {FEWEST_MOVES} moves between rests, without gaps or clipped "
-            f"readings: {advice}"
+            f"readings{clipped_moves(recordings, rests) if rests else ''}: {advice}"
         )
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     _require_determined(model.equations(start).base, advice)

@@ -37,6 +37,7 @@ then shows where the move ended, with more noise than the mean.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -135,6 +136,16 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
     warm = rests.temperature[before][:, None]
     temperature = warm + share * (rests.temperature[after][:, None] - warm)
     return Moves(before, after, reading - taken, time, temperature, weight, doubt)
+
+
+def clipped_moves(recordings: Sequence[Recording], rests: Rests) -> str:
+    """Return how many of the moves between the rests hold clipped or stuck readings, as a clause; empty for none."""
+    valid = []
+    for i, j in pairwise(range(len(rests.time))):
+        if rests.recording[i] == rests.recording[j]:
+            valid.append(recordings[rests.recording[j]].valid[rests.span[i, 1] - 1 : rests.span[j, 0] + 1].all())
+    lost = valid.count(False)
+    return f", and {lost} of the {len(valid)} moves hold clipped or stuck readings" if lost else ""
 
 
 def trapezoids(time: Values) -> Values:

@@ -10,13 +10,17 @@ import pytest
 from hand_session import hand_held
 from scipy.special import stdtrit
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.design import Term
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import to_the_end
+from pipeline.io.channel_table import ChannelTable
+from pipeline.io.ingest_settings import Checks
+from pipeline.io.quality_flags import examine
+from pipeline.io.units import TRIADS
 from pipeline.model.effects import effect
 from pipeline.simulation.trajectory import rotation_about
 
@@ -104,7 +108,7 @@ def test_without_rests_by_hand_the_gyroscope_is_left_null_with_the_reason() -> N
 
 def test_too_few_moves_are_refused() -> None:
     unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=0)
-    with pytest.raises(NotObservableError, match="at least 6 moves") as refused:
+    with pytest.raises(CannotCalibrateError, match="at least 6 moves") as refused:
         rests_and_moves.fit(unit.recordings, None, unit.settings)
     assert "holdout_every" not in str(refused.value)
     unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=3)
@@ -119,6 +123,31 @@ def test_too_few_moves_are_refused() -> None:
         if r.role == "rests"
     ]
     with pytest.raises(
-        NotObservableError, match=r"so 3 rests, .* are held out .* use them by procedure.holdout_every=0"
+        CannotCalibrateError, match=r"so 3 rests, .* are held out .* use them by procedure.holdout_every=0"
     ):
         rests_and_moves.fit(few, None, unit.settings)
+
+
+@pytest.mark.parametrize(("share", "left"), [(0.8, 14), (0.5, 0)])
+def test_moves_that_are_clipped_below_the_stated_range_are_left_out_and_named(share: float, left: int) -> None:
+    unit = hand_held("mpu6050", 5, interval_s=0.01)
+    whole, *others = unit.recordings
+    assert whole.gyroscope is not None
+    end = share * np.abs(whole.gyroscope).max(axis=0)
+    clipped = replace(whole, gyroscope=np.clip(whole.gyroscope, -end, end))
+    channels = {sensor: clipped.reading(sensor) for sensor in TRIADS}
+    values = {c: channels[s][:, k] for s, triad in TRIADS.items() for k, c in enumerate(triad)}
+    table = ChannelTable("log.csv", whole.time_ns, values, {}, np.arange(whole.samples), {})
+    flags, notes = examine(table, unit.settings["sensor"], Checks())
+    assert all(n.code == "N-CLIP" and n.detail.startswith("gyro_") for n in notes)
+    assert flags is not None
+    np.testing.assert_array_equal(flags > 0, np.any(np.abs(whole.gyroscope) >= end, axis=1))
+    marked = replace(unit, recordings=[replace(clipped, flags=flags), *others])
+    if not left:
+        with pytest.raises(CannotCalibrateError, match=r"and \d\d of the 39 moves hold clipped or stuck readings"):
+            marked.calibrated("gyroscope")
+        return
+    found = marked.calibrated("gyroscope")
+    assert found.stages[-1].details["moves"] == left
+    assert np.abs(found.matrix - unit.true_matrix("gyroscope")).max() < 3e-4  # 0.1 with the clipped moves
+    assert marked.diagnosed("gyroscope", calibration=found)["verdict"] == "nothing_missing"
