@@ -238,9 +238,7 @@ def _advances(values: Values) -> bool:
 
 def _triad(words: dict[int, list[str]]) -> Triad | None:
     """Return the columns of x, y and z among the columns of one sensor: the first of each axis."""
-    axes: dict[str, int] = {}
-    for index, w in words.items():
-        axes.setdefault(_axis_of(w), index)
+    axes = {_axis_of(w): index for index, w in reversed(words.items())}
     for names in ("xyz", "012", "123"):
         if set(names) <= axes.keys():
             x, y, z = (axes[n] for n in names)
@@ -353,8 +351,7 @@ def find_layout(data: bytes, path: str) -> Log:
     }
     evidence = {"rate_hz": f"the file states {rate_line!r}"} if rate_hz is not None else {}
     remarks = [f"{odd} rows have another number of fields than the others"] if odd else []
-    keys = [name if named else i for i, name in enumerate(names)]
-    return Log(path, csv_section, keys, names, numbers, evidence, remarks)
+    return Log(path, csv_section, [*(names if named else range(len(names)))], names, numbers, evidence, remarks)
 
 
 def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:
