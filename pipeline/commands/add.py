@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from pipeline.config.devices import Edit
 
 EPILOG = """\
-The effects are then part of the model of the unit in every run. The run repeats the stages that depend on them, and
-its last lines state the change of the held-out error.
+Added effects are part of the model of the unit in every run, until they are removed. The run repeats the stages that
+depend on them, and its last lines state the change of the held-out error.
 
 examples:
   python -m pipeline add demo mpu6050-2-hidden gyroscope.g_sensitivity

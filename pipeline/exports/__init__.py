@@ -15,7 +15,7 @@ default, of its file. Formats are listed nowhere else.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +25,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from pipeline.errors import ConfigurationError
 from pipeline.exports.c_effects import plan_of
-from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, noise_figures, plain
+from pipeline.exports.sensors import FACTORS, FUNCTIONS, ExportedSensor, before_use, noise_figures, plain
 from pipeline.records import SENSORS, SensorCalibration
 
 JSON = dict[str, Any]
@@ -77,13 +77,26 @@ def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
     return _environment().get_template(name).render(values)
 
 
+def _declared(template: Path, keys: JSON) -> Format:
+    """Return the declaration of a template; raises ``ConfigurationError`` for a missing or unknown key, or a unit."""
+    optional = {f.name for f in fields(Format) if f.default is not MISSING or f.default_factory is not MISSING}
+    known = {f.name for f in fields(Format)}
+    wrong = [f"the key {key} is missing" for key in sorted(known - optional - {"file"} - keys.keys())]
+    wrong += [f"there is no key {key}; expected {', '.join(sorted(known))}" for key in keys.keys() - known]
+    units = (keys.get("units") or {}).values()
+    wrong += [f"units: {unit} is none of {', '.join(FACTORS)}" for unit in units if unit not in FACTORS]
+    if wrong:
+        raise ConfigurationError(f"{template}: {'; '.join(wrong)}. docs/exports.md, Add a format, has an example")
+    return Format(**{"file": template.stem, **keys})
+
+
 @cache
 def formats() -> dict[str, tuple[Format, Template]]:
     """Return declaration and text of every format, by name, in alphabetical order."""
     formats_by_name: dict[str, tuple[Format, Template]] = {}
     for template in sorted(TEMPLATES.glob("*.j2")):
         header, _, text = template.read_text(encoding="utf-8").partition("\n---\n")
-        declared = Format(**{"file": template.stem, **yaml.safe_load(header)})
+        declared = _declared(template, yaml.safe_load(header))
         same = [name for name, (other, _) in formats_by_name.items() if other.file == declared.file]
         if same:
             raise ConfigurationError(

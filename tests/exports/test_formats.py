@@ -2,6 +2,7 @@
 
 import configparser
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -26,9 +27,8 @@ FILES = {
     *("imucal.json", "inav.txt", "kalibr.yaml", "kalibr_imu.yaml", "kalibr_imu_chain.yaml", "paparazzi_imu.xml"),
     *("px4.params", "realsense_calibration.json"),
 }
-EXAMPLE = (
-    (Path(__file__).parents[2] / "docs" / "exports.md").read_text().rpartition("\n```\n")[0].rpartition("\n```\n")[2]
-)
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "exports.md").read_text()
+EXAMPLE = DOCUMENT[DOCUMENT.index("consumer: my flight controller") :].partition("\n```\n")[0]
 ACCELEROMETER = np.array([[0.994, 0.004, -0.002], [0.021, 1.007, 0.003], [-0.005, 0.012, 0.951]])
 GYROSCOPE = np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0.005, 0.998]])
 
@@ -102,6 +102,26 @@ def test_the_template_of_the_documentation_adds_a_format_whose_file_is_named_by_
     assert lines[2].startswith("# Cross-axis terms of the accelerometer are left out")
     offset = [float(x) for x in lines[4].partition("=")[2].split(",")]
     assert offset == pytest.approx([0.031 * 9.80665, -0.022 * 9.80665, 0.067 * 9.80665])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("opening_remarks:", "opening_remark:", "the key opening_remarks is missing; there is no key opening_remark;"),
+        ("m/s^2", "mg", "units: mg is none of g, m/s^2, deg/s, rad/s"),
+    ],
+)
+def test_a_wrong_declaration_is_refused_by_its_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, after: str, message: str
+) -> None:
+    (tmp_path / "mine.j2").write_text(EXAMPLE.replace(before, after, 1))
+    monkeypatch.setattr(exports, "TEMPLATES", tmp_path)
+    formats.cache_clear()
+    try:
+        with pytest.raises(ConfigurationError, match=re.escape(message)):
+            formats()
+    finally:
+        formats.cache_clear()
 
 
 def test_every_format_writes_its_file(tmp_path: Path, settings: dict[str, Any]) -> None:
