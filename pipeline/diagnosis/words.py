@@ -10,6 +10,7 @@ from jinja2 import Environment, FileSystemLoader, Template
 
 from pipeline.estimation.candidates import HELD, TILT, is_held
 from pipeline.estimation.free_curves import OTHER
+from pipeline.estimation.posterior import CERTAIN
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, unit_of
 
@@ -51,7 +52,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"plain": plain, "listed": listed, "answer": _answer}
+    environment.filters |= {"plain": plain, "listed": listed, "said": _said}
     environment.globals |= {"is_held": is_held, "largest_by_unit": largest_by_unit, "plus_minus": PLUS_MINUS}
     environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED}
     return environment
@@ -133,6 +134,10 @@ def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: F
     if verdict == "unexplained":
         return of_unknown(found.unknown, on_table=found.on_table) if found.unknown else found.advice(verdict)
     if not found.selected:
+        if verdict == "nothing_missing" and found.answers.sets[0][0]:
+            pair = found.answers.sets[0], ((), dict(found.answers.sets).get((), 0.0))
+            sets = [{"effects": names, "probability": min(p, CERTAIN)} for names, p in pair]
+            return f"to distinguish {to_distinguish(sets, found.sensor, on_table=found.on_table)}"
         return found.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
     entries = {entry["effect"]: entry for entry in ranking}
 

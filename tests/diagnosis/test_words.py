@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from pipeline.diagnosis.words import PLUS_MINUS, in_words, next_experiment
+from pipeline.estimation.posterior import Answers
 from pipeline.model.effects import catalogue
 
 
@@ -40,11 +41,38 @@ def test_the_fit_without_the_effects_is_named() -> None:
     assert PLUS_MINUS not in none
 
 
-@pytest.mark.parametrize(("answer", "disagree"), [([], False), (["quadratic_nonlinearity"], True)])
-def test_probabilities_against_the_verdict_are_said(answer: list[str], *, disagree: bool) -> None:
-    said = " ".join(in_words(part("nothing_missing", [], [(answer, 0.91)]), "gyroscope"))
-    assert ("probabilities and selection disagree" in said) is disagree
-    assert ("What is missing" in said) is not disagree
+LIKELY = [(["quadratic_nonlinearity"], 0.69), ([], 0.24)]
+
+
+@pytest.mark.parametrize(("answers", "likely"), [([([], 0.91)], False), (LIKELY, True)])
+def test_an_answer_more_probable_than_nothing_is_the_headline(
+    answers: list[tuple[list[str], float]], *, likely: bool
+) -> None:
+    lines = in_words(part("nothing_missing", [], answers), "accelerometer")
+    assert lines[0].startswith("No effect was selected" if likely else "Nothing that these recordings can show")
+    assert ("the most probable answer is quadratic nonlinearity (0.69)" in lines[0]) is likely
+    assert ("What is missing" in " ".join(lines)) is not likely
+
+
+@pytest.mark.parametrize("on_table", [True, False])
+def test_the_next_experiment_distinguishes_the_most_probable_answer_from_nothing(*, on_table: bool) -> None:
+    class Found:
+        sensor, selected = "accelerometer", ()
+        answers = Answers([(("quadratic_nonlinearity",), 0.6), (("cubic_nonlinearity",), 0.25), ((), 0.15)], {})
+
+        @staticmethod
+        def advice(_verdict: str) -> str:
+            return "to make bias temperature observable"
+
+    Found.on_table = on_table  # type: ignore[attr-defined]
+    said = next_experiment("nothing_missing", [], Found())  # type: ignore[arg-type]
+    assert said.startswith("to distinguish quadratic nonlinearity (0.6) from nothing (0.15): ")
+    assert ("centrifuge" in said) is on_table
+    document = part("nothing_missing", [], LIKELY)
+    document |= {"next_experiment": said, "to_distinguish": said.removeprefix("to distinguish ")}
+    assert " ".join(in_words(document, "accelerometer")).lower().count(said) == 1
+    Found.answers = Answers([((), 0.9), (("quadratic_nonlinearity",), 0.1)], {})
+    assert next_experiment("nothing_missing", [], Found()) == Found.advice("")  # type: ignore[arg-type]
 
 
 def test_a_probability_is_said_of_effects_that_the_recordings_can_test() -> None:
