@@ -229,7 +229,7 @@ def _applied(turn: Turn, doubt: Note | None, departure: _Departure | None, hint:
     if turn.fit.unknown and logged and recording.role != "gyroscope":  # that needs neither face nor zero
         detail = f"upward face, turn axis and zero are taken as stated: {turn.fit.unknown}"
         notes.append(Note("N-MOUNTING", 1, 0, 0, detail))
-    if bench.conventional:
+    if bench.conventional and departure is None:
         return replace(recording, notes=tuple(notes))
     angle, rate = recording.table_angle, recording.table_rate
     how = "as stated" if departure is None else f"{departure.problem}; {hint}; used as found"

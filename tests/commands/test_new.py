@@ -57,7 +57,7 @@ def test_other_ranges_need_no_overrides_by_hand(tmp_path: Path) -> None:
     assert [sensor["accelerometer"][k] for k in ("full_scale", "counts_per_unit")] == [8, 4096]
     assert sensor["gyroscope"]["full_scale"] == 250
     assert "campaign.yaml states the ranges" in (tmp_path / "a" / "README.md").read_text()
-    with pytest.raises(ConfigurationError, match="in g, then that of the gyroscope"):
+    with pytest.raises(ConfigurationError, match="in g, then of the gyroscope in deg/s"):
         main([str(tmp_path / "b"), "--range", "8", "500", "2"])
 
 
