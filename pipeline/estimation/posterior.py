@@ -13,12 +13,13 @@ Source: Hoeting et al., Statistical Science 14 (1999), 382-417; conjugate prior 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
-from pipeline.estimation.evidence import NEGLIGIBLE, Given, Pick, Problem, Set
+from pipeline.estimation.evidence import NEGLIGIBLE, SCALE_PRIOR, SCALES, Given, Pick, Problem, Set
 from pipeline.estimation.free_curves import BEND
 from pipeline.estimation.selection import DELAYS
 
@@ -272,6 +273,12 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
             break
         found = following
     return np.split(following, np.cumsum(counts)[:-1])
+
+
+@cache
+def prior_limit() -> float:
+    """Return the upper limit that the prior gives without any reading, over the sensor file's limit."""
+    return float(quantiles([(np.exp(SCALE_PRIOR), np.zeros((len(SCALES), 1)), SCALES[:, None])])[0][0])
 
 
 def excluded(effects: Sequence[Effect]) -> dict[str, Set]:

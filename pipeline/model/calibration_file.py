@@ -336,14 +336,19 @@ def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
     found = []
     for cause, entries in by_cause.items():
         worst = max(entries, key=lambda e: e["ratio"])
-        names = ", ".join(e["parameter"] for e in entries)
+        names = ", ".join(map(_plain, entries))
         unit = "" if worst["unit"] == "1" else f" {worst['unit']}"
         found.append(
-            f"Implausible for this model of {sensor}: {names}; {worst['parameter']} is {worst['value']:+.4g}{unit}, "
+            f"Implausible for this model of {sensor}: {names}; {_plain(worst)} is {worst['value']:+.4g}{unit}, "
             f"{worst['ratio']:.3g} times the sensor file's limit of {worst['limit']:.4g}{unit}. Likely cause: {cause}. "
             f"Where it is meant so: sensor.{sensor}.accept_implausible=true."
         )
     return found
+
+
+def _plain(entry: Entry) -> str:
+    """Return the name of an entry's parameter in words: ``g sensitivity kg xx`` for ``g_sensitivity.kg_xx``."""
+    return str(entry["parameter"]).replace(".", " ").replace("_", " ")
 
 
 def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
@@ -359,7 +364,7 @@ def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
             U = part["expanded_uncertainty"][key]
             if size > max(u or 0.0 for u in (U if key == "bias" else np.diag(U))):
                 of = f"{size:.2g} {part['unit']} of bias" if key == "bias" else f"{100.0 * size:.2g} % of the matrix"
-                found.append((f"{entry['source']}, up to {of}", entry["reason"]))
+                found.append((f"{entry['source']}, up to {of}", entry["reason"].partition("; up to ")[0]))
     return found
 
 

@@ -91,7 +91,7 @@ def render(
         far_shown=FAR_SHOWN,
         far=FAR,
         causes=_causes(failures),
-        found=verdict_groups(findings) + _beyond_limits(fitted),
+        found=verdict_groups(findings) + _beyond_limits(fitted) + _not_held_out(rows),
         commands=next_commands(findings, settings or {"campaign": campaign}),
         history=history,
         history_data=script_data({"units": history["units"]}) if history else None,
@@ -116,6 +116,12 @@ def _beyond_limits(parameters: pd.DataFrame) -> list[tuple[str, list[str]]]:
     own = parameters[~parameters["parameter"].str.contains(CROSS_AXIS)]
     beyond = own[own["value"].abs() > own["limit"]].groupby("sensor")["unit"].unique()
     return [(f"{sensor}, beyond the sensor file's limits", list(units)) for sensor, units in beyond.items()]
+
+
+def _not_held_out(rows: Sequence[JSON]) -> list[tuple[str, list[str]]]:
+    """Return the units with errors on the samples of the fit instead of held-out motion, by sensor."""
+    found = [(s, [row["unit"] for row in rows if row.get(f"{s}_not_held_out")]) for s in SENSORS]
+    return [(f"{sensor}, not checked on held-out motion", units) for sensor, units in found if units]
 
 
 def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:

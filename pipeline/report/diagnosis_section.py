@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import first
+from pipeline.estimation.posterior import prior_limit
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, parameter_limits
 from pipeline.records import AXES, SENSOR_UNITS, Values
@@ -29,6 +30,7 @@ JSON = dict[str, Any]
 GATE = LINEAR_TO  # delta BIC, strong evidence: A. E. Raftery, Sociological Methodology 25 (1995) 139, table 6
 CLOSE = 0.8  # share of the selected effect's delta BIC from which another effect is named as a rival
 MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart or its caption has room for
+EXCLUDED = 0.5  # of the upper limit by the prior alone, below which the recordings exclude an effect: convention
 MOST_LIMITS = 8  # upper limits that a chart has room for
 ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, bins being correlated
 MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they leave it by more
@@ -51,7 +53,8 @@ def evidence_figures(sensor: str, found: JSON) -> list[Figure | None]:
 def limit_rows(sensor: str, found: JSON, sensor_config: JSON) -> list[JSON]:
     """Return for each effect that was not selected its upper limits as text, and its share of the sensor file's limit.
 
-    ``share`` is None where the sensor file has no limit; the largest come first.
+    ``share`` is None where the sensor file has no limit; the largest come first. ``excluded``: whether the recordings
+    exclude an effect at that limit.
     """
     rows = []
     for name, limits in (found.get("upper_limit") or {}).items():
@@ -62,7 +65,13 @@ def limit_rows(sensor: str, found: JSON, sensor_config: JSON) -> list[JSON]:
             stated = dict(zip((p.name for p in this.parameters(sensor)), values, strict=True))
         text = ", ".join(f"{number(v, 2)} {unit_text(unit)}".rstrip() for unit, v in largest_by_unit(limits).items())
         shares = {key: v["value"] / stated[key] for key, v in limits.items() if np.isfinite(stated.get(key, np.inf))}
-        row: JSON = {"effect": name, "text": text, "share": max(shares.values(), default=None)}
+        share = max(shares.values(), default=None)
+        row: JSON = {
+            "effect": name,
+            "text": text,
+            "share": share,
+            "excluded": share is not None and share < EXCLUDED * prior_limit(),
+        }
         if shares:
             most = limits[max(shares, key=lambda key: shares[key])]
             row["label"] = f"{plain(name)}: below {number(most['value'], 2)} {unit_text(most['unit'])}".rstrip()
@@ -75,8 +84,14 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
     shown = [row for row in rows if row["share"]]
     if not shown:
         return None
-    excluded = sum(row["share"] < 1.0 for row in shown)
-    finding, caption, _ = sentences("limits", count=len(shown), excluded=excluded, others=len(shown) - MOST_LIMITS)
+    finding, caption, _ = sentences(
+        "limits",
+        count=len(shown),
+        excluded=sum(row["excluded"] for row in shown),
+        others=len(shown) - MOST_LIMITS,
+        below=EXCLUDED * prior_limit(),
+        prior=prior_limit(),
+    )
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
     figure = Figure(f"{sensor}-limits", finding, caption)
     label = "upper limit over the sensor file's limit (logarithmic)"

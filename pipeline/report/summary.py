@@ -19,7 +19,7 @@ SENSOR_COLUMNS = (
     "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
     "answers",
 )  # fmt: skip
-OF_CALIBRATION = tuple(f"{s}_{c}" for c in ("implausible", "not_in_uncertainty") for s in SENSORS)
+OF_CALIBRATION = tuple(f"{s}_{c}" for c in ("implausible", "not_in_uncertainty", "not_held_out") for s in SENSORS)
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, "left_out")
 PARAMETERS = (
     "sensor",
@@ -66,6 +66,7 @@ def summary_row(
         part = calibration.get(sensor)
         implausible = (part or {}).get("implausible") or []
         row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
+        row[f"{sensor}_not_held_out"] = held_out.get("reason")
         row[f"{sensor}_not_in_uncertainty"] = "; ".join(source for source, _ in beyond_uncertainty(part)) or None
     for key, value in units_table_row.items():
         if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:

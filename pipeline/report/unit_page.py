@@ -103,6 +103,8 @@ def _sensor(
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
     limits, kind = limit_rows(sensor, found, sensor_config), VERDICTS.get(found.get("verdict", ""), "")
+    held, likely = held_out.get("held_out", True), (found.get("answer_set") or [{}])[0].get("effects")
+    logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
     parameters = parameter_rows(part, sensor_config)
     return {
@@ -128,7 +130,8 @@ def _sensor(
         "limits": limits,
         "implausible": sentences(sensor, part),
         "beyond": beyond_uncertainty(part),
-        "kind": "" if far and kind == "good" else kind,
+        "kind": "warn" if not held else "" if (far or likely) and kind == "good" else kind,
+        "of_rests": table.get("motion") == "none" and not logged,
         "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),
     }

@@ -18,7 +18,7 @@ from pipeline.report.fleet import parameter_table, write_summary
 from pipeline.report.summary import COLUMNS, summary_row, unit_parameters
 from pipeline.report.unit_page import render
 
-from .conftest import Unit, build_unit
+from .conftest import SHEET, Unit, build_unit
 
 VOID = {
     "meta",
@@ -169,7 +169,7 @@ def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_sum
     entries = [{**entry, "likely_cause": "readings 0.5 times the truth"}]
     calibration = unit.calibration | {"gyroscope": {**unit.calibration["gyroscope"], "implausible": entries}}
     text = Text(render(calibration, unit.validation, unit.diagnosis, [], unit.settings)).text
-    assert "Implausible for this model of gyroscope: scale_factor_x; scale_factor_x is -0.5, 16.7 times" in text
+    assert "Implausible for this model of gyroscope: scale factor x; scale factor x is -0.5, 16.7 times" in text
     assert "sensor.gyroscope.accept_implausible=true" in text
     row = summary_row("U", calibration, unit.validation, unit.diagnosis, {})
     assert (row["accelerometer_implausible"], row["gyroscope_implausible"]) == (None, "scale_factor_x")
@@ -249,3 +249,44 @@ def test_nothing_missing_is_not_green_beside_an_error_far_above_the_noise(
     cell = re.search(r'<td( class="good-text")?>nothing missing', campaign_page.render("c", [row], []))
     assert cell is not None
     assert bool(cell[1]) == good
+
+
+def test_a_sensor_judged_on_the_samples_of_its_fit_is_marked_on_both_pages(unit: Unit) -> None:
+    validation, settings = copy.deepcopy((unit.validation, unit.settings))
+    reason = "no held-out recording holds readings of the gyroscope; judged on the samples of the fit"
+    validation["gyroscope"] |= {"held_out": False, "reason": reason, "samples": 13}
+    settings["table"] = {"name": "none", "motion": "none"}
+    page = render(unit.calibration, validation, unit.diagnosis, [], settings)
+    card = re.search(r'<div class="card ([^"]*)">\s*<h2>Gyroscope</h2>(.*?)<a href', page, re.DOTALL)
+    assert card is not None
+    assert card[1] == "warn"
+    assert f'<p class="warn-text"><b>Not checked on held-out motion</b>: {reason}.</p>' in card[2]
+    assert "Errors on the samples of the fit, of the magnitude in deg/s over 13 rests" in Text(page).text
+    assert "over 2,000 samples" in Text(render(*unit.arguments)).text
+    row = summary_row("U1", unit.calibration, validation, unit.diagnosis, {})
+    assert (row["gyroscope_not_held_out"], row["accelerometer_not_held_out"]) == (reason, None)
+    text = Text(campaign_page.render("c", [row], [])).text
+    assert "gyroscope, not checked on held-out motion: U1" in text
+    assert "nothing missing not held out" in text
+    assert "not checked" not in Text(campaign_page.render("c", rows(unit, 2), [])).text
+
+
+def test_nothing_missing_is_not_green_beside_a_more_probable_answer(unit: Unit) -> None:
+    diagnosis = copy.deepcopy(unit.diagnosis)
+    for effects, kind in (([], "good"), (["quadratic_nonlinearity"], "")):
+        diagnosis["gyroscope"]["answer_set"] = [{"effects": effects, "probability": 0.69}]
+        page = render(unit.calibration, unit.validation, diagnosis, [], unit.settings)
+        assert f'<div class="card {kind}">\n<h2>Gyroscope</h2>' in page
+
+
+def test_an_upper_limit_of_about_the_prior_excludes_no_effect(unit: Unit) -> None:
+    diagnosis, limit = copy.deepcopy(unit.diagnosis), SHEET["effects"]["quadratic_nonlinearity"]
+    for share, excluded in ((0.999, 0), (0.3, 1)):
+        entry = {"K2_x": {"value": share * limit, "unit": "1/g"}}
+        diagnosis["accelerometer"] |= {
+            "upper_limit": {"quadratic_nonlinearity": entry},
+            "probability": {"quadratic_nonlinearity": 0.06},
+        }
+        text = Text(render(unit.calibration, unit.validation, diagnosis, [], unit.settings)).text
+        assert f"{excluded} of 1 effects that were not selected" in text
+        assert (", not excluded" in text) == (not excluded)
