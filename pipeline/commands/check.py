@@ -285,7 +285,8 @@ def _topics(reading: Reading, *, fields: bool = False) -> list[Line]:
 
 
 def _refusal_of(reading: Reading, error: PipelineError) -> Told:
-    lines = [("REFUSED", f"{_place(error.file, reading.files)}{error.message}"), ("code", error.code)]
+    unlike = "the file needs another profile, see below: " if error.code in UNKNOWN_LAYOUT else ""
+    lines = [("REFUSED", f"{unlike}{_place(error.file, reading.files)}{error.message}"), ("code", error.code)]
     refused = Refused(error.code, error.message, error.file or str(reading.files[0]), reading)
     text = _told_of(reading, [*lines, *_topics(reading, fields=error.code == "missing_topic")])
     parts = getattr(error, "sessions", 0)
@@ -369,7 +370,7 @@ def _next_step(proposal: Proposal, name: str, save: Path | None) -> str:
     todo = "check it by" if save else f"save it in your campaign (--save {profile}), and check it by"
     lines = [
         f"If every line is right, {todo}",
-        f"python -m pipeline check {shlex.join(proposal.files[:MOST_IN_FULL])} --ingest {shlex.quote(str(profile))}",
+        f"python -m pipeline check {shlex.join(proposal.files)} --ingest {shlex.quote(str(profile))}",
         f"A run uses it from configs/ingest of the campaign, with the override ingest={name}, or with {name} in the",
         "column ingest of units.csv.",
     ]

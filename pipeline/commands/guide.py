@@ -118,12 +118,11 @@ def main(argv: Sequence[str]) -> int:
         if missing:
             raise ConfigurationError(f"there is no file {', '.join(missing)}; --follow waits for one")
         advice = _advice(source.read(growing=False), source.config, goals, arguments.dwell)
-        print("\n".join([*(rest.text for rest in advice.rests), *advice.words]))
+        print("\n".join([*(rest.text for rest in advice.rests), *_held_out(source), *advice.words]))
         return 0
-    try:
-        _follow(source, goals, arguments.dwell)
-    except KeyboardInterrupt:
-        print()
+    for line in _held_out(source):
+        print(line, flush=True)
+    _follow(source, goals, arguments.dwell)
     return 0
 
 
@@ -176,6 +175,22 @@ def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
 def _whole(entry: dict[str, Any]) -> dict[str, Any]:
     """Return the entry of a recording; one that a run cuts into parts counts as rests from its start to its end."""
     return {**entry, "role": "rests"} if entry["role"] == "session" else entry
+
+
+def _held_out(source: Source) -> list[str]:
+    """Return which rests are held out of the fit, and why; nothing where faces and turns are asked for."""
+    procedure = source.config["procedure"]
+    every = int(procedure.get("holdout_every") or 0)
+    if procedure.get("faces"):
+        return []
+    if any(entry["role"] == "validation" for entry, _ in source.entries().values()):
+        return ["no rest is held out of the fit: the recording for validation judges it"]
+    if not every:
+        return ["no rest is held out of the fit: procedure.holdout_every is 0"]
+    why = "there is no recording for validation"
+    return [
+        f"one of {every} rests is held out of the fit, to judge it: {why} (a run does so from holdout_from rests on)"
+    ]
 
 
 def _complete_rows(file: Path, folder: Path) -> Path:
@@ -297,28 +312,31 @@ def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str
 def _follow(source: Source, goals: Goals, dwell: float) -> None:
     """Look at a growing log again and again, and tell what is new, until it is enough."""
     told: list[RestLine] = []
-    last, waiting = "", ""
+    last, waiting, state = "", "", "no rest was read"
     bell = "\a" if sys.stdout.isatty() else ""
-    while True:
-        try:
-            recordings = [_without_last_rest(r, dwell) for r in source.read(growing=True)]
-            problem = "" if recordings else f"there is no file {source.files[0]} yet"
-            advice = _advice(recordings, source.config, goals, dwell) if recordings else None
-        except CannotCalibrateError:
-            raise
-        except PipelineError as error:
-            advice, problem = None, error.message
-        if problem and problem != waiting:
-            print(f"waiting: {problem}", flush=True)
-        waiting = problem
-        if advice is not None:
-            new = _news(advice.rests, told)
-            if new or advice.enough or not last or (not advice.rests and advice.words[-1] != last):
-                print("\n".join([*new, *advice.words]) + bell, flush=True)
-                last = advice.words[-1]
-                if advice.enough:
-                    return
-        time.sleep(POLL_S)
+    try:
+        while True:
+            try:
+                recordings = [_without_last_rest(r, dwell) for r in source.read(growing=True)]
+                problem = "" if recordings else f"there is no file {source.files[0]} yet"
+                advice = _advice(recordings, source.config, goals, dwell) if recordings else None
+            except CannotCalibrateError:
+                raise
+            except PipelineError as error:
+                advice, problem = None, error.message
+            if problem and problem != waiting:
+                print(f"waiting: {problem}", flush=True)
+            waiting = problem
+            if advice is not None:
+                state, new = advice.words[0], _news(advice.rests, told)
+                if new or advice.enough or not last or (not advice.rests and advice.words[-1] != last):
+                    print("\n".join([*new, *advice.words]) + bell, flush=True)
+                    last = advice.words[-1]
+                    if advice.enough:
+                        return
+            time.sleep(POLL_S)
+    except KeyboardInterrupt:
+        print(f"\nended before it was enough: {state}")
 
 
 def _news(rests: Sequence[RestLine], told: list[RestLine]) -> list[str]:

@@ -72,6 +72,9 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
     sets = part.get("answer_set") or []
     more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
+    by_reason: dict[str, list[str]] = {}
+    for hidden in part["not_observable"]:
+        by_reason.setdefault(hidden["reason"].split("; it needs ")[0], []).append(hidden["effect"])
     text = template("diagnosis.txt").render(
         part=part,
         sensor=sensor,
@@ -79,6 +82,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
         most_values=most_values,
         entries={entry["effect"]: entry for entry in part["ranking"]},
         catalogue=catalogue(),
+        by_reason=by_reason.items(),
         answers=listed([*map(_said, sets[:MOST_ANSWERS]), *more], "or"),
         held=HELD,
         tilt=TILT,

@@ -216,6 +216,8 @@ def test_files_alike_share_one_proposal_which_is_printed_last(
     assert checked.out.count("REFUSED  ") == 1
     assert "REFUSED as log0.csv: log1.csv, log2.csv, log3.csv, log4.csv" in checked.out
     assert checked.err == "python -m pipeline check: 5 files, for example log0.csv:1: refused (missing_column)\n"
+    assert "REFUSED the file needs another profile, see below: line 1: column" in checked.words
+    assert f"check {' '.join(names)} --ingest" in checked.words
     assert checked.words.count("read with the proposed profile") == 3
     assert "no column that the profile assigns to the gyroscope" in checked.words
     listed = ", ".join(names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,7 +83,10 @@ def test_a_growing_log_is_followed_until_it_is_enough(
     assert main(["guide", str(log), "--sensor", "mpu6050", "--goal", "0.8", "--follow"]) == 0
     out = capsys.readouterr().out
     lines = out.splitlines()
-    assert lines[0].startswith("waiting: there is no file")
+    assert lines[0].startswith(
+        "one of 3 rests is held out of the fit, to judge it: there is no recording for validation"
+    )
+    assert lines[1].startswith("waiting: there is no file")
     assert lines[-1] == "enough: the goal is reached"
     assert next(sizes, None) is not None  # before the log was complete
     numbers = [int(line.split()[0]) for line in lines if line.startswith("   ") and line.split()[0].isdigit()]
@@ -130,8 +134,29 @@ def test_a_rest_whose_rate_is_near_the_limit_is_told_again_once_where_the_end_di
     monkeypatch.setattr(guide.time, "sleep", grow)
     options = ["--sensor", "mpu6050", "--goal", "0.001", "--dwell", "2", "--follow"]
     assert main(["guide", str(tmp_path / "log.csv"), *options]) == 0
-    told = [line for line in capsys.readouterr().out.splitlines() if "  log 55." in line]
+    lines = capsys.readouterr().out.splitlines()
+    told = [line for line in lines if "  log 55." in line]
     assert ["left out" if "left out" in line else "used" for line in told] == ["used", "left out"]
+    assert re.fullmatch(r"ended before it was enough: expanded uncertainty: .* \(\d+ rests of the fit, .*\)", lines[-1])
+
+
+def test_a_recording_for_validation_leaves_every_rest_to_the_fit(
+    rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "bench"
+    shutil.copytree(rests.parents[2], bench)
+    recording = bench / "raw" / "U1" / "recording.csv"
+    assert main(["guide", str(recording), "--goal", "1"]) == 0
+    assert "one of 3 rests is held out of the fit" in capsys.readouterr().out
+    header, *rows = recording.read_text().splitlines()
+    table = np.array([row.split(",")[:7] for row in rows], float)
+    table += [1000.0, *np.full(6, 1e-4)]  # another recording, later
+    lines = [",".join(header.split(",")[:7]), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    recording.with_name("validation.csv").write_text("\n".join(lines) + "\n")
+    assert main(["guide", str(recording), "--goal", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "no rest is held out of the fit: the recording for validation judges it" in said
+    assert "rests of the fit, 0 held out" in said
 
 
 def test_a_log_of_two_files_is_guided_by_its_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -86,6 +86,22 @@ def test_a_probability_is_said_of_effects_that_the_recordings_can_test() -> None
     )
 
 
+def test_effects_that_cannot_be_seen_are_grouped_by_reason() -> None:
+    reasons = {
+        "time_offset": "there is no table",
+        "bias_temperature": "the recordings hold no temperature; it needs rests while the sensor warms",
+        "low_pass_lag": "there is no table",
+        "scale_factor_temperature": "the recordings hold no temperature; it needs each axis up and down",
+        "lever_arm": "nobody knows the heading",
+    }
+    hidden = [{"effect": name, "reason": reason} for name, reason in reasons.items()]
+    lines = in_words(part("nothing_missing", [], []) | {"not_observable": hidden}, "accelerometer")
+    assert lines[-1] == (
+        "Not observable: time offset and low pass lag (there is no table); bias temperature and scale factor "
+        "temperature (the recordings hold no temperature); lever arm (nobody knows the heading)."
+    )
+
+
 def test_an_effect_of_the_bench_is_no_fault_of_the_sensor() -> None:
     found = part("missing_effect", ["lever_arm"], [])
     assert "It is a property of the mounting, not of the sensor." in in_words(found, "accelerometer")
