@@ -254,9 +254,8 @@ def _remark_on_other_triads(columns: Columns, sensor: str, words: dict[int, list
         groups.setdefault((*w[:at], *w[at + 1 :]), {})[index] = w
     triads = [t for group in groups.values() if (t := _triad(group)) is not None]
     if len(triads) > 1:
-        texts = [", ".join(columns.log.names[i] for i in t) for t in triads]
         taken = ", ".join(columns.log.names[i] for i in columns.triads[sensor])
-        others = "; ".join(text for text in texts if text != taken)
+        others = "; ".join(", ".join(columns.log.names[i] for i in t) for t in triads if t != columns.triads[sensor])
         what = sensor if sensor != "?" else "sensor"
         remark = f"{len(triads)} triads may be the {what}: taken {taken}; the others are {others}; choose"
         columns.remarks.append(remark)
@@ -317,6 +316,7 @@ class Log:
     numbers: dict[int, Values]  # columns with only finite numbers
     evidence: dict[str, str] = field(default_factory=dict)  # by key of ``csv``
     remarks: list[str] = field(default_factory=list)
+    texts: dict[int, tuple[str, ...]] = field(default_factory=dict)  # the other columns
     topic: str | None = None
 
     @property
@@ -350,8 +350,9 @@ def find_layout(data: bytes, path: str) -> Log:
         "rate_hz": rate_hz,
     }
     evidence = {"rate_hz": f"the file states {rate_line!r}"} if rate_hz is not None else {}
+    texts = {i: cells for i, cells in enumerate(zip(*rows, strict=True)) if i not in numbers}
     remarks = [f"{odd} rows have another number of fields than the others"] if odd else []
-    return Log(path, csv_section, [*(names if named else range(len(names)))], names, numbers, evidence, remarks)
+    return Log(path, csv_section, [*(names if named else range(len(names)))], names, numbers, evidence, remarks, texts)
 
 
 def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:
@@ -390,9 +391,8 @@ def _numbers(rows: list[list[str]], decimal: str) -> dict[int, Values]:
     """Return the columns that contain only finite numbers, by index."""
     columns = {}
     for index, cells in enumerate(zip(*rows, strict=True)):
-        texts = [c.replace(",", ".") for c in cells] if decimal == "," else cells
         try:
-            column = np.array(texts, np.float64)
+            column = np.array([c.replace(",", ".") for c in cells] if decimal == "," else cells, np.float64)
         except ValueError:
             continue
         if np.isfinite(column).all():

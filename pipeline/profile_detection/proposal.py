@@ -8,11 +8,13 @@ does not determine is taken from another file of the same layout.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.io.csv_times import SHORTEST_PART
 from pipeline.io.gravity_rotation import Move, interval_of, moves_of
 from pipeline.io.ingest_settings import AUTO
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
+FEWEST_LABELS, MOST_LABELS = 3, 4  # two texts may be states of the logger; labels that a remark names
 Entries = dict[str, dict[str, Any]]
 
 
@@ -189,10 +192,24 @@ def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
         proposal.remarks += columns.remarks
         if proposal.topic is not None and columns.time is None:
             proposal.remarks.append("no field of the topic is a time, which each topic needs")
-        proposal.remarks += columns.log.remarks
+        proposal.remarks += columns.log.remarks + _labels(columns.log)
     if force is None and rate is None:
         _add_template(proposal)
     return proposal
+
+
+def _labels(log: Log) -> list[str]:
+    """Return remarks on columns whose text names a part of the recording: each text fills rows one after the other."""
+    found = []
+    for index, texts in log.texts.items():
+        labels = [label for label, _ in groupby(texts)]
+        if FEWEST_LABELS <= len(labels) == len(set(labels)) and len(texts) >= SHORTEST_PART * len(labels):
+            named = ", ".join(labels[:MOST_LABELS]) + " .." * (len(labels) > MOST_LABELS)
+            found.append(
+                f"column {log.names[index]} labels {len(labels)} parts ({named}), which may not follow each other in "
+                "time: give each rest and turn as a window or a file of its own, see docs/by_hand.md#parts"
+            )
+    return found
 
 
 def _described(values: Values | None) -> str:

@@ -98,7 +98,13 @@ def test_sessions_one_after_the_other_are_noticed(reference: Path) -> None:
     proposal = proposed(reference / "ferraris_wearable" / "annotated_session.csv")
     assert proposal.columns[0]["accel_x"]["counts_per_unit"] == 2048.0
     assert any("does not increase at 5 rows" in r for r in proposal.remarks)
-    assert "# not used: part (not all of it is numbers)" in as_yaml(proposal, "annotated")
+    text = as_yaml(proposal, "annotated")
+    assert "# not used: part (not all of it is numbers)" in text
+    assert "column part labels 9 parts (x_a, x_p, x_rot, y_a ..)" in text
+    assert "docs/by_hand.md#parts" in text
+    assert not any(
+        "labels" in r for r in proposed(reference / "ferraris_wearable" / "example_ferraris_session.csv").remarks
+    )
 
 
 @pytest.mark.parametrize("cell", ["a: b", "x # y", "no", "${sensor.name}", 'say "ax"', "1e3", "ü"])
