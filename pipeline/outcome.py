@@ -38,6 +38,7 @@ PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes 
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
 EFFECTS = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
 NOT_CALIBRATED = "not_calibrated"  # in a calibration document, why a sensor has none
+NOT_CONVERGED = "the fit did not converge: parameters and uncertainties are in doubt"
 RESULTS = "results"  # the default folder of results
 
 
@@ -147,6 +148,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         ("calibrations", NOT_CALIBRATED),
         ("validations", "reason"),
         ("calibrations", "not_determined"),
+        ("calibrations", "converged"),
     ):
         lines += first(_reasons(results / documents, key, units), NAMED, "reasons")
     lines += lines_of(_not_in_uncertainty(rows).items())
@@ -171,13 +173,14 @@ def _reasons(documents: Path, key: str, units: Sequence[str]) -> list[str]:
         file = documents / f"{unit}.json"
         document = read_json(file) if file.is_file() else {}
         for sensor in SENSORS:
-            if key == NOT_CALIBRATED:
-                reason = (document.get(key) or {}).get(sensor)
-            else:
-                reason = (document.get(sensor) or {}).get(key)
+            part = document.get(sensor) or {}
+            reason = part.get(key)
+            if key == NOT_CALIBRATED and (lack := (document.get(key) or {}).get(sensor)):
+                reason = f"not calibrated: {lack}"
+            elif key == "converged":
+                reason = "" if part.get(key, True) else NOT_CONVERGED
             if reason:
-                what = f"not calibrated: {reason}" if key == NOT_CALIBRATED else reason
-                groups.setdefault(f"{sensor}, {what}", []).append(unit)
+                groups.setdefault(f"{sensor}, {reason}", []).append(unit)
     return lines_of(groups.items())
 
 

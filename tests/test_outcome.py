@@ -63,3 +63,11 @@ def test_the_closing_lines_name_a_sensor_that_has_no_calibration(tmp_path: Path)
     document = {"accelerometer": {}, "gyroscope": None, "not_calibrated": {"gyroscope": "6 moves are needed"}}
     (tmp_path / "U1.json").write_text(json.dumps(document))
     assert _reasons(tmp_path, NOT_CALIBRATED, ["U1", "U2"]) == ["gyroscope, not calibrated: 6 moves are needed: U1"]
+
+
+def test_the_closing_lines_name_a_fit_that_did_not_converge(tmp_path: Path) -> None:
+    (tmp_path / "U1.json").write_text(json.dumps({"accelerometer": {"converged": False}, "gyroscope": None}))
+    (tmp_path / "U2.json").write_text(json.dumps({"accelerometer": {"converged": True}, "gyroscope": {}}))
+    (line,) = _reasons(tmp_path, "converged", ["U1", "U2"])
+    assert line.startswith("accelerometer, the fit did not converge")
+    assert line.endswith(": U1")

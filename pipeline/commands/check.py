@@ -298,7 +298,12 @@ def _recipe(reading: Reading, parts: int) -> str:
     ((name, entry),) = reading.settings["procedure"]["recordings"].items()
     if "file" not in entry:
         return "To use all parts, check the file where it lies in your campaign: check then prints the settings."
-    here = {k: v for k, v in entry.items() if v is not None}
+    if entry.get("windows"):
+        return (
+            "The procedure cuts this recording into windows, and its time falls back within it. Write a file for each "
+            "window, or one file whose time never falls back (docs/by_hand.md, Parts)."
+        )
+    here = {k: v for k, v in entry.items() if v is not None or k == "axis"}
     lines = [f"procedure.recordings.{name}.session=1"]
     for part in range(2, parts + 1):
         values = ", ".join(f"{k}: {json.dumps(v)}" for k, v in (here | {"session": part}).items())

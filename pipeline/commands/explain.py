@@ -17,7 +17,7 @@ from pipeline.exports.reading import counts_of, read_any
 from pipeline.files import read_json
 from pipeline.history import read_history
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
-from pipeline.outcome import Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
+from pipeline.outcome import NOT_CONVERGED, Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import FAR
@@ -122,6 +122,11 @@ def explain(selection: Selection) -> str:
                     f"{s.capitalize()}: {reason}."
                     for s in SENSORS
                     if (reason := (calibration.get(s) or {}).get("not_determined"))
+                ),
+                *(
+                    f"{s.capitalize()}: {NOT_CONVERGED}."
+                    for s in SENSORS
+                    if not (calibration.get(s) or {}).get("converged", True)
                 ),
                 *(f"Left out: {line}." for line in left_out(calibration.get("inputs"))),
             ],

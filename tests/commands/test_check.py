@@ -441,6 +441,26 @@ def test_the_parts_of_a_log_whose_clock_fell_back_are_used_by_the_settings_that_
     assert f"session 2 of 2: lines 433 to {432 + len(again)} were read" in both.words
 
 
+def test_the_parts_of_a_log_by_hand_are_used_by_the_settings_that_check_prints(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``axis`` of a recording of rests is null, and an override that leaves it out is refused."""
+    assert main(["new", str(tmp_path / "bench"), "--sensor", "generic", "--procedure", "multi_position"]) == 0
+    folder = tmp_path / "bench" / "raw" / "U1"
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = [f"{0.02 * (i % 600):.2f},0,0,{(-1) ** (i // 600)},0.1,0.2,0.3" for i in range(1200)]
+    names = ",".join(["time_s", *(f"accel_{a}_g" for a in "xyz"), *(f"gyro_{a}_dps" for a in "xyz")])
+    (folder / "recording.csv").write_text("\n".join([names, *rows]) + "\n")
+    capsys.readouterr()
+    refused = Checked(capsys, "--campaign", tmp_path / "bench")
+    recipe = refused.out[refused.out.index("overrides:") :].partition("\n\n")[0]
+    (tmp_path / "bench" / "devices").mkdir(exist_ok=True)
+    (tmp_path / "bench" / "devices" / "U1.yaml").write_text(recipe + "\n")
+    checked = Checked(capsys, "--campaign", tmp_path / "bench")
+    assert "the configuration is refused" not in checked.out + checked.err
+    assert "2 orientations determine neither" in checked.out  # one of each part
+
+
 def test_a_command_that_cannot_read_a_log_names_the_one_that_proposes_a_profile(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

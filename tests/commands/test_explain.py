@@ -58,10 +58,12 @@ def test_a_parameter_beyond_the_data_sheet_is_told(results: Path, capsys: pytest
 
 def test_what_the_rests_do_not_determine_is_told(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (results / "bench" / "calibrations").mkdir()
-    lack = {"accelerometer": None, "gyroscope": {"not_determined": "the rests do not determine it"}}
+    lack = {"accelerometer": None, "gyroscope": {"not_determined": "the rests do not determine it", "converged": False}}
     (results / "bench" / "calibrations" / "U1.json").write_text(json.dumps(lack))
     main([str(results / "bench"), "U1"])
-    assert "  Gyroscope: the rests do not determine it.\n" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "  Gyroscope: the rests do not determine it.\n" in told
+    assert "  Gyroscope: the fit did not converge" in told
 
 
 def test_an_error_far_above_the_noise_is_told_with_that_of_held_out_moves(
@@ -94,6 +96,19 @@ def test_why_the_error_is_not_that_of_held_out_motion_is_told(
     assert (
         "Not judged on held-out motion: no reference.\n    Held-out error: the expected error is not stated.\n" in said
     )
+
+
+def test_a_fit_that_passes_through_its_rests_states_no_error(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = results / "bench" / "validations"
+    folder.mkdir()
+    reason = "the fit passes through its 6 rests exactly"
+    judged = {"unit": "deg/s", "held_out": False, "reason": reason, "noise_floor": None, "expected_rms_error": None}
+    judged["steps"] = [{"name": "calibrated", "rms_error": None}]
+    (folder / "U1.json").write_text(json.dumps({"unit": "U1", "gyroscope": judged}))
+    assert main(["bench", "U1", "--results", str(results)]) == 0
+    told = capsys.readouterr().out
+    assert f"Not judged on held-out motion: {reason}." in told
+    assert "rms error" not in told
 
 
 def test_the_missing_effect_is_named_with_its_size_and_the_commands_that_add_it(

@@ -43,17 +43,9 @@ def fit(
     """Fit bias and matrix of the gyroscope (``pipeline.estimation.stages``).
 
     Role ``rests``, with the readings of the accelerometer, which is calibrated on the way. Raises
-    ``CannotCalibrateError`` also where the moves are too few or too much alike, and the accelerometer keeps its fit.
+    ``CannotCalibrateError`` also where there are too few moves: then the accelerometer keeps its fit. Moves and turns
+    that contradict gravity or the stated angle may have a wrong time base: then the unit fails.
     """
-    try:
-        return _fit(recordings, previous, settings)
-    except NotObservableError as lack:
-        raise CannotCalibrateError(lack.message, lack.file) from lack
-
-
-def _fit(
-    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
-) -> SensorCalibration:
     if not is_multi_position("gyroscope", recordings):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
     if not any(r.role == ROLE and r.accelerometer is not None for r in recordings):
@@ -65,7 +57,7 @@ def _fit(
     model = model_of(recordings, None, noise, settings)
     if model is None or (model.moves is None and model.turns is None):
         rests = rests_of("gyroscope", recordings, settings)
-        raise NotObservableError(
+        raise CannotCalibrateError(
             f"the gyroscope's matrix needs at least {FEWEST_MOVES} moves between rests, without gaps or clipped "
             f"readings{clipped_moves(recordings, rests) if rests else ''}: {advice}"
         )
