@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.commands import parser_of
-from pipeline.commands.readings import campaign_of, config_of_log, grouped, recordings_of_files
+from pipeline.commands.readings import campaign_of, complete_rows, config_of_log, grouped, recordings_of_files
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
+from pipeline.estimation import effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.rest_means import is_multi_position
-from pipeline.io.files import MESSAGE_FORMATS, recording_files
+from pipeline.io.files import recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.planning.guide import (
@@ -31,7 +32,8 @@ from pipeline.planning.guide import (
     propose,
 )
 from pipeline.preprocessing.checks import check_recordings
-from pipeline.signal.rests import NEIGHBOURS, WINDOW_S, find_rests
+from pipeline.signal.rests import WINDOW_S, find_rests
+from pipeline.signal.segments import cut
 from pipeline.simulation.description import BY_HAND
 
 if TYPE_CHECKING:
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.planning.guide import Progress
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
     from pipeline.signal.rests import Rest
 
 POLL_S = 1.0  # between two looks at a growing log: short against a rest
@@ -49,8 +51,8 @@ EPILOG = """\
 The next rest is the one that reduces the uncertainty of the accelerometer's calibration most. The goal is reached when
 the largest expanded uncertainty (95 %) of the bias, in mg, and of the matrix, in mg at 1 g, is below --goal. With
 --gyroscope-goal, turns for the gyroscope's matrix follow (method=rests_and_moves); until then each message states its
-uncertainty. With --procedure ferraris, the next
-missing face or turn is named. docs/record.md shows the names of the attitudes.
+uncertainty. With --procedure ferraris, the next missing face or turn is named. docs/record.md shows the names of the
+attitudes.
 
 A recording of a campaign is read as the campaign's configuration says, together with the unit's other recordings. Any
 other file is read by --sensor, --ingest and --procedure.
@@ -75,7 +77,7 @@ class Source:
         if self.folder is not None:
             procedure = self.config["procedure"]
             found = recording_files(procedure, self.config["ingest"], self.folder)
-            return {name: (_whole(procedure["recordings"][name]), files) for name, files in found.items()}
+            return {name: (procedure["recordings"][name], files) for name, files in found.items()}
         groups = [group for group in grouped(self.files, self.config["ingest"]) if all(f.exists() for f in group)]
         return {group[0].stem: ({"role": "rests", "axis": None}, group) for group in groups}
 
@@ -89,9 +91,11 @@ class Source:
         recordings = []
         with tempfile.TemporaryDirectory() as folder:
             for name, (entry, files) in entries.items():
-                whole = [_complete_rows(f, Path(folder)) for f in files] if growing else files
-                table = read_table(whole, ingest)
-                recordings.append(to_recording(name, entry, table, self.config["sensor"], checks_of(ingest)))
+                whole = [complete_rows(f, Path(folder)) for f in files] if growing else files
+                table, windows = read_table(whole, ingest), entry.get("windows")
+                role = "rests" if entry["role"] == "session" and not windows else entry["role"]
+                read = to_recording(name, {**entry, "role": role}, table, self.config["sensor"], checks_of(ingest))
+                recordings += cut(read, windows) if windows else [read]
         return check_recordings(recordings, settings) if recordings else []
 
 
@@ -113,6 +117,10 @@ def main(argv: Sequence[str]) -> int:
     if arguments.goal is None and not faces:
         name = source.config["sensor"]["name"]
         print(f"goal: {1e3 * goal:g} mg, what 24 rests 45 deg apart reach with the noise of the sensor file {name}")
+    left_out = source.config["effects"]["accelerometer"]
+    if left_out and not faces:
+        names = left_out if isinstance(left_out, str) else ", ".join(left_out)
+        print(f"the accelerometer is forecast without its configured effects: {names}")
     if not arguments.follow:
         missing = [str(f) for f in source.files if not f.exists()]
         if missing:
@@ -120,6 +128,9 @@ def main(argv: Sequence[str]) -> int:
         advice = _advice(source.read(growing=False), source.config, goals, arguments.dwell)
         print("\n".join([*(rest.text for rest in advice.rests), *_held_out(source), *advice.words]))
         return 0
+    if source.folder is not None and any(e.get("windows") for e in source.config["procedure"]["recordings"].values()):
+        name = source.config["procedure"]["name"]
+        raise ConfigurationError(f"procedure {name} states windows, so the recording must be complete: omit --follow")
     for line in _held_out(source):
         print(line, flush=True)
     _follow(source, goals, arguments.dwell)
@@ -172,18 +183,14 @@ def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
     return {**config, "procedure": {**procedure, "holdout_from": 0}}
 
 
-def _whole(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return the entry of a recording; one that a run cuts into parts counts as rests from its start to its end."""
-    return {**entry, "role": "rests"} if entry["role"] == "session" else entry
-
-
 def _held_out(source: Source) -> list[str]:
     """Return which rests are held out of the fit, and why; nothing where faces and turns are asked for."""
     procedure = source.config["procedure"]
     every = int(procedure.get("holdout_every") or 0)
     if procedure.get("faces"):
         return []
-    if any(entry["role"] == "validation" for entry, _ in source.entries().values()):
+    entries = [entry for entry, _ in source.entries().values()]
+    if any(part["role"] == "validation" for entry in entries for part in [entry, *(entry.get("windows") or ())]):
         return ["no rest is held out of the fit: the recording for validation judges it"]
     if not every:
         return ["no rest is held out of the fit: procedure.holdout_every is 0"]
@@ -193,23 +200,19 @@ def _held_out(source: Source) -> list[str]:
     ]
 
 
-def _complete_rows(file: Path, folder: Path) -> Path:
-    """Return a copy of a text log up to its last complete row; logs of messages as they are."""
-    if file.suffix.lower() in (".mcap", *MESSAGE_FORMATS):
-        return file
-    copy = folder / file.name
-    copy.write_bytes(file.read_bytes().rpartition(b"\n")[0] + b"\n")
-    return copy
-
-
 class RestLine(NamedTuple):
     """What is printed of a rest."""
 
     recording: str
-    start: float  # s
-    used: bool
-    final: bool  # whether the rests with whose rate its own is compared are there
+    start: float  # s; with the recording it identifies the rest, since its number may change
+    stop: float  # s
+    number: int  # 0 where the rest is left out
+    use: str  # "in the fit", "held out" or "left out"
     text: str
+
+    def overlaps(self, other: RestLine) -> bool:
+        """Return whether both are the same rest: more of the log may shift its start and its end."""
+        return self.recording == other.recording and self.start < other.stop and other.start < self.stop
 
 
 class Advice(NamedTuple):
@@ -232,21 +235,15 @@ def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goal
         done, words = next_face_or_turn(recordings, config["procedure"], dwell)
         return Advice(done, [], words)
     progress = progress_of(recordings, config, dwell)
-    starts = [(r.name, rest.start) for r, rest in (*progress.rests, *progress.left_out)]
-
-    def line(r: Recording, rest: Rest, text: str) -> RestLine:
-        of_recording = [start for name, start in starts if name == r.name]
-        after = sum(start > rest.start for start in of_recording)
-        final = after >= NEIGHBOURS // 2 and len(of_recording) >= NEIGHBOURS
-        return RestLine(r.name, r.time[rest.start], rest.accepted, final, text)
-
     rows = zip(progress.rests, progress.up, progress.held_out, strict=True)
     lines = [
-        line(r, rest, f"{k:>4}  {_described(r, rest, up, held=held)}")
+        RestLine(r.name, *_span(r, rest), k, "held out" if held else "in the fit", f"{k:>4}  {text}")
         for k, ((r, rest), up, held) in enumerate(rows, start=1)
+        for text in [_described(r, rest, up, held=held)]
     ]
     for r, rest in progress.left_out:
-        lines.append(line(r, rest, f"   -  {r.name} {r.time[rest.start]:.1f} s: left out: {rest.reason}"))
+        text = f"   -  {r.name} {_span(r, rest)[0]:.1f} s: left out: {rest.reason}"
+        lines.append(RestLine(r.name, *_span(r, rest), 0, "left out", text))
     done, words = _next(progress, goals.accelerometer, dwell)
     if goals.gyroscope is None:
         return Advice(done, lines, words)
@@ -262,7 +259,7 @@ def _next_turn(
 ) -> tuple[bool, list[str]]:
     """Return whether the gyroscope's goal is reached, and the next turn in words."""
     try:
-        found = rests_and_moves.fit(recordings, None, config)
+        found = effects.fit("gyroscope", recordings, rests_and_moves.fit(recordings, None, config), config)
     except (NotObservableError, CannotCalibrateError) as lack:
         if not is_multi_position("gyroscope", recordings):
             raise
@@ -278,8 +275,13 @@ def _next_turn(
     return False, [now, f"next: {turn.in_words(dwell)}"]
 
 
+def _span(recording: Recording, rest: Rest) -> tuple[float, float]:
+    """Return start and end of a rest, s."""
+    return float(recording.time[rest.start]), float(recording.time[rest.stop - 1])
+
+
 def _described(recording: Recording, rest: Rest, up: Any, *, held: bool) -> str:  # noqa: ANN401  (an array)
-    start, stop = recording.time[rest.start], recording.time[rest.stop - 1]
+    start, stop = _span(recording, rest)
     return f"{recording.name} {start:.1f} to {stop:.1f} s: {in_words(up)}{' (held out)' if held else ''}"
 
 
@@ -299,6 +301,8 @@ def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str
     lines.append(f"next: {in_words(proposal.up)}; rest it for {dwell:g} s")
     if progress.next_is_held_out:
         lines.append("      (held out of the fit, to judge it: an attitude far from all others)")
+    elif again := _again(progress, proposal.up):
+        lines.append(f"      ({again})")
     if proposal.expected > goal:
         lines.append(
             f"expected: {1e3 * proposal.expected:.3g} mg after {MOST} more rests, so the goal is out of reach: rest "
@@ -309,9 +313,23 @@ def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str
     return False, lines
 
 
+def _again(progress: Progress, up: Values) -> str:
+    """Return why an attitude is proposed that was recorded before; empty where no rest is near it."""
+    there = progress.near(up)
+    if not there:
+        return ""
+    of_fit = [i for i in there if not progress.held_out[i]]
+    i = (of_fit or there)[-1]
+    known = f"rest {i + 1} ({progress.rests[i][0].name} {_span(*progress.rests[i])[0]:.1f} s) is near this attitude"
+    if of_fit:
+        return f"{known}; of all attitudes another rest there still reduces the uncertainty most"
+    return f"{known}, but it is held out: the fit needs one there"
+
+
 def _follow(source: Source, goals: Goals, dwell: float) -> None:
     """Look at a growing log again and again, and tell what is new, until it is enough."""
     told: list[RestLine] = []
+    advice: Advice | None = None
     last, waiting, state = "", "", "no rest was read"
     bell = "\a" if sys.stdout.isatty() else ""
     try:
@@ -328,31 +346,45 @@ def _follow(source: Source, goals: Goals, dwell: float) -> None:
                 print(f"waiting: {problem}", flush=True)
             waiting = problem
             if advice is not None:
-                state, new = advice.words[0], _news(advice.rests, told)
+                state = advice.words[0]
+                new = any(not any(rest.overlaps(t) for t in told) for rest in advice.rests)
                 if new or advice.enough or not last or (not advice.rests and advice.words[-1] != last):
-                    print("\n".join([*new, *advice.words]) + bell, flush=True)
+                    lines, told = _news(advice.rests, told)
+                    print("\n".join([*lines, *advice.words]) + bell, flush=True)
                     last = advice.words[-1]
                     if advice.enough:
                         return
             time.sleep(POLL_S)
     except KeyboardInterrupt:
-        print(f"\nended before it was enough: {state}")
+        changes = _news(advice.rests, told)[0] if advice is not None else []
+        print("\n".join(["", *changes, f"ended before it was enough: {state}"]))
 
 
-def _news(rests: Sequence[RestLine], told: list[RestLine]) -> list[str]:
-    """Return the lines of rests that were not told before, and of those that are judged otherwise in the end.
+def _news(rests: Sequence[RestLine], told: Sequence[RestLine]) -> tuple[list[str], list[RestLine]]:
+    """Return the lines on the rests that are new or of another use than was told, and what then is told.
 
-    The rate of a rest is compared with that of its neighbours, so that rests to come may change what is told of it. To
-    tell each rest twice at most, a change is told when the neighbours are there. ``told`` is brought up to date.
+    More of the log may change the use of a rest: its rate is compared with that of its neighbours, the limit of a
+    quiet window is found from the whole log, and with a rest admitted or left out each later one has another number,
+    so that another one of three is held out. The changes are told together with the next new rest.
     """
-    new = []
+    changed, numbers, new, known = [], [], [], list(told)
     for rest in rests:
-        same = (t for t in told if t.recording == rest.recording and abs(t.start - rest.start) < WINDOW_S)
-        before = next(same, None)  # more of the log may shift the start of a rest
-        if before is None or (rest.final and not before.final):
-            new += [rest.text] if before is None or before.used != rest.used else []
-            told[:] = [*(t for t in told if t is not before), rest]
-    return new
+        before = next((t for t in known if rest.overlaps(t)), None)
+        if before is None:
+            new.append(rest.text)
+            continue
+        known.remove(before)
+        number = f" as number {before.number}" if before.number not in {0, rest.number} else ""
+        if before.use != rest.use:
+            changed.append(f"{rest.text}; before it was {before.use}{number}")
+        elif number:
+            numbers.append(f"{before.number} ({rest.recording} {rest.start:.1f} s) is now {rest.number}")
+    gone = [t for t in known if any(r.recording == t.recording and r.start >= t.stop for r in rests)]
+    changed += [
+        f"   -  {t.recording} {t.start:.1f} s: no rest of its own any more; before it was {t.use}" for t in gone
+    ]
+    renumbered = [f"      numbers: {', '.join(numbers)}"] if numbers else []
+    return [*changed, *renumbered, *new], [*rests, *(t for t in known if t not in gone)]
 
 
 def _without_last_rest(recording: Recording, dwell: float) -> Recording:

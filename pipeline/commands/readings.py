@@ -162,3 +162,12 @@ def composed(profile: str, sensor: str | None, campaign: Path | None, more: Sequ
             return Composer(directory).unit("check", [*layers, f"ingest={path.stem}"])
         except Problem as problem:
             raise ConfigurationError(str(problem), profile if directory == Path(folder) else None) from None
+
+
+def complete_rows(file: Path, folder: Path) -> Path:
+    """Return a copy in ``folder`` of a text log up to its last complete row; logs of messages as they are."""
+    if file.suffix.lower() in (".mcap", *MESSAGE_FORMATS):
+        return file
+    copy = folder / file.name
+    copy.write_bytes(file.read_bytes().rpartition(b"\n")[0] + b"\n")
+    return copy

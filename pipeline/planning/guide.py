@@ -29,7 +29,8 @@ with white noise s of the mean of a rest, bias wander q and tau, rests one after
 body.
 
 Faces and turns (procedure ``ferraris``): each of the six faces needs a rest, and each body axis a turn by the stated
-angle from rest to rest; where turns are held out, one that is. They are recognised as in the fit.
+angle from rest to rest; where turns are held out, one that is. They are recognised as in the fit; a
+recording that is stated as a turn about an axis may begin and end without a rest.
 
 Rests and moves: of turns by A about a level body axis a, from the vertical u, the one with the largest gain
 
@@ -55,10 +56,11 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import COLUMNS, IDEAL, PLACE, ROWS, triangle
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, limit_of_misalignment
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
+from pipeline.estimation.multi_position.moves import sound_span
 from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
 from pipeline.records import AXES, Recording, SensorCalibration, Values, coverage_factor
 from pipeline.signal.rests import WINDOW_S, Rest, find_rests
-from pipeline.signal.segments import turns_by_hand
+from pipeline.signal.segments import multiples, turns_by_hand
 from pipeline.simulation.trajectory import rotation_by
 
 if TYPE_CHECKING:
@@ -126,6 +128,11 @@ class Progress:
     def used(self) -> int:
         """Number of rests of the fit."""
         return self.held_out.count(False)
+
+    def near(self, up: Values) -> list[int]:
+        """Return the rests to which no other attitude that is proposed is nearer than ``up``."""
+        nearest = np.argmax(self.up @ attitudes().T, axis=1)
+        return [int(i) for i in np.flatnonzero(nearest == int(np.argmax(attitudes() @ up)))]
 
     def largest(self, information: Values, further: int) -> float:
         """Return the largest expected U after further rests, g (of the matrix at 1 g)."""
@@ -357,15 +364,22 @@ def next_face_or_turn(
     ``dwell``: s, of a rest to come.
     """
     stated = procedure["turns"]
+    if any(entry.get("windows") for entry in procedure["recordings"].values()):
+        stated = {**stated, "holdout_every": 0}  # the windows say what is held out
     faces, angle = dict.fromkeys(FACES, 0), float(stated["angle_deg"])
     turns: dict[str, list[bool]] = {axis: [] for axis in AXES}  # whether each is held out
-    for recording in (r for r in recordings if r.role == ROLE):
-        rests = [rest for rest in find_rests(recording) if rest.accepted]
+    found = [(r, [rest for rest in find_rests(r) if rest.accepted]) for r in recordings if r.role == ROLE]
+    at_rest = [r.gyroscope[rest.start : rest.stop] for r, rests in found for rest in rests if r.gyroscope is not None]
+    for recording, rests in found:
         for on in face_of(rest_means(recording, rests)[0])[0].tolist():
             if on >= 0:
                 faces[FACES[on]] += 1
         for turn in turns_by_hand(recording, rests, stated):
             turns[AXES[turn.axis]].append(turn.held_out)
+        if recording.axis and len(rests) < 2 and at_rest and sound_span(recording, slice(0, recording.samples)):
+            rate = np.asarray(recording.gyroscope) - np.concatenate(at_rest).mean(axis=0)  # a part that is one turn
+            axis, count = multiples(np.trapezoid(rate, recording.time, axis=0), angle)
+            turns[AXES[axis]] += [False] * bool(count)
     judged = bool(int(stated["holdout_every"])) and not any(r.role == "validation" for r in recordings)
     counts = (f"{axis} {len(held)}" + f" ({sum(held)} held out)" * judged for axis, held in turns.items())
     lines = [

@@ -12,6 +12,9 @@ import pytest
 from pipeline.__main__ import main
 from pipeline.commands import guide
 from pipeline.files import CONFIGS
+from pipeline.records import Recording
+from pipeline.signal.rests import find_rests
+from pipeline.signal.segments import turns_by_hand
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import description_from
 
@@ -114,7 +117,7 @@ def test_a_rest_that_is_left_out_is_told_once_and_hides_no_later_one(
     assert told[-1] == "enough: the goal is reached"
 
 
-def test_a_rest_whose_rate_is_near_the_limit_is_told_again_once_where_the_end_differs(
+def test_the_rests_as_last_told_are_those_that_each_message_counts(
     rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     header, *rows = rests.read_text().splitlines()
@@ -135,9 +138,61 @@ def test_a_rest_whose_rate_is_near_the_limit_is_told_again_once_where_the_end_di
     options = ["--sensor", "mpu6050", "--goal", "0.001", "--dwell", "2", "--follow"]
     assert main(["guide", str(tmp_path / "log.csv"), *options]) == 0
     lines = capsys.readouterr().out.splitlines()
-    told = [line for line in lines if "  log 55." in line]
-    assert ["left out" if "left out" in line else "used" for line in told] == ["used", "left out"]
+    uses: dict[float, str] = {}
+    numbers: dict[float, int] = {}
+    counted = 0
+    for line in lines:
+        if rest := re.match(r" *(\d+|-)  log (\d+\.\d)", line):
+            near = [start for start in uses if abs(start - float(rest[2])) < 0.5]
+            assert ("; before it was " in line) == bool(near)  # told again only with what was told before
+            start = near[0] if near else float(rest[2])
+            assert uses.get(start) != _use(line)
+            uses[start], numbers[start] = _use(line), 0 if rest[1] == "-" else int(rest[1])
+        for start, number in re.findall(r"\(log (\d+\.\d) s\) is now (\d+)", line):
+            numbers[min(numbers, key=lambda known: abs(known - float(start)))] = int(number)
+        if count := re.match(r"expanded uncertainty: .*\((\d+) rests of the fit, (\d+) held out", line):
+            counted += 1
+            of = list(uses.values())
+            assert [of.count("in the fit"), of.count("held out")] == [int(count[1]), int(count[2])]
+            accepted = [numbers[start] for start in sorted(uses) if numbers[start]]
+            assert accepted == list(range(1, len(accepted) + 1))
+    assert counted > 4
+    assert sum("  log 55." in line for line in lines) > 1  # the rest near the limit
     assert re.fullmatch(r"ended before it was enough: expanded uncertainty: .* \(\d+ rests of the fit, .*\)", lines[-1])
+
+
+def _use(line: str) -> str:
+    """Return the use of a rest by its line, without what it was before."""
+    now = line.partition("; before")[0]
+    return "left out" if "left out" in now else "held out" if "(held out)" in now else "in the fit"
+
+
+def test_an_attitude_is_proposed_again_with_the_reason(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    up = [*np.eye(3), *-np.eye(3), *np.eye(3)]
+    parts = [part for v in up for part in (np.tile(v, (90, 1)), 0.5 * rng.standard_normal((10, 3)))]
+    force = np.concatenate(parts) + 1e-3 * rng.standard_normal((100 * len(up), 3))
+    rows = np.column_stack([0.05 * np.arange(len(force)), force, np.zeros_like(force)])
+    head = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
+    reasons = set()
+    for count in range(2, len(up) + 1):
+        (tmp_path / "part.csv").write_text(
+            "\n".join([head, *(",".join(f"{v:.6f}" for v in r) for r in rows[: 100 * count])])
+        )
+        assert main(["guide", str(tmp_path / "part.csv"), "--sensor", "mpu6050", "--goal", "0.2"]) == 0
+        out = capsys.readouterr().out
+        known = re.findall(r"part \d.*?: (.*)", out)
+        proposed = re.search(r"next: (.*);", out)
+        assert proposed
+        again = re.search(r"\(rest (\d+) \(part .* s\) is near this attitude(.*)\)", out)
+        if "to judge it: an attitude far" not in out:
+            assert bool(again) == (proposed[1] in {line.replace(" (held out)", "") for line in known})
+        if again:
+            reasons.add("held out" in again[2])
+            assert known[int(again[1]) - 1].removesuffix(" (held out)") == proposed[1]
+            assert ("held out" in again[2]) == known[int(again[1]) - 1].endswith("(held out)")
+    assert True in reasons
 
 
 def test_a_recording_for_validation_leaves_every_rest_to_the_fit(
@@ -157,6 +212,34 @@ def test_a_recording_for_validation_leaves_every_rest_to_the_fit(
     said = capsys.readouterr().out
     assert "no rest is held out of the fit: the recording for validation judges it" in said
     assert "rests of the fit, 0 held out" in said
+
+
+def test_the_gyroscope_is_planned_with_the_effects_of_its_configuration(
+    rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "bench"
+    shutil.copytree(rests.parents[2], bench)
+    recording = bench / "raw" / "U1" / "recording.csv"
+    header, *rows = recording.read_text().splitlines()
+    table = np.array([row.split(",")[:7] for row in rows], float)
+    table[:, 4:] += 0.5 * table[:, [2, 3, 1]]  # deg/s/g, across the axes
+    lines = [",".join(header.split(",")[:7]), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    recording.write_text("\n".join(lines) + "\n")
+    stated = []
+    for listed in ("", "[g_sensitivity]"):
+        if listed:
+            (bench / "devices").mkdir()
+            lines = [f"effects.gyroscope={listed}", "effects.accelerometer=[quadratic_nonlinearity]"]
+            (bench / "devices" / "U1.yaml").write_text(f"overrides: {lines}\n")
+        assert main(["guide", str(recording), "--goal", "1", "--gyroscope-goal", "0.001"]) == 0
+        out = capsys.readouterr().out
+        assert ("accelerometer is forecast without its configured effects: quadratic_nonlinearity" in out) == bool(
+            listed
+        )
+        found = re.search(r"gyroscope's matrix: ([\d.]+) %", out)
+        assert found
+        stated.append(float(found[1]))
+    assert stated[1] < 0.5 * stated[0]
 
 
 def test_a_log_of_two_files_is_guided_by_its_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -196,6 +279,39 @@ def test_faces_and_turns_that_lack_are_named(tmp_path: Path, capsys: pytest.Capt
         seen.append(capsys.readouterr().out.splitlines()[-1])
     assert seen[0].endswith(" up; rest it for 5 s")
     assert all(line.startswith("next: +") and "about the vertical" in line for line in seen[1:])
+
+
+def test_the_windows_of_a_procedure_are_read_as_a_run_reads_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = campaign(tmp_path / "faces", "ferraris", static_s=0.0)
+    values = np.loadtxt(whole, delimiter=",", skiprows=1, usecols=range(7))
+    nanoseconds = np.round(1e9 * values[:, 0]).astype(np.int64)
+    recording = Recording("r", "rests", None, nanoseconds, accelerometer=values[:, 1:4], gyroscope=values[:, 4:])
+    found = find_rests(recording)
+    face = [int(np.argmax(np.abs(values[r.start : r.stop, 1:4].mean(axis=0)))) for r in found]
+    since = values[:, 0] - values[0, 0]
+    windows = [("null", since[r.start], since[r.stop - 1]) for r in found]
+    stated = {"angle_deg": 360.0, "holdout_every": 0}
+    turns = {"xyz"[t.axis]: (t.before[1], t.after[0]) for t in turns_by_hand(recording, found, stated)}
+    assert set(turns) == set("xyz")
+    assert set(face) == {0, 1, 2}
+    windows += [(axis, start, stop) for axis, (start, stop) in turns.items()]  # each without a rest before or after it
+    listed = [f"{{role: rests, axis: {axis}, start_s: {start}, stop_s: {stop}}}" for axis, start, stop in windows]
+    parts = whole.parents[2] / "configs" / "procedure" / "parts.yaml"
+    parts.parent.mkdir(parents=True)
+    plain = (CONFIGS / "procedure" / "ferraris.yaml").read_text()
+    sheet = whole.parents[2] / "units.csv"
+    sheet.write_text(sheet.read_text().replace("ferraris", "parts"))
+    for count, said in ((0, "enough: all faces and turns are there"), (1, "next: +z up; ")):
+        of = f"role: session, windows: [{', '.join(listed[: len(listed) - count])}],"
+        parts.write_text(plain.replace("recording, role: rests,", f"recording, {of}"))
+        assert main(["guide", str(whole)]) == 0
+        *_, seen, last = capsys.readouterr().out.splitlines()
+        assert seen == f"turns by 360 deg: x 1, y 1, z {1 - count}"
+        assert last.startswith(said)
+    assert main(["guide", str(whole), "--follow"]) == 2
+    assert "procedure parts states windows, so the recording must be complete" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
