@@ -37,7 +37,6 @@ SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
 EFFECTS = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
-NOT_CALIBRATED = "not_calibrated"  # in a calibration document, why a sensor has none
 NOT_CONVERGED = "the fit did not converge: parameters and uncertainties are in doubt"
 RESULTS = "results"  # the default folder of results
 
@@ -143,14 +142,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         f"units calibrated: {calibrated}{failed}; look at {results}/index.html",
         *lines_of(verdict_groups(findings)),
     ]
-    units = [row["unit"] for row in rows]
-    for documents, key in (
-        ("calibrations", NOT_CALIBRATED),
-        ("validations", "reason"),
-        ("calibrations", "not_determined"),
-        ("calibrations", "converged"),
-    ):
-        lines += first(_reasons(results / documents, key, units), NAMED, "reasons")
+    lines += _reasons(results, [row["unit"] for row in rows])
     lines += lines_of(_not_in_uncertainty(rows).items())
     lines += first([f"{r['unit']}, left out: {what}" for r in rows if (what := r.get("left_out"))], NAMED, "units")
     entries = read_history(results) if of_this_run else []
@@ -166,22 +158,26 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     return "\n".join(lines) + "\n"
 
 
-def _reasons(documents: Path, key: str, units: Sequence[str]) -> list[str]:
-    """Return a line for each text that the published documents of units state for a sensor under ``key``."""
-    groups: dict[str, list[str]] = {}
+def _reasons(results: Path, units: Sequence[str]) -> list[str]:
+    """Return lines on the doubts that the published calibrations and validations of units state, by kind."""
+    kinds: dict[str, dict[str, list[str]]] = {}
     for unit in units:
-        file = documents / f"{unit}.json"
-        document = read_json(file) if file.is_file() else {}
+        files = [results / folder / f"{unit}.json" for folder in ("calibrations", "validations")]
+        calibration, validation = (read_json(file) if file.is_file() else {} for file in files)
         for sensor in SENSORS:
-            part = document.get(sensor) or {}
-            reason = part.get(key)
-            if key == NOT_CALIBRATED and (lack := (document.get(key) or {}).get(sensor)):
-                reason = f"not calibrated: {lack}"
-            elif key == "converged":
-                reason = "" if part.get(key, True) else NOT_CONVERGED
-            if reason:
-                groups.setdefault(f"{sensor}, {reason}", []).append(unit)
-    return lines_of(groups.items())
+            part = calibration.get(sensor) or {}
+            lack = (calibration.get("not_calibrated") or {}).get(sensor)
+            doubts = {
+                "not_calibrated": lack and f"not calibrated: {lack}",
+                "not_held_out": (validation.get(sensor) or {}).get("reason"),
+                "not_determined": part.get("not_determined"),
+                "not_converged": None if part.get("converged", True) else NOT_CONVERGED,
+            }
+            for kind, doubt in doubts.items():
+                groups = kinds.setdefault(kind, {})
+                if doubt:
+                    groups.setdefault(f"{sensor}, {doubt}", []).append(unit)
+    return [line for groups in kinds.values() for line in first(lines_of(groups.items()), NAMED, "reasons")]
 
 
 def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from snakemake.cli import parse_config
 
-from pipeline.outcome import NOT_CALIBRATED, _reasons, add_command, once_command, run_command
+from pipeline.outcome import _reasons, add_command, once_command, run_command
 
 TEXT = st.text(
     st.characters(codec="utf-8", exclude_characters="\0\n\r\x85\u2028\u2029", exclude_categories=("Cc", "Cs"))
@@ -61,13 +61,16 @@ def test_effects_that_one_run_had_are_kept_by_the_command_that_adds_more() -> No
 
 def test_the_closing_lines_name_a_sensor_that_has_no_calibration(tmp_path: Path) -> None:
     document = {"accelerometer": {}, "gyroscope": None, "not_calibrated": {"gyroscope": "6 moves are needed"}}
-    (tmp_path / "U1.json").write_text(json.dumps(document))
-    assert _reasons(tmp_path, NOT_CALIBRATED, ["U1", "U2"]) == ["gyroscope, not calibrated: 6 moves are needed: U1"]
+    (tmp_path / "calibrations").mkdir()
+    (tmp_path / "calibrations" / "U1.json").write_text(json.dumps(document))
+    assert _reasons(tmp_path, ["U1", "U2"]) == ["gyroscope, not calibrated: 6 moves are needed: U1"]
 
 
 def test_the_closing_lines_name_a_fit_that_did_not_converge(tmp_path: Path) -> None:
-    (tmp_path / "U1.json").write_text(json.dumps({"accelerometer": {"converged": False}, "gyroscope": None}))
-    (tmp_path / "U2.json").write_text(json.dumps({"accelerometer": {"converged": True}, "gyroscope": {}}))
-    (line,) = _reasons(tmp_path, "converged", ["U1", "U2"])
+    folder = tmp_path / "calibrations"
+    folder.mkdir()
+    (folder / "U1.json").write_text(json.dumps({"accelerometer": {"converged": False}, "gyroscope": None}))
+    (folder / "U2.json").write_text(json.dumps({"accelerometer": {"converged": True}, "gyroscope": {}}))
+    (line,) = _reasons(tmp_path, ["U1", "U2"])
     assert line.startswith("accelerometer, the fit did not converge")
     assert line.endswith(": U1")
