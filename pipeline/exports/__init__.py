@@ -15,7 +15,8 @@ default, of its file. Formats are listed nowhere else.
 from __future__ import annotations
 
 import json
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, replace
+from dataclasses import fields as dataclass_fields
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +27,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from pipeline.errors import ConfigurationError
 from pipeline.exports.c_effects import plan_of
 from pipeline.exports.sensors import FACTORS, FUNCTIONS, ExportedSensor, before_use, noise_figures, plain
+from pipeline.model.checked import Check, WrongValueError, each, fields, one_of
 from pipeline.records import SENSORS, SensorCalibration
 
 JSON = dict[str, Any]
@@ -77,17 +79,16 @@ def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
     return _environment().get_template(name).render(values)
 
 
-def _declared(template: Path, keys: JSON) -> Format:
+def _declared(template: Path, header: object) -> Format:
     """Return the declaration of a template; raises ``ConfigurationError`` for a missing or unknown key, or a unit."""
-    optional = {f.name for f in fields(Format) if f.default is not MISSING or f.default_factory is not MISSING}
-    known = {f.name for f in fields(Format)}
-    wrong = [f"the key {key} is missing" for key in sorted(known - optional - {"file"} - keys.keys())]
-    wrong += [f"there is no key {key}; expected {', '.join(sorted(known))}" for key in keys.keys() - known]
-    units = (keys.get("units") or {}).values()
-    wrong += [f"units: {unit} is none of {', '.join(FACTORS)}" for unit in units if unit not in FACTORS]
-    if wrong:
-        raise ConfigurationError(f"{template}: {'; '.join(wrong)}. docs/exports.md, Add a format, has an example")
-    return Format(**{"file": template.stem, **keys})
+    keys = [key for key in dataclass_fields(Format) if key.name != "file"]
+    required = [key.name for key in keys if key.default is MISSING and key.default_factory is MISSING]
+    checks: dict[str, Check] = {key.name: lambda value: value for key in dataclass_fields(Format)}
+    try:
+        declared = fields(checks | {"units": each(one_of(*FACTORS))}, required)(header)
+    except WrongValueError as wrong:
+        raise ConfigurationError(f"{template}: {wrong}. docs/exports.md, Add a format, has an example") from None
+    return Format(**{"file": template.stem, **declared})
 
 
 @cache

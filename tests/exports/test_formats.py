@@ -107,8 +107,13 @@ def test_the_template_of_the_documentation_adds_a_format_whose_file_is_named_by_
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ("opening_remarks:", "opening_remark:", "the key opening_remarks is missing; there is no key opening_remark;"),
-        ("m/s^2", "mg", "units: mg is none of g, m/s^2, deg/s, rad/s"),
+        (
+            "opening_remarks:",
+            "opening_remark:",
+            "opening_remark: unknown key; nearest: opening_remarks; valid: consumer",
+        ),
+        ("consumer: my flight controller\n", "", "consumer is missing"),
+        ("m/s^2", "mg", "units.accelerometer: one of 'g', 'm/s^2', 'deg/s' or 'rad/s' is expected, not \"mg\""),
     ],
 )
 def test_a_wrong_declaration_is_refused_by_its_key(
