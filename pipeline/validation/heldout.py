@@ -72,8 +72,9 @@ def validate(
     samples, reason = _choose(sensor, recordings, noise, settings)
     if reason and (count := _fitted_exactly(calibration)):
         samples = []
-        reason = reason.partition("; judged")[0]
         reason += f"; the fit passes through its {count} rests exactly, so that their error says nothing: record more"
+    elif reason and samples:
+        reason += "; judged on the samples of the fit"
     count = int(sum(s.known.sum() for s in samples))
     no_figures: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
     part: dict[str, Any] = {
@@ -315,7 +316,7 @@ def _choose(
         count, fewest, every = count_of_rests(recordings), stated["holdout_from"], stated["holdout_every"]
         reason += f" ({count} rests all go to the fit; of {fewest} and more, one of {every} is held out)"
     fitted = moving(sensor) or resting(rests_of("rests")) or resting(rests_of(sensor))
-    return fitted, reason + ("; judged on the samples of the fit" if fitted else "")
+    return fitted, reason
 
 
 def _fitted_exactly(calibration: SensorCalibration) -> int:
