@@ -35,6 +35,16 @@ def rests(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return campaign(tmp_path_factory.mktemp("a") / "bench", "orientations_24", static_s=0.0, warm_up_rest_s=4.0)
 
 
+def readings_of(log: Path) -> tuple[str, np.ndarray]:
+    """Return the header and the values of time and readings: (n, 7) array."""
+    header, *rows = log.read_text().splitlines()
+    return ",".join(header.split(",")[:7]), np.array([row.split(",")[:7] for row in rows], float)
+
+
+def lines_of(header: str, table: np.ndarray) -> list[str]:
+    return [header, *(",".join(f"{v:.6f}" for v in row) for row in table)]
+
+
 def test_of_few_rests_it_says_what_they_leave_open_and_what_comes_next(
     rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -100,11 +110,10 @@ def test_a_growing_log_is_followed_until_it_is_enough(
 def test_a_rest_that_is_left_out_is_told_once_and_hides_no_later_one(
     rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    header, *rows = rests.read_text().splitlines()
-    table = np.array([row.split(",")[:7] for row in rows], float)
+    header, table = readings_of(rests)
     leans = (table[:, 0] - table[0, 0] > 16.6) & (table[:, 0] - table[0, 0] < 20.6)
     table[leans, 1] += np.linspace(-0.1, 0.1, np.count_nonzero(leans))
-    lines = [",".join(header.split(",")[:7]), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    lines = lines_of(header, table)
     log, sizes = tmp_path / "log.csv", iter(range(100, len(lines), 60))
     monkeypatch.setattr(guide.time, "sleep", lambda _: log.write_text("\n".join(lines[: next(sizes)]) + "\n"))
     assert main(["guide", str(log), "--sensor", "mpu6050", "--goal", "0.9", "--follow"]) == 0
@@ -120,12 +129,11 @@ def test_a_rest_that_is_left_out_is_told_once_and_hides_no_later_one(
 def test_the_rests_as_last_told_are_those_that_each_message_counts(
     rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    header, *rows = rests.read_text().splitlines()
-    table = np.array([row.split(",")[:7] for row in rows], float)
+    header, table = readings_of(rests)
     since = table[:, 0]
     table[(since >= 55.0) & (since < 59.0), 6] += 0.6
     table[(since >= 57.3) & (since < 59.0), 6] += 0.5
-    lines = [",".join(header.split(",")[:7]), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    lines = lines_of(header, table)
     times = iter([*np.arange(55.0, 59.6, 0.4), 64.5, 69.5, 74.5])
 
     def grow(_: float) -> None:
@@ -203,10 +211,9 @@ def test_a_recording_for_validation_leaves_every_rest_to_the_fit(
     recording = bench / "raw" / "U1" / "recording.csv"
     assert main(["guide", str(recording), "--goal", "1"]) == 0
     assert "one of 3 rests is held out of the fit" in capsys.readouterr().out
-    header, *rows = recording.read_text().splitlines()
-    table = np.array([row.split(",")[:7] for row in rows], float)
+    header, table = readings_of(recording)
     table += [1000.0, *np.full(6, 1e-4)]  # another recording, later
-    lines = [",".join(header.split(",")[:7]), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    lines = lines_of(header, table)
     recording.with_name("validation.csv").write_text("\n".join(lines) + "\n")
     assert main(["guide", str(recording), "--goal", "1"]) == 0
     said = capsys.readouterr().out
@@ -220,10 +227,9 @@ def test_the_gyroscope_is_planned_with_the_effects_of_its_configuration(
     bench = tmp_path / "bench"
     shutil.copytree(rests.parents[2], bench)
     recording = bench / "raw" / "U1" / "recording.csv"
-    header, *rows = recording.read_text().splitlines()
-    table = np.array([row.split(",")[:7] for row in rows], float)
+    header, table = readings_of(recording)
     table[:, 4:] += 0.5 * table[:, [2, 3, 1]]  # deg/s/g, across the axes
-    lines = [",".join(header.split(",")[:7]), *(",".join(f"{v:.6f}" for v in row) for row in table)]
+    lines = lines_of(header, table)
     recording.write_text("\n".join(lines) + "\n")
     stated = []
     for listed in ("", "[g_sensitivity]"):
