@@ -33,25 +33,27 @@ class Stretch:
 
     first: float
     last: float
-    begin: float = float("nan")  # time of the first sample of the log, s
-    blocks: list[tuple[Values, Values, Values]] = field(default_factory=list)  # time, specific force, rate
+    begin: float | None = None  # time of the first sample of the log, s
+    blocks: list[tuple[Values, Values, Values]] = field(  # s from the first sample, specific force, rate
+        default_factory=lambda: [(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))]
+    )
 
     def add(self, readings: Mapping[str, Values], time: Values | None, file: str) -> None:
         """Add a block: (n, 3) calibrated readings of each sensor, (n,) times in s."""
         if time is None or not {"accelerometer", "gyroscope"} <= set(readings):
             message = "--rest needs the time and the readings of both sensors; the log lacks some of these"
             raise InputError(f"{message}: leave out --rest", file)
-        if not self.blocks:
+        if self.begin is None:
             self.begin = float(time[0])
-            self.blocks.append((time[:0], readings["accelerometer"][:0], readings["gyroscope"][:0]))
-        inside = (time - self.begin >= self.first) & (time - self.begin <= self.last)
+        since = time - self.begin
+        inside = (since >= self.first) & (since <= self.last)
         if inside.any():
-            self.blocks.append((time[inside], readings["accelerometer"][inside], readings["gyroscope"][inside]))
+            self.blocks.append((since[inside], readings["accelerometer"][inside], readings["gyroscope"][inside]))
 
     def mean_rate(self, file: str) -> tuple[Values, str]:
         """Return the mean rate of the longest rest, deg/s, (3,) array, and a note that states it."""
-        time, force, rate = (np.concatenate(column) for column in zip(*self.blocks, strict=True))
-        log = Recording("log", "rests", None, np.round(time * 1e9).astype(np.int64), force, rate)
+        since, force, rate = (np.concatenate(column) for column in zip(*self.blocks, strict=True))
+        log = Recording("log", "rests", None, np.round(since * 1e9).astype(np.int64), force, rate)
         rests = [r for r in find_rests(log) if r.accepted]
         if not rests:
             message = f"no rest of 1 s or more from {self.first:g} to {self.last:g} s of the log"
@@ -64,7 +66,7 @@ class Stretch:
         parts = np.array([part.mean(axis=0) for part in np.array_split(still, PARTS)])
         error = parts.std(axis=0, ddof=1) / np.sqrt(PARTS)  # of the mean, also for noise correlated within a part
         words = ", ".join(f"{m:.4f} +- {K95 * e:.4f}" for m, e in zip(mean, error, strict=True))
-        start, stop = time[[longest.start, longest.stop - 1]] - self.begin
+        start, stop = since[[longest.start, longest.stop - 1]]
         return mean, (
             f"mean rate of the rest from {start:.1f} to {stop:.1f} s of the log, subtracted from all rates: {words} "
             f"deg/s (x, y, z; +- is the 95 % interval from the scatter of {PARTS} parts of the rest)"

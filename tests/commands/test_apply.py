@@ -136,6 +136,9 @@ def test_a_log_that_moves_where_a_rest_is_named_is_refused(calibration: Path, tm
     with pytest.raises(InputError, match=r"no rest of 1 s or more from 0 to 1\.2 s"):
         main(["--calibration", str(calibration), str(log), "-o", str(out), "--rest", "0:1.2"])
     assert not out.exists()
+    log.write_text(log.read_text(encoding="utf-8").splitlines()[0] + "\n", encoding="utf-8")  # a log without samples
+    with pytest.raises(InputError, match="no rest of 1 s or more"):
+        main(["--calibration", str(calibration), str(log), "-o", str(out), "--rest", "0:10"])
     with pytest.raises(ConfigurationError, match="expected FROM:TO"):
         main(["--calibration", str(calibration), str(log), "-o", str(out), "--rest", "10:0"])
 
