@@ -50,10 +50,10 @@ from pipeline.records import SENSORS, Recording, Values
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from pipeline.simulation.session import Streams, random_environment
-from pipeline.study.cases import COURSES, OF_TEMPERATURE, Case
+from pipeline.study.cases import COURSES, Case
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
 
 INTERVAL_S = 0.12  # the default of ``UnitDescription``
@@ -65,6 +65,11 @@ AMPLITUDE = {  # g and deg/s; by assumption, near the limits of the MPU-6050's s
     "saturation": {"accelerometer": 3e-3, "gyroscope": 0.6},
     "exponential": {"accelerometer": 3e-3, "gyroscope": 0.6},
     "band": {"accelerometer": 2e-3, "gyroscope": 0.05},
+}
+CURVES: dict[str, Callable[[Values], Values]] = {  # of the scaled temperature
+    "temperature_step": lambda x: 0.5 + 0.5 * np.tanh((x - 0.5) / 0.04),
+    "saturation": lambda x: np.tanh(4.0 * x),
+    "exponential": lambda x: np.expm1(3.0 * x) / np.expm1(3.0),
 }
 GAUSS_MARKOV = ("normal", "wander")  # families of noise for which lambda is known
 
@@ -92,7 +97,13 @@ def recordings_of(case: Case) -> list[Recording]:
     )
     recordings, _ = simulate_unit(unit, case.seed, case.number)
     if case.procedure == "at_rest":
-        recordings = [_at_rest(r) for r in recordings if r.role != "gyroscope"]
+        recordings = [
+            r.select((r.table_rate == 0.0) & (np.diff(r.table_angle, prepend=0.0) == 0.0))
+            if r.table_angle is not None and r.table_rate is not None
+            else r  # held-out motion
+            for r in recordings
+            if r.role != "gyroscope"
+        ]
     rng = np.random.default_rng([case.seed, case.number, 1])
     for sensor in SENSORS:
         recordings = _with_noise(recordings, sensor, case.noise, sensor_configs[sensor], rng)
@@ -105,27 +116,25 @@ def recordings_of(case: Case) -> list[Recording]:
     return recordings
 
 
-def _at_rest(recording: Recording) -> Recording:
-    """Return the samples at which the table does not move; all samples of held-out motion."""
-    if recording.table_angle is None or recording.table_rate is None:
-        return recording
-    return recording.select((recording.table_rate == 0.0) & (np.diff(recording.table_angle, prepend=0.0) == 0.0))
-
-
 def _with_noise(
-    recordings: list[Recording], sensor: str, noise: str, sensor_config: dict[str, Any], rng: np.random.Generator
+    recordings: list[Recording], sensor: str, noise: str, sensor_config: Mapping[str, Any], rng: np.random.Generator
 ) -> list[Recording]:
     """Add noise that the simulator does not have to one sensor, continuous over all recordings of the unit."""
     first = min(float(r.time[0]) for r in recordings)
     last = max(float(r.time[-1]) for r in recordings)
-    count = int((last - first) / INTERVAL_S) + 2
+    count, wander = int((last - first) / INTERVAL_S) + 2, sensor_config["bias_wander"]
     if noise in OF_WHITE:
-        added = _white(sensor_config) * _autoregression(count, OF_WHITE[noise], rng)
+        drive = np.sqrt(1.0 - OF_WHITE[noise] ** 2) * rng.standard_normal((count, 3))
+        drive[0] = rng.standard_normal(3)
+        added = _white(sensor_config) * scipy.signal.lfilter([1.0], [1.0, -OF_WHITE[noise]], drive, axis=0)
     elif noise == "random_walk":
-        step = sensor_config["bias_wander"] * np.sqrt(INTERVAL_S / sensor_config["wander_time_s"])
+        step = wander * np.sqrt(INTERVAL_S / sensor_config["wander_time_s"])
         added = np.cumsum(step * rng.standard_normal((count, 3)), axis=0)
     elif noise == "one_over_f":
-        added = 3.0 * sensor_config["bias_wander"] * _one_over_f(count, rng)
+        shape = np.concatenate([[0.0], 1.0 / np.sqrt(np.fft.rfftfreq(count)[1:])])
+        spectrum = np.fft.rfft(rng.standard_normal((count, 3)), axis=0) * shape[:, None]
+        values = np.fft.irfft(spectrum, count, axis=0)
+        added = 3.0 * wander * (values / values.std(axis=0))
     else:
         return recordings
     return [_added(r, sensor, added[np.rint((r.time - first) / INTERVAL_S).astype(int)]) for r in recordings]
@@ -136,43 +145,18 @@ def _white(sensor_config: Mapping[str, Any]) -> float:
     return float(sensor_config["noise_density"] * np.sqrt(0.5 / INTERVAL_S))
 
 
-def _autoregression(count: int, coefficient: float, rng: np.random.Generator) -> Values:
-    drive = np.sqrt(1.0 - coefficient**2) * rng.standard_normal((count, 3))
-    drive[0] = rng.standard_normal(3)
-    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -coefficient], drive, axis=0))
-
-
-def _one_over_f(count: int, rng: np.random.Generator) -> Values:
-    """Return noise with a spectrum of power 1/f and variance 1: (n, 3) array."""
-    frequency = np.fft.rfftfreq(count)
-    shape = np.zeros(len(frequency))
-    shape[1:] = 1.0 / np.sqrt(frequency[1:])
-    spectrum = np.fft.rfft(rng.standard_normal((count, 3)), axis=0) * shape[:, None]
-    noise = np.fft.irfft(spectrum, count, axis=0)
-    return np.asarray(noise / noise.std(axis=0), np.float64)
-
-
 def _with_shape(recordings: list[Recording], case: Case) -> list[Recording]:
     """Add physics in a functional form that is not in the catalogue."""
-    if case.shape in OF_TEMPERATURE:
+    if case.shape in CURVES:
         room = random_environment(Streams(case.seed, case.number)["room"])
         room = room if case.room_degc is None else replace(room, drift=case.room_degc)
         temperatures = [room.temperature(r.time) for r in recordings]
         low, high = min(float(w.min()) for w in temperatures), max(float(w.max()) for w in temperatures)
-        signals = [_of_temperature(case.shape, (w - low) / (high - low)) for w in temperatures]
+        signals = [CURVES[case.shape]((w - low) / (high - low)) for w in temperatures]
     else:
         signals = [_of_motion(case.shape, r) for r in recordings]
     size = AMPLITUDE[case.shape][case.sensor] * np.array(case.amplitude)
     return [_added(r, case.sensor, signal[:, None] * size) for r, signal in zip(recordings, signals, strict=True)]
-
-
-def _of_temperature(shape: str, x: Values) -> Values:
-    curves: dict[str, Values] = {
-        "temperature_step": 0.5 + 0.5 * np.tanh((x - 0.5) / 0.04),
-        "saturation": np.tanh(4.0 * x),
-        "exponential": np.expm1(3.0 * x) / np.expm1(3.0),
-    }
-    return curves[shape]
 
 
 def _of_motion(shape: str, recording: Recording) -> Values:
@@ -195,10 +179,14 @@ def signals_left(case: Case) -> dict[str, float]:
     if not case.hidden or case.noise not in GAUSS_MARKOV:
         return {}
     recordings = _used(case)
+
+    def reading(recordings: list[Recording]) -> Values:
+        return np.concatenate([np.asarray(r.reading(case.sensor)) for r in recordings])
+
     signals = []
     for name in case.hidden:
-        rest = {other: values for other, values in case.hidden.items() if other != name}
-        signals.append(_readings(recordings, case.sensor) - _readings(_used(replace(case, hidden=rest)), case.sensor))
+        others = {other: values for other, values in case.hidden.items() if other != name}
+        signals.append(reading(recordings) - reading(_used(replace(case, hidden=others))))
     sensor_config = read_config("sensor", case.model)[case.sensor]
     gravity = read_config("table", "acutronic")["gravity_g"]
     motions = [motion for r in recordings if (motion := reference_motion(r, gravity)) is not None]
@@ -213,15 +201,13 @@ def signals_left(case: Case) -> dict[str, float]:
     )
     products = noise.products(columns / size)[0] * np.outer(size, size) / white**2
     rounding = 3 * n / (6.0 * sensor_config["counts_per_unit"] ** 2 * white**2)
-    found = {}
-    for k, name in enumerate(case.hidden):
-        residual = 0.0
-        for axis in range(3):
-            column = 4 + 3 * k + axis
-            others = [*range(4), *(c for c in range(4 + axis, len(size), 3) if c != column)]
-            residual += _squared_residual(products, column, others)
-        found[name] = max(0.0, residual - rounding)
-    return found
+    found = dict.fromkeys(case.hidden, -rounding)
+    for column in range(4, len(size)):  # its squared norm minus that of its projection
+        others_of_axis = [*range(4), *(c for c in range(4 + (column - 4) % 3, len(size), 3) if c != column)]
+        cross = products[others_of_axis, column]
+        inverse = scaled_inverse(products[np.ix_(others_of_axis, others_of_axis)])
+        found[list(case.hidden)[(column - 4) // 3]] += float(products[column, column] - cross @ inverse @ cross)
+    return {name: max(0.0, value) for name, value in found.items()}
 
 
 def at_detection(case: Case) -> Case:
@@ -240,17 +226,6 @@ def at_detection(case: Case) -> Case:
     return replace(case, hidden={name: np.where(kept, values, share * np.array(values)).tolist()})
 
 
-def _squared_residual(products: Values, column: int, others: list[int]) -> float:
-    """Return the squared norm of a column minus its projection onto others, from the products of all columns."""
-    cross = products[others, column]
-    inverse = scaled_inverse(products[np.ix_(others, others)])
-    return float(products[column, column] - cross @ inverse @ cross)
-
-
 def _used(case: Case) -> list[Recording]:
     """Return the recordings that a fit uses, in order of time."""
     return sorted((r for r in recordings_of(case) if r.role in SENSORS), key=lambda r: int(r.time_ns[0]))
-
-
-def _readings(recordings: Sequence[Recording], sensor: str) -> Values:
-    return np.concatenate([np.asarray(r.reading(sensor)) for r in recordings])

@@ -55,7 +55,7 @@ ALTERNATIVES = [  # not hidden together: their signals are nearly alike
 FACTOR = {"small": 0.3, "tiny": 0.1}  # of the sensor file's size
 WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the sensor file's
 STIM_SHARE = 0.25  # of the units of the families that have both models
-REFERENCE, STAGED = "reference_least_squares", "staged"
+REFERENCE = "reference_least_squares"
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 
 
@@ -114,15 +114,16 @@ def draw(family: str, number: int, seed: int) -> Case:
         procedure = "stop_and_go"  # the method needs rests, and turns in both directions
     names = _names(kind, model, sensor, procedure, rng)
     hidden = {name: drawn(model, sensor, name, rng, FACTOR.get(family, 1.0)) for name in names}
-    if kind == "one":
-        hidden = {name: _on_one_axis(sensor, name, values, rng) for name, values in hidden.items()}
+    if kind == "one":  # parameters are in the order of the axes
+        for values in hidden.values():
+            values.reshape(3, -1)[np.arange(3) != rng.integers(3)] = 0.0
     return replace(
         Case(family, number, seed, model, sensor, procedure),
         hidden={name: values.tolist() for name, values in hidden.items()},
         wander=5.0 if detail == "wander" else 1.0,
         noise=family if family in ("lost", "coarse", "cold") else "normal",
         left_out=tuple(names) if kind == "removed" else (),
-        method=STAGED if kind == "staged" else REFERENCE,
+        method="staged" if kind == "staged" else REFERENCE,
     )
 
 
@@ -137,14 +138,6 @@ def _names(kind: str, model: str, sensor: str, procedure: str, rng: np.random.Ge
         names = [str(name) for name in rng.choice(pool, count, replace=False)]
         if not any(len(same & set(names)) > 1 for same in ALTERNATIVES):
             return names
-
-
-def _on_one_axis(sensor: str, name: str, values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Set the parameters to zero on all axes but one; per-axis parameters are named ``.._x`` or ``.._x?``."""
-    each = values.reshape(3, -1).copy()
-    each[np.arange(3) != rng.integers(3)] = 0.0
-    found: np.ndarray = each.ravel() if len(values) == len(effect(name).parameters(sensor)) else values
-    return found
 
 
 def _unseen(number: int, seed: int, rng: np.random.Generator) -> Case:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from pipeline.model.effects import effect
@@ -31,6 +32,7 @@ JSON = dict[str, Any]
 Rows = list[list[Any]]
 LISTED = 40  # cases on the page that miss a goal
 OF_SIZE = ("single", "small", "tiny")
+OUTCOMES = ("unexplained", "other warning", "answered", "silent", "nothing")  # with physics of another form
 BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))  # of lambda; a selection needs 40 to 100
 DIAGRAM = "reliability.svg"
 
@@ -59,23 +61,15 @@ def page(cases: Sequence[JSON], command: str) -> str:
 
 def table_of(cases: Iterable[JSON]) -> pd.DataFrame:
     """Return a row for each diagnosis of a unit with one hidden effect, or with effects left out of the catalogue."""
-    rows = [
-        {
-            "family": case["family"],
-            "model": case["model"],
-            "sensor": case["sensor"],
-            "hidden": (case["left_out"] or list(case["hidden"]))[0],
-            "said": _said(case),
-            "left_out": bool(case["left_out"]),
-            "alone": case["selected"] == list(case["hidden"]),
-            "first": first_is_right(case),
-            "warned": "yes" if warned(case) else "no",
-        }
-        for case in cases
-        if "error" not in case and (case["left_out"] or len(case["hidden"]) == 1)
-    ]
-    columns = ["family", "model", "sensor", "hidden", "said", "left_out", "alone", "first", "warned"]
-    return pd.DataFrame(rows, columns=columns).astype({"left_out": bool, "alone": bool})
+    used = [c for c in cases if "error" not in c and (c["left_out"] or len(c["hidden"]) == 1)]
+    return pd.DataFrame(used, columns=["family", "model", "sensor"]).assign(
+        hidden=[(case["left_out"] or list(case["hidden"]))[0] for case in used],
+        said=[_said(case) for case in used],
+        left_out=np.array([bool(case["left_out"]) for case in used], bool),
+        alone=np.array([case["selected"] == list(case["hidden"]) for case in used], bool),
+        first=[first_is_right(case) for case in used],
+        warned=["yes" if warned(case) else "no" for case in used],
+    )
 
 
 def _said(case: JSON) -> str:
@@ -84,12 +78,10 @@ def _said(case: JSON) -> str:
 
 def found_at(answers: pd.DataFrame) -> Rows:
     """Return for each sensor and effect in how many cases of each size it was selected first, ``n of m``."""
-    rows_of_size = answers[answers["family"].isin(OF_SIZE) & (answers["model"] == "mpu6050")]
-    rows: dict[tuple[str, str], dict[str, str]] = {}
-    for (sensor, name, size), first in rows_of_size.groupby(["sensor", "hidden", "family"])["first"]:
-        row = rows.setdefault((sensor, name), dict.fromkeys(OF_SIZE, ""))
-        row[size] = f"{first.sum()} of {len(first)}"
-    return [[sensor, f"`{name}`", *row.values()] for (sensor, name), row in rows.items()]
+    of_size = answers[answers["family"].isin(OF_SIZE) & (answers["model"] == "mpu6050")]
+    count = of_size.pivot_table("first", ["sensor", "hidden"], "family", lambda f: f"{f.sum()} of {len(f)}", "")
+    rows = count.reindex(columns=OF_SIZE, fill_value="").itertuples()
+    return [[sensor, f"`{name}`", *counts] for (sensor, name), *counts in rows]
 
 
 def confusions(answers: pd.DataFrame) -> Rows:
@@ -128,20 +120,22 @@ def by_signal(cases: Iterable[JSON]) -> Rows:
 def of_shapes(cases: Sequence[JSON]) -> Rows:
     """Return a row for each form of unknown physics: the answers, and their effect on the held-out error."""
     rows = []
-    for family in sorted({case["family"] for case in cases if case["shape"]}):
-        cases_of_family = [case for case in cases if case["family"] == family and "error" not in case]
-        if not cases_of_family:
-            continue
-        unexplained = sum(case["verdict"] == "unexplained" for case in cases_of_family)
-        with_warning = sum(case["verdict"] != "unexplained" and warned(case) for case in cases_of_family)
-        unwarned = [outside_answered(case) for case in cases_of_family if case["selected"] and not warned(case)]
-        answered, silent = sum(unwarned), len(unwarned) - sum(unwarned)
-        name, count = Counter(map(_said, cases_of_family)).most_common(1)[0]
-        gone = "".join(f"{100 * mean.value:.0f} % (n = {mean.total})" for mean in mean_excess_gone(cases_of_family))
-        nothing = len(cases_of_family) - unexplained - with_warning - len(unwarned)
-        counts = [len(cases_of_family), unexplained, with_warning, answered, silent, nothing]
+    for family in sorted({case["family"] for case in cases if case["shape"] and "error" not in case}):
+        of_family = [case for case in cases if case["family"] == family and "error" not in case]
+        outcomes = Counter(map(_outcome, of_family))
+        name, count = Counter(map(_said, of_family)).most_common(1)[0]
+        gone = "".join(f"{100 * mean.value:.0f} % (n = {mean.total})" for mean in mean_excess_gone(of_family))
+        counts = [len(of_family), *(outcomes[outcome] for outcome in OUTCOMES)]
         rows.append([family.replace("_", " "), *counts, f"{name} ({count})", gone])
     return rows
+
+
+def _outcome(case: JSON) -> str:
+    if warned(case):
+        return "unexplained" if case["verdict"] == "unexplained" else "other warning"
+    if not case["selected"]:
+        return "nothing"
+    return "answered" if outside_answered(case) else "silent"
 
 
 def _misses(cases: Sequence[JSON], scores: Sequence[Score]) -> Rows:

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
 JSON = dict[str, Any]
-_Planned = tuple[str, int, int]
 HELD_OUT = ("single", "pairs", "triples", "one_axis", "shape", "cycle")
 
 
@@ -68,7 +67,7 @@ def run_study(
         )
     done = {line["key"] for line in read_lines(directory / RESULTS)}
     code = code_digest("pipeline.study.run")
-    planned: list[_Planned] = [(family, number, seed) for number in range(count) for family in families]
+    planned = [(family, number, seed) for number in range(count) for family in families]
     planned = [item for item in planned if draw(*item).key not in done]
     with (
         (directory / TRUTH).open("a", encoding="utf-8") as truth,
@@ -82,7 +81,7 @@ def run_study(
             progress(number, len(planned))
 
 
-def _judged(planned: Sequence[_Planned], processes: int) -> Iterator[tuple[JSON, list[JSON]]]:
+def _judged(planned: Sequence[tuple[str, int, int]], processes: int) -> Iterator[tuple[JSON, list[JSON]]]:
     if processes == 1:
         yield from map(_judged_or_fault, planned)
         return
@@ -92,7 +91,7 @@ def _judged(planned: Sequence[_Planned], processes: int) -> Iterator[tuple[JSON,
         yield from pool.map(_judged_or_fault, planned, chunksize=4)
 
 
-def _judged_or_fault(planned: _Planned) -> tuple[JSON, list[JSON]]:
+def _judged_or_fault(planned: tuple[str, int, int]) -> tuple[JSON, list[JSON]]:
     """Return the truth and the results of a case; an exception is a result and does not end the study."""
     case = at_detection(draw(*planned))
     hidden = {**case.to_json(), "signal_left": signals_left(case)}
@@ -171,21 +170,19 @@ def _held_out(recordings: list[Recording], model: str, sensor: str, names: Seque
     """
     settings = settings_of(model, method)
     noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
-    plain = calibrated(recordings, sensor, settings)
-
-    def error(calibration: SensorCalibration, settings: JSON) -> tuple[float, float]:
-        found = validate(calibration, recordings, noise, settings)
-        last = found["steps"][-1]
-        if last["vector_rms_error"] is not None and found["vector_noise_floor"] is not None:
-            return last["vector_rms_error"], found["vector_noise_floor"]
-        return last["rms_error"], found["noise_floor"]
-
-    before, floor = error(plain, settings)
-    after = before
+    fits = {"before": (calibrated(recordings, sensor, settings), settings)}
     if names:
         adding = {**settings, "effects": {**settings["effects"], sensor: list(names)}}
-        after, _ = error(fit_effects(sensor, recordings, plain, adding), adding)
-    return {"before": before, "after": after, "floor": floor}
+        fits["after"] = fit_effects(sensor, recordings, fits["before"][0], adding), adding
+    errors = {}
+    for when, (calibration, used) in fits.items():
+        found = validate(calibration, recordings, noise, used)
+        last = found["steps"][-1]
+        vector = last["vector_rms_error"] is not None and found["vector_noise_floor"] is not None
+        errors[when] = last["vector_rms_error" if vector else "rms_error"]
+        if when == "before":
+            errors["floor"] = found["vector_noise_floor" if vector else "noise_floor"]
+    return {key: errors.get(key, errors["before"]) for key in ("before", "after", "floor")}
 
 
 @cache

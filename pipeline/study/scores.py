@@ -10,10 +10,10 @@ compared with each parameter of a hidden effect that was not selected.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import scipy
 
 from pipeline.estimation.free_curves import OTHER
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 Z = 1.96  # standard normal quantile of a 95 % interval
 OF_WHICH = "... of those in which each stands out (lambda >= 100)"
+# Families with effects of the catalogue at the usual size and wander.
 IN_THE_CATALOGUE = ("single", "pairs", "triples", "one_axis")
 MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "triples")
 ALIKE = 0.95  # share of a signal above which effects are look-alikes, as on the pages
@@ -149,27 +150,26 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
-def share(name: str, right: Mapping[str, bool] | Sequence[bool], goal: str = "") -> list[Score]:
-    """Return the share of the true values in ``right``, a mapping by case or a sequence; an empty list for no cases."""
-    named_cases = right if isinstance(right, Mapping) else dict(enumerate(right))
-    hits, total = sum(map(bool, named_cases.values())), len(named_cases)
-    misses = tuple(str(case) for case, good in named_cases.items() if not good)
+def share(name: str, right: pd.Series[bool], goal: str = "") -> list[Score]:
+    """Return the share of the true values, with the labels of the others as misses; an empty list for no values."""
+    hits, total = int(right.sum()), len(right)
+    misses = tuple(map(str, right.index[~right]))
     return [Score(name, hits / total, total, goal, wilson(hits, total), misses)] if total else []
 
 
-def _judged(cases: Iterable[JSON], right: Callable[[JSON], bool]) -> dict[str, bool]:
-    """Return for each case whether ``right`` is true; False for a fault."""
-    return {_name(case): "error" not in case and right(case) for case in cases}
+def _judged(cases: Sequence[JSON], right: Callable[[JSON], bool]) -> pd.Series[bool]:
+    """Return for each case whether ``right`` is true; False for a fault.
+
+    A case is labelled with its key, and with its sensor where both sensors are scored.
+    """
+    both = [family_of(case) == "null" and "error" not in case for case in cases]
+    labels = [f"{case['key']} {case['sensor']}" if b else case["key"] for case, b in zip(cases, both, strict=True)]
+    return pd.Series(["error" not in case and right(case) for case in cases], labels, dtype=bool)
 
 
-def _name(case: JSON) -> str:
-    """Return the name of a case, with its sensor where both sensors are scored."""
-    return f"{case['key']} {case['sensor']}" if is_null(case) and "error" not in case else str(case["key"])
-
-
-def is_null(case: JSON) -> bool:
-    """Return whether nothing is hidden in a case."""
-    return str(case["family"]).startswith("null")
+def family_of(case: JSON) -> str:
+    """Return the family of a case; one family for all noises with nothing hidden."""
+    return "null" if str(case["family"]).startswith("null") else str(case["family"])
 
 
 def family_scores(cases: Sequence[JSON]) -> list[Score]:
@@ -183,11 +183,11 @@ def family_scores(cases: Sequence[JSON]) -> list[Score]:
         strong = [c for c in family_cases if stands_out(c)]
         if family in MAY_HIDE and len(strong) < len(family_cases):
             found += share(OF_WHICH, _judged(strong, right))
-    for family in sorted({c["family"] for c in cases if is_null(c)}):
+    for family in sorted({c["family"] for c in cases if family_of(c) == "null"}):
         family_cases = [c for c in cases if c["family"] == family]
         name = f"nothing hidden, {family.removeprefix('null_')}: nothing selected"
         found += share(name, _judged(family_cases, lambda case: not case["selected"]), ">= 99 %")
-    return found + mean_excess_gone(in_the_catalogue(cases))
+    return found + mean_excess_gone(c for c in cases if c["family"] in IN_THE_CATALOGUE)
 
 
 def mean_excess_gone(cases: Iterable[JSON]) -> list[Score]:
@@ -199,11 +199,6 @@ def mean_excess_gone(cases: Iterable[JSON]) -> list[Score]:
     mean, half = float(values.mean()), Z * float(values.std(ddof=1) / np.sqrt(len(values)))
     least = f"held-out excess over the noise floor that is gone with what was selected, mean (least {values.min():.0%})"
     return [Score(least, mean, len(values), ">= 98 %", (mean - half, mean + half))]
-
-
-def in_the_catalogue(cases: Iterable[JSON]) -> list[JSON]:
-    """Return the cases in which effects of the catalogue are hidden at the usual size and wander."""
-    return [case for case in cases if case["family"] in IN_THE_CATALOGUE]
 
 
 SETS = (
@@ -218,11 +213,6 @@ STYLE = (
     "path{fill:none;stroke:currentColor;stroke-width:1.5;vector-effect:non-scaling-stroke}.grid{stroke:#d0d7de}"
     ".dots{stroke-width:6;stroke-linecap:round}.dashed{stroke-dasharray:4}.c2{color:#1d5fbf}.c5{color:#8b949e}</style>"
 )
-
-
-def family_of(case: JSON) -> str:
-    """Return the family of a case; one family for all noises with nothing hidden."""
-    return "null" if is_null(case) else str(case["family"])
 
 
 def true_set(case: JSON) -> list[str]:
@@ -257,7 +247,7 @@ def answer_scores(cases: Sequence[JSON]) -> list[Score]:
     found += share("... selected: exactly the truth", _judged(known, lambda c: exact({**c, "hidden": true_set(c)})))
     over = {size: ratios(cases, family) for family, (size, _) in LIMITS.items()}
     for size, each in over.items():
-        found += share(f"upper limits at {size} x the detection size: above the truth", (each >= 1.0).tolist(), GOAL)
+        found += share(f"upper limits at {size} x the detection size: above the truth", pd.Series(each >= 1.0), GOAL)
     sizes = [len(case["answer_set"]) for case in known if "error" not in case]
     found += [Score("answers in a set, mean", float(np.mean(sizes)), len(sizes), f"<= {SIZE_GOAL:g}")] if sizes else []
     for size, goal in LIMITS.values():
@@ -286,9 +276,9 @@ def reliability(cases: Sequence[JSON]) -> list[Score]:
         if "error" not in case
         for name, probability in case["probability"].items()
     ]
-    stated, true = np.array(pairs, float).reshape(-1, 2).T
-    place = np.clip(np.searchsorted(EDGES, stated, side="right") - 1, 0, len(EDGES) - 2)
-    return [each for k in np.unique(place) for each in share(repr(float(stated[place == k].mean())), true[place == k])]
+    found = pd.DataFrame(pairs, columns=["stated", "true"]).astype({"stated": float, "true": bool})
+    bins = found.groupby(pd.cut(found["stated"], [*EDGES[:-1], np.inf], right=False), observed=True)
+    return [score for _, each in bins for score in share(repr(float(each["stated"].mean())), each["true"])]
 
 
 def reliability_diagram(cases: Sequence[JSON]) -> str:
