@@ -23,6 +23,7 @@ from pipeline.estimation.rest_means import is_multi_position
 from pipeline.model.effects import catalogue, effect
 from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
 from pipeline.validation.heldout import last_error, static_error
+from pipeline.validation.samples import HeldOutCase
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -137,16 +138,15 @@ def evidence_of(
         if fit is None or case.noise is None or found is None:
             return None
         try:
-            error = last_error(fit(), recordings, case.noise, settings, other=found.other, smoothed=smoothed)
+            judged_on = HeldOutCase(fit(), recordings, case.noise, settings, found.other)
+            error = last_error(judged_on, smoothed=smoothed)
         except ConvergenceError:  # the fit's effects cannot be subtracted from the held-out readings
             return None
         return None if error is None else HeldOut(error[0], *error[1])
 
-    static = (
-        None
-        if case.noise is None
-        else static_error(case.calibration, recordings, case.noise, settings, other=case.accelerometer)
-    )
+    static = None
+    if case.noise is not None:
+        static = static_error(HeldOutCase(case.calibration, recordings, case.noise, settings, case.accelerometer))
     accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")
     implausible = [
         e["effect"] for e in document["ranking"] if e["effect"] in document["selected"] and not e["plausible"]

@@ -47,8 +47,8 @@ def effective_noise(
     """
     sensor = calibration.sensor
     held_out = [r for r in recordings if r.role == "validation"]
-    samples = [(r, s) for r in held_out if (s := samples_of_motion(sensor, r, noise, table)) is not None]
-    errors = [(r, s, e) for r, s in samples if (e := _error(calibration, s, other)) is not None]
+    samples = [(r, s) for r in held_out if (s := samples_of_motion(sensor, r, noise, table, other=other)) is not None]
+    errors = [(r, s, e) for r, s in samples if (e := _error(calibration, s)) is not None]
     if not errors:
         return None
     effects = {name: [_of_effect(calibration, s, found, name) for _, s in samples] for name in found["selected"]}
@@ -79,9 +79,9 @@ def effective_noise(
     }
 
 
-def _error(calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None) -> Values | None:
+def _error(calibration: SensorCalibration, samples: Samples) -> Values | None:
     """Return the error of calibrated readings, (n, 3), or of their magnitude, (n, 1); None if an effect is left out."""
-    found = last_step(calibration, samples, other)
+    found = last_step(calibration, samples)
     if found is None:
         return None
     vector, magnitude, true = found

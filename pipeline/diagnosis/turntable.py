@@ -193,7 +193,7 @@ def _held_out(selection: Selection, fits: Sequence[Fit], case: Case) -> tuple[li
     if not samples:
         return None, 0.0
     calibrations = [calibration_of(fit, selection.observations, None) for fit in fits]
-    corrected = [[with_known_effects(calibration, each, None) for each in samples] for calibration in calibrations]
+    corrected = [[with_known_effects(calibration, each) for each in samples] for calibration in calibrations]
     directed = all(true is not None for each in corrected for _, _, true in each)
     errors: list[float] = []
     for by_fit in corrected:

@@ -63,7 +63,7 @@ class Evidence:
     moves: tuple[float, float] | None = None  # rms error of held-out moves, and the largest that is expected, deg
     free: HeldOut | None = None  # of a free fit of the same recordings; filtered ones against the filtered reference
     full: HeldOut | None = None  # of the free fit with the selected effects
-    agreement: Mapping[str, Any] | None = None  # of matrix and held-out motion (``pipeline.validation.agreement``)
+    agreement: Mapping[str, Any] | None = None  # of matrix and held-out motion (``pipeline.validation.heldout``)
     static: HeldOut | None = None  # mean of the static recording, by the unit's calibration
     doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
     approximations: Sequence[str] = ()  # what the method's matrix and bias lack (``pipeline.diagnosis.method_errors``)

@@ -116,9 +116,9 @@ def held_out_figures(
         logged = sensor == "accelerometer" or (recording.table_rate is not None and table.get("latitude_deg") is None)
         needed = fits[sensor].effects or not logged  # else the attitude, slow to follow, changes nothing
         seen = recording if needed else replace(recording, table_attitude=None)
-        samples = samples_of_motion(sensor, seen, SILENT, table)
+        samples = samples_of_motion(sensor, seen, SILENT, table, other=fits.get(OTHER[sensor]))
         if samples is not None:
-            vector, reference, _ = with_known_effects(fits[sensor], samples, fits.get(OTHER[sensor]))
+            vector, reference, _ = with_known_effects(fits[sensor], samples)
             raw = np.linalg.norm(samples.reading, axis=1) - samples.magnitude
             after = np.linalg.norm(vector, axis=1) - reference
             name, floor = f"{sensor}-held-out-{recording.name}", held_out.get("noise_floor")

@@ -3,10 +3,10 @@
     accelerometer: e_n = |a_n| - gravity_g,    gyroscope: e_n = |g_n| - I_n        (Sudsanguan 2019, eqs 5.1 to 5.4)
     corrected = matrix @ (reading - bias - sum of effects)
 
-with e_n the error of sample n, a_n and g_n its corrected readings and I_n the rate of the table. Where the attitude is
-logged, effects are computed from the reference motion, effects of timing shift the reference in time, and the vector
-error is ``sqrt(mean |corrected - truth|^2)``. Without an attitude, effects are computed from the log's own calibrated
-readings, by fixed point, and effects of timing shift the logged rate.
+with the error e_n of sample n, its corrected readings a_n and g_n, and the rate I_n of the table. Where the attitude is
+logged, effects are computed from the motion of the reference, effects of timing shift the reference in time, and the
+vector error is ``sqrt(mean |corrected - truth|^2)``. Without an attitude, effects are computed from the calibrated
+readings of the log by fixed point, and effects of timing shift the logged rate.
 """
 
 from __future__ import annotations
@@ -36,64 +36,57 @@ SPLINE_DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s a
 
 
 def error_breakdown(
-    calibration: SensorCalibration, samples: Sequence[Samples], other: SensorCalibration | None
+    calibration: SensorCalibration, samples: Sequence[Samples]
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the figures of every step, and notes on effects that the samples cannot show.
-
-    ``other`` is that of the other sensor, for effects that need its signal.
-    """
+    """Return the errors after each step, and notes on effects that the samples cannot show."""
     stages = [(f"stage:{stage.name}", stage.correction) for stage in calibration.stages if stage.correction is not None]
     figures = [
         _figures(name, [_uncorrected(s, apply_correction(correction, s.reading)) for s in samples])
         for name, correction in [("raw", None), *stages]
     ]
-    figures.append(_figures("calibrated", [_with_effects(calibration, (), other, s) for s in samples]))
+    figures.append(_figures("calibrated", [_with_effects(calibration, (), s) for s in samples]))
     shown: list[FittedEffect] = []
     notes = []
     for fitted in calibration.effects:
-        lack = next(filter(None, (_lack(calibration, fitted, s) for s in samples)), None)
+        lack = next(filter(None, (_lack(fitted, s) for s in samples)), None)
         if lack:
             notes.append(f"{fitted.name} is left out: {lack}")
         else:
             shown.append(fitted)
-        figures.append(_figures(f"+ {fitted.name}", [_with_effects(calibration, shown, other, s) for s in samples]))
-    raw = figures[0]["mean_abs_error"]
-    if not all(direction_known(calibration, s) for s in samples):
-        figures = [row | {"vector_rms_error": None} for row in figures]
+        figures.append(_figures(f"+ {fitted.name}", [_with_effects(calibration, shown, s) for s in samples]))
+    raw, directed = figures[0]["mean_abs_error"], all(direction_known(calibration, s) for s in samples)
     for row in figures:
         row["change_percent"] = 100.0 * (raw - row["mean_abs_error"]) / raw if raw else None
+        if not directed:
+            row["vector_rms_error"] = None
     return figures, notes
 
 
-def last_step(calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None) -> Corrected | None:
+def last_step(calibration: SensorCalibration, samples: Samples) -> Corrected | None:
     """Return calibrated readings, magnitude and vector of the reference with all effects; None if one is left out."""
-    if any(_lack(calibration, fitted, samples) for fitted in calibration.effects):
+    if left_out(calibration, [samples]):
         return None
-    return _with_effects(calibration, calibration.effects, other, samples)
+    return _with_effects(calibration, calibration.effects, samples)
 
 
-def left_out(calibration: SensorCalibration, samples: Sequence[Samples]) -> str:
-    """Return the effects that some of the samples cannot show, with a verb: ``a, b are``."""
-    names = [e.name for e in calibration.effects if any(_lack(calibration, e, s) for s in samples)]
-    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
+def left_out(calibration: SensorCalibration, samples: Sequence[Samples]) -> list[str]:
+    """Return the names of the effects that cannot be subtracted from some of the samples."""
+    return [fitted.name for fitted in calibration.effects if any(_lack(fitted, s) for s in samples)]
 
 
-def last_error_of_magnitude(
-    calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None
-) -> Values | None:
+def last_error_of_magnitude(calibration: SensorCalibration, samples: Samples) -> Values | None:
     """Return the error of the magnitude after the last step, (n,); None if an effect is left out."""
-    found = last_step(calibration, samples, other)
+    found = last_step(calibration, samples)
     return None if found is None else np.linalg.norm(found[0], axis=1) - found[1]
 
 
-def with_known_effects(calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None) -> Corrected:
-    """Return the same as ``last_step``, with those effects that the samples can show."""
-    shown = [fitted for fitted in calibration.effects if not _lack(calibration, fitted, samples)]
-    return _with_effects(calibration, shown, other, samples)
+def with_known_effects(calibration: SensorCalibration, samples: Samples) -> Corrected:
+    """Return the same as ``last_step``, with the effects that can be subtracted from the samples."""
+    return _with_effects(calibration, [fitted for fitted in calibration.effects if not _lack(fitted, samples)], samples)
 
 
 def _uncorrected(samples: Samples, readings: Values) -> Corrected:
-    """Return readings, and the reference as it was logged."""
+    """Return readings, and the magnitude and vector of the reference without effects."""
     return readings, samples.magnitude, None if samples.motion is None else truth(samples.sensor, samples.motion)
 
 
@@ -115,8 +108,8 @@ def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
     }
 
 
-def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples) -> str | None:
-    """Say what the held-out recording lacks for an effect to be subtracted, or None."""
+def _lack(fitted: FittedEffect, samples: Samples) -> str | None:
+    """Return what the held-out recording lacks to subtract an effect, or None."""
     found = effect_of(fitted)
     if samples.motion is not None or _elsewhere(fitted, samples):
         missing = [need for need in found.needs if samples.motion and getattr(samples.motion, need) is None]
@@ -125,40 +118,34 @@ def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples
         few = not samples.resting and len(samples.time) <= SPLINE_DEGREE
         return f"the held-out recording has {len(samples.time)} samples, too few to follow its rate" if few else None
     try:
-        used = fields_used(calibration.sensor, [fitted])
+        used = fields_used(samples.sensor, [fitted])
     except ConfigurationError as error:
         return f"the held-out recording logs no attitude ({error})"
     if "temperature" in used and samples.temperature is None:
         return "the held-out recording holds no temperature"
-    across = "angular_rate" if calibration.sensor == "accelerometer" else "specific_force"
-    if across in used and samples.other is None and not samples.resting:
-        return f"the held-out recording holds no {OTHER[calibration.sensor]}"
+    signal_of_other = "angular_rate" if samples.sensor == "accelerometer" else "specific_force"
+    if signal_of_other in used and samples.other is None and not samples.resting:
+        return f"the held-out recording holds no {OTHER[samples.sensor]}"
     return None
 
 
 def _elsewhere(fitted: FittedEffect, samples: Samples) -> bool:
-    """Return whether the recording is without an effect: of another session, or a tilt where the magnitude is compared.
-
-    A tilt turns the specific force: its magnitude stays the same.
-    """
-    if samples.motion is None and fitted.name.partition(SEPARATOR)[0] == "table_tilt":
-        return True
-    return SEPARATOR in fitted.name and fitted.name.partition(SEPARATOR)[2] != samples.setup
+    """Return whether an effect is absent: it is of another session, or a tilt, which changes no magnitude."""
+    name, separator, session = fitted.name.partition(SEPARATOR)
+    return (samples.motion is None and name == "table_tilt") or (bool(separator) and session != samples.setup)
 
 
-def _with_effects(
-    calibration: SensorCalibration, effects: Sequence[FittedEffect], other: SensorCalibration | None, samples: Samples
-) -> Corrected:
+def _with_effects(calibration: SensorCalibration, effects: Sequence[FittedEffect], samples: Samples) -> Corrected:
     """Return calibrated readings, magnitude and vector of the reference with some effects."""
     effects = [fitted for fitted in effects if not _elsewhere(fitted, samples)]
     if not effects:
         return _uncorrected(samples, linear_truth(calibration, samples.reading))
-    own = [fitted for fitted in effects if not effect_of(fitted).moves]
+    of_reading = [fitted for fitted in effects if not effect_of(fitted).moves]
     if samples.motion is None:
-        moves = [fitted for fitted in effects if fitted not in own]
-        return _from_own_signals(calibration, own, samples, other), _moved_magnitude(samples, moves), None
+        moves = [fitted for fitted in effects if fitted not in of_reading]
+        return _by_calibrated_log(calibration, of_reading, samples), _moved_magnitude(samples, moves), None
     motion = _moved(samples.motion, effects)
-    rest = Part.of(calibration, own).take_off(samples.reading, motion)
+    rest = Part.of(calibration, of_reading).take_off(samples.reading, motion)
     moved, logged = truth(samples.sensor, motion), truth(samples.sensor, samples.motion)
     change = np.linalg.norm(moved, axis=1) - np.linalg.norm(logged, axis=1)
     direction = moved if direction_known(calibration, samples) else None
@@ -166,9 +153,9 @@ def _with_effects(
 
 
 def direction_known(calibration: SensorCalibration, samples: Samples) -> bool:
-    """Return whether the attitude log shows the direction: not where this recording may have another mounting."""
-    anew = [e for fitted in calibration.effects if isinstance(e := effect_of(fitted), Mounting)]
-    return samples.motion is not None and all(e.covers(samples.motion) for e in anew)
+    """Return whether the reference has a direction: an attitude log, and no mounting that is unknown here."""
+    mountings = [e for fitted in calibration.effects if isinstance(e := effect_of(fitted), Mounting)]
+    return samples.motion is not None and all(e.covers(samples.motion) for e in mountings)
 
 
 def _moved(motion: Motion, effects: Sequence[FittedEffect]) -> Motion:
@@ -181,8 +168,8 @@ def _moved(motion: Motion, effects: Sequence[FittedEffect]) -> Motion:
 def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> Values:
     """Return the reference's magnitude with effects that move the motion in time.
 
-    That of a specific force is gravity at any time, that of a rest is 0. That of a rate is interpolated by a cubic
-    spline; more than an interval beyond the log its last value holds.
+    The magnitude of a specific force is gravity at any time, the rate of a rest is 0. A rate is interpolated by a cubic
+    spline; from one interval beyond the log on, it is constant.
     """
     if not effects or samples.sensor == "accelerometer" or samples.resting:
         return samples.magnitude
@@ -205,32 +192,24 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> Value
     return np.asarray(np.abs(_moved(motion(), effects).angular_rate[:, 0]))
 
 
-def _from_own_signals(
-    calibration: SensorCalibration, effects: Sequence[FittedEffect], samples: Samples, other: SensorCalibration | None
-) -> Values:
-    """Return calibrated readings whose effects follow from the log's own calibrated signals."""
+def _by_calibrated_log(calibration: SensorCalibration, effects: Sequence[FittedEffect], samples: Samples) -> Values:
+    """Return calibrated readings, with effects by the calibrated signals of the log itself."""
     sensor = calibration.sensor
     readings = {sensor: samples.reading}
-    parts = {sensor: Part.of(calibration, effects)}
     if samples.other is not None:
         readings[OTHER[sensor]] = samples.other
-        if other is not None:
-            parts[OTHER[sensor]] = Part.of(other, ())
     used = fields_used(sensor, effects)
     nothing = np.zeros_like(samples.reading)
 
     def motion_of(truths: dict[str, Values], _number: int) -> Motion:
-        force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
-        if samples.resting:
-            rate = nothing
         found = log_motion(
             samples.time,
-            specific_force=force,
-            angular_rate=rate,
+            specific_force=truths.get("accelerometer", nothing),
+            angular_rate=nothing if samples.resting else truths.get("gyroscope", nothing),
             temperature=samples.temperature,
             used=used,
             end=LogEnd(),
         )
         return replace(found, specific_force_rate=nothing, angular_acceleration=nothing) if samples.resting else found
 
-    return solve(parts, readings, motion_of)[sensor]
+    return solve({sensor: Part.of(calibration, effects)}, readings, motion_of)[sensor]

@@ -1,14 +1,19 @@
 """The interval in which the held-out rms error lies with 99 % probability, if model, noise and uncertainties are right.
 
-The error of the calibrated reading of held-out sample n is ``M w_n + M m_n + J_n d``, where M is the calibration's
-matrix, w white noise after the filter, m bias wander (a Gauss-Markov process, and the slower drift that the sensor file
-and the residuals of the fit allow), d errors of the calibration's parameters and of the scale of the table's rate
-(once: in the covariance where its budget has such a line, else as a parameter of its own), and J the derivative with
-respect to d. An error of local gravity or of the time base is in d no more than in the reference: it is left out.
+The error of the calibrated reading of held-out sample n is ``M w_n + M m_n + J_n d``, with
 
-The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.samples``); its mean over samples
-is a quadratic form in Gaussians, replaced by a shifted chi-square with the same cumulants (J. P. Imhof, Biometrika 48
-(1961), 419-426, section 4), C the covariance of all w, m and d, and A the form:
+    M  the matrix of the calibration
+    w  white noise after the filter
+    m  bias wander: a Gauss-Markov process, and the slower drift that the sensor file and the residuals of the fit allow
+    d  errors of the parameters of the calibration, and of the scale of the table's rate (in the covariance where the
+       uncertainty budget has such a line, else as an additional parameter)
+    J  the derivative with respect to d
+
+An error of local gravity or of the time base is the same in calibration and reference, and is left out.
+
+The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.samples``). Its mean over samples is
+a quadratic form A in Gaussians w, m and d of covariance C. It is replaced by a shifted chi-square with the same
+cumulants (J. P. Imhof, Biometrika 48 (1961), 419-426, section 4):
 
     k_1 = tr Q,   k_2 = 2 tr Q^2,   k_3 = 8 tr Q^3,      Q = A C
 
@@ -19,10 +24,11 @@ determine the noise exactly, so the interval is that of a mixture over factors o
     drift       z^2: its size is hardly known
     parameters  nu / chi^2(nu),   1 / sqrt(nu) = sum_i s_i / sqrt(nu_i)
 
-with the degrees of freedom nu_i of each parameter, and its share s_i of the mean squared error by all: a rest shows the
-bias of a gyroscope alone, of which few moves say nothing. The estimates of the variances, of relative uncertainty
-``sqrt(2 / nu_i)``, count as wholly correlated, which makes the interval rather too wide. The variance of white noise
-has the relative uncertainty ``sqrt(2 / n)`` of the n samples that determined it.
+with the degrees of freedom nu_i of each parameter, and its share s_i of the mean squared error by all parameters: the
+error of a gyroscope at rest depends on the bias only, whose degrees of freedom are not those of the matrix. The
+estimated variances have the relative uncertainty ``sqrt(2 / nu_i)``. They count as fully correlated, which makes the
+interval rather too wide. The variance of white noise has the relative uncertainty ``sqrt(2 / n)``, where n samples
+determined it.
 """
 
 from __future__ import annotations
@@ -38,101 +44,94 @@ from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED, covariance_beside_reference
 from pipeline.model.measurement import inverse_of
 from pipeline.validation.error_breakdown import last_step
-from pipeline.validation.samples import Samples, mean_squares
+from pipeline.validation.samples import Samples, mean_squares, reference_vector
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.records import Noise, SensorCalibration, Values
 
 
-LACK_OF_FIT = "lack of fit"  # the part of a budget's line that no noise explains: 0 in a model that is right
+LACK_OF_FIT = "lack of fit"  # the part of a line of the budget that noise does not explain: 0 in a correct model
 TAIL = 0.005  # probability on each side of a 99 % interval
 # Probabilities at which the factors are taken; each stands for the probability up to the middle of its neighbours.
 LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
 WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
 BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time
 SMALLEST_WIDTH = 0.5  # s of a wander of minutes, which may be a random walk (blind study, family null_random_walk)
-REST_SAMPLES = 300  # that determine the white noise where there is no static recording: a few rests of seconds
+REST_SAMPLES = 300  # that determine the white noise without a static recording: a few rests of seconds
 EXACT_FREEDOM = 1e4  # degrees of freedom beyond which nu / chi^2(nu) is 1 to 1.4 %
 NORMAL_FREEDOM = 1e6  # beyond which a chi-square is normal to 1e-3
-REPRESENTATIVE_SAMPLES = 2000  # samples of a recording that stand for all: its directions and rates change slowly
 
 
 @dataclass(frozen=True)
 class LinearizedSamples:
-    """Held-out samples of one recording with the derivative of their calibrated readings."""
+    """Representative held-out samples of one recording, with the derivative of their calibrated readings."""
 
     time: Values  # (n,), s
     white_variance: Values  # (n, 3), of white noise per reading axis
     wander_variance: Values  # (n, 3)
     truth: Values  # (n, 3), g or deg/s
-    derivative: Values  # (n, 3, p): J, of the parameters of the calibration's covariance
-    number: int  # samples of the recording, of which these are some
+    derivative: Values  # (n, 3, p): J, with respect to the parameters of the calibration's covariance
+    number: int  # known samples of the recording
     correlated_samples: float = 1.0  # as in ``Samples``
 
 
-def linearized(
-    calibration: SensorCalibration, samples: Samples, truth: Values, other: SensorCalibration | None
-) -> LinearizedSamples | None:
-    """Return held-out samples with their derivative; None where they hold nothing, or an effect is left out of them.
+def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSamples | None:
+    """Return representative held-out samples with their derivative; None where an effect is left out of them.
 
-    ``calibrated = M (reading - b - z)`` gives ``d/db = -M`` and ``d/dM_ij = e_i (M^-1 calibrated)_j``. Parameters of
-    effects take a difference quotient over one standard uncertainty; where an effect moves the reference in time, the
-    change of its magnitude counts along the truth with the opposite sign.
-    ``truth`` is the (n, 3) reference, ``other`` the calibration of the other sensor.
+    ``calibrated = M (reading - b - z)`` gives ``d/db = -M`` and ``d/dM_ij = e_i (M^-1 calibrated)_j``. The derivative
+    with respect to a parameter of an effect is a difference quotient over one standard uncertainty. Where an effect
+    moves the reference in time, the change of its magnitude counts along the truth with the opposite sign.
     """
-    step_values = last_step(calibration, samples, other)
-    known = np.flatnonzero(samples.known)
-    if step_values is None or len(known) == 0:
+    found = last_step(calibration, samples)
+    if found is None:
         return None
-    vector, magnitude, _ = step_values
-    chosen = known[np.unique(np.linspace(0, len(known) - 1, REPRESENTATIVE_SAMPLES).astype(int))]
-    along = truth[chosen] / np.maximum(np.linalg.norm(truth[chosen], axis=1, keepdims=True), 1e-300)
+    vector, magnitude, _ = found
+    chosen = samples.representative
+    truth = reference_vector(calibration, samples)[chosen]
+    along = truth / np.maximum(np.linalg.norm(truth, axis=1, keepdims=True), 1e-300)
     J = np.zeros((len(chosen), 3, len(calibration.parameter_names())))
+    covariance = np.zeros(J.shape[2:] * 2) if calibration.covariance is None else calibration.covariance
     J[:, :, :3] = -calibration.matrix
     before = vector[chosen] @ inverse_of(calibration).T
     for i in range(3):
         J[:, i, 3 + 3 * i : 6 + 3 * i] = before
-    for column, changed, step in _changed_parameters(calibration):
-        moved = last_step(changed, samples, other)
-        assert moved is not None  # noqa: S101  (the same effects)
-        shift = along * (moved[1] - magnitude)[chosen, None]
-        J[:, :, column] = (moved[0][chosen] - vector[chosen] - shift) / step
-    noise = samples.white_variance[chosen], samples.wander_variance[chosen]
+    names = [(n, name) for n, effect in enumerate(calibration.effects) for name in effect.parameters]
+    for column, (n, name) in enumerate(names, 12):
+        step = float(np.sqrt(max(covariance[column, column], 0.0)))
+        if step > 0.0:
+            moved = last_step(_changed(calibration, n, name, step), samples)
+            assert moved is not None  # noqa: S101  (the same effects)
+            shift = along * (moved[1] - magnitude)[chosen, None]
+            J[:, :, column] = (moved[0][chosen] - vector[chosen] - shift) / step
     return LinearizedSamples(
         samples.time[chosen],
-        *noise,
-        truth[chosen],
+        samples.white_variance[chosen],
+        samples.wander_variance[chosen],
+        truth,
         np.nan_to_num(J),
-        len(known),
-        correlated_samples=samples.correlated_samples,
+        int(np.count_nonzero(samples.known)),
+        samples.correlated_samples,
     )
 
 
-def _changed_parameters(calibration: SensorCalibration) -> Iterator[tuple[int, SensorCalibration, float]]:
-    """Yield each parameter of an effect: its column, the calibration with it changed, and by how much."""
-    if calibration.covariance is None:
-        return
-    column = 12
-    for n, effect in enumerate(calibration.effects):
-        for name, parameter in effect.parameters.items():
-            step = float(np.sqrt(max(calibration.covariance[column, column], 0.0)))
-            if step > 0.0:
-                parameters = {**effect.parameters, name: {**parameter, "value": parameter["value"] + step}}
-                effects = list(calibration.effects)
-                effects[n] = replace(effect, parameters=parameters)
-                yield column, replace(calibration, effects=tuple(effects)), step
-            column += 1
+def _changed(calibration: SensorCalibration, number: int, name: str, step: float) -> SensorCalibration:
+    """Return a calibration with a parameter of one of its effects changed by a step."""
+    effects = list(calibration.effects)
+    parameters = effects[number].parameters
+    changed = {**parameters[name], "value": parameters[name]["value"] + step}
+    effects[number] = replace(effects[number], parameters={**parameters, name: changed})
+    return replace(calibration, effects=tuple(effects))
 
 
 @dataclass(frozen=True)
 class _Uncertain:
-    """What is random in addition to the white noise."""
+    """Random quantities in addition to the white noise."""
 
     covariance: Values  # (p + 1, p + 1), of the parameters and of the scale of the table's rate
     noise: Noise
-    coarse: Values  # (3,), variance of rounding that is no part of the white noise
+    coarse: Values  # (3,), variance of rounding that the white noise does not contain
     drift: Values  # (3,), variance of a drift in addition to the wander
     drift_time: float  # s
 
@@ -146,14 +145,14 @@ def expected_rms_error(
 ) -> tuple[float, float]:
     """Return the interval in which the rms error lies with 99 % probability, g or deg/s.
 
-    Without a covariance, the calibration's parameters count as exact. ``settings`` hold the sections ``table``
-    (``rate_accuracy``) and ``sensor`` (``bias_wander, wander_time_s, counts_per_unit``), ``fitted_s`` is the length of
-    the recordings of the fit.
+    Without a covariance, the parameters of the calibration count as exact. ``settings``: sections ``table``
+    (``rate_accuracy``) and ``sensor`` (``bias_wander, wander_time_s, counts_per_unit``); ``fitted_s``: length of the
+    recordings of the fit, s.
     """
     sensor_file = (settings.get("sensor") or {}).get(calibration.sensor) or {}
     step = 1.0 / float(sensor_file["counts_per_unit"]) if sensor_file.get("counts_per_unit") else 0.0
     wanders = [s.details["bias_wander"] for s in calibration.stages if "bias_wander" in s.details]
-    residual_wander = np.array(wanders[-1]) if wanders else None  # that the residuals of the fit show: (3,)
+    residual_wander = np.array(wanders[-1]) if wanders else None  # of the residuals of the fit: (3,)
     time = float(sensor_file.get("wander_time_s") or DEFAULT_TIME_S)
     uncertain = _Uncertain(
         _covariance(calibration, settings.get("table") or {}),
@@ -175,9 +174,9 @@ def expected_rms_error(
 def _drift(residual_wander: Values | None, noise: Noise, size: float, time: float) -> Values:
     """Return the variance of a drift in addition to the wander: (3,) array.
 
-    It is the sensor file's wander (``size``, ``time``) beyond that of the noise model, and what the residuals of the
-    fit, which last longer than a rest, show beyond it. A residual may hold a missing effect, so at most ``INFLATED``
-    times the expected wander counts.
+    It is the amount by which the wander of the sensor file (``size``, ``time``), and that of the residuals of the fit,
+    which last longer than a rest, exceed the wander of the noise model. A residual may contain a missing effect, so at
+    most ``INFLATED`` times the expected wander counts.
     """
     slow = noise.wander**2 * min(1.0, noise.correlation_time / time)
     limit = INFLATED**2 * np.maximum(noise.wander**2, size**2)
@@ -194,24 +193,24 @@ def _covariance(calibration: SensorCalibration, table: Mapping[str, Any]) -> Val
         covariance = covariance_beside_reference(calibration)
         total = np.diag(covariance)
         lack = np.sum([np.square(line["parts"][LACK_OF_FIT]) for line in lines if LACK_OF_FIT in line["parts"]], axis=0)
-        kept = np.sqrt(np.clip(1.0 - lack / np.where(total > 0.0, total, 1.0), 0.0, 1.0)) * np.ones(size)
-        out[:size, :size] = covariance * kept[:, None] * kept
+        share = np.sqrt(np.clip(1.0 - lack / np.where(total > 0.0, total, 1.0), 0.0, 1.0)) * np.ones(size)
+        out[:size, :size] = covariance * share[:, None] * share
     if calibration.sensor == "gyroscope" and not any(line["source"] == "table rate" for line in lines):
         out[size, size] = float(table.get("rate_accuracy") or 0.0) ** 2
     return out
 
 
 def _freedom(calibration: SensorCalibration) -> Values:
-    """Return the degrees of freedom of the covariance of ``_covariance``: (p + 1,) array.
+    """Return the degrees of freedom of ``_covariance``, by Welch and Satterthwaite: (p + 1,) array.
 
-    By Welch and Satterthwaite, without the variance of exact size that the reference shares.
+    The variance that calibration and reference share is left out; its size is exact.
     """
     if calibration.covariance is None:
         return np.full(len(calibration.parameter_names()) + 1, np.inf)
-    variance, own = np.diag(calibration.covariance), np.diag(covariance_beside_reference(calibration))
-    left = np.clip(own / np.where(variance > 0.0, variance, 1.0), 0.0, 1.0)
+    total, of_calibration = np.diag(calibration.covariance), np.diag(covariance_beside_reference(calibration))
+    share = np.clip(of_calibration / np.where(total > 0.0, total, 1.0), 0.0, 1.0)
     with np.errstate(invalid="ignore"):  # of a parameter without variance
-        nu = np.where(left > 0.0, calibration.effective_freedom() * left**2, np.inf)
+        nu = np.where(share > 0.0, calibration.effective_freedom() * share**2, np.inf)
     return np.append(np.maximum(nu, 1.0), np.inf)
 
 
@@ -221,16 +220,16 @@ class _QuadraticForm:
 
     by_parameter: Values  # (p + 1,): mean squared error by the uncertainty of each parameter alone
     white: Values  # (2,): tr Q and tr Q^2 of white noise
-    within: Values  # (2,): of wander within blocks
+    within: Values  # (2,): the same of wander within blocks
     doubt: float  # one over the number of samples that determined the white noise
     first: Values  # (3,): tr Q of parameters, of wander and of drift
-    second: Values  # (3, 3): traces of products of two
-    third: Values  # (3, 3, 3): of three
+    second: Values  # (3, 3): traces of products of two of them
+    third: Values  # (3, 3, 3): traces of products of three
 
     def freedom(self, each: Values) -> float:
-        """Return the degrees of freedom of the error by all parameters, of those of each: (p + 1,)."""
-        vague = float(self.by_parameter @ each**-0.5)
-        return (float(self.by_parameter.sum()) / vague) ** 2 if vague > 0.0 else float("inf")
+        """Return the degrees of freedom of the error by all parameters, from those of each parameter: (p + 1,)."""
+        uncertain = float(self.by_parameter @ each**-0.5)
+        return (float(self.by_parameter.sum()) / uncertain) ** 2 if uncertain > 0.0 else float("inf")
 
     def cumulants(self, factor: Values) -> Values:
         """Return k_1 to k_3, (3, k), for factors of the variances of parameters, wander, drift, white noise: (4, k)."""
@@ -263,36 +262,36 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
         J = np.concatenate([each.derivative, -each.truth[:, :, None]], axis=2)
         WJ, MWM = W @ J, M.T @ W @ M
         of_parameters += share / n * np.tensordot(J, WJ, ([0, 1], [0, 1]))
-        own = np.add.reduceat(MWM, first, axis=0) * share / n
+        of_wander = np.add.reduceat(MWM, first, axis=0) * share / n
         across = np.swapaxes(np.add.reduceat(WJ, first, axis=0), 1, 2) @ M * share / n
-        of_blocks.append((own, across, B, block_covariance(start, length, uncertain.drift_time)))
+        of_blocks.append((of_wander, across, B, block_covariance(start, length, uncertain.drift_time)))
         size += 3 * count
         Q = MWM * (each.white_variance + uncertain.coarse)[:, None, :]
         white = white + _traces_of(Q) * [share, share**2 * each.correlated_samples / each.number]
-        left = np.clip(each.wander_variance - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
+        within_block = np.clip(each.wander_variance - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
         correlated = np.clip(noise.correlation_time / interval, 1.0, n / count) / n
-        within = within + _traces_of(MWM * left[:, None, :]) * [share, share**2 * correlated]
+        within = within + _traces_of(MWM * within_block[:, None, :]) * [share, share**2 * correlated]
     A, Q = np.zeros((size, size)), np.zeros((3, size, size))
     A[:q, :q], at = of_parameters, q
-    for own, across, _, _ in of_blocks:
-        for form, mixed in zip(own, across, strict=True):
-            mine = slice(at, at + 3)
-            A[mine, mine], A[:q, mine], A[mine, :q] = form, mixed, mixed.T
-            at = mine.stop
+    for of_wander, across, _, _ in of_blocks:
+        for form, mixed in zip(of_wander, across, strict=True):
+            block = slice(at, at + 3)
+            A[block, block], A[:q, block], A[block, :q] = form, mixed, mixed.T
+            at = block.stop
     Q[0, :, :q], at = A[:, :q] @ uncertain.covariance, q
-    for own, _, B, slow in of_blocks:  # the covariance of a recording's blocks is that in time, on each axis
-        mine = slice(at, at + 3 * len(own))
-        of_axes = A[:, mine].reshape(size, -1, 3).swapaxes(1, 2)
+    for of_wander, _, B, slow in of_blocks:  # the blocks of a recording have the covariance in time, on each axis
+        blocks = slice(at, at + 3 * len(of_wander))
+        of_axes = A[:, blocks].reshape(size, -1, 3).swapaxes(1, 2)
         for k, in_time, of_axis in ((1, B, noise.wander**2), (2, slow, uncertain.drift)):
-            Q[k, :, mine] = ((of_axes @ in_time).swapaxes(1, 2) * of_axis).reshape(size, -1)
-        at = mine.stop
+            Q[k, :, blocks] = ((of_axes @ in_time).swapaxes(1, 2) * of_axis).reshape(size, -1)
+        at = blocks.stop
     transposed = np.swapaxes(Q, 1, 2).reshape(3, -1)
     determined = noise.length / interval if noise.length > 0.0 else REST_SAMPLES
     first_order, second_order = np.trace(Q, axis1=1, axis2=2), Q.reshape(3, -1) @ transposed.T
     third_order = np.empty((3, 3, 3))
     for i, j in ((0, 0), (0, 1), (1, 1), (2, 2)):  # with each of the three: the trace is the same in every order
-        held = slice(q, None) if i else slice(q)  # the columns that are not zero
-        for l, trace in enumerate(transposed @ (Q[i, :, held] @ Q[j, held]).ravel()):
+        filled = slice(q, None) if i else slice(q)  # the columns that are not zero
+        for l, trace in enumerate(transposed @ (Q[i, :, filled] @ Q[j, filled]).ravel()):
             for order in permutations((i, j, l)):
                 third_order[order] = trace
     by_parameter = np.diag(of_parameters) * np.diag(uncertain.covariance)
@@ -306,9 +305,9 @@ def _traces_of(Q: Values) -> Values:
 
 def _weights(M: Values, each: LinearizedSamples, uncertain: _Uncertain) -> Values:
     """Return W of each sample: (n, 3, 3) array."""
-    J, own = each.derivative, uncertain.covariance[:-1, :-1]
+    J, C = each.derivative, uncertain.covariance[:-1, :-1]
     noise = each.white_variance + each.wander_variance + uncertain.drift + uncertain.coarse
-    of_parameters = np.einsum("nip,pq,njq->ij", J, own, J, optimize=True) / len(J)
+    of_parameters = np.einsum("nip,pq,njq->ij", J, C, J, optimize=True) / len(J)
     mean = np.einsum("ij,j,kj->ik", M, noise.mean(axis=0), M) + of_parameters
     size = np.linalg.norm(each.truth, axis=1)
     u = each.truth / np.where(size > 0.0, size, 1.0)[:, None]
@@ -317,10 +316,10 @@ def _weights(M: Values, each: LinearizedSamples, uncertain: _Uncertain) -> Value
 
 
 def _factors(nu: float, noise: Noise, observed_s: float, *, upper: bool) -> tuple[Values, Values]:
-    """Return the factors that are mixed, (4, k), and their probabilities (k,).
+    """Return the factors of the mixture, (4, k), and their probabilities (k,).
 
-    The lower end leaves out drift and errors of parameters, and takes the wander as the sensor file states it: none of
-    these need have occurred in this recording.
+    The lower end leaves out drift and errors of parameters, which need not occur in this recording. It assumes that the
+    wander is known no better than by a data sheet.
     """
     from scipy.special import gammaincinv, ndtri  # noqa: PLC0415  (0.1 s that other stages do not pay)
 

@@ -1,40 +1,61 @@
-"""Held-out errors: what a calibration leaves on samples that no fit has seen, and what noise alone would leave.
+"""Held-out errors: the errors of a calibration on samples that no fit used, and the error by noise alone.
 
-Held out are the recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``). Where
-nothing is held out, the samples of the fit are judged, and the result says so. With t the truth, M the matrix, n the
-noise of a sample (white noise after the filter, and bias wander) and V its covariance, which is diagonal,
+The recordings of role ``validation`` are held out; without one, every third rest (``procedure.holdout_every``). Where
+nothing is held out, the samples of the fit are used, and the result says so. With the truth t, the matrix M, the noise
+n of a sample (white noise after the filter, and bias wander) and its covariance V, which is diagonal,
 
     noise_floor = sqrt(mean E[(|t + M n| - |t|)^2]),    vector_noise_floor = sqrt(mean tr(M V M^T))
 
 A calibration is worse than the raw readings where its error is above its expected interval
-(``pipeline.validation.expected_error``) and a t-test says so: per stretch of the recordings, the mean of its squared
-errors minus that of the raw readings' squared errors, over B stretches, with B - 1 degrees of freedom and the
-probability ``FALSE_REFUSALS``.
+(``pipeline.validation.expected_error``) and a t-test confirms it. The test compares the mean squared error of each
+stretch of the recordings with that of the raw readings: B stretches, B - 1 degrees of freedom, and the probability
+``FALSE_REFUSALS``.
+
+A small error of the matrix does not show in the magnitude of a held-out error, because the noise of single samples
+covers it. It shows in calibrated readings v of held-out motion whose reference u is a vector: with the error E of the
+matrix, and noise e,
+
+    v = e + (1 + E) u,    T = E^T C^-1 E,    C = C_held + S C_fit S^T
+
+E is fitted in the same way as a calibration (``pipeline.estimation.reference_least_squares``). C_held is the covariance
+of its nine elements by this fit, C_fit the covariance of the calibration's parameters, and S their effect on E. T / 9
+has Fisher's distribution with 9 degrees of freedom and the effective degrees of freedom of the less certain fit. Errors
+of local gravity and of the time base are the same in calibration and reference.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError
+from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
+from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import NAMES
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
-from pipeline.estimation.rest_means import count_of_rests, held_out_rests, split_rests
-from pipeline.model.effects.base import truth, unit_of
+from pipeline.estimation.rest_means import count_of_rests
+from pipeline.estimation.uncertainty_budget import covariance_beside_reference
+from pipeline.io.quality_flags import STUCK
+from pipeline.model.effects import bench_priors, effect_of
+from pipeline.model.effects.base import unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
-from pipeline.model.measurement import linear_truth
+from pipeline.records import AXES, Motion
 from pipeline.signal.rests import Rest
-from pipeline.validation.agreement import agreement
-from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude, left_out
-from pipeline.validation.expected_error import expected_rms_error, linearized
-from pipeline.validation.samples import Samples, samples_of_motion, samples_of_rests, squared_norm_errors
+from pipeline.validation.error_breakdown import (
+    direction_known,
+    error_breakdown,
+    last_error_of_magnitude,
+    last_step,
+    left_out,
+)
+from pipeline.validation.expected_error import LinearizedSamples, expected_rms_error, linearized
+from pipeline.validation.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Noise, Recording, SensorCalibration, Values
+    from pipeline.records import Noise, Recording, SensorCalibration
 
 FALSE_REFUSALS = 1e-3  # probability that a calibration as good as the raw readings is refused
 STRETCHES = 20  # a stretch of a recording of minutes is longer than the correlation time of most wander
@@ -42,6 +63,7 @@ FEWEST_SAMPLES = 5  # of the t-test
 BIN_DEGC = 5.0  # a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
 SWEEP_DEGC = 2 * BIN_DEGC  # fills two bins; a unit that warms up on the bench changes by less
 FEWEST_IN_BIN = 10  # samples of a bin that is shown
+MATRIX = slice(3, 12)  # its elements among the parameters of a calibration
 FIGURES = ("mean_abs_error", "sum_abs_error", "max_error", "min_error", "rms_error", "change_percent")
 
 
@@ -53,28 +75,26 @@ def validate(
     *,
     other: SensorCalibration | None = None,
 ) -> dict[str, Any]:
-    """Return a sensor's part of ``validations/<unit>.json``.
-
-    ``recordings``: all of the unit, filtered as for the fit; ``settings``: sections ``table``, ``procedure``,
-    ``limits`` and, for the expected error, ``sensor``; ``other``: that of the unit's other sensor. Only where no
-    attitude is logged: effects that look at the other sensor's signal then take it calibrated; without it, as it was
-    read.
+    """Return a sensor's part of ``validations/<unit>.json``; arguments as of ``HeldOutCase``.
 
     The part has ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor,
-    vector_noise_floor, steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit),
+    vector_noise_floor, steps`` of the published file, and ``held_out`` (false: the samples of the fit are used),
     ``reason`` (why), ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why
-    the calibration must not be used, or None), ``agreement`` (``pipeline.validation.agreement``),
+    the calibration must not be used, or None), ``agreement`` (of the matrix and held-out motion),
     ``over_temperature`` (``residuals_over_temperature``; only where the temperature was swept), ``limits``, ``pass``.
     ``vector_rms_error`` is the root of the mean squared length of the difference to the reference. Raises
     ``ConfigurationError`` if a limit's name is unknown.
     """
-    sensor = calibration.sensor
-    samples, reason = _choose(sensor, recordings, noise, settings)
-    if reason and (count := _fitted_exactly(calibration)):
-        samples = []
-        reason += f"; the fit passes through its {count} rests exactly, so that their error says nothing: record more"
-    elif reason and samples:
-        reason += "; judged on the samples of the fit"
+    case, sensor = HeldOutCase(calibration, recordings, noise, settings, other), calibration.sensor
+    samples, reason = case.held_out_samples(), None
+    if not samples:
+        reason = _why_not_held_out(case)
+        if count := _fitted_exactly(calibration):
+            reason += (
+                f"; the fit passes through its {count} rests exactly, so that their error says nothing: record more"
+            )
+        elif samples := case.fit_samples():
+            reason += "; judged on the samples of the fit"
     count = int(sum(s.known.sum() for s in samples))
     no_figures: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
     part: dict[str, Any] = {
@@ -102,20 +122,25 @@ def validate(
     if count:
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
         part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
-        part["steps"], part["notes"] = error_breakdown(calibration, samples, other)
-        expected, notes = _expected(calibration, recordings, samples, noise, settings, other=other)
-        part["expected_rms_error"] = expected
-        part["notes"] += notes
-        if part["held_out"] and expected is not None:
-            part["agreement"] = agreement(calibration, recordings, samples, noise, settings, other)
-            part["worse_than_raw"] = _worse_than_raw(
-                calibration, samples, expected[1], other, on_table=settings["table"].get("motion") != "none"
+        part["steps"], part["notes"] = error_breakdown(calibration, samples)
+        parts = [linearized(calibration, s) for s in samples if s.known.any()]
+        complete = [p for p in parts if p is not None]
+        if len(complete) == len(parts):
+            part["expected_rms_error"] = expected = _expected(case, samples, complete)
+            part["notes"] += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
+            if part["held_out"]:
+                part["agreement"] = _agreement(case, samples, complete)
+                part["worse_than_raw"] = _worse_than_raw(case, samples, expected[1])
+        else:
+            names = left_out(calibration, samples)
+            verb = "is" if len(names) == 1 else "are"
+            part["notes"].append(
+                f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
             )
-        bins = residuals_over_temperature(calibration, samples, other)
+        bins = residuals_over_temperature(calibration, samples)
         samples_of = "the held-out samples" if part["held_out"] else "the samples of the fit"
         if bins is None and part["held_out"] and _is_swept(recordings):
-            fitted, _ = _choose(sensor, recordings, noise, settings, of_fit=True)
-            bins, samples_of = residuals_over_temperature(calibration, fitted, other), "the samples of the fit"
+            bins, samples_of = residuals_over_temperature(calibration, case.fit_samples()), "the samples of the fit"
         if bins:
             part["over_temperature"] = {"samples_of": samples_of, "bins": bins}
     limits = (settings.get("limits") or {}).get(sensor) or {}
@@ -123,18 +148,24 @@ def validate(
     return part
 
 
+EARTH_LEFT_OUT = (
+    "the held-out recording logs no attitude: Earth's rotation is left out of its reference, and the expected error "
+    f"allows for its {EARTH_RATE_DPS:.2g} deg/s"
+)
+
+
 def residuals_over_temperature(
-    calibration: SensorCalibration, samples: Sequence[Samples], other: SensorCalibration | None
+    calibration: SensorCalibration, samples: Sequence[Samples]
 ) -> list[dict[str, Any]] | None:
     """Return the errors of the magnitude after the last step, in bins of the temperature of the sensor.
 
-    The mean of a bin (``mean_error``, g or deg/s) shows what still depends on the temperature, ``rms_error`` what noise
-    adds; ``temperature_degc`` is a mean. None where the temperature is not recorded, or its range is below
-    ``SWEEP_DEGC``.
+    The mean of a bin (``mean_error``, g or deg/s) shows the remaining dependence on the temperature; ``rms_error``
+    also contains the noise. ``temperature_degc`` is a mean. None where the temperature is not recorded, or its range is
+    below ``SWEEP_DEGC``.
     """
     temperatures, errors = [np.zeros(0)], [np.zeros(0)]
     for each in samples:
-        error = last_error_of_magnitude(calibration, each, other)
+        error = last_error_of_magnitude(calibration, each)
         if error is None or each.temperature is None:
             return None
         known = each.known & np.isfinite(error) & np.isfinite(each.temperature)
@@ -157,104 +188,119 @@ def residuals_over_temperature(
 
 
 def _is_swept(recordings: Sequence[Recording]) -> bool:
-    """Return whether the temperature of the recordings may have been swept: it spans ``SWEEP_DEGC`` in all of them."""
-    warmth = [r.temperature[np.isfinite(r.temperature)] for r in recordings if r.temperature is not None]
-    return bool(np.ptp(np.concatenate([np.zeros(0), *warmth])) >= SWEEP_DEGC) if any(map(len, warmth)) else False
+    """Return whether the temperatures of all recordings together span ``SWEEP_DEGC``."""
+    warmth = np.concatenate([np.zeros(0), *(r.temperature for r in recordings if r.temperature is not None)])
+    warmth = warmth[np.isfinite(warmth)]
+    return len(warmth) > 0 and bool(np.ptp(warmth) >= SWEEP_DEGC)
 
 
-def _expected(
-    calibration: SensorCalibration,
-    recordings: Sequence[Recording],
-    samples: Sequence[Samples],
-    noise: Noise,
-    settings: Mapping[str, Any],
-    *,
-    other: SensorCalibration | None,
-) -> tuple[list[float] | None, list[str]]:
-    """Return the interval of the last step's rms error (None where an effect is left out), and notes on it or why not.
+def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> list[float]:
+    """Return the interval of the last step's rms error; ``parts``: the samples with their derivatives.
 
     Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
     """
-    parts = [linearized(calibration, s, _truth(calibration, s), other) for s in samples if s.known.any()]
-    complete = [p for p in parts if p is not None]
-    if len(complete) < len(parts):
-        effects = left_out(calibration, samples)
-        return None, [f"the expected error is not stated, because {effects} left out of the held-out error"]
-    fitted = [r for r in recordings if r.role in {calibration.sensor, "rests"} and r.samples]
-    fitted_s = sum(float(r.time[-1] - r.time[0]) for r in fitted if r.reading(calibration.sensor) is not None)
-    low, high = expected_rms_error(calibration, complete, noise, settings, fitted_s)
-    if not any(s.earth_left_out for s in samples):
-        return [low, high], []
-    note = (
-        "the held-out recording logs no attitude: Earth's rotation is left out of its reference, and the expected "
-        f"error allows for its {EARTH_RATE_DPS:.2g} deg/s"
-    )
-    return [max(low - EARTH_RATE_DPS, 0.0), high + EARTH_RATE_DPS], [note]
+    sensor = case.calibration.sensor
+    fitted = [r for r in case.recordings if r.role in {sensor, "rests"} and r.samples and r.reading(sensor) is not None]
+    fitted_s = sum(float(r.time[-1] - r.time[0]) for r in fitted)
+    low, high = expected_rms_error(case.calibration, parts, case.noise, case.settings, fitted_s)
+    earth = EARTH_RATE_DPS if any(s.earth_left_out for s in samples) else 0.0
+    return [max(low - earth, 0.0), high + earth]
 
 
-def last_error(
-    calibration: SensorCalibration,
-    recordings: Sequence[Recording],
-    noise: Noise,
-    settings: Mapping[str, Any],
-    *,
-    other: SensorCalibration | None = None,
-    smoothed: bool = False,
-) -> tuple[float, list[float]] | None:
+def last_error(case: HeldOutCase, *, smoothed: bool = False) -> tuple[float, list[float]] | None:
     """Return the rms error after the last step and its interval; None without held-out motion or interval.
 
-    With ``smoothed``, the reference of a filtered recording goes through its filter, too: the filter leaves no error.
+    With ``smoothed``, the reference of a filtered recording passes its filter as well: the filter then causes no error.
     """
-    samples, reason = _choose(calibration.sensor, recordings, noise, settings, smoothed=smoothed)
-    if reason is not None:
-        return None
-    return _error_and_interval(calibration, recordings, samples, noise, settings, other=other)
+    return _error_and_interval(case, case.held_out_samples(smoothed=smoothed))
 
 
-def static_error(
-    calibration: SensorCalibration,
-    recordings: Sequence[Recording],
-    noise: Noise,
-    settings: Mapping[str, Any],
-    other: SensorCalibration | None = None,
-) -> tuple[float, list[float]] | None:
-    """Return the error of the mean of the static recording, and its interval as of a held-out rest; None without one.
+def static_error(case: HeldOutCase) -> tuple[float, list[float]] | None:
+    """Return the error of the mean of the static recording, and its interval as a held-out rest; None without one.
 
-    The heading is not known, so Earth's rotation widens the interval of a gyroscope: once by what the bias holds of it,
-    once by what the recording shows.
+    The heading is unknown, so Earth's rotation widens the interval of a gyroscope twice: its component in the bias, and
+    its component in the recording are unknown.
     """
-    static = [r for r in recordings if r.role == "static" and r.reading(calibration.sensor) is not None and r.samples]
-    found = [samples_of_rests(calibration.sensor, r, [Rest(0, r.samples)], noise, settings["table"]) for r in static]
-    samples = [s for s in found if s is not None and s.known.any()]
-    judged = _error_and_interval(calibration, recordings, samples, noise, settings, other=other) if samples else None
+    static = {r.name: [Rest(0, r.samples)] for r in case.recordings if r.role == "static" and r.samples}
+    judged = _error_and_interval(case, [s for s in case.at_rests(static) if s.known.any()])
     if judged is None:
         return None
     error, (low, high) = judged
-    turning = 2.0 * EARTH_RATE_DPS if calibration.sensor == "gyroscope" else 0.0
+    turning = 2.0 * EARTH_RATE_DPS if case.calibration.sensor == "gyroscope" else 0.0
     return error, [max(low - turning, 0.0), high + turning]
 
 
-def _error_and_interval(
-    calibration: SensorCalibration,
-    recordings: Sequence[Recording],
-    samples: Sequence[Samples],
-    noise: Noise,
-    settings: Mapping[str, Any],
-    *,
-    other: SensorCalibration | None,
-) -> tuple[float, list[float]] | None:
-    """Return the rms error of samples after the last step and its interval; None where either is not known."""
-    expected, _ = _expected(calibration, recordings, samples, noise, settings, other=other)
-    errors = [error for s in samples if (error := last_error_of_magnitude(calibration, s, other)) is not None]
-    if expected is None or not errors:
+def _error_and_interval(case: HeldOutCase, samples: Sequence[Samples]) -> tuple[float, list[float]] | None:
+    """Return the rms error of samples after the last step and its interval; None where either is unknown."""
+    errors = [last_error_of_magnitude(case.calibration, s) for s in samples]
+    parts = [linearized(case.calibration, s) for s in samples if s.known.any()]
+    complete = [p for p in parts if p is not None]
+    if not complete or len(complete) < len(parts):
         return None
-    return float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2))), expected
+    error = np.concatenate([e for e in errors if e is not None])
+    return float(np.sqrt(np.nanmean(error**2))), _expected(case, samples, complete)
+
+
+def _agreement(
+    case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[LinearizedSamples]
+) -> dict[str, Any] | None:
+    """Return ``p_value``, and of the element that differs most ``reads``, ``of``, ``error`` and its U.
+
+    None where no held-out motion has a vector reference, the method fixes elements of the matrix, a filter was applied,
+    or an effect moves the motion in time. ``held_out``: the samples of the held-out recordings; ``parts``: the same
+    with their derivatives.
+    """
+    calibration, settings = case.calibration, case.settings
+    sensor = calibration.sensor
+    of_method = any(stage.name == reference_least_squares.NAME for stage in calibration.stages)
+    recordings = [r for r in case.recordings if r.role == "validation" and r.reading(sensor) is not None]
+    vectors = all(r.table_attitude is not None and r.filter["name"] == "none" for r in recordings)
+    moved = any(effect_of(fitted).moves for fitted in calibration.effects)
+    if not (of_method and recordings and vectors and calibration.covariance is not None) or moved:
+        return None
+    if len(parts) < len(recordings) or any(samples.resting for samples in held_out):
+        return None
+    calibrated, slopes = [], np.zeros((9, len(calibration.covariance)))
+    for recording, samples, part in zip(recordings, held_out, parts, strict=True):
+        found = last_step(calibration, samples)
+        if found is None or found[2] is None or not direction_known(calibration, samples):
+            return None
+        reading, truth = found[0], found[2]
+        known = samples.known & np.isfinite(np.hstack([reading, truth])).all(axis=1)
+        rows = np.isfinite(truth[samples.representative]).all(axis=1)
+        columns = np.column_stack([np.ones(np.count_nonzero(rows)), truth[samples.representative][rows]])
+        per_parameter = np.einsum("jn,nip->ijp", np.linalg.pinv(columns)[1:], part.derivative[rows])
+        slopes += part.number * per_parameter.reshape(9, -1)
+        flags = np.zeros(len(known), np.uint16) if recording.flags is None else recording.flags
+        values: dict[str, Any] = {"role": sensor, sensor: np.nan_to_num(reading)}
+        calibrated.append(replace(recording, flags=np.where(known, flags, flags | STUCK), **values))
+        calibrated[-1].cache.update({k: motion for k, motion in recording.cache.items() if isinstance(motion, Motion)})
+    at_rest = [r for r in case.recordings if r.role == "static"]
+    table = {**settings["table"], **dict.fromkeys(bench_priors().values())}
+    plain = {"table": table, "sensor": settings.get("sensor") or {}, "noise": {sensor: case.noise}}
+    try:
+        fit = reference_least_squares.fit(sensor, [*calibrated, *at_rest], None, plain)
+    except (CannotCalibrateError, NotObservableError):
+        return None
+    slopes /= sum(part.number for part in parts)
+    error = np.linalg.inv(fit.matrix).ravel() - np.eye(3).ravel()
+    C = covariance_beside_reference(fit)[MATRIX, MATRIX]
+    C += slopes @ covariance_beside_reference(calibration) @ slopes.T
+    freedom = min(float(np.min(each.effective_freedom()[MATRIX])) for each in (fit, calibration))
+    from scipy.special import fdtrc  # noqa: PLC0415  (only held-out motion with a vector reference needs it)
+
+    p_value = float(fdtrc(9, min(freedom, 1e9), float(error @ np.linalg.solve(C, error)) / 9.0))
+    u = np.sqrt(np.diag(C))
+    worst = int(np.argmax(np.abs(error) / u))
+    axes = {"reads": AXES[worst // 3], "of": AXES[worst % 3]}
+    return {"p_value": p_value, **axes, "error": float(error[worst]), "expanded_uncertainty": 2.0 * float(u[worst])}
 
 
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
-    """Return the rms error, and where an attitude is known the vector rms error, that noise alone would give."""
+    """Return the rms error by noise alone, and the vector rms error by noise alone where an attitude is known."""
     squares = [
-        squared_norm_errors(_truth(calibration, s)[s.known], calibration.matrix, s.variance[s.known]) for s in samples
+        squared_norm_errors(reference_vector(calibration, s)[s.known], calibration.matrix, s.variance[s.known])
+        for s in samples
     ]
     floor = float(np.sqrt(np.mean(np.concatenate(squares))))
     if not all(direction_known(calibration, s) for s in samples):
@@ -263,60 +309,17 @@ def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> 
     return floor, float(np.sqrt(np.mean(vectors)))
 
 
-def _truth(calibration: SensorCalibration, samples: Samples) -> Values:
-    """Return the reference's magnitude along its direction, or along that of the calibrated reading: (n, 3) array."""
-    reading = linear_truth(calibration, samples.reading)
-    direction = reading
-    if samples.motion is not None:
-        reference = truth(samples.sensor, samples.motion)
-        direction = np.where(np.isfinite(reference).all(axis=1, keepdims=True), reference, reading)
-    size = np.linalg.norm(direction, axis=1, keepdims=True)
-    unit = np.where(size > 0, direction / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
-    return np.asarray(samples.magnitude[:, None] * unit)
-
-
-def _choose(
-    sensor: str,
-    recordings: Sequence[Recording],
-    noise: Noise,
-    settings: Mapping[str, Any],
-    *,
-    smoothed: bool = False,
-    of_fit: bool = False,
-) -> tuple[list[Samples], str | None]:
-    """Return the samples to judge on, and why they are not held out where they are not (``of_fit``: asked for)."""
-    table = settings["table"]
-    by_rests = any(r.role == "rests" for r in recordings)
-
-    def moving(role: str) -> list[Samples]:
-        chosen = [r for r in recordings if r.role == role]
-        if by_rests:  # hand-held: between its rests the specific force is not known
-            logs = ("table_attitude", "table_rate", "table_angle")
-            chosen = [r for r in chosen if any(getattr(r, log) is not None for log in logs)]
-        samples = [samples_of_motion(sensor, r, noise, table, smoothed=smoothed) for r in chosen]
-        return [s for s in samples if s is not None and np.isfinite(s.reading).all(axis=1).any()]
-
-    def resting(rests: Mapping[str, Sequence[Rest]]) -> list[Samples]:
-        chosen = [(r, rests[r.name]) for r in recordings if rests.get(r.name)]
-        return [s for s in (samples_of_rests(sensor, r, rs, noise, table) for r, rs in chosen) if s is not None]
-
-    def rests_of(role: str) -> dict[str, Sequence[Rest]]:
-        return {r.name: split_rests(r, 0).used for r in recordings if r.role == role}
-
-    held_out = [] if of_fit else moving("validation")
-    if not held_out and by_rests and not of_fit:
-        held_out = resting(held_out_rests(recordings, settings)) or resting(rests_of("validation"))
-    if held_out:
-        return held_out, None
-    reason = f"no held-out recording holds readings of the {sensor} and a reference for them"
-    stated = settings.get("procedure", {})
-    if by_rests and stated.get("turns"):
-        reason += " (with two turns about each axis between rests of 4 s or longer, the second is held out)"
-    elif count_of_rests(recordings) < stated.get("holdout_from", 0) and all(r.role != "validation" for r in recordings):
-        count, fewest, every = count_of_rests(recordings), stated["holdout_from"], stated["holdout_every"]
-        reason += f" ({count} rests all go to the fit; of {fewest} and more, one of {every} is held out)"
-    fitted = moving(sensor) or resting(rests_of("rests")) or resting(rests_of(sensor))
-    return fitted, reason
+def _why_not_held_out(case: HeldOutCase) -> str:
+    """Return why no samples are held out."""
+    reason = f"no held-out recording holds readings of the {case.calibration.sensor} and a reference for them"
+    stated = case.settings.get("procedure", {})
+    if case.by_hand and stated.get("turns"):
+        return reason + " (with two turns about each axis between rests of 4 s or longer, the second is held out)"
+    count, fewest = count_of_rests(case.recordings), stated.get("holdout_from", 0)
+    if count < fewest and all(r.role != "validation" for r in case.recordings):
+        every = stated["holdout_every"]
+        return reason + f" ({count} rests all go to the fit; of {fewest} and more, one of {every} is held out)"
+    return reason
 
 
 def _fitted_exactly(calibration: SensorCalibration) -> int:
@@ -327,16 +330,9 @@ def _fitted_exactly(calibration: SensorCalibration) -> int:
     return 0
 
 
-def _worse_than_raw(
-    calibration: SensorCalibration,
-    samples: Sequence[Samples],
-    allowed: float,
-    other: SensorCalibration | None,
-    *,
-    on_table: bool,
-) -> str | None:
-    """Return why a calibration must not be used, as one sentence; None where it may: its error is ``allowed``."""
-    errors = [last_error_of_magnitude(calibration, s, other) for s in samples]
+def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: float) -> str | None:
+    """Return why a calibration must not be used, as one sentence; None where it may be used."""
+    errors = [last_error_of_magnitude(case.calibration, s) for s in samples]
     after = [error[s.known] for error, s in zip(errors, samples, strict=True) if error is not None]
     if len(after) < len(samples):
         return None
@@ -352,7 +348,7 @@ def _worse_than_raw(
     limit = stdtrit(len(means) - 1, 1.0 - FALSE_REFUSALS) * float(means.std(ddof=1))
     if means.mean() * np.sqrt(len(means)) <= limit:
         return None
-    unit = unit_of(calibration.sensor)
+    unit, on_table = unit_of(case.calibration.sensor), case.settings["table"].get("motion") != "none"
     return (
         f"the calibration makes held-out motion worse: {sizes[0]:.3g} {unit} rms before it, {sizes[1]:.3g} {unit} "
         f"after, where noise and stated uncertainties leave at most {allowed:.3g} {unit}. Check that fit and "

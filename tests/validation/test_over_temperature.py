@@ -21,7 +21,7 @@ def samples(low: float, high: float, *, warm: bool = True) -> Samples:
 
 
 def test_a_slope_that_is_not_modelled_is_the_mean_residual_of_the_bins() -> None:
-    found = residuals_over_temperature(SensorCalibration("accelerometer"), [samples(10.0, 40.0)], None)
+    found = residuals_over_temperature(SensorCalibration("accelerometer"), [samples(10.0, 40.0)])
     assert found is not None
     assert [b["temperature_degc"] for b in found] == pytest.approx([12.5, 17.5, 22.5, 27.5, 32.5, 37.5], abs=0.1)
     for b in found:
@@ -33,7 +33,7 @@ def test_a_slope_that_is_not_modelled_is_the_mean_residual_of_the_bins() -> None
 def test_a_slope_that_is_modelled_leaves_noise() -> None:
     values = {"b_T_x": 0.0, "b_T_y": 0.0, "b_T_z": SLOPE}
     effect = FittedEffect("bias_temperature", {k: {"value": v, "unit": "g/degC"} for k, v in values.items()})
-    found = residuals_over_temperature(SensorCalibration("accelerometer", effects=(effect,)), [samples(10, 40)], None)
+    found = residuals_over_temperature(SensorCalibration("accelerometer", effects=(effect,)), [samples(10, 40)])
     assert found is not None
     assert max(abs(b["mean_error"]) for b in found) < 5e-5
     assert [b["rms_error"] for b in found] == pytest.approx([1e-4] * 6, rel=0.3)
@@ -41,6 +41,6 @@ def test_a_slope_that_is_modelled_leaves_noise() -> None:
 
 def test_a_temperature_that_was_not_swept_or_not_recorded_gives_none() -> None:
     c = SensorCalibration("accelerometer")
-    assert residuals_over_temperature(c, [samples(25.0, 33.0)], None) is None
-    assert residuals_over_temperature(c, [samples(10.0, 40.0, warm=False)], None) is None
-    assert residuals_over_temperature(c, [], None) is None
+    assert residuals_over_temperature(c, [samples(25.0, 33.0)]) is None
+    assert residuals_over_temperature(c, [samples(10.0, 40.0, warm=False)]) is None
+    assert residuals_over_temperature(c, []) is None
