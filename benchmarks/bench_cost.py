@@ -20,7 +20,7 @@ from unittest.mock import patch
 import numpy as np
 
 from pipeline.diagnosis.diagnose import diagnose
-from pipeline.estimation.noise_prior import noise_of
+from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.preprocessing.checks import check_recordings

@@ -15,7 +15,7 @@ import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.gauss_markov import Blocks, Prior
-from pipeline.estimation.noise_prior import prior_of
+from pipeline.estimation.noise import prior_of
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects.base import STANDARD_GRAVITY
 from pipeline.model.kinematics import skew

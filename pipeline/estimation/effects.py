@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.estimation.noise_prior import noise_of
+from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select

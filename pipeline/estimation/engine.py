@@ -1,21 +1,21 @@
-"""Compute the uncertainty of an estimate from the residuals of its fit, in the same way for every fit.
+"""Compute the uncertainty of an estimate from the residuals of its fit.
 
 Every fit is linear in the readings near its solution, ``d beta = sum over channels c of J_c A_c dy_c`` (``LinearMap``).
 Under one hypothesis about the noise (``pipeline.estimation.gauss_markov``) the estimate has the covariance
 
     V = sum_c s_c^2 J_c (A_c diag(1/n) A_c^T + q a_c B(tau) a_c^T) J_c^T
 
-where ``a`` has the columns of A summed over each block, and n the samples of each row. One calibration does not
+where ``a`` is A summed over the rows of each block, and n holds the samples of each row. One calibration does not
 determine q and tau well. So each hypothesis of the prior's grid has the weight of its restricted likelihood times its
 prior (Patterson & Thompson, Biometrika 58, 1971), and the error of a parameter is distributed as a mixture over all
-hypotheses (``Posterior``). The mixture is approximated by a scaled Student's t with the same probabilities within one
-and within two standard uncertainties:
+hypotheses (``Posterior``). The mixture is approximated by a scaled Student's t that has the same probabilities within
+one and within two standard uncertainties:
 
     P(|e| < x) = sum_i p_i (2 Phi(x / sigma_i) - 1),    x_P: P(|e| < x_P) = P
     t_95(nu) / t_68(nu) = x_95 / x_68,    u = x_95 / t_95(nu)
 
-To match variance and kurtosis instead fails if the hypothesis without bias instability has nine tenths of the weight: a
-hypothesis with a large instability and little weight then determines both, but not the ends of the interval.
+A Student's t of the same variance and kurtosis fails if the hypothesis without bias instability has nine tenths of the
+weight: a hypothesis with a large instability and little weight then determines both, but not the ends of the interval.
 
 Stated accuracies of the bench (type B) are propagated by the same map. They are nuisance parameters with a normal prior
 that the estimator does not fit (consider parameters; Schmidt 1966), and add ``J A Z diag(u^2) Z^T A^T J^T``.
@@ -43,17 +43,17 @@ FEWEST = 2.0  # degrees of freedom: Student's t has no variance below
 STEPS, SMALL_STEP = 60, 1e-5  # of Newton's method for a quantile; relative
 NEGLIGIBLE = 1e-6  # weight of a hypothesis, relative to the largest, below which it does not change two digits of u
 RANK = 1e-12  # of the eigenvalues of a scaled matrix: the rounding of a double, with a margin
-AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it does not take up their noise
+AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it does not absorb their noise
 
 
 @dataclass(frozen=True)
 class LinearMap:
     """The linear map from small changes of the readings to the parameters of a solved fit."""
 
-    # each (q, n): A, weights of the readings of a channel in what is fitted of it; may be one array for all
-    weights: tuple[Values, Values, Values]
-    # each (p, q): J, derivative of the parameters with respect to that
-    derivative: tuple[Values, Values, Values]
+    # of each channel, (q, n): A, from its readings to its q fitted values; may be one array for all channels
+    weights: tuple[Values, ...]
+    # of each channel, (p, q): J, derivative of the parameters by its fitted values
+    derivative: tuple[Values, ...]
 
     @property
     def parameters(self) -> int:
@@ -61,25 +61,21 @@ class LinearMap:
         return int(self.derivative[0].shape[0])
 
     def then(self, change: Values) -> LinearMap:
-        """Return the map to what (r, p) ``change`` makes of the parameters."""
-        x, y, z = (change @ J for J in self.derivative)
-        return LinearMap(self.weights, (x, y, z))
+        """Return the map to ``change @ parameters``; ``change``: (r, p)."""
+        return LinearMap(self.weights, tuple(change @ J for J in self.derivative))
 
     def first(self) -> LinearMap:
-        """Return the map to what is fitted of the channels, one after the other."""
+        """Return the map to the fitted values of all channels, one after the other."""
         sizes = [len(A) for A in self.weights]
-        x, y, z = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
-        return LinearMap(self.weights, (x, y, z))
+        return LinearMap(self.weights, tuple(np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)))
 
     def results(self, kept: slice) -> LinearMap:
         """Return the map to some of the parameters."""
-        x, y, z = (J[kept] for J in self.derivative)
-        return LinearMap(self.weights, (x, y, z))
+        return LinearMap(self.weights, tuple(J[kept] for J in self.derivative))
 
     def rows(self, rows: slice) -> LinearMap:
-        """Return the map of some consecutive readings."""
-        x, y, z = (A[:, rows] for A in self.weights)
-        return LinearMap((x, y, z), self.derivative)
+        """Return the map from some consecutive readings."""
+        return LinearMap(tuple(A[:, rows] for A in self.weights), self.derivative)
 
     def of(self, change: Values) -> Values:
         """Return the change of the parameters by a change of the readings, (n, 3): (p,) array."""
@@ -106,9 +102,9 @@ class Posterior:
     spare: float  # degrees of freedom of the scale of the noise
 
     def averaged(self) -> tuple[Values, Values]:
-        """Return the covariance under all hypotheses together, (p, p), and the degrees of freedom, (p,).
+        """Return the covariance of the mixture, (p, p), and the degrees of freedom, (p,).
 
-        Degrees of freedom are infinite where nothing is uncertain.
+        Degrees of freedom are infinite for parameters without uncertainty.
         """
         mean = np.tensordot(self.weight, self.covariances, 1)
         average = np.diag(mean)
@@ -137,7 +133,8 @@ class Posterior:
 def scaled_inverse(matrix: Values) -> Values:
     """Return the pseudo-inverse of a (p, p) symmetric matrix whose parameters have different units and sizes.
 
-    Rows and columns are scaled to a unit diagonal first, so that no small parameter counts as rounding of a large one.
+    Rows and columns are scaled to a unit diagonal first, so that no small parameter is lost in the rounding of a large
+    one.
     """
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     scale = np.outer(size, size)
@@ -156,7 +153,7 @@ def root_of(covariance: Values) -> Values:
 
 
 def _within(weight: Values, sigma: Values, probability: float) -> Values:
-    """Return the bound of the absolute value that each mixture is within with ``probability``: (p,) array.
+    """Return the x with ``P(|e| < x) = probability`` of each mixture: (p,) array.
 
     The probability is concave in x, so that Newton's method from below stays below.
     """
@@ -218,7 +215,7 @@ class ResidualNoise:
 
     @property
     def white(self) -> Values:
-        """Standard deviation of a white sample: (3,) array."""
+        """Standard deviation of the white noise of a sample: (3,) array."""
         return np.asarray(np.sqrt(self.weight @ self.white_variance))
 
     @property
@@ -228,7 +225,7 @@ class ResidualNoise:
         return np.asarray(np.sqrt((self.weight * q) @ self.white_variance))
 
     def draws(self, rng: np.random.Generator, number: int) -> Iterator[Values]:
-        """Yield noise of the likeliest hypothesis at each sample, (n, 3) arrays; the bias is even over a block."""
+        """Yield simulated noise of the likeliest hypothesis, (n, 3) arrays; the bias is constant over a block."""
         best = int(np.argmax(self.weight))
         setting, rows = self.settings[best], int(self.blocks.weight.sum())
         bias = GaussMarkov(self.blocks, [Setting(1.0, setting.time)], np.zeros(len(self.blocks.weight)))
@@ -241,30 +238,30 @@ class ResidualNoise:
         """Return the error of a fit's parameters."""
         total = np.zeros((len(self.weight), fit.parameters, fit.parameters))
         ratios = np.array([s.ratio**2 for s in self.settings])[:, None, None]
-        times = [s.time for s in self.settings]
-        for J, own, (white, slow) in zip(
-            fit.derivative, self.white_variance.T, self._products(fit, times), strict=True
-        ):
-            total += own[:, None, None] * (J @ (white + ratios * np.stack([slow[t] for t in times])) @ J.T)
+        products = self._products(fit, [s.time for s in self.settings])
+        for J, variance, (white, slow) in zip(fit.derivative, self.white_variance.T, products, strict=True):
+            total += variance[:, None, None] * (J @ (white + ratios * slow) @ J.T)
         return Posterior(self.weight, total, self.spare)
 
     def variances(self, fit: LinearMap, prior: Prior) -> tuple[Values, Values]:
-        """Return the variances by the white noise that is seen, and by the bias instability of a prior: (p,) arrays."""
+        """Return the variances by the estimated white noise, and by the bias instability of a prior: (p,) arrays."""
         white, wander = np.zeros(fit.parameters), np.zeros(fit.parameters)
         for J, s, (alone, slow) in zip(fit.derivative, self.white, self._products(fit, [prior.time]), strict=True):
             white += s**2 * np.einsum("pi,ij,pj->p", J, alone, J)
-            wander += prior.wander**2 * np.einsum("pi,ij,pj->p", J, slow[prior.time], J)
+            wander += prior.wander**2 * np.einsum("pi,ij,pj->p", J, slow[0], J)
         return white, wander
 
-    def _products(self, fit: LinearMap, times: Sequence[float]) -> list[tuple[Values, dict[float, Values]]]:
-        """Return ``A diag(1/n) A^T`` and ``a B(tau) a^T`` of each channel."""
-        found: dict[int, tuple[Values, dict[float, Values]]] = {}
+    def _products(self, fit: LinearMap, times: Sequence[float]) -> list[tuple[Values, Values]]:
+        """Return ``A diag(1/n) A^T``, (q, q), and ``a B(tau) a^T`` at each time, (t, q, q), of each channel."""
+        covariance = {tau: self.blocks.covariance(tau) for tau in set(times)}
+        products: dict[int, tuple[Values, Values]] = {}
         for A in fit.weights:
-            if id(A) not in found:
+            if id(A) not in products:
                 a = self.blocks.sums(A.T)
-                slow = {tau: a.T @ self.blocks.covariance(tau) @ a for tau in set(times)}
-                found[id(A)] = (A if self.row_weight is None else A / self.row_weight) @ A.T, slow
-        return [found[id(A)] for A in fit.weights]
+                slow = {tau: a.T @ B @ a for tau, B in covariance.items()}
+                white = (A if self.row_weight is None else A / self.row_weight) @ A.T
+                products[id(A)] = white, np.stack([slow[tau] for tau in times])
+        return [products[id(A)] for A in fit.weights]
 
 
 def assess_noise(
@@ -272,12 +269,13 @@ def assess_noise(
 ) -> ResidualNoise:
     """Weight the hypotheses of a prior by the residuals of a fit, one sample a row.
 
-    Where the table's stated accuracies are worse than the noise, the residuals contain its errors, which have separate
-    lines in the budget. Then the directions in which these exceed white noise are projected out of all channels.
+    If the stated accuracies of the table are worse than the noise, the residuals contain errors of the table, which
+    have separate lines in the budget. The directions in which these errors exceed white noise are then projected out
+    of all channels.
 
-    ``residuals``: (n, 3). ``design``: (n, p), columns that were fitted; those of one channel may be more than its own.
-    ``disturbance``: (3 m, 3 m), covariance that the table's stated errors give the sums over the blocks, channel by
-    channel. Raises ``NotObservableError`` if there are no more samples than parameters.
+    ``residuals``: (n, 3). ``design``: (n, p), the fitted columns of all channels. ``disturbance``: (3 m, 3 m), channel
+    by channel: covariance of the sums over the blocks by the stated errors of the table. Raises ``NotObservableError``
+    if there are no more samples than parameters.
     """
     count = blocks.weight[:, None]
     spare = len(count) - design.shape[1]
@@ -314,9 +312,10 @@ def noise_beside(  # noqa: PLR0917  (what a restricted likelihood beside known e
 ) -> ResidualNoise:
     """Weight hypotheses about the noise by the residuals' block means, in directions without known errors.
 
-    ``columns``: (3, m, p), those that were fitted, in means times ``sqrt(samples) / white``, over the norm of the
-    samples. ``means``: (m, 3). ``white``: (3,), noise of a sample. ``disturbance``: see ``assess_noise``; directions in
-    which it exceeds white noise are left out. ``row_weight``: (n,), samples of each row.
+    ``columns``: (3, m, p), block means of the fitted columns of each channel, times ``sqrt(samples) / white``, over the
+    norm of the column. ``means``: (m, 3), of the residuals. ``white``: (3,), noise of a sample. ``disturbance``: see
+    ``assess_noise``; directions in which it exceeds white noise are not used. ``row_weight``: (n,), samples of each
+    row.
     """
     count = blocks.weight[:, None]
     scale = np.outer(white, np.sqrt(count)).ravel()
@@ -327,8 +326,8 @@ def noise_beside(  # noqa: PLR0917  (what a restricted likelihood beside known e
     z = basis.T @ (np.sqrt(count) * means / white).T.ravel()
     logarithm, squares = _in_subspace(basis, z, blocks, settings)
     variance = np.maximum(squares / len(z), np.finfo(float).tiny)[:, None]
-    found = ResidualNoise.of(blocks, settings, logarithm, variance, len(z), row_weight)
-    return replace(found, white_variance=found.white_variance * white**2)
+    noise = ResidualNoise.of(blocks, settings, logarithm, variance, len(z), row_weight)
+    return replace(noise, white_variance=noise.white_variance * white**2)
 
 
 def _in_subspace(basis: Values, z: Values, blocks: Blocks, settings: Sequence[Setting]) -> tuple[Values, Values]:
@@ -339,16 +338,14 @@ def _in_subspace(basis: Values, z: Values, blocks: Blocks, settings: Sequence[Se
     for tau in {s.time for s in settings}:
         R = root[:, None] * blocks.covariance(tau) * root
         e, U = np.linalg.eigh(np.einsum("cbi,cbj->ij", channels, R @ channels, optimize=True))
-        own = np.array([k for k, s in enumerate(settings) if s.time == tau])
-        spectrum = 1.0 + np.outer([settings[k].ratio ** 2 for k in own], np.clip(e, 0.0, None))
-        logarithm[own] = np.log(spectrum).sum(axis=1)
-        squares[own] = (1.0 / spectrum) @ (U.T @ z) ** 2
+        chosen = [k for k, s in enumerate(settings) if s.time == tau]
+        spectrum = 1.0 + np.outer([settings[k].ratio ** 2 for k in chosen], np.clip(e, 0.0, None))
+        logarithm[chosen] = np.log(spectrum).sum(axis=1)
+        squares[chosen] = (1.0 / spectrum) @ (U.T @ z) ** 2
     return logarithm, squares
 
 
 def derivative(function: Callable[[Values], Values], x: Values, step: Values) -> Values:
     """Return the (n, m) derivative of a function of (m,) by central differences with a step for each input."""
-    columns = [
-        (function(x + h * e) - function(x - h * e)) / (2.0 * h) for h, e in zip(step, np.eye(len(x)), strict=True)
-    ]
-    return np.stack(columns, axis=-1)
+    steps = np.diag(step)
+    return np.stack([(function(x + h) - function(x - h)) / (2.0 * h.sum()) for h in steps], axis=-1)

@@ -14,10 +14,10 @@ where
           0 between blocks whose distance in time is unknown
 
 The differences ``w_k = y_k / h_k - phi_k y_(k-1) / h_(k-1)`` with ``phi_k = exp(-(start_k - start_(k-1)) / tau)`` are
-correlated with their neighbours only. Their covariance T is tridiagonal and positive definite for every q, so that
-``A^T C^-1 A`` and ``log det C`` follow from one factorisation of T (LAPACK ``pttrf``), with all settings of a grid side
-by side. Block means and the scatter within the blocks are independent, so that products over samples are those
-within the blocks, formed once, plus those of the means.
+correlated with their neighbours only. Their covariance T is tridiagonal and positive definite for every q. So one
+factorisation of T (LAPACK ``pttrf``) gives ``A^T C^-1 A`` and ``log det C``, for all settings of a grid in one call.
+Block means and the scatter within the blocks are independent. Products over samples are therefore the sum of the
+products within the blocks, which no setting changes, and of the products of the means.
 
 Sources: IEEE Std 952-1997, annex C (the process); Rybicki & Press, Phys. Rev. Lett. 74, 1995 (its inverse); Patterson &
 Thompson, Biometrika 58, 1971 (restricted likelihood).
@@ -37,21 +37,21 @@ if TYPE_CHECKING:
 
     from pipeline.records import Index, Integers, Noise, Values
 
-DEFAULT_TIME_S = 100.0  # correlation time where the sensor file gives none: of MEMS sensors, by IEEE Std 952 examples
+DEFAULT_TIME_S = 100.0  # correlation time if the sensor file gives none: of MEMS sensors, by IEEE Std 952 examples
 STATED_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a sensor file gives: a factor of three
 SHARPEST_WIDTH = 0.15  # of the same logarithm, however long the static recording
 STATIC_WIDTH = (0.35, 1.1)  # the same for the coarse grid of ``selection_grid``, whose steps are factors of two
 FARTHEST = 3.0  # widths of the prior beyond which the residuals alone decide
-SURE = 9.0  # odds of no bias instability at all where none is stated
-TIME_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation times tried, in those of the prior
+SURE = 9.0  # odds of no bias instability at all if none is stated
+TIME_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation times of the grid, over that of the prior
 TIME_PRIOR = (0.1, 0.2, 0.4, 0.2, 0.1)
-RATIOS = np.append(0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1))  # ratios tried of the bias to the white noise of a sample
-RANDOM_WALK = 8.0  # times the correlation time seen, with the same variance of short differences
-# A bias that never settles: times the ratio and the time of a setting, and its share of that setting's prior. Of 80
+RATIOS = np.append(0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1))  # ratios of the grid: bias to white noise of a sample
+RANDOM_WALK = 8.0  # correlation time over the measured one, with the same variance of short differences
+# A random walk of the bias: factors on ratio and time of a setting, and its share of that setting's prior. Of 80
 # simulated random walks 17 showed an invented effect without it, and 6 with it.
 WALK_RATIO, WALK_TIME, WALK_SHARE = 8.0, 64.0, 0.3
 SLOW = 0.3  # share of white noise's spectrum, see ``steady_s``: right answers as with 0.05 (docs/blind_study.md)
-FAST_S = 25.0  # correlation time below which ``information`` replaces the model, as its blocks last seconds
+FAST_S = 25.0  # correlation time below which ``information`` replaces the model, because its blocks last seconds
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,17 @@ WHITE = Setting(0.0, 1.0)
 class Prior:
     """The prior of the bias instability."""
 
-    wander: float = 0.0  # unit of the sensor; its standard deviation; 0 where nothing is known
+    wander: float = 0.0  # unit of the sensor; its standard deviation; 0: unknown
     time: float = DEFAULT_TIME_S  # s; its correlation time
     width: float = STATED_WIDTH  # standard deviation of the logarithm of ``wander``
-    stated: Prior | None = None  # what is known beside the static recording, where ``seen`` holds what that tells
-    # wanders tried, (w,), and the log likelihood of a static recording at them, (t, w), by ``TIME_FACTORS``
+    stated: Prior | None = None  # the prior without the static recording
+    # of a static recording: wanders, (w,), and its log likelihood at them, (t, w), by ``TIME_FACTORS``
     seen: tuple[Values, Values] | None = None
 
     def log_belief(self, wander: Values) -> Values:
         """Return the log prior, up to a constant, of (m,) standard deviations of which the first is 0.
 
-        Where none is stated, the first has ``SURE`` times the weight of all others together.
+        If no wander is stated, the first has ``SURE`` times the weight of all others together.
         """
         if self.wander <= 0.0:
             return np.append(np.log(SURE * (len(wander) - 1)), np.zeros(len(wander) - 1))
@@ -90,13 +90,12 @@ class Prior:
     def grid(self, white: float) -> list[Setting]:
         """Return the hypotheses over which a covariance is averaged, for white noise of ``white`` per sample."""
         wander = RATIOS * white
-        belief = (self.stated or self).log_belief(wander)
-        told = np.zeros((len(TIME_FACTORS), 1))
+        belief = np.tile((self.stated or self).log_belief(wander), (len(TIME_FACTORS), 1))
         if self.seen is not None:
-            told = np.stack([np.interp(wander, self.seen[0], row) for row in self.seen[1]])
+            belief += [np.interp(wander, self.seen[0], row) for row in self.seen[1]]
         return [
             Setting(float(ratio), factor * self.time, float(log + np.log(share)))
-            for factor, share, logs in zip(TIME_FACTORS, TIME_PRIOR, belief + told, strict=True)
+            for factor, share, logs in zip(TIME_FACTORS, TIME_PRIOR, belief, strict=True)
             for ratio, log in zip(RATIOS, logs, strict=True)
             if np.isfinite(log)
         ]
@@ -107,12 +106,12 @@ def selection_grid(
 ) -> list[Setting]:
     """Return the hypotheses over which the likelihoods of models are maximised.
 
-    With a static recording they are its ratio, the half, double and fourfold of it with a log-normal weight, and random
-    walks that cannot be distinguished in the recording and grow after it. Otherwise they cover the usual sensors.
+    With a static recording they are its ratio, and the half, double and fourfold of it with a log-normal weight. Random
+    walks with the same short differences are added: they exceed these hypotheses only over times that are longer than
+    the recording. Without one, the hypotheses cover the usual sensors.
     """
-    pinned = noise is not None and noise.source == "static" and not fast(noise)
-    if noise is not None and pinned and np.any(noise.wander > 0) and np.all(noise.white > 0):
-        known = float(np.sqrt(np.mean((noise.wander / noise.white) ** 2)))
+    known = _static_ratio(noise)
+    if noise is not None and known > 0.0 and not fast(noise):
         factors = np.array([0.5, 1.0, 2.0, 4.0])
         least, most = STATIC_WIDTH
         width = np.clip(np.sqrt(noise.correlation_time / noise.length), least, most) if noise.length > 0 else least
@@ -126,12 +125,12 @@ def selection_grid(
 
 def random_walks(settings: Iterable[Setting]) -> dict[Setting, Setting]:
     """Return for each ratio the setting of its shortest time, and a random walk with the same short differences."""
-    found: dict[float, Setting] = {}
+    shortest: dict[float, Setting] = {}
     for s in settings:
-        if s.ratio > 0.0 and (s.ratio not in found or s.time < found[s.ratio].time):
-            found[s.ratio] = s
+        if s.ratio > 0.0 and (s.ratio not in shortest or s.time < shortest[s.ratio].time):
+            shortest[s.ratio] = s
     share = float(np.log(WALK_SHARE))
-    return {s: Setting(s.ratio * WALK_RATIO, s.time * WALK_TIME, s.prior + share) for s in found.values()}
+    return {s: Setting(s.ratio * WALK_RATIO, s.time * WALK_TIME, s.prior + share) for s in shortest.values()}
 
 
 def fast(noise: Noise | None) -> bool:
@@ -139,30 +138,34 @@ def fast(noise: Noise | None) -> bool:
     return noise is not None and noise.source == "static" and noise.correlation_time < FAST_S
 
 
+def _static_ratio(noise: Noise | None) -> float:
+    """Return the ratio of bias wander to white noise by a static recording, mean of the axes; 0 if it shows none."""
+    if noise is None or noise.source != "static" or not np.all(noise.white > 0):
+        return 0.0
+    return float(np.sqrt(np.mean((noise.wander / noise.white) ** 2)))
+
+
 def information(noise: Noise | None, interval: float) -> float:
     """Return the effective information per sample, relative to white noise: ``1 / (1 + 2 q tau / dt)``.
 
     ``interval``: s, dt.
     """
-    if noise is None or not fast(noise) or not np.all(noise.white > 0):
+    if noise is None or not fast(noise):
         return 1.0
-    ratio = float(np.mean((noise.wander / noise.white) ** 2))
-    return 1.0 / (1.0 + 2.0 * ratio * noise.correlation_time / interval)
+    return 1.0 / (1.0 + 2.0 * _static_ratio(noise) ** 2 * noise.correlation_time / interval)
 
 
 def steady_s(noise: Noise | None, interval: float) -> float:
     """Return the time over which a bias is assumed constant, s: L with ``2 q L^2 / (pi^2 tau) = SLOW dt``.
 
     At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is ``SLOW`` times that of white noise, dt.
-    Above, white noise hides it. Without a static recording that shows slow wander, there is no bound. ``interval``:
-    s, dt.
+    At higher frequencies white noise is larger still. Without a static recording that shows slow wander, L is infinite.
+    ``interval``: s, dt.
     """
-    if noise is None or noise.source != "static" or fast(noise):
+    ratio = _static_ratio(noise)
+    if noise is None or ratio == 0.0 or fast(noise):
         return float("inf")
-    if not np.any(noise.wander > 0) or not np.all(noise.white > 0):
-        return float("inf")
-    ratio = float(np.mean((noise.wander / noise.white) ** 2))
-    return float(np.pi * np.sqrt(0.5 * SLOW * noise.correlation_time * interval / ratio))
+    return float(np.pi / ratio * np.sqrt(0.5 * SLOW * noise.correlation_time * interval))
 
 
 def variance_of_average(length: Values, tau: float | Values) -> Values:
@@ -206,16 +209,13 @@ class Blocks:
         ``rows``: times (n,), s, and samples (n,) of the rows of each recording. ``clocks``: of each recording.
         ``length``: s.
         """
-        first, start, weight, clock, row = [], [], [], [], 0
-        for (time, samples), number in zip(rows, clocks, strict=True):
-            own = np.flatnonzero(np.diff(np.floor((time - time[0]) / length), prepend=-1.0))
-            first.append(own + row)
-            weight.append(np.add.reduceat(samples, own))
-            start.append(np.add.reduceat(samples * time, own) / weight[-1])
-            clock.append(np.full(len(own), number))
-            row += len(time)
-        middle = np.concatenate(start)
-        return cls(np.concatenate(first), np.concatenate(weight), middle, np.zeros(len(middle)), np.concatenate(clock))
+        labels = [np.floor((time - time[0]) / length) for time, _ in rows]
+        time, samples = (np.concatenate(each) for each in zip(*rows, strict=True))
+        first = np.flatnonzero(np.concatenate([np.diff(label, prepend=-1.0) for label in labels]))
+        clock = np.repeat(clocks, [len(label) for label in labels])[first]
+        weight = np.add.reduceat(samples, first)
+        middle = np.add.reduceat(samples * time, first) / weight
+        return cls(first, weight, middle, np.zeros(len(middle)), clock)
 
     @cached_property
     def order(self) -> Index:
@@ -254,9 +254,9 @@ class GaussMarkov:
         own = (v + q * variance_of_average(length, tau)) / h**2
         diagonal = own.copy()
         diagonal[:, 1:] += phi * (phi * own[:, :-1] - 2.0 * q * near)
-        beside = np.zeros_like(own)
-        beside[:, :-1] = q * near - phi * own[:, :-1]
-        self._d, self._e, info = scipy.linalg.lapack.dpttrf(diagonal.ravel(), beside.ravel()[:-1])
+        neighbour = np.zeros_like(own)
+        neighbour[:, :-1] = q * near - phi * own[:, :-1]
+        self._d, self._e, info = scipy.linalg.lapack.dpttrf(diagonal.ravel(), neighbour.ravel()[:-1])
         assert info == 0  # noqa: S101  (T is a covariance)
         self.log_determinant: Values = np.sum(np.log(self._d.reshape(h.shape)) + 2.0 * np.log(h), axis=1)
 
@@ -267,18 +267,15 @@ class GaussMarkov:
 
     def whitened(self, columns: Values) -> Values:
         """Return ``R A`` with ``R^T R = C^-1`` of (m, p) columns, blocks last and in order: (g, p, m) array."""
-        # blocks, columns, settings: numpy is fast where the last axis is long and contiguous
-        half, phi, below = (np.ascontiguousarray(v.T) for v in (self._half, self._phi, self._e_by_setting()))
+        below = np.append(self._e, 0.0).reshape(self._half.shape)  # subdiagonal of L; T = L D L^T
+        # blocks, columns, settings: numpy is fast if the last axis is long and contiguous
+        half, phi, below = (np.ascontiguousarray(v.T) for v in (self._half, self._phi, below))
         z = columns[self._order][:, :, None] / half[:, None, :]
         z[1:] -= phi[:, None, :] * z[:-1]
-        for k in range(1, len(z)):  # T = L D L^T: z = L^-1 w
+        for k in range(1, len(z)):  # z = L^-1 w
             z[k] -= below[k - 1] * z[k - 1]
         z /= np.sqrt(np.ascontiguousarray(self._d.reshape(self._half.shape).T))[:, None, :]
         return np.ascontiguousarray(z.transpose(2, 1, 0))
-
-    def _e_by_setting(self) -> Values:
-        """Return the subdiagonal of L at every setting: (g, m - 1) array."""
-        return np.append(self._e, 0.0).reshape(self._half.shape)[:, :-1]
 
     def solve(self, columns: Values) -> Values:
         """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""
@@ -333,15 +330,15 @@ class Products:
 
     def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return ``A^T C^-1 A``, (g, p, p), and ``log det C`` of one channel, (g,), up to that of the weights."""
-        found, logarithm = np.repeat(self.white[None], len(settings), axis=0), np.zeros(len(settings))
+        products, logarithm = np.repeat(self.white[None], len(settings), axis=0), np.zeros(len(settings))
         wander = [g for g, setting in enumerate(settings) if setting.ratio > 0.0]
         if wander:
             model = GaussMarkov(self.blocks, [settings[g] for g in wander])
-            # First what is within the blocks: in another order, rounding exceeds what collinear columns leave.
+            # The difference comes first: in another order, rounding exceeds the remainder of collinear columns.
             within = self.white - self.means.T @ (self.blocks.weight[:, None] * self.means)
-            found[wander] = within + model.products(self.means)
+            products[wander] = within + model.products(self.means)
             logarithm[wander] = model.log_determinant + np.sum(np.log(self.blocks.weight))
-        return found, logarithm
+        return products, logarithm
 
     def influence(self, setting: Setting) -> Values:
         """Return ``A^T C^-1``: (p, n) array."""

@@ -39,7 +39,7 @@ from pipeline.estimation.engine import RANK, Posterior, ResidualNoise, noise_bes
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import with_matrix
-from pipeline.estimation.noise_prior import wander_prior
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.observations import Observations, observe, weighted
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.uncertainty_budget import (

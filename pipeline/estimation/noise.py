@@ -1,4 +1,4 @@
-"""Estimate the noise of a sensor from its recordings.
+"""Estimate the noise of a sensor from its recordings, and the prior of its bias wander for a fit.
 
     noise[n] = white * w[n] + wander * m[n]        (``pipeline.records.Noise``)
 
@@ -10,21 +10,19 @@ the noise:
 2. ``rests``: the rests of the other recordings, each with a separate mean. In recordings by hand the unit creeps
    (``pipeline.signal.quiet_motion``): gravity moves from one axis to another, which is not wander of a bias. The
    accelerometer's wander is then estimated from the component along gravity, and its white noise from the scatter about
-   a parabola in time. A hand trembles, but it stays in place: the integral of its rate is bounded. The correlation time
-   of what fluctuates within rests by hand is therefore at most the length of a rest. With the sensor file's 100 s, a
-   tremor of 0.4 deg/s would be taken for a wander of 1 deg/s.
-3. ``residual``: scatter of windows of 16 samples in turns about a local polynomial: white noise only. With P the
+   a parabola in time. A hand trembles in place: the integral of its rate is bounded. So the correlation time is at most
+   the length of a rest. With the 100 s of a sensor file, a tremor of 0.4 deg/s would be a wander of 1 deg/s.
+3. ``residual``: the scatter of windows of 16 samples in turns about a local polynomial: white noise only. With P the
    projection that removes the polynomial and R the autocovariance of the filter, ``median(|P y|^2) = white^2 tr(P R)
    (1 - 2/(9 nu))^3``, where ``nu = tr(P R)^2 / tr(P R P R)`` (Satterthwaite 1946; the median is robust against windows
    over a ramp).
-4. ``sensor_file``: the figures of the sensor file, ``white = noise_density sqrt(1 / (2 dt))``.
+4. ``data_sheet``: the figures of the sensor file, ``white = noise_density sqrt(1 / (2 dt))``.
 
 ``white`` is the noise of a raw sample: the effect of a filter is removed by its exact autocovariance, from its impulse
 response. If the recordings do not show wander, it is the sensor file's figure if they allow it, else 0
 (``Noise.wander_source``). A recording held out for validation is not used.
 
-Rests are cut into blocks. The restricted likelihood of the block means and of the scatter within the blocks follows
-from
+Rests are cut into blocks. The block means and the scatter within the blocks have a restricted likelihood:
 
     mean_b = d_b beta + white (sqrt(v_b) e_b + sqrt(q) m_b)
     S      = sum of squares about the block means,   E S = white^2 sum n_b (r_0 - v_b + q (1 - B_bb))
@@ -39,23 +37,29 @@ where
 
     -2 log L = log det C + log det(d^T C^-1 d) + nu log(E S) + (N - p + nu) log white^2
 
-with ``nu`` degrees of freedom of S. White noise is at its maximum at every q and tau.
+with ``nu`` degrees of freedom of S, maximised over the white noise at every q and tau.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
-from pipeline.errors import ConfigurationError
+from pipeline.errors import ConfigurationError, InputError
 from pipeline.estimation.gauss_markov import (
     DEFAULT_TIME_S,
+    FARTHEST,
+    SHARPEST_WIDTH,
+    STATED_WIDTH,
     TIME_FACTORS,
     Blocks,
     GaussMarkov,
+    Prior,
     Setting,
+    fast,
     orthonormal,
     variance_of_average,
 )
@@ -69,20 +73,20 @@ if TYPE_CHECKING:
 
     from pipeline.records import Integers, Mask, Values
 
-TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in units of that of the sensor file
-OF_A_HAND = np.exp2(np.arange(-11.0, 4.0))  # the same by hand: from 0.05 s at 100 s; a tremor has 8 to 12 Hz
+TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times of the grid, over that of the sensor file
+TIMES_BY_HAND = np.exp2(np.arange(-11.0, 4.0))  # the same by hand: from 0.05 s at 100 s; a tremor has 8 to 12 Hz
 SHORTEST_BLOCK = 8  # samples of a block
 FEWEST_SAMPLES = 60  # which determine the white noise to a tenth
-WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0
+WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0  # samples, degree of the polynomial, largest turn within
 WARM_UP_S = (60.0, 180.0, 500.0)  # time constants of warm-up that are regressed out
 SMALLEST_WHITE = 1e-9  # keeps the weights of a noise-free recording finite
 DETECTION_GAIN, AGREEMENT_LOSS = 6.0, 4.0  # twice the difference in log-likelihood
 BLOCKS = 60  # of all rests together
-RATIOS = np.concatenate([[0.0], np.geomspace(2e-3, 5.0, 40)])  # sqrt(q) tried; a step is 22 %
+RATIOS = np.concatenate([[0.0], np.geomspace(2e-3, 5.0, 40)])  # sqrt(q) of the grid; a step is 22 %
 WEAKEST_DIRECTION = 1e-3  # singular value of unit columns, below which two nuisance columns count as one
 
 
-def estimate_noise(sensor: str, recordings: list[Recording], sensor_file: dict[str, Any]) -> Noise:
+def estimate_noise(sensor: str, recordings: Sequence[Recording], sensor_file: Mapping[str, Any]) -> Noise:
     """Return white noise and bias wander of a sensor.
 
     ``sensor_file``: ``noise_density`` (g/sqrt(Hz) or deg/s/sqrt(Hz)), ``bias_wander`` (g or deg/s), ``wander_time_s``.
@@ -90,8 +94,15 @@ def estimate_noise(sensor: str, recordings: list[Recording], sensor_file: dict[s
     """
     fitted = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     static = [r for r in fitted if r.role == "static"]
-    static_rests = _rests_of(static, sensor, whole_recording=True)
-    rests = _rests_of([r for r in fitted if r.role != "static"], sensor, whole_recording=False)
+    static_rests, rests = (
+        [
+            Rest(time, reading, 0 if recording.clock_shared else number)
+            for number, recording in enumerate(fitted, start=1)
+            if (recording.role == "static") == whole
+            for time, reading in rest_readings(recording, sensor, whole_recording=whole)
+        ]
+        for whole in (True, False)
+    )
     if sum(len(rest.time) for rest in static_rests) >= FEWEST_SAMPLES:
         noise = _noise_of_rests(static_rests, static, sensor_file, "static", other_rests=rests)
         return replace(noise, length=sum(float(rest.time[-1] - rest.time[0]) for rest in static_rests))
@@ -100,18 +111,16 @@ def estimate_noise(sensor: str, recordings: list[Recording], sensor_file: dict[s
             return _noise_along_gravity(rests, fitted, sensor_file)
         return _noise_of_rests(rests, fitted, sensor_file, "rests")
     white = _white_of_turns(fitted, sensor)
-    return (
-        _of_sensor_file(fitted, sensor_file) if white is None else _with_stated_wander(white, sensor_file, "residual")
-    )
-
-
-def _rests_of(recordings: Sequence[Recording], sensor: str, *, whole_recording: bool) -> list[Rest]:
-    """Return the rests of recordings; recordings with a shared clock have a common time."""
-    return [
-        Rest(time, reading, 0 if recording.clock_shared else number)
-        for number, recording in enumerate(recordings, start=1)
-        for time, reading in rest_readings(recording, sensor, whole_recording=whole_recording)
-    ]
+    if white is not None:
+        return _with_stated_wander(white, sensor_file, "residual")
+    density = sensor_file.get("noise_density")
+    if not density or not fitted:
+        raise ConfigurationError(
+            "the recordings hold no rest and too few even stretches to determine the noise; "
+            "give the sensor's noise_density, or record static (a rest of some minutes)"
+        )
+    white = np.full(3, float(density) * np.sqrt(0.5 / fitted[0].interval))
+    return _with_stated_wander(white, sensor_file, "data_sheet")
 
 
 def _by_hand(recordings: list[Recording]) -> bool:
@@ -119,26 +128,24 @@ def _by_hand(recordings: list[Recording]) -> bool:
     return any(r.role == "rests" for r in recordings) and not logged
 
 
-def _noise_along_gravity(rests: list[Rest], recordings: list[Recording], sensor_file: dict[str, Any]) -> Noise:
+def _noise_along_gravity(rests: list[Rest], recordings: list[Recording], sensor_file: Mapping[str, Any]) -> Noise:
     """Return the noise of an accelerometer in a unit that may creep: see the module, 2."""
     components = [component_along_gravity(rest.time, rest.reading) for rest in rests]
     along = [replace(rest, reading=values[:, None]) for rest, (values, _) in zip(rests, components, strict=True)]
     creeping = [k for k, (_, creeps) in enumerate(components) if creeps]
     noise = _noise_of_rests(along, recordings, sensor_file, "rests", creeping=creeping)
-    covariance = filter_autocovariance(recordings[0])
     creeps = [creep_of_readings(rest.time, rest.reading) for rest in rests]
-    fitted = [len(rest.time) - creep.freedom for rest, creep in zip(rests, creeps, strict=True)]
-    counts = np.array([len(rest.time) for rest in rests])
-    free = np.sum(counts * covariance[0] - np.array(fitted) * counts * variance_of_mean(covariance, counts))
+    counts, covariance = np.array([len(rest.time) for rest in rests]), filter_autocovariance(recordings[0])
+    fitted = counts - [creep.freedom for creep in creeps]
+    free = np.sum(counts * (covariance[0] - fitted * variance_of_mean(covariance, counts)))
     white = np.sqrt(np.sum([creep.squares for creep in creeps], axis=0) / float(free))
-    wander = np.full(3, float(noise.wander[0]))
-    return replace(noise, white=np.maximum(white, SMALLEST_WHITE), wander=wander)
+    return replace(noise, white=np.maximum(white, SMALLEST_WHITE), wander=np.full(3, noise.wander[0]))
 
 
 def _noise_of_rests(
     rests: list[Rest],
     recordings: list[Recording],
-    sensor_file: dict[str, Any],
+    sensor_file: Mapping[str, Any],
     source: str,
     *,
     other_rests: Sequence[Rest] = (),
@@ -157,13 +164,13 @@ def _noise_of_rests(
         expected = np.sum(blocks.count * (covariance[0] - variance_of_mean(covariance, blocks.count)))
         return _with_stated_wander(np.sqrt(blocks.scatter / max(float(expected), 1e-300)), sensor_file, source)
     design, lengths = _nuisance(blocks, recordings, source, creeping), [float(r.time[-1] - r.time[0]) for r in rests]
-    by_hand = source == "rests" and _by_hand(recordings)
-    longest = max(lengths) if by_hand else float("inf")
-    noise = _most_likely(blocks, design, covariance, sensor_file, source, longest=longest)
-    return replace(noise, length=sum(lengths)) if by_hand and noise.wander_source == "rests" else noise
+    if source == "static" or not _by_hand(recordings):
+        return _most_likely(blocks, design, covariance, sensor_file, source)
+    noise = _most_likely(blocks, design, covariance, sensor_file, source, longest=max(lengths))
+    return replace(noise, length=sum(lengths)) if noise.wander_source == "rests" else noise
 
 
-def _nuisance(blocks: _RestBlocks, recordings: list[Recording], source: str, creeping: Sequence[int] = ()) -> Values:
+def _nuisance(blocks: _RestBlocks, recordings: list[Recording], source: str, creeping: Sequence[int]) -> Values:
     """Return the nuisance columns: a constant for each rest, a line for creep; temperature and warm-up if static."""
     rest, centre = blocks.rest[blocks.cut], (blocks.start + blocks.length / 2.0)[blocks.cut]
     columns = [(rest == r).astype(float) for r in np.unique(rest)]
@@ -183,38 +190,41 @@ def _most_likely(
     blocks: _RestBlocks,
     design: Values,
     covariance: Values,
-    sensor_file: dict[str, Any],
+    sensor_file: Mapping[str, Any],
     source: str,
     *,
-    longest: float,
+    longest: float = float("inf"),
 ) -> Noise:
     """Return the most likely noise; one ratio of wander to white noise for all axes unless they differ.
 
-    ``longest``: largest correlation time, s, that is possible.
+    ``longest``: largest possible correlation time by hand, s.
     """
-    times = (TIMES if np.isinf(longest) else OF_A_HAND) * stated_time(sensor_file)
-    log_likelihood, white = likelihood(blocks, design, covariance, times)
+    times = (TIMES if np.isinf(longest) else TIMES_BY_HAND) * _stated_time(sensor_file)
+    log_likelihood, white = _likelihood(blocks, design, covariance, times)
     gain = 2.0 * (log_likelihood - log_likelihood[:, :1])
     pooled = gain.sum(axis=2).max(axis=1)
     possible = max(np.count_nonzero(times <= longest), 1)
     row, time_source = int(np.argmax(pooled[:possible])), source
-    stated_row = int(np.argmin(np.abs(times - stated_time(sensor_file))))
+    stated_row = int(np.argmin(np.abs(times - _stated_time(sensor_file))))
     if np.isinf(longest) and pooled[row] < max(pooled[stated_row] + AGREEMENT_LOSS, DETECTION_GAIN):
         row, time_source = stated_row, "data_sheet"
-    if pooled[row] < DETECTION_GAIN:
-        noise = _without_detected_wander(gain[stated_row], white[stated_row, 0], sensor_file, source)
+    if pooled[row] < DETECTION_GAIN:  # the sensor file's wander if the likelihood allows it, else 0
+        noise = _with_stated_wander(white[stated_row, 0], sensor_file, source)
+        nearest = np.argmin(np.abs(RATIOS[:, None] - noise.wander / noise.white), axis=0)
+        if -float(np.take_along_axis(gain[stated_row], nearest[None], axis=0).sum()) >= AGREEMENT_LOSS:
+            noise = replace(noise, wander=np.zeros(3), wander_source=source)
     else:
         columns = range(gain.shape[2])
         axes_differ = gain[row].max(axis=0).sum() - pooled[row] > DETECTION_GAIN
         axes = [slice(c, c + 1) for c in columns] if axes_differ else [slice(None)] * len(columns)
         ratio = np.array([_peak(gain[row][:, axis].sum(axis=1)) for axis in axes])
-        own = np.maximum([np.interp(ratio[c], RATIOS, white[row, :, c]) for c in columns], SMALLEST_WHITE)
-        noise = Noise(own, own * ratio, float(times[row]), source, source, time_source)
+        likeliest = np.maximum([np.interp(ratio[c], RATIOS, white[row, :, c]) for c in columns], SMALLEST_WHITE)
+        noise = Noise(likeliest, likeliest * ratio, float(times[row]), source, source, time_source)
     if source != "static":
         return noise
     near = np.clip(row + np.log2(TIME_FACTORS).astype(int), 0, len(times) - 1)
-    tried = RATIOS * float(np.sqrt(np.mean(noise.white**2)))
-    return replace(noise, likelihood=WanderLikelihood(times[near], tried, 0.5 * gain[near].sum(axis=2)))
+    wander = RATIOS * float(np.sqrt(np.mean(noise.white**2)))
+    return replace(noise, likelihood=WanderLikelihood(times[near], wander, 0.5 * gain[near].sum(axis=2)))
 
 
 def _peak(gain: Values) -> float:
@@ -227,29 +237,20 @@ def _peak(gain: Values) -> float:
     return float(np.exp(x[1] + (0.5 * (a - c) / bend * (x[1] - x[0]) if bend < 0 else 0.0)))
 
 
-def _without_detected_wander(gain: Values, white: Values, sensor_file: dict[str, Any], source: str) -> Noise:
-    """Return the sensor file's wander if the likelihood allows it, else 0; ``gain``: by ratio and axis."""
-    noise = _with_stated_wander(white, sensor_file, source)
-    column = np.argmin(np.abs(RATIOS[:, None] - noise.wander / noise.white), axis=0)
-    loss = -float(np.take_along_axis(gain, column[None], axis=0).sum())
-    return noise if loss < AGREEMENT_LOSS else replace(noise, wander=np.zeros(3), wander_source=source)
-
-
-def stated_time(sensor_file: Mapping[str, Any]) -> float:
+def _stated_time(sensor_file: Mapping[str, Any]) -> float:
     """Return the correlation time of the bias wander by the sensor file, s."""
     return float(sensor_file.get("wander_time_s") or DEFAULT_TIME_S)
 
 
-def _with_stated_wander(white: Values, sensor_file: dict[str, Any], source: str) -> Noise:
+def _with_stated_wander(white: Values, sensor_file: Mapping[str, Any], source: str) -> Noise:
     wander = np.full(3, float(sensor_file.get("bias_wander") or 0.0))
-    return Noise(np.maximum(white, SMALLEST_WHITE), wander, stated_time(sensor_file), source)
+    return Noise(np.maximum(white, SMALLEST_WHITE), wander, _stated_time(sensor_file), source)
 
 
 def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
     """Return the white noise from short windows about a local polynomial, or None if there are too few."""
-    squares, trace, nu = [], 0.0, 1.0
-    x = np.linspace(-1.0, 1.0, WINDOW)
-    basis, _ = np.linalg.qr(np.vander(x, WINDOW_DEGREE + 1))
+    squares, nu = [], 1.0
+    basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, WINDOW), WINDOW_DEGREE + 1))
     P = np.eye(WINDOW) - basis @ basis.T
     for recording in recordings:
         values = recording.reading(sensor)
@@ -257,10 +258,8 @@ def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
         slow = usable(recording, values)
         if recording.table_rate is not None:
             slow &= np.abs(recording.table_rate) * recording.interval * WINDOW < WINDOW_ARC_DEG
-        covariance = np.zeros(WINDOW)
         lags = filter_autocovariance(recording)[:WINDOW]
-        covariance[: len(lags)] = lags
-        PR = P @ covariance[np.abs(np.subtract.outer(np.arange(WINDOW), np.arange(WINDOW)))]
+        PR = P @ scipy.linalg.toeplitz(np.pad(lags, (0, WINDOW - len(lags))))
         trace = float(np.trace(PR))
         nu = trace**2 / float(np.sum(PR * PR.T))
         for start, stop in stretches_of(recording, slow):
@@ -273,24 +272,13 @@ def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
     return np.sqrt(median(scatter) / (1.0 - 2.0 / (9.0 * nu)) ** 3)
 
 
-def _of_sensor_file(recordings: list[Recording], sensor_file: dict[str, Any]) -> Noise:
-    density = sensor_file.get("noise_density")
-    if not density or not recordings:
-        raise ConfigurationError(
-            "the recordings hold no rest and too few even stretches to determine the noise; "
-            "give the sensor's noise_density, or record static (a rest of some minutes)"
-        )
-    white = float(density) * np.sqrt(0.5 / recordings[0].interval)
-    return _with_stated_wander(np.full(3, white), sensor_file, "data_sheet")
-
-
 @dataclass(frozen=True)
 class Rest:
-    """Times, s, and readings of a rest, and the number of its clock: rests of one number share their time."""
+    """Times, s, and readings of a rest; rests with the same ``clock`` have a common time."""
 
     time: Values
     reading: Values
-    clock: int = 0
+    clock: int
 
 
 @dataclass(frozen=True)
@@ -304,30 +292,24 @@ class _RestBlocks:
     mean: Values  # (b, 3); minus the mean of its rest
     rest: Integers  # (b,); number of the rest of each
     clock: Integers  # (b,); blocks of the same number have a known distance in time
-    # (b,); whether its rest holds two blocks or more; the mean of a single one does not show wander
-    cut: Mask
+    cut: Mask  # (b,); whether its rest has two blocks or more: the mean of a single one does not show wander
     scatter: Values  # (3,); sum of squares about the block means
 
 
 def _blocks_of(rests: Sequence[Rest], shortest: int) -> _RestBlocks:
-    """Cut rests into blocks.
-
-    ``shortest``: fewest samples of a block in a rest that is cut.
-    """
+    """Cut rests into blocks of at least ``shortest`` samples; a shorter rest is one block."""
     sizes = np.array([len(rest.time) for rest in rests])
     size = max(shortest, int(np.ceil(sizes.sum() / BLOCKS)))
     if not np.any(sizes >= 2 * size):  # many rests, all short: cut each in two rather than none
         size = max(shortest, int(sizes.max()) // 2)
     pieces = np.maximum(1, sizes // size)
-    cuts = {(n, k): np.diff(np.linspace(0, n, k + 1).astype(int)) for n, k in set(zip(sizes, pieces, strict=True))}
-    counts = np.concatenate([cuts[n, k] for n, k in zip(sizes, pieces, strict=True)])
     rest = np.repeat(np.arange(len(rests)), pieces)
+    place = np.arange(len(rest)) - (np.cumsum(pieces) - pieces)[rest]  # of a block in its rest
+    counts = (place + 1) * sizes[rest] // pieces[rest] - place * sizes[rest] // pieces[rest]
     time = np.concatenate([r.time for r in rests])
-    values = np.concatenate([r.reading for r in rests])
+    values = np.concatenate([r.reading - r.reading.mean(axis=0) for r in rests])
     clock = np.array([r.clock for r in rests])[rest]
-    means = np.add.reduceat(values, np.concatenate([[0], np.cumsum(sizes)[:-1]])) / sizes[:, None]
-    values = values - np.repeat(means, sizes, axis=0)
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    first = np.cumsum(counts) - counts
     mean = np.add.reduceat(values, first) / counts[:, None]
     scatter = np.maximum(np.sum(values * values, axis=0) - np.sum(counts[:, None] * mean * mean, axis=0), 0.0)
     length = (time[first + counts - 1] - time[first]) * counts / np.maximum(counts - 1, 1)
@@ -335,24 +317,19 @@ def _blocks_of(rests: Sequence[Rest], shortest: int) -> _RestBlocks:
 
 
 def _with_scatter(blocks: _RestBlocks, others: _RestBlocks) -> _RestBlocks:
-    """Add the scatter of other blocks, without their means, if it agrees.
-
-    Scatters agree if the estimates of white noise differ by less than 3 standard deviations on every axis.
-    """
+    """Add the scatter of other blocks, without their means, if both agree within 3 standard deviations on each axis."""
     nu = np.array([np.sum(b.count - 1) for b in (blocks, others)], float)
     if np.any(nu < 1) or np.any(blocks.scatter == 0) or np.any(others.scatter == 0):
         return blocks
     log_ratio = np.log(blocks.scatter / nu[0]) - np.log(others.scatter / nu[1])
     if np.any(np.abs(log_ratio) > 3.0 * np.sqrt(2.0 / nu[0] + 2.0 / nu[1])):
         return blocks
-
-    stacked = {f.name: np.concatenate([getattr(blocks, f.name), getattr(others, f.name)]) for f in fields(_RestBlocks)}
-    stacked["rest"][len(blocks.rest) :] += blocks.rest.max() + 1
-    stacked["cut"][len(blocks.cut) :] = False
+    without_means = replace(others, rest=others.rest + blocks.rest.max() + 1, cut=np.zeros_like(others.cut))
+    stacked = {name: np.concatenate([value, vars(without_means)[name]]) for name, value in vars(blocks).items()}
     return _RestBlocks(**{**stacked, "scatter": blocks.scatter + others.scatter})
 
 
-def likelihood(
+def _likelihood(
     blocks: _RestBlocks, design: Values, covariance: Values, correlation_times: Values
 ) -> tuple[Values, Values]:
     """Return the log likelihood at each correlation time, by ``RATIOS``, by axis, and the white noise there: (t, r, 3).
@@ -373,7 +350,47 @@ def likelihood(
     expected = within + np.outer(inner, RATIOS**2).ravel()
     free = len(cut_blocks.weight) - basis.shape[1] + nu
     variance = np.maximum((squares + nu * blocks.scatter / expected[:, None]) / free, 1e-18)
-    penalty = log_determinant + nu * np.log(expected)
-    log_likelihood = -0.5 * (penalty[:, None] + free * np.log(variance))
+    log_likelihood = -0.5 * ((log_determinant + nu * np.log(expected))[:, None] + free * np.log(variance))
     shape = (len(correlation_times), len(RATIOS), -1)
     return log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape)
+
+
+def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Noise | None:
+    """Return the noise from an earlier stage (``settings["noise"]``), else estimate it; None if that is impossible."""
+    if "noise" in settings:
+        noise: Noise | None = settings["noise"][sensor]
+        return noise
+    try:
+        return estimate_noise(sensor, recordings, settings.get("sensor", {}).get(sensor) or {})
+    except (ConfigurationError, InputError):
+        return None
+
+
+def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Prior:
+    """Return the prior of the bias wander from the sensor file and a static recording; ``settings``: ``sensor``.
+
+    It is the prior of the sensor file times the likelihood of the static recording at each wander and correlation time.
+    A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative uncertainty
+    ``sqrt(tau / T)``. If that is below ``SHARPEST_WIDTH``, the likelihood is widened to that of a shorter rest, because
+    no sensor is exactly a Gauss-Markov process. Above the likeliest wander, the likelihood is at least
+    ``exp(-FARTHEST**2)`` of its maximum: the residuals of turns can show more wander than the rest (lack of fit). Noise
+    that is correlated over seconds (a filter in the sensor, values repeated between samples, chance in a short rest)
+    does not determine a slow wander, and is white noise in the means of the blocks of a fit: then the prior is that of
+    the sensor file.
+    """
+    sensor_file = settings.get("sensor", {}).get(sensor) or {}
+    static = any(r.role == "static" and r.reading(sensor) is not None and r.samples > 1 for r in recordings)
+    return wander_prior(noise_of(sensor, recordings, settings) if static and sensor_file else None, sensor_file)
+
+
+def wander_prior(noise: Noise | None, sensor_file: Mapping[str, Any]) -> Prior:
+    """Return the prior by the sensor file, and by the noise of a static recording (``prior_of``)."""
+    stated = Prior(float(sensor_file.get("bias_wander") or 0.0), _stated_time(sensor_file))
+    if noise is None or noise.source != "static" or noise.likelihood is None or fast(noise):
+        return stated
+    width = float(np.sqrt(noise.correlation_time / noise.length))
+    log_likelihood = noise.likelihood.log_likelihood * min(1.0, (width / SHARPEST_WIDTH) ** 2)
+    largest = int(np.argmax(log_likelihood.max(axis=0)))
+    log_likelihood[:, largest:] = np.maximum(log_likelihood[:, largest:], log_likelihood.max() - FARTHEST**2)
+    wander, width = float(np.sqrt(np.mean(noise.wander**2))), float(np.clip(width, SHARPEST_WIDTH, STATED_WIDTH))
+    return Prior(wander, noise.correlation_time, width, stated, (noise.likelihood.wander, log_likelihood))

@@ -35,7 +35,7 @@ from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
-from pipeline.estimation.noise_prior import noise_of, prior_of
+from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import Part, blocks_of_samples, parts_of, settled
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution

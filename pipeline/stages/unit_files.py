@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.noise import estimate_noise
-from pipeline.estimation.noise_prior import noise_of
+from pipeline.estimation.noise import estimate_noise, noise_of
 from pipeline.io.arrow import from_parquet
 from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
 

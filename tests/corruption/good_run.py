@@ -19,7 +19,7 @@ from typing import Any
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import CannotCalibrateError, PipelineError
-from pipeline.estimation.noise_prior import noise_of
+from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.model.effects import leaving_out

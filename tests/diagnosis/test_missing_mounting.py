@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.diagnosis.diagnose import diagnose
-from pipeline.estimation.noise_prior import noise_of
+from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import fit_stage
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import SENSORS

@@ -18,8 +18,7 @@ from pipeline.estimation.gauss_markov import (
     block_covariance,
     variance_of_average,
 )
-from pipeline.estimation.noise import estimate_noise
-from pipeline.estimation.noise_prior import wander_prior
+from pipeline.estimation.noise import estimate_noise, wander_prior
 from pipeline.estimation.noise_terms import allan_deviation
 from pipeline.estimation.reference_least_squares import fit
 from pipeline.records import Noise, Recording

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.config.schema import OF_BENCH
 from pipeline.diagnosis.diagnose import diagnose
-from pipeline.estimation.noise_prior import noise_of
+from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
 from pipeline.estimation.stages import fit_stage

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import PipelineError
 from pipeline.estimation.gauss_markov import TIME_FACTORS, TIME_PRIOR
-from pipeline.estimation.noise_prior import noise_of, wander_prior
+from pipeline.estimation.noise import noise_of, wander_prior
 from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.model.effects import built_in

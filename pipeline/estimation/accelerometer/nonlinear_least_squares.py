@@ -40,7 +40,7 @@ from pipeline.estimation.multi_position.result import (
     require_faces,
     with_stage,
 )
-from pipeline.estimation.noise_prior import prior_of
+from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import blocks_of_samples

@@ -39,7 +39,7 @@ from pipeline.estimation.accelerometer.turn_extremes import (
 )
 from pipeline.estimation.engine import LinearMap, ResidualNoise
 from pipeline.estimation.least_squares import ScaledColumns
-from pipeline.estimation.noise_prior import prior_of
+from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before, two_sided
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import Sinusoid, blocks_of_samples, parts_of

@@ -41,7 +41,7 @@ from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
-from pipeline.estimation.noise_prior import prior_of
+from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import of_channels
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import Part, blocks_of_samples, parts_of

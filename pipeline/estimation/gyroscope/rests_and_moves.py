@@ -23,7 +23,7 @@ from pipeline.estimation.multi_position.likelihood import NEW, prior_hypotheses
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
-from pipeline.estimation.noise_prior import noise_of, prior_of
+from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
 from pipeline.records import Recording, SensorCalibration, Values
 

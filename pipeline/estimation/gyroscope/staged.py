@@ -29,7 +29,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certified
-from pipeline.estimation.noise_prior import prior_of
+from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import Part, blocks_of_samples, parts_of, steady_turns

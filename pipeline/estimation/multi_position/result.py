@@ -26,7 +26,7 @@ from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_
 from pipeline.estimation.multi_position.likelihood import prior_hypotheses, selection_hypotheses
 from pipeline.estimation.multi_position.model import Model, State, parameter_places, refusal, stepped
 from pipeline.estimation.multi_position.selection import Selection, fit_configured
-from pipeline.estimation.noise_prior import noise_of, prior_of
+from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.table_errors import TIME_BASE
 from pipeline.estimation.uncertainty_budget import (

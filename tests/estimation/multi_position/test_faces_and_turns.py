@@ -13,8 +13,7 @@ from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
-from pipeline.estimation.noise import estimate_noise
-from pipeline.estimation.noise_prior import noise_of
+from pipeline.estimation.noise import estimate_noise, noise_of
 from pipeline.signal.rests import find_rests
 from pipeline.signal.segments import multiples, turns_by_hand
 from pipeline.validation.attitude import gravity_direction
