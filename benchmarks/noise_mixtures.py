@@ -25,9 +25,8 @@ from scipy.signal import fftconvolve, lfilter
 from scipy.stats import beta
 
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.estimation.noise_likelihood import solved, spectrum_of
 from pipeline.estimation.noise_search import Search, best_of, count_of
-from pipeline.estimation.noise_terms import STOCHASTIC
+from pipeline.estimation.noise_terms import STOCHASTIC, solved, spectrum_of
 from pipeline.records import Recording
 
 if TYPE_CHECKING:

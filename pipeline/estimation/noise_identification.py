@@ -1,6 +1,6 @@
-"""Identify the noise of a sensor at rest, for the part ``noise`` of ``calibrations/<unit>.json``.
+"""Identify the noise of a sensor at rest, for the section ``noise`` of ``calibrations/<unit>.json``.
 
-The part states for each axis
+The section states for each axis
 
 - each term of ``noise_terms`` with its 95 % interval, or null with a reason and an upper limit if the recording does
   not show it,
@@ -10,7 +10,7 @@ The part states for each axis
 The readings are from the static recording before any filter, else from the rests. A ramp, sinusoids and a changing
 temperature are regressed out (``noise_regression``).
 
-A fit is in doubt if the power of its spectrum in bins of frequency differs from the model: the cube root of a
+A fit is in doubt if the power of the spectrum in bins of frequency differs from the model: the cube root of a
 chi-square variable over its degrees of freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty,
 PNAS 17, 1931).
 """
@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from pipeline.estimation.noise_likelihood import at_once, solved, spectrum_of
 from pipeline.estimation.noise_regression import Regression, Stretch
 from pipeline.estimation.noise_search import QUANTILE, Search, best_of, limits, ranked
 from pipeline.estimation.noise_terms import (
@@ -32,7 +31,10 @@ from pipeline.estimation.noise_terms import (
     WHITE,
     allan_deviation,
     allan_variance,
+    at_once,
     each_term,
+    solved,
+    spectrum_of,
     unit_of,
 )
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
@@ -42,26 +44,22 @@ from pipeline.signal.rests import rest_readings, usable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.noise_likelihood import Fits, Spectrum
     from pipeline.estimation.noise_search import Candidate
+    from pipeline.estimation.noise_terms import Spectrum
     from pipeline.records import Recording, Values
 
     JSON = dict[str, Any]
 
-FEWEST_SAMPLES = 60  # determine the white noise to a tenth
-SHORTEST_STRETCH = 16  # samples of a stretch
-GAP_INTERVALS = 1.5  # intervals; a longer step of time is a gap
-MOST_JITTER = 0.5  # rms scatter of the sampling intervals, relative, above which averages over equal times mean nothing
-INTERVAL_TOLERANCE = 0.02  # by which the sampling intervals of rests may differ; those of other rates are left out
-LONGEST_FILL = 10  # samples that are missing or marked in a row, up to which a straight line replaces them
+FEWEST_SAMPLES = 60  # which determine the white noise to a tenth
+SHORTEST_STRETCH = 16  # samples
+GAP_INTERVALS = 1.5  # sampling intervals; a longer step of time is a gap
+MOST_JITTER = 0.5  # rms scatter of the sampling intervals, relative, above which equal counts are not equal times
+INTERVAL_TOLERANCE = 0.02  # relative; rests whose sampling interval differs by more are not used
+LONGEST_FILL = 10  # missing or flagged samples in a row, up to which a straight line replaces them
 LEAST_FIT_PROBABILITY = 1e-4  # probability of the bins under the fit, below which the composition is in doubt
-COARSE_COUNTS = (
-    0.4  # standard deviation, in counts, below which rounding is no longer white noise (Widrow & Kollar 2008)
-)
-LONGEST_AVERAGE_SHARE = (
-    0.25  # longest averaging time that the Allan deviation shows with some confidence, in lengths of the recording
-)
-AVERAGES_PER_DECADE = 8  # averaging times
+COARSE_COUNTS = 0.4  # standard deviation in counts, below which rounding is not white noise (Widrow & Kollar 2008)
+LONGEST_AVERAGE_SHARE = 0.25  # longest averaging time that the Allan deviation determines, in lengths of the recording
+AVERAGES_PER_DECADE = 8
 DERIVATIVE_STEP = 1.01  # of a correlation time, for a derivative
 SLOW = ("bias_instability", "random_walk", "gauss_markov", "ramp", "temperature")
 STILL = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
@@ -73,28 +71,31 @@ def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
 
     Axes whose readings have the same sampling are fitted together.
     """
-    found = {sensor: _source(sensor, recordings) for sensor in SENSORS}
-    alike: dict[tuple[Any, ...], list[tuple[str, Regression]]] = {}
-    for sensor, (told, stretches) in found.items():
+    documents: dict[str, JSON] = {}
+    same_sampling: dict[tuple[Any, ...], list[tuple[str, Regression]]] = {}
+    for sensor in SENSORS:
+        document, stretches = _source(sensor, recordings)
+        documents[sensor] = document
         if not stretches:
             continue
-        told["axes"] = dict.fromkeys(AXES, STILL)
-        single = told["source"] == "static" and len(told["recordings"]) == 1
+        document["axes"] = dict.fromkeys(AXES, STILL)
+        single = document["source"] == "static" and len(document["recordings"]) == 1
         for c in range(3):
             steps = np.concatenate([np.abs(np.diff(s.reading[:, c])) for s in stretches])
             if steps.any():
-                regression = Regression(told["unit"], stretches, c, told["sampling_interval_s"], steps, single=single)
-                key = (regression.interval, len(regression.optional), *(len(s.time) for s in stretches))
-                alike.setdefault(key, []).append((sensor, regression))
-    for pairs in alike.values():
+                interval = document["sampling_interval_s"]
+                regression = Regression(document["unit"], stretches, c, interval, steps, single=single)
+                key = (interval, len(regression.optional), *(len(s.time) for s in stretches))
+                same_sampling.setdefault(key, []).append((sensor, regression))
+    for pairs in same_sampling.values():
         axes = _axes([regression for _, regression in pairs])
         for (sensor, regression), axis in zip(pairs, axes, strict=True):
-            found[sensor][0]["axes"][AXES[regression.column]] = axis
-    return {sensor: told for sensor, (told, _) in found.items()}
+            documents[sensor]["axes"][AXES[regression.column]] = axis
+    return documents
 
 
 def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[Stretch]]:
-    """Return the source of a sensor's noise and its stretches, or no stretches with the reason."""
+    """Return the document of a sensor's noise so far and its stretches, or no stretches and the reason."""
     known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
     if not known:
@@ -106,16 +107,18 @@ def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[St
     static, others = ([r for r in even if (r.role == "static") == is_static] for is_static in (True, False))
     source, chosen, stretches = "static", static, [s for r in static for s in static_stretches(sensor, r)]
     if _samples(stretches) < FEWEST_SAMPLES and others:
-        source, chosen, stretches = "rests", others, [s for r in others for s in _rests(sensor, r)]
-    if _samples(stretches) < FEWEST_SAMPLES:
-        reason = (
-            f"the rests hold {_samples(stretches)} evenly sampled readings; {FEWEST_SAMPLES} are needed: record static"
-        )
+        rests = [each for r in others for each in rest_readings(r, sensor, whole_recording=False)]
+        stretches = [Stretch(time, reading) for time, reading in rests if len(time) >= SHORTEST_STRETCH]
+        source, chosen = "rests", others
+    count = _samples(stretches)
+    if count < FEWEST_SAMPLES:
+        reason = f"the rests hold {count} evenly sampled readings; {FEWEST_SAMPLES} are needed: record static"
         return empty | {"reason": reason}, []
-    rates = np.array([(s.time[-1] - s.time[0]) / (len(s.time) - 1) for s in stretches])
-    interval = float(np.median(rates))
-    stretches = [s for s, rate in zip(stretches, rates, strict=True) if abs(rate / interval - 1.0) < INTERVAL_TOLERANCE]
-    told = empty | {
+    intervals = np.array([(s.time[-1] - s.time[0]) / (len(s.time) - 1) for s in stretches])
+    interval = float(np.median(intervals))
+    even_steps = np.abs(intervals / interval - 1.0) < INTERVAL_TOLERANCE
+    stretches = [s for s, used in zip(stretches, even_steps, strict=True) if used]
+    document = empty | {
         "source": source,
         "recordings": [r.name for r in chosen],
         "samples": _samples(stretches),
@@ -123,7 +126,7 @@ def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[St
         "length_s": float(interval * max(len(s.time) for s in stretches)),
         "doubts": [OF_RESTS] if source == "rests" else [],
     }
-    return told, stretches
+    return document, stretches
 
 
 def _scatter_of_intervals(recording: Recording) -> float:
@@ -145,7 +148,7 @@ def static_stretches(sensor: str, recording: Recording) -> list[Stretch]:
     warm = temperature_of(recording) if warm is not None and np.isfinite(warm).all() else None
     step = np.diff(recording.time[good]) / recording.interval
     steps = np.where(step > GAP_INTERVALS, np.rint(step), 1).astype(int)
-    out = []
+    stretches = []
     for index in np.split(np.arange(len(good)), np.flatnonzero(steps > LONGEST_FILL) + 1):
         if len(index) < SHORTEST_STRETCH:
             continue
@@ -153,14 +156,8 @@ def static_stretches(sensor: str, recording: Recording) -> list[Stretch]:
         grid, rows = np.arange(place[-1] + 1), good[index]
         reading = np.stack([np.interp(grid, place, values[rows, c]) for c in range(3)], axis=1)
         time = np.linspace(recording.time[rows[0]], recording.time[rows[-1]], len(grid))
-        out.append(Stretch(time, reading, None if warm is None else np.interp(grid, place, warm[rows])))
-    return out
-
-
-def _rests(sensor: str, recording: Recording) -> list[Stretch]:
-    """Return the rests of a recording that have ``SHORTEST_STRETCH`` samples."""
-    found = rest_readings(recording, sensor, whole_recording=False)
-    return [Stretch(time, reading) for time, reading in found if len(time) >= SHORTEST_STRETCH]
+        stretches.append(Stretch(time, reading, None if warm is None else np.interp(grid, place, warm[rows])))
+    return stretches
 
 
 def _axes(regressions: Sequence[Regression]) -> list[JSON]:
@@ -189,112 +186,91 @@ def _axis(
     bounds: tuple[Values, dict[int, float]],
     measured: tuple[Values, Values],
 ) -> JSON:
-    """Return the noise of one axis as published."""
-    spectrum, unit = search.spectrum, regression.unit
-    p_value = _p_value(spectrum, best.fit)
+    """Return the noise of one axis as published; ``bounds``: of ``limits``; ``measured``: tau and Allan deviation."""
+    spectrum, unit, fit = search.spectrum, regression.unit, best.fit
+    spread = 2.0 / (9.0 * spectrum.count)
+    z = (np.cbrt(fit.power[0] / fit.total[0] / spectrum.count) - 1.0 + spread) / np.sqrt(spread)
+    p_value = float(scipy.special.chdtrc(max(len(z) - len(best.kinds), 1), float(z @ z)))
     doubts = []
     if p_value < LEAST_FIT_PROBABILITY:
         doubts.append(f"no composition fits the spectrum (p = {p_value:.1g}): a filter, vibration or a disturbance")
     if regression.scale < COARSE_COUNTS * regression.count:
         doubts.append(f"the readings are rounded to {regression.count:.3g} {unit}, which is coarser than their noise")
-    terms = _terms(spectrum, best, bounds, regression) | regression.terms(best, spectrum)
+    present = _present(best, bounds[0], regression)
+    terms: JSON = {}
+    for kind in SINGLE:
+        name = STOCHASTIC[kind]
+        if kind in best.kinds:
+            terms[name] = present[best.kinds.index(kind)]
+        else:
+            limit = regression.scale * float(np.sqrt(bounds[1][kind]))
+            reason = _reason(kind, regression.names(best), spectrum)
+            terms[name] = {
+                "value": None, "unit": unit_of(name, unit), "interval": None, "reason": reason, "upper_limit": limit
+            }  # fmt: skip
+    processes = [term for term in present if "correlation_time_s" in term]
+    terms[STOCHASTIC[MARKOV]] = sorted(processes, key=lambda term: float(term["correlation_time_s"]["value"]))
+    deterministic = regression.terms(best, spectrum)
     return {
-        "terms": terms,
+        "terms": terms | deterministic,
         "reason": None,
         "ranking": [
             {"terms": regression.names(c), "delta_bic": c.bic - best.bic, "probability": probability}
             for c, probability in ranked(search)
         ],
         "p_value": p_value,
-        "allan": _allan(*measured, terms, best, spectrum),
+        "allan": _allan(*measured, best, present, deterministic, spectrum),
         "doubts": doubts,
     }
 
 
-def _allan(tau: Values, measured: Values, terms: JSON, best: Candidate, spectrum: Spectrum) -> JSON:
+def _present(best: Candidate, within: Values, regression: Regression) -> list[JSON]:
+    """Return the stochastic terms of a composition as published; ``within``: intervals of the parameters."""
+    n, terms = len(best.kinds), []
+    for j, kind in enumerate(best.kinds):
+        term: JSON = {
+            "value": regression.scale * float(np.exp(0.5 * best.parameters[j])),
+            "unit": unit_of(STOCHASTIC[kind], regression.unit),
+            "interval": (regression.scale * np.exp(0.5 * within[:, j])).tolist(),
+        }
+        if kind == MARKOV:
+            time, interval = float(np.exp(best.parameters[n + j])), np.exp(within[:, n + j]).tolist()
+            term["correlation_time_s"] = {"value": time, "interval": interval}
+        terms.append(term)
+    return terms
+
+
+def _allan(  # noqa: PLR0917  (the curve and its terms)
+    tau: Values, measured: Values, best: Candidate, present: Sequence[JSON], deterministic: JSON, spectrum: Spectrum
+) -> JSON:
     """Return the Allan deviation of the readings, and that of the terms with its 95 % band.
 
-    The band is that of the logarithm, from the covariance of the terms: the parameters of the stochastic ones are
-    logarithms of squared coefficients, in which the derivative of the variance is the part of the term itself.
+    The band is that of the logarithm, from the covariance of the terms: the parameters of the stochastic terms are
+    logarithms of squared coefficients, and the derivative of the total by such a parameter is the variance of the term.
     """
-    parts = [(name, term, allan_variance(name, term, tau)) for name, term in each_term(terms)]
-    total = np.sum([part for _, _, part in parts], axis=0)
-    kinds, times = best.kinds, best.parameters[len(best.kinds) :]
-    # each kind's terms in the order in which they are published
-    waiting = {kind: [(t, v) for name, t, v in parts if name == STOCHASTIC[kind]] for kind in set(kinds)}
     by_size, by_time = np.zeros((2, best.fit.kinds.shape[1], len(tau)))
-    for j in np.argsort(times, kind="stable"):
-        term, by_size[j] = waiting[kinds[j]].pop(0)
-        if kinds[j] == MARKOV:
+    for j, (kind, term) in enumerate(zip(best.kinds, present, strict=True)):
+        by_size[j] = allan_variance(STOCHASTIC[kind], term, tau)
+        if kind == MARKOV:
             longer = {"value": DERIVATIVE_STEP * term["correlation_time_s"]["value"]}
             changed = allan_variance(STOCHASTIC[MARKOV], {**term, "correlation_time_s": longer}, tau)
             by_time[j] = (changed - by_size[j]) / np.log(DERIVATIVE_STEP)
+    others = [(term, allan_variance(name, term, tau)) for name, term in each_term(deterministic)]
+    total = by_size.sum(axis=0) + np.sum([np.zeros(len(tau)), *(part for _, part in others)], axis=0)
     jacobian = np.concatenate([by_size, by_time]) / total
     covariance = best.fit.covariance(spectrum.count)[0]
     variance = np.maximum(np.einsum("it,ij,jt->t", jacobian, covariance, jacobian), 0.0)
-    for name, term, part in parts:
-        if name not in STOCHASTIC:  # ramp and sinusoid: their square by their own interval
-            variance += (part / total * np.diff(term["interval"])[0] / term["value"] / QUANTILE) ** 2
-    half = QUANTILE * np.sqrt(variance)
-    deviation = np.sqrt(total)
-    return {
-        "tau_s": _short(tau),
-        "deviation": _short(measured),
-        "fit": _short(deviation),
-        "low": _short(deviation * np.exp(-0.5 * half)),
-        "high": _short(deviation * np.exp(0.5 * half)),
+    for coefficient, part in others:  # by the interval of the coefficient
+        variance += (part / total * np.diff(coefficient["interval"])[0] / coefficient["value"] / QUANTILE) ** 2
+    half, deviation = QUANTILE * np.sqrt(variance), np.sqrt(total)
+    curves = {
+        "tau_s": tau,
+        "deviation": measured,
+        "fit": deviation,
+        "low": deviation * np.exp(-0.5 * half),
+        "high": deviation * np.exp(0.5 * half),
     }
-
-
-def _short(values: Values) -> list[float]:
-    """Return values to five digits, enough for a curve."""
-    return [float(f"{v:.5g}") for v in values]
-
-
-def _p_value(spectrum: Spectrum, fit: Fits) -> float:
-    """Return the probability of a spectrum that differs from the fit by at least as much."""
-    spread = 2.0 / (9.0 * spectrum.count)
-    z = (np.cbrt(fit.power[0] / fit.total[0] / spectrum.count) - 1.0 + spread) / np.sqrt(spread)
-    return float(scipy.special.chdtrc(max(len(z) - int(np.sum(fit.kinds >= 0)), 1), float(z @ z)))
-
-
-def _terms(
-    spectrum: Spectrum, best: Candidate, bounds: tuple[Values, dict[int, float]], regression: Regression
-) -> JSON:
-    """Return the stochastic terms."""
-    (within, upper), scale, names, unit = bounds, regression.scale, regression.names(best), regression.unit
-    kinds, n = best.kinds, len(best.kinds)
-    out: JSON = {}
-    for kind in SINGLE:
-        name = STOCHASTIC[kind]
-        term: JSON = {"value": None, "unit": unit_of(name, unit), "interval": None}
-        if kind in kinds:
-            j = kinds.index(kind)
-            out[name] = term | _coefficient(best.parameters[j], within[:, j], scale)
-        else:
-            reason = _reason(kind, names, spectrum)
-            out[name] = term | {"reason": reason, "upper_limit": scale * float(np.sqrt(upper[kind]))}
-    out[STOCHASTIC[MARKOV]] = [
-        {"unit": unit}
-        | _coefficient(best.parameters[j], within[:, j], scale)
-        | {
-            "correlation_time_s": {
-                "value": float(np.exp(best.parameters[n + j])),
-                "interval": np.exp(within[:, n + j]).tolist(),
-            }
-        }
-        for j in sorted(range(n), key=lambda j: float(best.parameters[n + j]))
-        if kinds[j] == MARKOV
-    ]
-    return out
-
-
-def _coefficient(logarithm: float, within: Values, scale: float) -> JSON:
-    """Return a coefficient and its interval, from the logarithms of their squares."""
-    return {
-        "value": scale * float(np.exp(0.5 * logarithm)),
-        "interval": (scale * np.exp(0.5 * within)).tolist(),
-    }
+    return {name: [float(f"{v:.5g}") for v in values] for name, values in curves.items()}
 
 
 def _reason(kind: int, names: Sequence[str], spectrum: Spectrum) -> str:

@@ -4,10 +4,10 @@ Compositions (sets of the terms of ``noise_terms``) are compared by
 
     BIC = -2 log L + p ln(n),    probability proportional to exp(-BIC / 2)
 
-with p parameters and n coefficients (``noise_likelihood``). The search begins with white noise and adds, drops or swaps
-one term at a time until no step lowers the BIC. A term whose gain is certain is not dropped. Terms are tried only if
-their score, the derivative of the likelihood at zero, predicts a gain, so that a recording of white noise needs one
-fit. A ramp, sinusoids and a dependence on temperature are deterministic columns (``noise_regression``).
+with p parameters and n coefficients. The search begins with white noise and adds, drops or swaps one term at a time
+until no step lowers the BIC. A term whose gain is certain is not dropped. A term is fitted only if its score, the
+derivative of the likelihood at zero, predicts a gain, so that a recording of white noise needs one fit. A ramp,
+sinusoids and a dependence on temperature are deterministic columns (``noise_regression``).
 
 Intervals are those of the profile likelihood (of a ramp and a sinusoid: of generalised least squares). The upper limit
 of a term that is not in the composition is the coefficient at which -2 log L of the profile rises by 1.645^2: one-sided
@@ -22,23 +22,34 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.noise_likelihood import LONGEST_TIME, Composition, Fits, Trial, active, at_once, evaluate
-from pipeline.estimation.noise_terms import MARKOV, SINGLE, WHITE, markov_shape
+from pipeline.estimation.noise_terms import (
+    LONGEST_TIME,
+    MARKOV,
+    SINGLE,
+    WHITE,
+    Composition,
+    Fits,
+    Trial,
+    active,
+    at_once,
+    evaluate,
+    markov_shape,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.estimation.noise_likelihood import Spectrum, Work
+    from pipeline.estimation.noise_terms import Spectrum, Work
     from pipeline.records import Values
 
 MOST_MARKOV = 2  # processes of different correlation times; to distinguish a third takes some 10^6 samples
-TIMES_TRIED = 10  # correlation times whose score is computed, in equal steps of their logarithm
+TIMES_SCORED = 10  # correlation times whose score is computed, in equal steps of their logarithm
 TIMES_FITTED = 2  # of them that are fitted
-LEAST_PROMISE = 0.25  # of the penalty of a term: a score that predicts less of it is not followed
-CERTAIN_GAIN = 10.0  # penalties of a term: what a term gains at least, by its spread, so that it is certainly there
-SLIGHT_GAIN = 2.0  # of the gain of one parameter: its penalty is ln(n), 4 and more
+LEAST_PREDICTED_GAIN = 0.25  # of the penalty of a term: a term whose score predicts less is not fitted
+CERTAIN_GAIN = 10.0  # penalties of a term: a term that gains more, by its spread, is not dropped
+SLIGHT_GAIN = 2.0  # in -2 log L of a deterministic column: its penalty is ln(n), 4 and more
 QUANTILE, ONE_SIDED = 1.959964, 1.644854  # of the standard normal distribution: 95 % from two sides, from one
-MOST_PUBLISHED = 12  # compositions that are published, best first
+MOST_PUBLISHED = 12  # compositions
 LARGEST_CHANGE = 14.0  # change of the logarithm of a squared coefficient: a factor of 1000 in the coefficient
 PROFILE_STEPS, PROFILE_PRECISE = 9, 0.02  # of the root of the loss: 2 % of half an interval
 
@@ -49,7 +60,7 @@ class Candidate:
 
     kinds: Composition
     columns: tuple[int, ...]
-    parameters: Values  # as ``Trial.parameters``
+    parameters: Values  # as in ``Trial.parameters``
     bic: float
     fit: Fits  # of one row
 
@@ -78,59 +89,53 @@ class Search:
         yield from self.fit(starts, columns)
         best = self._best(columns)
         while True:
-            tries = self._added(best)
+            more = self._added(best)
             if len(best.kinds) > 1:
-                dropped = [_without(best, j) for j in self._dispensable(best)]
+                # a term gains at least (coefficient^2 / spread)^2
+                variance = np.diag(best.fit.covariance(self.spectrum.count)[0])[: len(best.kinds)]
+                uncertain = np.flatnonzero(1.0 / variance < CERTAIN_GAIN * self.penalty).tolist()
+                dropped = [_without(best, j) for j in uncertain]
                 yield from self.fit(dropped, columns)
-                tries += [new for kinds, _ in dropped for new in self._added(self.found[kinds, columns])]
-            yield from self.fit(tries, columns)
+                more += [new for kinds, _ in dropped for new in self._added(self.found[kinds, columns])]
+            yield from self.fit(more, columns)
             new = self._best(columns)
             if new is best:
                 return best
             best = new
 
-    def _dispensable(self, candidate: Candidate) -> list[int]:
-        """Return the terms without a certain gain; the gain is at least ``(coefficient^2 / spread)^2``."""
-        spread = np.sqrt(np.diag(candidate.fit.covariance(self.spectrum.count)[0])[: len(candidate.kinds)])
-        return np.flatnonzero(spread**-2 < CERTAIN_GAIN * self.penalty).tolist()
-
     def _best(self, columns: tuple[int, ...]) -> Candidate:
         """Return the best composition so far with these columns."""
         return min((c for c in self.found.values() if c.columns == columns), key=lambda c: c.bic)
 
-    def fit(self, tries: Sequence[tuple[Composition, Values]], columns: tuple[int, ...]) -> Work[None]:
+    def fit(self, starts: Sequence[tuple[Composition, Values]], columns: tuple[int, ...]) -> Work[None]:
         """Fit compositions from their starts, and store the best fit of each."""
-        trials = [Trial(self.axis, k, columns, p) for k, p in tries if (k, columns) not in self.found]
+        trials = [Trial(self.axis, k, columns, p) for k, p in starts if (k, columns) not in self.found]
         if not trials:
             return
-        fits, first = yield trials
-        out: dict[Composition, Candidate] = {}
-        for g, trial in enumerate(trials, first):
-            k = trial.kinds
-            bic = float(fits.unrestricted[g]) + count_of(k, columns) * self.penalty
-            if k not in out or bic < out[k].bic:
-                out[k] = Candidate(k, columns, fits.own(g), bic, fits.rows(slice(g, g + 1)))
-        self.found |= {(c.kinds, columns): c for c in out.values()}
+        fits = yield trials
+        for g, trial in enumerate(trials):
+            key, bic = (trial.kinds, columns), float(fits.unrestricted[g])
+            bic += count_of(*key) * self.penalty
+            if key not in self.found or bic < self.found[key].bic:
+                self.found[key] = Candidate(*key, fits.own(g), bic, fits.rows(slice(g, g + 1)))
 
     def _added(self, candidate: Candidate) -> list[tuple[Composition, Values]]:
-        """Return compositions with one additional term whose score predicts a lower criterion, and their starts."""
+        """Return compositions with one additional term whose score predicts a gain, and their starts."""
         spectrum = self.spectrum
         absent = [k for k in SINGLE if k not in candidate.kinds]
+        gain, size, _ = _scores(spectrum, candidate.fit, spectrum.shapes[absent])
+        least = LEAST_PREDICTED_GAIN * self.penalty
+        out = [_with_term(candidate, kind, size[i], 0.0) for i, kind in enumerate(absent) if gain[i] > least]
         longest = np.log(LONGEST_TIME * spectrum.length / 1.5)
-        times = np.linspace(np.log(2.0 * spectrum.interval), longest, TIMES_TRIED)
-        markov = candidate.kinds.count(MARKOV) < MOST_MARKOV and longest > np.log(4.0 * spectrum.interval)
-        shapes = [spectrum.shapes[absent]]
-        if markov:
-            shapes.append(markov_shape(spectrum.omega, spectrum.interval, times)[0])
-        gain, size, _ = _scores(spectrum, candidate.fit, np.concatenate(shapes))
-        promising = gain > LEAST_PROMISE * self.penalty
-        out = [_with_term(candidate, kind, size[i], 0.0) for i, kind in enumerate(absent) if promising[i]]
-        if markov:
+        if candidate.kinds.count(MARKOV) < MOST_MARKOV and longest > np.log(4.0 * spectrum.interval):
+            times = np.linspace(np.log(2.0 * spectrum.interval), longest, TIMES_SCORED)
+            shapes, _ = markov_shape(spectrum.omega, spectrum.interval, times)
+            gain, size, _ = _scores(spectrum, candidate.fit, shapes)
             chosen: list[int] = []
-            for i in np.argsort(gain[len(absent) :])[::-1].tolist():
-                if promising[len(absent) + i] and all(abs(i - c) > 1 for c in chosen):
+            for i in np.argsort(gain)[::-1].tolist():
+                if gain[i] > least and all(abs(i - c) > 1 for c in chosen):
                     chosen.append(i)
-            out += [_with_term(candidate, MARKOV, size[len(absent) + i], times[i]) for i in chosen[:TIMES_FITTED]]
+            out += [_with_term(candidate, MARKOV, size[i], times[i]) for i in chosen[:TIMES_FITTED]]
         return out
 
 
@@ -144,9 +149,9 @@ def _without(candidate: Candidate, index: int) -> tuple[Composition, Values]:
 def _with_term(candidate: Candidate, kind: int, size: float, log_time: float) -> tuple[Composition, Values]:
     """Return a composition with one additional term, and its start."""
     kinds = candidate.kinds
-    at = sum(k <= kind for k in kinds)
-    start = np.insert(candidate.parameters, [at, len(kinds) + at], [np.log(size), log_time])
-    return (*kinds[:at], kind, *kinds[at:]), start
+    place = sum(k <= kind for k in kinds)
+    start = np.insert(candidate.parameters, [place, len(kinds) + place], [np.log(size), log_time])
+    return (*kinds[:place], kind, *kinds[place:]), start
 
 
 def _scores(spectrum: Spectrum, fit: Fits, shapes: Values) -> tuple[Values, Values, Values]:
@@ -161,16 +166,17 @@ def _scores(spectrum: Spectrum, fit: Fits, shapes: Values) -> tuple[Values, Valu
     free = active(fit.kinds)[0]
     inner = fit.information(spectrum.count)[0][np.ix_(free, free)]
     cross = cross[:, free]
-    left = np.maximum(own - np.sum(cross @ np.linalg.inv(inner) * cross, axis=1), 1e-9 * own)
-    gain = np.where(u > 0, u**2 / left, 0.0)
-    spread = 1.0 / np.sqrt(left)
-    return gain, np.maximum(u / left, 0.01 * spread), spread
+    information = np.maximum(own - np.sum(cross @ np.linalg.inv(inner) * cross, axis=1), 1e-9 * own)
+    gain = np.where(u > 0, u**2 / information, 0.0)
+    spread = 1.0 / np.sqrt(information)
+    return gain, np.maximum(u / information, 0.01 * spread), spread
 
 
 def limits(spectrum: Spectrum, best: Candidate) -> Work[tuple[Values, dict[int, float]]]:
-    """Return the 95 % intervals of the parameters, and the upper limits of single terms that are not selected.
+    """Return the 95 % intervals of the parameters, and the upper limits of absent terms without a correlation time.
 
-    The intervals are a (2, 2 k) array, NaN where there is no parameter; the limits are for squared coefficients.
+    The intervals are a (2, 2 k) array, NaN for terms without a correlation time; the limits are of squared
+    coefficients.
     """
     trial = Trial(int(best.fit.axis[0]), best.kinds, best.columns, best.parameters)
     spread = np.sqrt(np.diag(best.fit.covariance(spectrum.count)[0]))
@@ -180,37 +186,33 @@ def limits(spectrum: Spectrum, best: Candidate) -> Work[tuple[Values, dict[int, 
     works = [_crossing(best, trial, j, (-1.0, 1.0)[sign] * QUANTILE * spread[j]) for j, sign in sides]
     absent = [k for k in SINGLE if k not in best.kinds]
     gain, size, spread = _scores(spectrum, best.fit, spectrum.shapes[absent])
-    starts = []
-    for i, kind in enumerate(absent):  # from a coefficient that is certainly inside, upwards
-        kinds, start = _with_term(best, kind, 1e-3 * spread[i], 0.0)
-        step = float(np.log(((size[i] if gain[i] > 0.0 else 0.0) + ONE_SIDED * spread[i]) / (1e-3 * spread[i])))
-        starts.append(float(start[kinds.index(kind)]))
+    least = 1e-3 * spread  # certainly below the limit
+    for i, kind in enumerate(absent):
+        kinds, start = _with_term(best, kind, least[i], 0.0)
+        step = float(np.log(((size[i] if gain[i] > 0.0 else 0.0) + ONE_SIDED * spread[i]) / least[i]))
         more = trial._replace(kinds=kinds, parameters=start)
         works.append(_crossing(best, more, kinds.index(kind), step, one_sided=True))
-    found = yield from at_once(works)
+    offsets = yield from at_once(works)
     within = np.full((2, 2 * n), np.nan)
-    for (j, sign), offset in zip(sides, found, strict=False):
+    for (j, sign), offset in zip(sides, offsets, strict=False):
         within[sign, j] = best.parameters[j] + offset
-    upper = np.exp(np.array(starts) + np.array(found[len(sides) :])).tolist()
-    return within, dict(zip(absent, upper, strict=True))
+    upper = least * np.exp(offsets[len(sides) :])
+    return within, dict(zip(absent, upper.tolist(), strict=True))
 
 
-def _crossing(best: Candidate, trial: Trial, at: int, step: float, *, one_sided: bool = False) -> Work[float]:
-    """Return the change of a parameter at which -2 log L of the profile has risen by a given square.
+def _crossing(best: Candidate, trial: Trial, j: int, step: float, *, one_sided: bool = False) -> Work[float]:
+    """Return the change of parameter j at which -2 log L of the profile rises by the square of the quantile.
 
     ``step``: a first guess.
     """
     quantile, least = ONE_SIDED if one_sided else QUANTILE, float(best.fit.deviance[0])
-    start, sign, size = (
-        float(trial.parameters[at]),
-        float(np.sign(step)),
-        float(np.clip(abs(step), 1e-6, LARGEST_CHANGE)),
-    )
-    parameters, inner, outer = trial.parameters.copy(), 0.0, np.inf
+    sign, size = float(np.sign(step)), float(np.clip(abs(step), 1e-6, LARGEST_CHANGE))
+    start, parameters = float(trial.parameters[j]), trial.parameters.copy()
+    inner, outer = 0.0, np.inf
     for _ in range(PROFILE_STEPS):
-        parameters[at] = start + sign * size
-        fits, row = yield [trial._replace(parameters=parameters, held=at)]
-        deviance = float(fits.deviance[row])
+        parameters[j] = start + sign * size
+        fits = yield [trial._replace(parameters=parameters, held=j)]
+        deviance = float(fits.deviance[0])
         least = min(least, deviance) if one_sided else least
         excess = float(np.sqrt(max(deviance - least, 1e-12))) / quantile
         if abs(excess - 1.0) < PROFILE_PRECISE or (size >= LARGEST_CHANGE and excess < 1.0):
@@ -221,15 +223,15 @@ def _crossing(best: Candidate, trial: Trial, at: int, step: float, *, one_sided:
         if not inner < guess < outer:
             guess = 0.5 * (inner + outer) if np.isfinite(outer) else min(2.0 * size, size + 2.0)
         size = min(guess, LARGEST_CHANGE)
-        parameters = fits.own(row)
+        parameters = fits.own()
     return sign * size
 
 
 def ranked(search: Search) -> list[tuple[Candidate, float]]:
     """Return the compositions by their criterion, best first, each with its probability."""
-    best = sorted(search.found.values(), key=lambda c: c.bic)
-    weight = np.exp(-0.5 * (np.array([c.bic for c in best]) - best[0].bic))
-    return list(zip(best[:MOST_PUBLISHED], (weight / weight.sum())[:MOST_PUBLISHED].tolist(), strict=True))
+    candidates = sorted(search.found.values(), key=lambda c: c.bic)
+    weight = np.exp(-0.5 * (np.array([c.bic for c in candidates]) - candidates[0].bic))
+    return list(zip(candidates, (weight / weight.sum()).tolist(), strict=True))[:MOST_PUBLISHED]
 
 
 def best_of(search: Search, required: tuple[int, ...], optional: Sequence[int]) -> Work[Candidate]:

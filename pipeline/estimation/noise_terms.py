@@ -1,4 +1,4 @@
-"""Spectra and Allan variances of the noise terms of a sensor at rest, with the coefficients of IEEE Std 952.
+"""Noise terms of a sensor at rest: spectra, Allan variances, and the likelihood of a sum of terms.
 
 With ``w = 2 pi f dt`` and ``s = 2 sin(w / 2)``, each term adds to the variance of a coefficient of the cosine transform
 (first column) and to the Allan variance at the averaging time t (second column):
@@ -18,28 +18,56 @@ is ``sqrt(2) N``. The overlapping Allan deviation of N readings with the integra
     sigma^2(tau) = sum_i (theta[i + 2m] - 2 theta[i + m] + theta[i])^2 / (2 tau^2 (N - 2m + 1)),   tau = m dt
 
 For long averages only every (m / ``PER_AVERAGE``)th term is summed, because neighbouring terms are nearly equal.
-Sources: IEEE Std 952-1997, annex C; Riley, NIST SP 1065, section 5.2.4.
+
+The orthonormal cosine transform (DCT-II) of n samples diagonalises the covariance of white noise plus a random walk of
+unknown start exactly. For the other terms it does so approximately, with errors from the ends of the recording. The
+mean, k = 0, is not used. With the other coefficients y_k,
+
+    y_k = sum_d beta_d z_dk + sqrt(S(w_k)) e_k,   w_k = pi k / n,   S = sum_j exp(theta_j) s_j(w)
+    -2 log L = sum_k (log S_k + (y_k - z_k beta)^2 / S_k) + log det(sum_k z_k z_k^T / S_k)
+
+where s_j is the spectrum of term j, exp(theta_j) its squared coefficient, e unit white noise, and z the transforms of
+the deterministic columns (ramp, sinusoids, temperature). beta follows by generalised least squares, and the last term
+makes the likelihood a restricted one. Sums over the coefficients are computed once, in bins whose edges have the ratio
+``BIN_RATIO``. Fits of all axes, compositions and columns run together, by Fisher scoring with the damping of Levenberg
+and Marquardt. A search is a generator: it yields the ``Trial``s that it needs next and receives their ``Fits``;
+``at_once`` joins the trials of several searches.
+
+Sources: IEEE Std 952-1997, annex C; Riley, NIST SP 1065, section 5.2.4; Strang, SIAM Review 41, 1999 (the transform);
+Whittle 1953; Patterson & Thompson, Biometrika 58, 1971.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields
+from functools import cached_property
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
+import scipy
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Generator, Mapping, Sequence
 
-    from pipeline.records import Values
+    from pipeline.records import Integers, Mask, Values
 
 QUANTISATION, WHITE, INSTABILITY, WALK, MARKOV = range(5)
-PER_AVERAGE = 64  # terms of the sum that overlap in one average
+PER_AVERAGE = 64  # overlapping terms of the sum in one average
 SINGLE = (QUANTISATION, WHITE, INSTABILITY, WALK)
 STOCHASTIC = ("quantisation", "white", "bias_instability", "random_walk", "gauss_markov")
 UNITS = {
     "quantisation": "{0} s", "white": "{0}/sqrt(Hz)", "bias_instability": "{0}", "random_walk": "{0}/sqrt(s)",
     "gauss_markov": "{0}", "ramp": "{0}/s", "sinusoid": "{0}",
 }  # fmt: skip
+BIN_RATIO = 1.05  # of the edges of a bin: the spectrum of a random walk changes by a tenth, its mean by 0.2 %
+LONGEST_TIME = 0.5  # correlation time, in lengths of the recording, above which a process is a random walk
+STEP_LIMITS = (-4.0, 1.5)  # largest changes of a logarithm in one iteration; an absent term falls fast
+ITERATIONS, PRECISION = 40, 1e-2  # gain in -2 log L, predicted or of the last step, that ends them; 3.84 is 95 %
+LARGEST_DAMPING = 1e4
+LOG_LEAST = -690.0  # of a squared coefficient: above the smallest double
+
+Composition = tuple[int, ...]  # a set of stochastic terms: their kinds, in rising order
 
 
 def unit_of(term: str, unit: str) -> str:
@@ -50,8 +78,7 @@ def unit_of(term: str, unit: str) -> str:
 def fixed_shapes(omega: Values, interval: float) -> Values:
     """Return the spectra of Q, N, B and K with unit coefficients: (4, b) array. ``omega``: w, rad per sample."""
     s = 2.0 * np.sin(omega / 2.0)
-    dt = interval
-    return np.stack([s**2 / dt**2, np.full_like(s, 1.0 / dt), 1.0 / s, dt / s**2])
+    return np.stack([s**2 / interval**2, np.full_like(s, 1.0 / interval), 1.0 / s, interval / s**2])
 
 
 def markov_shape(omega: Values, interval: float, log_time: Values) -> tuple[Values, Values]:
@@ -88,7 +115,7 @@ def allan_variance(name: str, term: Mapping[str, Any], tau: Values) -> Values:
 
 
 def each_term(terms: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return name and content of each published term of an axis with a value, without terms that are regressed out."""
+    """Return name and content of each published noise term of an axis that has a value."""
     listed = [(name, part) for name, parts in terms.items() for part in (parts if isinstance(parts, list) else [parts])]
     return [(name, part) for name, part in listed if part["value"] is not None and name in UNITS]
 
@@ -96,7 +123,7 @@ def each_term(terms: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
 def allan_deviation(values: Values, interval: float, points_per_decade: int = 10) -> tuple[Values, Values]:
     """Return averaging times, s, and the overlapping Allan deviation of (n,) or (n, k) readings, evenly sampled.
 
-    (m,) and (m,) or (m, k) arrays; both empty where there are fewer than 3 readings.
+    (m,) and (m,) or (m, k) arrays; both are empty for fewer than 3 readings.
     """
     n = len(values)
     longest = (n - 1) // 2
@@ -114,3 +141,234 @@ def allan_deviation(values: Values, interval: float, points_per_decade: int = 10
         second += theta[:, : -2 * m : step]
         deviation[row] = np.sqrt(np.einsum("ij,ij->i", second, second) / (2.0 * second.shape[1])) / m
     return lengths.astype(np.float64) * interval, deviation.reshape(-1, *values.shape[1:])
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Coefficients of the axes in b bins of frequency."""
+
+    # each (b,); mean of w in rad a sample, and coefficients, of each bin
+    omega: Values
+    count: Values
+    products: Values  # (a, b, c, c); sums over each bin of y and the deterministic columns, in this order, of a axes
+    interval: float  # s; between samples
+    length: float  # s; of the longest stretch without a gap
+
+    @cached_property
+    def shapes(self) -> Values:
+        """Spectra of the terms without a correlation time, and zeros for Gauss-Markov (4) and none (-1): (6, b)."""
+        return np.pad(fixed_shapes(self.omega, self.interval), ((0, 2), (0, 0)))
+
+    @property
+    def size(self) -> float:
+        """Number of coefficients of an axis."""
+        return float(self.count.sum())
+
+
+def spectrum_of(stretches: Sequence[Values], interval: float) -> Spectrum:
+    """Return the spectrum of stretches of samples: (a, n, c) arrays, readings first, then deterministic columns."""
+    rows = [
+        scipy.fft.dct(values - values.mean(axis=1, keepdims=True), axis=1, norm="ortho", overwrite_x=True)[:, 1:]
+        for values in stretches
+    ]
+    w = np.concatenate([np.pi * np.arange(1, values.shape[1]) / values.shape[1] for values in stretches])
+    y = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
+    if len(stretches) > 1:
+        order = np.argsort(w, kind="stable")
+        w, y = w[order], y[:, order]
+    bins = np.floor(np.log(w / w[0]) / np.log(BIN_RATIO) + 1e-9)
+    first = np.flatnonzero(np.diff(bins, prepend=-1.0))
+    count = np.diff(np.append(first, len(w))).astype(np.float64)
+    parts = np.split(y, first[1:], axis=1)
+    products = np.stack([part.transpose(0, 2, 1) @ part for part in parts], axis=1)
+    length = interval * max(values.shape[1] for values in stretches)
+    return Spectrum(np.add.reduceat(w, first) / count, count, products, interval, length)
+
+
+class Trial(NamedTuple):
+    """A sum of terms to be fitted: axis, terms, numbers of its deterministic columns from 1, and the start."""
+
+    axis: int
+    kinds: Composition
+    columns: tuple[int, ...]
+    parameters: Values  # (2 k,); of k terms the logarithms of the squared coefficients, then of the correlation times
+    held: int | None = None  # index of a parameter that is fixed at its start
+
+
+@dataclass(frozen=True)
+class Fits:
+    """g sums of up to J terms, fitted together."""
+
+    axis: Integers  # (g,)
+    kinds: Integers  # (g, J); of ``noise_terms.STOCHASTIC``, -1 for none
+    columns: Mask  # (g, d); which of the deterministic columns are fitted
+    parameters: Values  # (g, 2 J); logarithms of the squared coefficients, then of the correlation times
+    # each (g,); -2 log L with and without the determinant of the deterministic columns
+    deviance: Values
+    unrestricted: Values
+    total: Values  # (g, b), S
+    power: Values  # (g, b), its estimate by the data times ``count``
+    slopes: Values  # (g, 2 J, b), of log S by each parameter
+    # of the deterministic columns; zeros for those that are not fitted
+    beta: Values  # (g, d)
+    beta_covariance: Values  # (g, d, d)
+
+    def rows(self, index: Integers | Mask | slice) -> Fits:
+        """Return some of the fits."""
+        return Fits(*(getattr(self, name)[index] for name in NAMES))
+
+    def replace(self, index: Integers | Mask, others: Fits) -> None:
+        """Replace some of the fits."""
+        for name in NAMES[3:]:
+            getattr(self, name)[index] = getattr(others, name)
+
+    def own(self, row: int = 0) -> Values:
+        """Return the parameters of one fit, as in ``Trial.parameters``."""
+        k, terms = int(np.sum(self.kinds[row] >= 0)), self.kinds.shape[1]
+        return self.parameters[row, [*range(k), *range(terms, terms + k)]]
+
+    def information(self, count: Values) -> Values:
+        """Return the Fisher information of the parameters: (g, 2 J, 2 J) array; 1 on the diagonal for absent ones."""
+        information = 0.5 * (self.slopes * count) @ self.slopes.transpose(0, 2, 1)
+        np.einsum("gpp->gp", information)[...] += np.where(active(self.kinds), 1e-12, 1.0)
+        return information
+
+    def covariance(self, count: Values) -> Values:
+        """Return the covariance of the parameters: (g, 2 J, 2 J) array."""
+        return np.asarray(np.linalg.inv(self.information(count)), np.float64)
+
+
+NAMES = tuple(f.name for f in fields(Fits))
+Result = TypeVar("Result")
+if TYPE_CHECKING:
+    Work = Generator[list[Trial], Fits, Result]  # yields trials, receives their fits, returns a result
+
+
+def active(kinds: Integers) -> Mask:
+    """Return which parameters (g, J) terms have: (g, 2 J) array."""
+    return np.concatenate([kinds >= 0, kinds == MARKOV], axis=1)
+
+
+def at_once(works: Sequence[Work[Result]]) -> Work[list[Result]]:
+    """Join the trials of several generators and yield them; return the results of the generators."""
+    results: dict[int, Result] = {}
+    replies: dict[int, Fits | None] = dict.fromkeys(range(len(works)))
+    while True:
+        wanted: dict[int, list[Trial]] = {}
+        for i, reply in replies.items():
+            try:
+                wanted[i] = works[i].send(reply)  # type: ignore[arg-type]
+            except StopIteration as end:
+                results[i] = end.value
+        if not wanted:
+            return [results[i] for i in range(len(works))]
+        fits = yield [trial for trials in wanted.values() for trial in trials]
+        ends = accumulate(len(trials) for trials in wanted.values())
+        replies = {i: fits.rows(slice(end - len(wanted[i]), end)) for i, end in zip(wanted, ends, strict=True)}
+
+
+def solved(spectrum: Spectrum, work: Work[Result]) -> Result:
+    """Maximise the likelihood of all trials that a generator yields; return its result."""
+    fits: Fits | None = None
+    while True:
+        try:
+            fits = maximised(spectrum, work.send(fits))  # type: ignore[arg-type]
+        except StopIteration as end:
+            result: Result = end.value
+            return result
+
+
+def evaluate(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
+    """Return likelihood and derivatives at the parameters of trials."""
+    return _evaluated(spectrum, *_packed(spectrum, trials)[:4])
+
+
+def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[Integers, Integers, Mask, Values, Mask]:
+    """Return axis, kinds, columns and parameters of trials, as in ``Fits``, and which parameters are free."""
+    g, terms = len(trials), max(len(trial.kinds) for trial in trials)
+    kinds, parameters = np.full((g, terms), -1), np.zeros((g, 2 * terms))
+    columns, held = np.zeros((g, spectrum.products.shape[2]), bool), np.zeros((g, 2 * terms), bool)
+    for i, trial in enumerate(trials):
+        k = len(trial.kinds)
+        kinds[i, :k] = trial.kinds
+        parameters[i, :k], parameters[i, terms : terms + k] = trial.parameters[:k], trial.parameters[k:]
+        columns[i, list(trial.columns)] = True
+        if trial.held is not None:
+            held[i, trial.held if trial.held < k else terms + trial.held - k] = True
+    return np.array([trial.axis for trial in trials]), kinds, columns[:, 1:], parameters, active(kinds) & ~held
+
+
+def _evaluated(spectrum: Spectrum, axis: Integers, kinds: Integers, columns: Mask, parameters: Values) -> Fits:
+    terms = kinds.shape[1]
+    theta, log_time = parameters[:, :terms], parameters[:, terms:]
+    shapes = spectrum.shapes[kinds]
+    slopes = np.zeros((len(kinds), 2 * terms, len(spectrum.omega)))
+    markov = kinds == MARKOV
+    size = np.exp(theta)[:, :, None]
+    if markov.any():
+        shapes[markov], by_time = markov_shape(spectrum.omega, spectrum.interval, log_time[markov])
+        slopes[:, terms:][markov] = size[markov] * by_time
+    shapes *= size
+    total = shapes.sum(axis=1)
+    slopes[:, :terms] = shapes
+    slopes /= total[:, None, :]
+    weight, (g, d) = 1.0 / total, columns.shape
+    power, determinant = spectrum.products[axis, :, 0, 0], np.zeros(g)
+    beta, covariance, restricted = np.zeros((g, d)), np.zeros((g, d, d)), power
+    used = np.flatnonzero(columns.any(axis=0))
+    if used.size:
+        index, n = np.append(0, used + 1), len(used)
+        products = spectrum.products[:, :, index[:, None], index].reshape(*spectrum.products.shape[:2], -1)[axis]
+        sums = (weight[:, None, :] @ products).reshape(g, n + 1, n + 1)
+        unused = ~columns[:, used]
+        absent = unused[:, :, None] * np.eye(n)
+        inner = np.where(unused[:, :, None] | unused[:, None, :], absent, sums[:, 1:, 1:])
+        inverse, determinant = np.linalg.inv(inner) - absent, np.linalg.slogdet(inner)[1]
+        signed = np.concatenate([np.ones((g, 1)), -np.einsum("gij,gj->gi", inverse, sums[:, 1:, 0])], axis=1)
+        outer = signed[:, :, None] * signed[:, None, :]
+        power = np.maximum(products @ outer.reshape(g, -1, 1), 0.0)[:, :, 0]
+        outer[:, 1:, 1:] += inverse
+        restricted = (products @ outer.reshape(g, -1, 1))[:, :, 0]
+        beta[:, used], covariance[:, used[:, None], used] = -signed[:, 1:], inverse
+    unrestricted = np.log(total) @ spectrum.count + np.sum(power * weight, axis=1)
+    return Fits(
+        axis, kinds, columns, parameters, unrestricted + determinant, unrestricted, total, restricted, slopes, beta,
+        covariance,
+    )  # fmt: skip
+
+
+def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
+    """Maximise the restricted likelihood of trials."""
+    axis, kinds, columns, start, free = _packed(spectrum, trials)
+    low = np.log(spectrum.interval)
+    high = max(np.log(LONGEST_TIME * spectrum.length), low + 1e-6)
+    bounds = np.repeat([[LOG_LEAST, low], [np.inf, high]], kinds.shape[1], axis=1)
+    now = best = _evaluated(spectrum, axis, kinds, columns, start)
+    damping, running = np.full(len(trials), 1e-2), np.arange(len(trials))  # of the fits in ``now``
+    for _ in range(ITERATIONS):
+        gradient = 0.5 * np.sum(now.slopes * (spectrum.count - now.power / now.total)[:, None, :], axis=2)
+        at_bound = np.where(gradient > 0.0, now.parameters <= bounds[0], now.parameters >= bounds[1])
+        moving = free & ~at_bound
+        information = 0.5 * (now.slopes * spectrum.count) @ now.slopes.transpose(0, 2, 1)
+        information *= moving[:, :, None] & moving[:, None, :]
+        diagonal = np.einsum("gpp->gp", information)  # a view
+        diagonal += np.where(moving, damping[:, None] * diagonal + 1e-9, 1.0)
+        gradient = np.where(moving, gradient, 0.0)
+        step = np.clip(-np.linalg.solve(information, gradient[:, :, None])[:, :, 0], *STEP_LIMITS)
+        stepped = np.where(moving, np.clip(now.parameters + step, *bounds), now.parameters)
+        new = _evaluated(spectrum, now.axis, now.kinds, now.columns, stepped)
+        gain = now.deviance - new.deviance
+        better = gain > 0
+        now.replace(better, new.rows(better))
+        damping *= np.where(better, 0.2, 8.0)
+        predicted = -np.sum(gradient * step, axis=1)
+        slow = better & (gain < PRECISION) & (damping < 1.0)
+        unfinished = (predicted > PRECISION) & ~slow & (damping < LARGEST_DAMPING)
+        if not unfinished.all():
+            best.replace(running[~unfinished], now.rows(~unfinished))
+            running, now = running[unfinished], now.rows(unfinished)
+            free, damping = free[unfinished], damping[unfinished]
+        if not running.size:
+            break
+    best.replace(running, now)
+    return best

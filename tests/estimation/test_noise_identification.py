@@ -11,15 +11,18 @@ from scipy.fft import dct
 from scipy.signal import lfilter
 
 from pipeline.estimation.noise_identification import identify_noise, static_stretches
-from pipeline.estimation.noise_likelihood import Trial, evaluate, maximised, spectrum_of
 from pipeline.estimation.noise_terms import (
     INSTABILITY,
     QUANTISATION,
     WALK,
     WHITE,
+    Trial,
     allan_variance,
+    evaluate,
     fixed_shapes,
     markov_shape,
+    maximised,
+    spectrum_of,
 )
 from pipeline.records import Recording
 
