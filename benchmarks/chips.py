@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from board_simulator import by_hand, draw_chip, hand_board, table_board
 
-from pipeline.estimation.chip_document import chip_document
+from pipeline.estimation.chips import chip_document
 
 
 def board(kind: str, seed: int) -> tuple[dict, dict[str, np.ndarray]]:

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.chip_rows import Chip
+from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.stages import fit_stage
 from pipeline.records import Recording

@@ -1,12 +1,12 @@
-"""Estimate rotation, lever arm and time offset between the chips of one board, from readings at the same times.
+"""Estimate the mounting of a chip relative to the reference chip of its board, from readings at the same times.
 
     w_b = R (w_a + alpha tau_w) + d_w
     f_b = R (f_a + [omega x (omega x r) + alpha x r] / 9.80665 + f' tau_f) + d_f
 
 a is the reference chip, b another one: calibrated specific force f, g, and angular rate w, deg/s (omega in rad/s). R
 rotates vectors of a into the axes of b; r, m, is the position of b in the axes of a; a reading of b at t shows the
-motion at t + tau; d are differences of the biases. Rows are means over 0.1 s. The noise of the two chips is
-independent, so that the signals of b are instrumental variables for the signals of a: the noise of the regressors
+motion at t + tau; d are differences of the biases. Rows are means over 0.1 s (``chip_fit``). The noise of the two chips
+is independent, so that the signals of b are instrumental variables for the signals of a: the noise of the regressors
 causes no bias (Durbin, Rev. Inst. Int. Stat. 22, 1954, 23).
 
 Accelerometers and gyroscopes each give R; the result is their best linear combination. With more than two chips, each
@@ -20,54 +20,35 @@ both chips, so that they cancel as far as the chips' axes agree.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.chip_rows import (
-    Chip,
-    Means,
-    blocks_of,
-    clear_of,
-    columns_of,
-    joined,
-    lever,
-    rows_of,
-    shared,
-    turned,
-)
-from pipeline.estimation.engine import LinearMap, assess_noise, scaled_inverse
-from pipeline.estimation.gauss_markov import Blocks, Prior
-from pipeline.estimation.uncertainty_budget import own_and_bench
+from pipeline.estimation.chip_fit import PRIORS, ROW_S, Chip, Fit, Fits, clear_of, columns_of, fit_chips, lever, turned
+from pipeline.estimation.engine import assess_noise, scaled_inverse
+from pipeline.estimation.gauss_markov import Prior
+from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, own_and_bench
 from pipeline.model.kinematics import turn_by_vector
-from pipeline.records import AXES, SENSORS, Mask, Values
+from pipeline.records import AXES, SENSOR_UNITS, SENSORS, SensorCalibration, Values, coverage_factor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 
-# Weak priors: what a recording does not show keeps them. Sizes of a device (assumption); the group delays of an
-# MPU-6050's low-pass filters differ by up to 19 ms (its register map, register 26).
-PRIORS = {"rotation": 1.0, "lever_arm": 0.3, "time_offset": 0.02}
 OBSERVED = 0.5  # standard uncertainty over that of the prior, above which a parameter is not observable
 BY_HAND = 10.0  # times the standard deviation of the gyroscopes' rotation: a hundredth of the weight
-SHIFTS, SMALL_SHIFT_S = 4, 1e-6  # rounds in which the stamps of b are moved by its offset; below any uncertainty
-ROUNDS, SMALL = 20, 1e-10  # of Gauss-Newton steps; rad
-
-
-@dataclass(frozen=True)
-class Fit:
-    """The estimate by one sensor, linear about the rotation at hand."""
-
-    sensor: str
-    names: list[str]  # (p,), kinds of the parameters
-    step: Values  # (p,)
-    map: LinearMap
-    residual: Values  # (n, 3)
-    scale: float  # standard deviation of a row
-    inverse: Values  # (p, p), of the normal equations with the prior
+FEWEST_ROWS = 20  # at rest and in motion, whose noise is compared
+DOUBTFUL = 0.001  # p-value of the agreement of both rotations, below which it is in doubt (Pearson's chi^2, 3 degrees)
+ROUGHER = 2.0  # noise in motion over that at rest, above which the model does not explain the motion
+SHEAR = 1e-6  # relative, of the differences
+WHY = {
+    "rotation": "gravity keeps its direction in the board, and no turn about it is fast enough",
+    "lever_arm": "no turn, or none about another axis, is fast enough for this direction",
+    "time_offset": "no change of the motion is fast enough",
+}
+UNITS = {"rotation": "deg", "lever_arm": "m", "time_offset": "s"}
 
 
 @dataclass(frozen=True)
@@ -84,7 +65,7 @@ class Error:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The best linear combination of the fits: rotation from the one at hand, lever arm, time offsets."""
+    """The best linear combination of the fits: rotation from that of the fits, lever arm, time offsets."""
 
     names: list[str]  # (q,)
     values: Values  # (q,)
@@ -96,64 +77,22 @@ class Estimate:
         """Of the values: (q, q) array."""
         return np.asarray(sum(e.of_fits @ e.covariance @ e.of_fits.T for e in self.errors))
 
-    @property
-    def lever_arm(self) -> Values:
-        """In the axes of a, m: (3,) array."""
-        return self.values[[i for i, name in enumerate(self.names) if name.startswith("lever_arm")]]
 
-
-@dataclass(frozen=True)
-class Found:
-    """The result for two chips: rotation, estimate, fits, which rows are in motion, and the held-out rows."""
-
-    R: Values
-    estimate: Estimate
-    fits: list[Fit]
-    moving: Mask
-    held_out: tuple[Means, Means] | None
-
-
-def place_of(reference: Chip, other: Chip) -> Found:
-    """Return the mounting of a chip relative to the reference chip of its board.
+def chip_document(reference: Chip, other: Chip) -> dict[str, Any]:
+    """Return the mounting of a chip relative to the reference chip of its board, for ``calibrations/<unit>.json``.
 
     Raises ``NotObservableError`` if the chips share no calibrated sensor, or too little time.
     """
-    sensors = [s for s in SENSORS if all(c.calibrations.get(s) is not None for c in (reference, other))]
+    chips = reference, other
+    sensors = [s for s in SENSORS if all(chip.calibrations.get(s) is not None for chip in chips)]
     if not sensors:
         raise NotObservableError("no sensor is calibrated in both chips")
-    recordings, offset = shared(reference, other, sensors), dict.fromkeys(sensors, 0.0)
-    for _ in range(SHIFTS):
-        used, held_out = rows_of(recordings, offset)
-        a, b = joined(used)
-        R, clear, fits = _solved(sensors, a, b)
-        steps = {fit.sensor: float(fit.step[fit.names.index("time_offset")]) for fit in fits}
-        if max(map(abs, steps.values())) < SMALL_SHIFT_S:
-            break
-        offset = {s: offset[s] + step for s, step in steps.items()}
+    found = fit_chips(*chips, sensors)
     on_table = any(r.table_angle is not None or r.table_attitude is not None for r in reference.recordings)
-    turning = [clear[k] for k in ("gyroscope", "gyroscope'", "accelerometer'") if k in clear]
-    moving = np.any(np.concatenate(turning, axis=1) > 0.0, axis=1)
-    blocks = blocks_of([pair[0]["time"] for pair in used])
-    estimate = _combined(fits, _errors(fits, R, (a, b), clear, moving, blocks, (reference, other)), on_table=on_table)
-    for sensor, shift in offset.items():
-        estimate.values[estimate.names.index(f"time_offset_{sensor}")] += shift
-    R = R @ turn_by_vector(estimate.values[:3])
-    return Found(R, estimate, fits, moving, joined(held_out) if held_out else None)
-
-
-def _solved(sensors: Sequence[str], a: Means, b: Means) -> tuple[Values, Means, list[Fit]]:
-    """Return the rotation at which the fits are linear, which signals are clear of noise, and the fits."""
-    R = _first_rotation(a, b, sensors)
-    clear = clear_of(a, b, R)
-    for _ in range(ROUNDS):
-        fits = [_fit(s, R, a, b, clear) for s in sensors]
-        weights = [scaled_inverse(fit.inverse[:3, :3]) for fit in fits]
-        moments = [W @ fit.step[:3] for W, fit in zip(weights, fits, strict=True)]
-        turn = np.linalg.solve(np.sum(weights, axis=0), np.sum(moments, axis=0))
-        R = R @ turn_by_vector(turn)
-        if np.linalg.norm(turn) < SMALL:
-            break
-    return R, clear, [_fit(s, R, a, b, clear) for s in sensors]
+    estimate = _combined(found.fits, _errors(found, chips), on_table=on_table)
+    R = found.R @ turn_by_vector(estimate.values[:3])
+    document = _estimated(R, estimate, chips) | _checks(found, R, estimate)
+    return document | {"duration_s": round(len(found.moving) * ROW_S, 3)}
 
 
 def vector_of(R: Values) -> Values:
@@ -161,114 +100,67 @@ def vector_of(R: Values) -> Values:
     return np.asarray(scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec())
 
 
-def _first_rotation(a: Means, b: Means, sensors: Sequence[str]) -> Values:
-    """Return the rotation that brings vectors of a nearest to those of b (Wahba's problem, by Markley's SVD)."""
-    B = np.sum([m / np.linalg.norm(m) for m in (b[s].T @ a[s] for s in sensors)], axis=0)
-    U, _, Vt = np.linalg.svd(B)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+def _rms(values: Values) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
-def _fit(sensor: str, R: Values, a: Means, b: Means, clear: Mapping[str, Values]) -> Fit:
-    """Return the estimate by one sensor: instrumental variables with the weak priors."""
-    columns = columns_of(sensor, turned(a, np.eye(3), clear))
-    X = np.concatenate([c for _, c in columns], axis=2)
-    Z = np.concatenate([c for _, c in columns_of(sensor, turned(b, R, clear))], axis=2)
-    names = [kind for kind, c in columns for _ in range(c.shape[2])]
-    y = b[sensor] @ R - a[sensor]
-    prior = np.diag([PRIORS[kind] ** -2 if kind in PRIORS else 0.0 for kind in names])
-    products, moment = np.einsum("nci,ncj->ij", Z, X), np.einsum("nci,nc->i", Z, y)
-    scale, step = float(np.std(y)), np.zeros(len(names))
-    for _ in range(3):  # the prior's weight beside the noise settles at once
-        step = np.linalg.solve(products + scale**2 * prior, moment)
-        scale = float(np.sqrt(np.mean((y - X @ step) ** 2)))
-    inverse = np.linalg.inv(products / scale**2 + prior)
-    J = inverse / scale**2
-    u, v, w = Z.transpose(1, 2, 0)
-    return Fit(sensor, names, step, LinearMap((u, v, w), (J, J, J)), y - X @ step, scale, inverse)
-
-
-def _errors(  # noqa: PLR0917  (what acts on the fits)
-    fits: Sequence[Fit],
-    R: Values,
-    signals: tuple[Means, Means],
-    clear: Mapping[str, Values],
-    moving: Mask,
-    blocks: Blocks,
-    chips: tuple[Chip, Chip],
-) -> list[Error]:
+def _errors(found: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
     """Return the sources of error of the fits' parameters, one after the other, without the biases."""
+    fits, R, moving = found.fits, found.R, found.moving
     kept = [np.flatnonzero(np.array(fit.names) != "bias") for fit in fits]
     sizes = [len(k) for k in kept]
-    place = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
-    found = []
-    for fit, k, put in zip(fits, kept, place, strict=True):
+    places = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
+    errors, none = [], np.zeros((3, 3))
+    for fit, k, place in zip(fits, kept, places, strict=True):
         priors = [chip.prior(fit.sensor) for chip in chips]
         prior = Prior(float(np.linalg.norm([p.wander for p in priors])), max(p.time for p in priors))
-        design = np.column_stack([np.ones(len(fit.residual)), signals[0][fit.sensor]])
-        covariance, freedom = assess_noise(fit.residual, design, blocks, prior).posterior(fit.map).averaged()
-        none = np.zeros((3, len(k)))
-        source = f"noise of the {fit.sensor}s"
-        # what motion alone determines: its noise may be larger than that at rest
+        design = np.column_stack([np.ones(len(fit.residual)), found.rows[0][fit.sensor]])
+        covariance, freedom = assess_noise(fit.residual, design, found.blocks, prior).posterior(fit.map).averaged()
+        # Motion alone determines all but the accelerometers' rotation; its noise may be larger than that at rest.
         by_motion = (np.array(fit.names)[k] != "rotation") | (fit.sensor == "gyroscope")
-        rougher = np.where(by_motion, max(_rms(fit.residual[moving]) / fit.scale, 1.0), 1.0)
+        in_motion = _rms(fit.residual[moving]) if moving.any() else 0.0
+        rougher = np.where(by_motion, max(in_motion / fit.scale, 1.0), 1.0)
         noise = covariance[np.ix_(k, k)] * np.outer(rougher, rougher)
-        found.append(Error(source, "A", float(freedom[k].min()), noise, put, none))
+        of_axes, source = np.zeros((3, len(k))), f"noise of the {fit.sensor}s"
+        errors.append(Error(source, "A", float(freedom[k].min()), noise, place, of_axes))
         weak = np.array([PRIORS[fit.names[i]] ** -2 for i in k])
         pulled = fit.inverse[np.ix_(k, k)]
-        found.append(Error("weak priors", "B", np.inf, pulled @ np.diag(weak) @ pulled.T, put, none))
-
-    def response(of: str, E: Values, who: Sequence[int]) -> Values:
-        """Return what ``u + E u`` instead of the truths u of a sensor, in the axes of the reference, does."""
-        return np.concatenate(
-            [fit.map.of(_change(fit, of, E, R, signals, clear, who))[k] for fit, k in zip(fits, kept, strict=True)]
-        )
-
-    for fit in fits:
-        of = fit.sensor
-        own: list[tuple[str, str, float, Values, list[int]]] = []
+        errors.append(Error("weak priors", "B", np.inf, pulled @ np.diag(weak) @ pulled.T, place, of_axes))
+    for of in (fit.sensor for fit in fits):
+        # Each error of a matrix is a pair of shears E of the chips in the axes of a: their truths are ``u + E u``.
+        sources = []
         for number, chip in enumerate(chips):
             calibration = chip.calibrations[of]
             assert calibration is not None  # noqa: S101  (of the sensors)
-            alone, bench = own_and_bench(calibration)
-            nu = float(np.min(calibration.effective_freedom()[3:12]))
-            own.append((f"calibration of the {of} of {chip.unit}", "A", nu, alone[3:12, 3:12], [number]))
+            of_unit, of_bench = own_and_bench(calibration)
+            freedom_of_unit = float(np.min(calibration.effective_freedom()[3:12]))
+            shears = [d.reshape(3, 3) @ np.linalg.inv(calibration.matrix) for d in np.eye(9)]
+            pairs = [(none, R.T @ E @ R) if number else (E, none) for E in shears]
+            sources.append((f"calibration of the {of} of {chip.unit}", "A", freedom_of_unit, of_unit, pairs))
             if number == 0:
-                own.append((f"stated accuracies of the bench, {of}s", "B", np.inf, bench[3:12, 3:12], [0, 1]))
-        for source, kind, nu, own_covariance, who in own:
-            inverse = np.linalg.inv(matrix_of(chips[who[0]], of))
-            shears = [d.reshape(3, 3) @ inverse for d in np.eye(9)]
-            if who == [1]:
-                shears = [R.T @ E @ R for E in shears]
-            of_fits = np.stack([response(of, E, who) for E in shears], axis=1)
+                both = [(E, E) for E in shears]
+                sources.append((f"stated accuracies of the bench, {of}s", "B", np.inf, of_bench, both))
+        for source, kind, degrees, covariance, pairs in sources:
+            of_fits = [
+                np.concatenate([fit.map.of(_change(found, fit, of, *E))[k] for fit, k in zip(fits, kept, strict=True)])
+                for E in pairs
+            ]
             of_axes = np.zeros((3, 9))
             if of == "accelerometer":
-                of_axes = np.stack([_axes_change(chips, R, E, who) for E in shears], axis=1)
-            found.append(Error(source, kind, nu, own_covariance, of_fits, of_axes))
-    return found
+                of_axes = np.stack([_axes_change(chips, R, *E) for E in pairs], axis=1)
+            errors.append(Error(source, kind, degrees, covariance[3:12, 3:12], np.stack(of_fits, axis=1), of_axes))
+    return errors
 
 
-def _rms(values: Values) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
-
-
-def _change(  # noqa: PLR0917  (as above)
-    fit: Fit,
-    of: str,
-    E: Values,
-    R: Values,
-    signals: tuple[Means, Means],
-    clear: Mapping[str, Values],
-    who: Sequence[int],
-) -> Values:
-    """Return the change of a fit's readings, (n, 3), by errors of the truth of a sensor of one chip, or of both."""
-    a, b = signals
+def _change(found: Fits, fit: Fit, of: str, E_a: Values, E_b: Values) -> Values:
+    """Return the change of a fit's readings, (n, 3), where the truths of a sensor are sheared."""
+    a, b = found.rows
     change = np.zeros_like(fit.residual)
     if of == fit.sensor:
-        change += (b[of] @ R @ E.T) * (1 in who) - (a[of] @ E.T) * (0 in who)
-    if of == "gyroscope" and fit.sensor == "accelerometer" and 0 in who:
-        x, r = turned(a, np.eye(3), clear), fit.step[np.array(fit.names) == "lever_arm"]
-        wrong = lever(E @ x["turn"] + x["turn"] @ E.T, x["gyroscope'"] @ E.T)
-        change -= wrong @ r
+        change += b[of] @ found.R @ E_b.T - a[of] @ E_a.T
+    if of == "gyroscope" and fit.sensor == "accelerometer":
+        x, r = turned(a, np.eye(3), found.clear), fit.step[np.array(fit.names) == "lever_arm"]
+        change -= lever(E_a @ x["turn"] + x["turn"] @ E_a.T, x["gyroscope'"] @ E_a.T) @ r
     return change
 
 
@@ -281,29 +173,25 @@ def axes_of(matrix: Values) -> Values:
     return np.asarray((q * np.sign(np.diag(r))).T)
 
 
-def matrix_of(chip: Chip, sensor: str = "accelerometer") -> Values:
-    """Return the matrix of a sensor that is calibrated."""
-    calibration = chip.calibrations[sensor]
-    assert calibration is not None  # noqa: S101  (of the sensors)
-    return calibration.matrix
-
-
-def axes_between(chips: Sequence[Chip], R: Values, E: Values | None = None, who: Sequence[int] = ()) -> Values:
-    """Return the rotation from the axes of a to those of b, where the truths of some are ``u + E u``."""
-    C = []
-    for k, chip in enumerate(chips):
-        wrong = np.zeros((3, 3)) if E is None or k not in who else R @ E @ R.T if k else E
-        C.append(axes_of((np.eye(3) + wrong) @ matrix_of(chip)))
-    return np.asarray(C[1] @ R @ C[0].T)
-
-
-def _axes_change(chips: Sequence[Chip], R: Values, E: Values, who: Sequence[int]) -> Values:
-    """Return the turn between the chips' axes, in those of a, by truths ``u + E u``: (3,) array."""
-    step = 1e-6
-    turned = axes_between(chips, R, -step * E, who).T @ axes_between(chips, R, step * E, who)
-    return (
-        np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]) / 4.0 / step
+def axes_between(chips: Sequence[Chip], R: Values, E_a: Values, E_b: Values) -> Values:
+    """Return the rotation from the axes of a to those of b, where the accelerometers' truths are sheared."""
+    a, b = (
+        axes_of((np.eye(3) + E) @ calibration.matrix)
+        for E, calibration in zip((E_a, R @ E_b @ R.T), _accelerometers(chips), strict=True)
     )
+    return np.asarray(b @ R @ a.T)
+
+
+def _accelerometers(chips: Sequence[Chip]) -> list[SensorCalibration]:
+    """Return the calibrations of the accelerometers; empty if one of them has none."""
+    found = [chip.calibrations.get("accelerometer") for chip in chips]
+    return [c for c in found if c is not None] if None not in found else []
+
+
+def _axes_change(chips: Sequence[Chip], R: Values, E_a: Values, E_b: Values) -> Values:
+    """Return the derivative of the rotation between the chips' axes, in those of a, by a pair of shears: (3,) array."""
+    less, more = (axes_between(chips, R, step * E_a, step * E_b) for step in (-SHEAR, SHEAR))
+    return vector_of(less.T @ more) / (2.0 * SHEAR)
 
 
 def _combined(fits: Sequence[Fit], errors: Sequence[Error], *, on_table: bool) -> Estimate:
@@ -314,29 +202,130 @@ def _combined(fits: Sequence[Fit], errors: Sequence[Error], *, on_table: bool) -
     """
     names, values, columns = [f"rotation_{a}" for a in AXES], [], []
     for fit in fits:
-        kinds = [k for k in fit.names if k != "bias"]
-        values.append(fit.step[: len(kinds)])
-        own = [f"lever_arm_{AXES[i - 3]}" if k == "lever_arm" else f"{k}_{fit.sensor}" for i, k in enumerate(kinds)]
-        names += own[3:]
-        columns += [0, 1, 2, *range(len(names) - len(own) + 3, len(names))]
-    H = np.eye(len(names))[columns]
-    x = np.concatenate(values)
-    total = sum(e.of_fits @ e.covariance @ e.of_fits.T for e in errors)
-    weighed = np.asarray(total).copy()
-    if not on_table and len(fits) > 1:
-        second = len(values[0])
-        weighed[second : second + 3] *= BY_HAND
-        weighed[:, second : second + 3] *= BY_HAND
-    W = scaled_inverse(weighed)
-    T = np.linalg.solve(H.T @ W @ H, H.T @ W)
-    agreement = None
+        kinds = [k for k in fit.names[3:] if k != "bias"]
+        values.append(fit.step[: 3 + len(kinds)])
+        columns += [0, 1, 2, *range(len(names), len(names) + len(kinds))]
+        names += [f"lever_arm_{AXES[i]}" if k == "lever_arm" else f"{k}_{fit.sensor}" for i, k in enumerate(kinds)]
+    H, x = np.eye(len(names))[columns], np.concatenate(values)
+    total = np.asarray(sum(e.of_fits @ e.covariance @ e.of_fits.T for e in errors))
+    agreement, size, second = None, np.ones(len(x)), slice(len(values[0]), len(values[0]) + 3)
     if len(fits) > 1:
-        second = len(values[0])
-        D = np.eye(len(x))[:3] - np.eye(len(x))[second : second + 3]
+        D = np.eye(len(x))[:3] - np.eye(len(x))[second]
         apart = D @ x
         chi2 = float(apart @ np.linalg.solve(D @ total @ D.T, apart))
-        agreement = {
-            "angle_deg": float(np.degrees(np.linalg.norm(apart))),
-            "p_value": float(scipy.special.chdtrc(3, chi2)),
-        }
+        angle = float(np.degrees(np.linalg.norm(apart)))
+        agreement = {"angle_deg": angle, "p_value": float(scipy.special.chdtrc(3, chi2))}
+        size[second] = 1.0 if on_table else BY_HAND
+    W = scaled_inverse(total * np.outer(size, size))
+    T = np.linalg.solve(H.T @ W @ H, H.T @ W)
     return Estimate(names, T @ x, [replace(e, of_fits=T @ e.of_fits) for e in errors], agreement)
+
+
+def _checks(found: Fits, R: Values, estimate: Estimate) -> dict[str, Any]:
+    """Return the residuals of the fits, and doubts about them."""
+    doubts, residual, held_out, agree, moving = [], {}, {}, estimate.agreement, found.moving
+    if agree and agree["p_value"] < DOUBTFUL:
+        doubts.append(
+            f"accelerometers and gyroscopes state rotations that differ by {agree['angle_deg']:.2g} deg (p = "
+            f"{agree['p_value']:.1g}): one of the calibrations is wrong in its axes; see the chips' diagnoses"
+        )
+    for fit in found.fits:
+        unit = SENSOR_UNITS[fit.sensor]
+        parts = [fit.residual[moving], fit.residual[~moving]]
+        in_motion, at_rest = (_rms(part) if len(part) else None for part in parts)
+        residual[fit.sensor] = {"unit": unit, "rms": fit.scale, "in_motion": in_motion, "at_rest": at_rest}
+        if in_motion and at_rest and min(map(len, parts)) >= FEWEST_ROWS and in_motion > ROUGHER * at_rest:
+            doubts.append(
+                f"in motion the {fit.sensor}s differ by {in_motion:.2g} {unit}, at rest by {at_rest:.2g} {unit}: the "
+                "board bends, the chips' filters differ, or an effect is missing in a calibration"
+            )
+        if found.held_out is not None:
+            a, b = found.held_out
+            columns = dict(columns_of(fit.sensor, turned(a, np.eye(3), clear_of(a, b, R))))
+            y = b[fit.sensor] @ R - a[fit.sensor]
+            held_out[fit.sensor] = {"unit": unit, "rows": len(y), "without_lever_arm": _rms(y - y.mean(axis=0))}
+            if "lever_arm" in columns:
+                arm = [i for i, name in enumerate(estimate.names) if name.startswith("lever_arm")]
+                y = y - columns["lever_arm"] @ estimate.values[arm]
+            held_out[fit.sensor]["difference"] = _rms(y - y.mean(axis=0))
+    return {"residual": residual, "held_out": held_out or None, "agreement": agree, "doubts": doubts}
+
+
+def _estimated(R: Values, estimate: Estimate, chips: Sequence[Chip]) -> dict[str, Any]:
+    """Return rotation, parameters with uncertainties, what is not observable, and the budget."""
+    names, axes = list(estimate.names), None
+    of_values, of_axes = np.eye(len(names)), np.zeros((len(names), 3))
+    values = np.concatenate([vector_of(R), estimate.values[3:]])
+    of_values[:3, :3] = _of_vector(R)
+    if calibrations := _accelerometers(chips):
+        axes = axes_between(chips, R, np.zeros((3, 3)), np.zeros((3, 3)))
+        names += [f"axes_rotation_{a}" for a in AXES]
+        values = np.append(values, vector_of(axes))
+        by_rotation = np.eye(3, len(estimate.names))
+        of_values = np.concatenate([of_values, _of_vector(axes) @ axes_of(calibrations[0].matrix) @ by_rotation])
+        of_axes = np.concatenate([of_axes, _of_vector(axes)])
+    factor = np.array([np.degrees(1.0) if "rotation" in name else 1.0 for name in names])
+    covariance, lines, u = np.zeros((len(names), len(names))), [], []
+    for e in estimate.errors:
+        G = factor[:, None] * (of_values @ e.of_fits + of_axes @ e.of_axes)
+        covariance += (C := G @ e.covariance @ G.T)
+        u.append(np.sqrt(np.clip(np.diag(C), 0.0, None)))
+        lines.append({"source": e.source, "type": e.kind, "contribution": u[-1].tolist()})
+    freedom = effective_degrees_of_freedom(np.array(u), np.array([e.freedom for e in estimate.errors]))
+    standard = np.sqrt(np.diag(covariance))
+    expanded = coverage_factor(freedom) * standard
+    parameters = {}
+    for i, name in enumerate(names):
+        kind = next(k for k in PRIORS if k in name)
+        parameters[name] = {
+            "value": float(factor[i] * values[i]),
+            "unit": UNITS[kind],
+            "standard_uncertainty": float(standard[i]),
+            "expanded_uncertainty": float(expanded[i]),
+            "observable": bool(standard[i] <= OBSERVED * PRIORS[kind] * factor[i]),
+        }
+    return {
+        "rotation": R.tolist(),
+        "axes_rotation": None if axes is None else axes.tolist(),
+        "parameters": parameters,
+        "covariance": {"parameters": names, "values": covariance.tolist()},
+        "not_observable": _not_observable(estimate),
+        "uncertainty_budget": lines,
+    }
+
+
+def _of_vector(R: Values) -> Values:
+    """Return the derivative of the rotation vector of ``R exp([phi x])`` with respect to phi: (3, 3) array."""
+    step, columns = 1e-6, []
+    for phi in step * np.eye(3):
+        v, w = vector_of(R @ turn_by_vector(-phi)), vector_of(R @ turn_by_vector(phi))
+        if v @ w < 0.0:  # on both sides of half a turn
+            w = w * (1.0 - 2.0 * np.pi / np.linalg.norm(w))
+        columns.append((w - v) / (2.0 * step))
+    return np.stack(columns, axis=1)
+
+
+def _not_observable(estimate: Estimate) -> list[dict[str, Any]]:
+    """Return the directions of rotation and lever arm, and the time offsets, that the recordings do not show."""
+    found = []
+    for kind, prior in PRIORS.items():
+        place = [i for i, name in enumerate(estimate.names) if name.startswith(kind)]
+        for group in [[i] for i in place] if kind == "time_offset" else [place] * bool(place):
+            variances, directions = np.linalg.eigh(estimate.covariance[np.ix_(group, group)])
+            for variance, direction in zip(variances, directions.T, strict=True):
+                if variance > (OBSERVED * prior) ** 2:
+                    size = coverage_factor(np.inf) * np.sqrt(variance)
+                    along = np.sign(direction[np.argmax(np.abs(direction))]) * direction.round(4)
+                    found.append({
+                        "parameter": kind if len(group) > 1 else estimate.names[group[0]],
+                        "direction": along.tolist() if len(group) > 1 else None,
+                        "expanded_uncertainty": float(np.degrees(size) if kind == "rotation" else size),
+                        "unit": UNITS[kind],
+                        "reason": WHY[kind],
+                    })  # fmt: skip
+    if not any(name.startswith("lever_arm") for name in estimate.names):
+        found.append({
+            "parameter": "lever_arm", "direction": None, "expanded_uncertainty": None, "unit": "m",
+            "reason": "it needs both sensors of both chips, calibrated",
+        })  # fmt: skip
+    return found

@@ -2,7 +2,7 @@
 
 A rest is one orientation: its mean reading is one equation, ``|matrix @ (mean - bias)| = G``. If a unit has no
 recording for validation, every ``holdout_every``-th rest is held out of the fit for validation. The gyroscope is fitted
-to the rests of the accelerometer's method. ``Orientations`` are the rows of a fit by gravity's length alone, also on a
+to the rests of the accelerometer's method. ``Orientations`` are the rows of a fit to the length of gravity, also on a
 table: dwells of stop-and-go turns, or single samples of continuous turns.
 """
 
@@ -34,13 +34,13 @@ class RestSplit:
 
     used: tuple[Rest, ...]  # for the fit
     held_out: tuple[Rest, ...]  # for the validation
-    left_out: tuple[Rest, ...]  # refused, with the reason
+    left_out: tuple[Rest, ...]  # refused, each with its reason
 
 
 def holdout_interval(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> int:
     """Return k if every k-th rest is held out; 0 if none is held out.
 
-    None is with a recording for validation, or with fewer rests than ``holdout_from``. ``settings``: section
+    With a recording for validation, or fewer rests than ``holdout_from``, none is held out. ``settings``: section
     ``procedure``: ``holdout_every`` and ``holdout_from``.
     """
     procedure = settings["procedure"]
@@ -51,38 +51,35 @@ def holdout_interval(recordings: Sequence[Recording], settings: Mapping[str, Any
 
 
 def count_of_rests(recordings: Sequence[Recording]) -> int:
-    """Return how many rests the recordings of role ``rests`` have, without those in which the sensor moved."""
+    """Return the number of accepted rests in the recordings of role ``rests``."""
     return sum(len(split_rests(recording, 0).used) for recording in recordings if recording.role == ROLE)
 
 
 def split_rests(recording: Recording, every: int) -> RestSplit:
     """Find the rests of a recording, by the table's log or else by its readings, and hold out some.
 
-    The middle one of each ``every`` accepted rests is held out, so that the first and the last rest are in the fit; 0
-    holds out none.
+    ``every``: the middle one of so many accepted rests is held out, so that the first and the last rest are in the fit;
+    0 holds out none.
     """
     if "rests" not in recording.cache:
         recording.cache["rests"] = rests_from_table(recording) or find_rests(recording)
     rests: list[Rest] = recording.cache["rests"]
-    sound = [rest for rest in rests if rest.accepted]
-    held = set(range(every // 2, len(sound), every)) if every else set()
+    accepted = [rest for rest in rests if rest.accepted]
+    held = range(every // 2, len(accepted), every) if every else range(0)
     return RestSplit(
-        used=tuple(rest for i, rest in enumerate(sound) if i not in held),
-        held_out=tuple(sound[i] for i in sorted(held)),
+        used=tuple(rest for i, rest in enumerate(accepted) if i not in held),
+        held_out=tuple(accepted[i] for i in held),
         left_out=tuple(rest for rest in rests if not rest.accepted),
     )
 
 
 def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[Rest]]:
-    """Return the held-out rests, by the name of their recording; empty with a recording for validation.
+    """Return the held-out rests of recordings of role ``rests``, by the name of the recording; empty if there are none.
 
-    ``recordings``: those of role ``rests`` are used. ``settings``: ``procedure.holdout_every``. The move before a
-    held-out rest is held out, too.
+    The move before a held-out rest is held out, too.
     """
     every = holdout_interval(recordings, settings)
-    if not every:
-        return {}
-    return {r.name: list(split_rests(r, every).held_out) for r in recordings if r.role == "rests"}
+    return {r.name: list(split_rests(r, every).held_out) for r in recordings if every and r.role == ROLE}
 
 
 def advice_on_held_out(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> str:
@@ -97,18 +94,17 @@ def advice_on_held_out(recordings: Sequence[Recording], settings: Mapping[str, A
 
 
 def rests_by_use(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Return which rests of the recordings of role ``rests`` a fit would use, and which not, with the reason.
+    """Describe the rests of the recordings of role ``rests`` by their use in a fit: see ``describe_rests``.
 
-    ``settings``: ``procedure.holdout_every``. The keys are ``rests_used``, ``rests_held_out`` and ``rests_left_out``,
-    the values as of ``describe_rests``. Rests that the fit later excludes are listed as used here.
+    The keys are ``rests_used``, ``rests_held_out`` and ``rests_left_out``. Rests that the fit itself excludes later are
+    listed as used.
     """
     every = holdout_interval(recordings, settings)
-    found: dict[str, list[dict[str, Any]]] = {"rests_used": [], "rests_held_out": [], "rests_left_out": []}
-    for recording in (r for r in recordings if r.role == "rests"):
-        split = split_rests(recording, every)
-        for use, rests in zip(found, (split.used, split.held_out, split.left_out), strict=True):
-            found[use] += describe_rests([(recording, rest) for rest in rests])
-    return found
+    splits = [(r, split_rests(r, every)) for r in recordings if r.role == ROLE]
+    return {
+        f"rests_{use}": describe_rests([(r, rest) for r, split in splits for rest in getattr(split, use)])
+        for use in ("used", "held_out", "left_out")
+    }
 
 
 def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, Any]]:
@@ -118,7 +114,7 @@ def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, An
             "recording": recording.name,
             "time_s": float(recording.time[rest.start]),
             "duration_s": float(recording.time[rest.stop - 1] - recording.time[rest.start]),
-            "creep_dps": 0.0  # where it does not stand out of the noise
+            "creep_dps": 0.0  # where it is not significant
             if recording.accelerometer is None
             else float(np.linalg.norm(creep_of_rest(recording, rest.start, rest.stop).rate)),
             "reason": rest.reason,
@@ -128,20 +124,17 @@ def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, An
 
 
 def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer") -> tuple[Values, Integers]:
-    """Return the mean reading of each rest, without clipped, stuck or missing samples.
+    """Return the mean reading of each rest, (m, 3), g or deg/s, and the number of valid samples in it, (m,).
 
-    By hand a unit may creep: the mean over its directions is too short, which is corrected (see
-    ``pipeline.signal.quiet_motion``).
-
-    Returns ``means`` (m, 3), g or deg/s: NaN where a rest has no sound sample; ``counts`` (m,): number of samples
-    averaged.
+    The mean is NaN where a rest has no valid sample. By hand a unit may creep: the mean over its directions is too
+    short, which is corrected (see ``pipeline.signal.quiet_motion``).
     """
     reading = recording.reading(sensor)
     if reading is None or not rests:
         return np.empty((0, 3)), np.empty(0, np.int64)
     good = sound_samples(recording, sensor)
     edges = np.array([[rest.start, rest.stop] for rest in rests])
-    centre = np.mean(reading[good], axis=0) if good.any() else np.zeros(3)  # keeps the running sums short
+    centre = np.mean(reading[good], axis=0) if good.any() else np.zeros(3)  # keeps the running sums small
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(good[:, None], reading - centre, 0.0), axis=0)])
     number = np.concatenate([[0], np.cumsum(good)])
     counts = number[edges[:, 1]] - number[edges[:, 0]]
@@ -169,7 +162,7 @@ class Rests:
     count: Integers  # (m,); samples of each
     share: Values  # (m,); variance of each mean by white noise, over that of a raw sample
     scatter: Values  # (m, 3); sums of squares about the means
-    # each (m,), s; when each begins, how long it is, and its mean time
+    # each (m,), s; start, length and mean time
     start: Values
     length: Values
     time: Values
@@ -202,9 +195,9 @@ class Rests:
 
 def is_multi_position(sensor: str, recordings: Sequence[Recording]) -> bool:
     """Return whether a sensor was recorded in rests and moves, without the motion of a table."""
-    own = [r for r in recordings if r.reading(sensor) is not None and r.role != HELD_OUT]
-    logged = any(r.table_angle is not None or r.table_attitude is not None for r in own)
-    return any(r.role == ROLE for r in own) and not logged
+    used = [r for r in recordings if r.reading(sensor) is not None and r.role != HELD_OUT]
+    logged = any(r.table_angle is not None or r.table_attitude is not None for r in used)
+    return any(r.role == ROLE for r in used) and not logged
 
 
 def rests_of(
@@ -220,7 +213,11 @@ def rests_of(
     out here. ``role``: ``rests``, or ``validation``, whose rests are all held out.
     """
     every = holdout_interval(recordings, settings) if role == ROLE else 0
-    refused = _left_out(accelerometer)
+    refused = {
+        (rest["recording"], float(rest["time_s"]))
+        for stage in (accelerometer.stages if accelerometer else ())
+        for rest in stage.details.get("rests_left_out", ())
+    }
     chosen: dict[int, list[Rest]] = {}
     held: set[tuple[int, int]] = set()
     for index, recording in enumerate(recordings):
@@ -237,25 +234,19 @@ def rests_of(
 
 
 def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, Sequence[Rest]]) -> Rests:
-    """Return given rests of some recordings, by their index; none is held out."""
-    columns: dict[str, list[Any]] = {}
-    for index, rests in chosen.items():
-        found = _of_recording(sensor, recordings[index], rests)
-        count = len(found["count"])
-        found |= {"held_out": np.zeros(count, bool), "recording": np.full(count, index)}
-        for name, values in found.items():
-            columns.setdefault(name, []).append(values)
-    alone = len(np.unique(np.concatenate(columns["recording"]))) == 1
-    shared = alone or all(recordings[index].clock_shared for index in chosen)
-    return Rests(**{name: np.concatenate(values) for name, values in columns.items()}, clock_shared=shared)
+    """Gather rests of some recordings, which ``chosen`` has by their index; none is held out."""
+    parts = [_of_recording(sensor, index, recordings[index], rests) for index, rests in chosen.items()]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
+    return Rests(**columns, clock_shared=shared)
 
 
 @dataclass(frozen=True)
 class Orientations:
-    """Mean readings in different orientations."""
+    """The rows of a fit to the length of gravity, and the rests that are not in them."""
 
     recordings: Sequence[Recording]
-    rests: Rests  # the rows of the fit
+    rests: Rests
     held_out: tuple[tuple[Recording, Rest], ...]
     left_out: tuple[tuple[Recording, Rest], ...]
     by_hand: bool  # whether no row is of a table
@@ -275,10 +266,10 @@ class Orientations:
 
 
 def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Orientations:
-    """Collect the rows of all recordings made for the accelerometer.
+    """Return the rows of all recordings of role ``rests`` and ``accelerometer``.
 
-    ``recordings``: those of role ``rests`` and ``accelerometer`` are used. ``settings``: sections ``table`` and
-    ``procedure``. Raises ``CannotCalibrateError`` if no such recording holds readings of the accelerometer.
+    ``settings``: sections ``table`` and ``procedure``. Raises ``CannotCalibrateError`` if no such recording holds
+    readings of the accelerometer.
     """
     every = holdout_interval(recordings, settings)
     used: dict[int, Sequence[Rest]] = {}
@@ -286,11 +277,11 @@ def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]
     left_out: list[tuple[Recording, Rest]] = []
     by_hand = True
     for i, recording in enumerate(recordings):
-        if recording.role not in {"rests", "accelerometer"} or recording.accelerometer is None:
+        if recording.role not in {ROLE, "accelerometer"} or recording.accelerometer is None:
             continue
         on_table = _rests_on_table(recording, settings["table"])
         if on_table is None:
-            split = split_rests(recording, every if recording.role == "rests" else 0)
+            split = split_rests(recording, every if recording.role == ROLE else 0)
             used[i] = split.used
             held_out += [(recording, rest) for rest in split.held_out]
             left_out += [(recording, rest) for rest in split.left_out]
@@ -315,22 +306,13 @@ def _rests_on_table(recording: Recording, table: Mapping[str, Any]) -> list[Rest
     return [Rest(i, i + 1) for i in np.flatnonzero(sound_samples(recording, "accelerometer")).tolist()]
 
 
-def _left_out(accelerometer: SensorCalibration | None) -> set[tuple[str, float]]:
-    return {
-        (rest["recording"], float(rest["time_s"]))
-        for stage in (accelerometer.stages if accelerometer else ())
-        for rest in stage.details.get("rests_left_out", ())
-    }
-
-
-def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> dict[str, Any]:
-    """Return the columns of ``Rests`` for one recording; rests without a sound sample are left out."""
+def _of_recording(sensor: str, index: int, recording: Recording, rests: Sequence[Rest]) -> dict[str, Any]:
+    """Return the columns of ``Rests`` for one recording; rests without a valid sample are left out."""
     means, counts = rest_means(recording, rests, sensor)
     kept = counts > 0
     span = np.array([[rest.start, rest.stop] for rest in rests], np.intp).reshape(-1, 2)[kept]
     means, counts, time = means[kept], counts[kept], recording.time
-    reading, good = recording.reading(sensor), sound_samples(recording, sensor)
-    assert reading is not None  # noqa: S101
+    reading, good = np.asarray(recording.reading(sensor)), sound_samples(recording, sensor)
     inside = [slice(a, b) for a, b in span]
     scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
     by_hand = recording.accelerometer is not None and recording.table_angle is None
@@ -338,7 +320,7 @@ def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> d
     rate, error, about = (
         posterior_creep_rates(creeps) if creeps else (np.zeros((len(span), 3)), np.zeros(len(span)), 0.0)
     )
-    if sensor == "accelerometer" and by_hand:  # minus the tilt of a unit that creeps
+    if sensor == "accelerometer" and by_hand:  # without the tilt of a unit that creeps
         scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
     warmth = np.full(recording.samples, np.nan)
     if recording.temperature is not None:
@@ -353,6 +335,8 @@ def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> d
         "length": time[span[:, 1] - 1] - start + recording.interval,
         "time": np.array([time[s].mean() for s in inside]),
         "temperature": np.array([warmth[s].mean() for s in inside]),
+        "recording": np.full(len(span), index),
+        "held_out": np.zeros(len(span), bool),
         "span": span,
         "creep": rate,
         "creep_error": error,

@@ -15,8 +15,8 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
-from pipeline.estimation.chip_document import chip_document
-from pipeline.estimation.chip_rows import Chip
+from pipeline.estimation.chip_fit import Chip
+from pipeline.estimation.chips import chip_document
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.channel_table import axis_maps
 from pipeline.io.quality_flags import GAP

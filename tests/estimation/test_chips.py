@@ -11,7 +11,7 @@ from board_simulator import Chip, by_hand, draw_chip, felt, hand_board, table_bo
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.chip_document import chip_document
+from pipeline.estimation.chips import chip_document
 from pipeline.records import Recording, SensorCalibration
 
 Q = Rotation.from_euler("zyx", [90, 3, -2], degrees=True).as_matrix()

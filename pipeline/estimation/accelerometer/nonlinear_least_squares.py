@@ -7,9 +7,9 @@ its y is in the plane of x and y, because the length of gravity does not determi
 orientations need not be known. ``pipeline.estimation.multi_position`` has the equations and the fit; the rows are
 hand-held rests, the dwells of a table's stop-and-go turns, or the single samples of its continuous turns.
 
-A misalignment that the orientations determine less than the sensor file, as in six positions, has a pseudo-observation
-by the file's limit, which the result states. On a table the bias wander correlates the errors of the rows;
-``pipeline.estimation.engine`` gives the covariance.
+If the orientations determine a misalignment worse than the sensor file does, as in six positions, it has a
+pseudo-observation by the file's limit, and the result states this. On a table the bias wander correlates the errors of
+the rows; ``pipeline.estimation.engine`` gives the covariance.
 
 The start is the ellipsoid ``p . (x^2, y^2, z^2, 2xy, 2xz, 2yz, 2x, 2y, 2z) = 1``, that is ``y^T Q y + 2 h^T y = 1``. It
 is linear in p; its centre is ``b = -Q^-1 h``, and ``L^T L = Q G^2 / (1 + b^T Q b)``.
@@ -52,7 +52,7 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.model.kinematics import table_motion
-from pipeline.records import Mask, Noise, Recording, SensorCalibration, Values, coverage_factor
+from pipeline.records import AXES, Mask, Noise, Recording, SensorCalibration, Values, coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -62,21 +62,18 @@ NAME = "nonlinear_least_squares"
 ROWS, COLUMNS = np.tril_indices(3)
 PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine values among bias and full matrix
 PLACED = np.eye(12)[:, PLACE]
+ELEMENTS = [(AXES[i], AXES[j]) for i, j in zip(ROWS, COLUMNS, strict=True)]
 NAMES = np.array(
-    [f"bias_{axis}" for axis in "xyz"]
-    + [
-        f"scale_factor_{'xyz'[i]}" if i == j else f"misalignment_{'xyz'[i]}{'xyz'[j]}"
-        for i, j in zip(ROWS, COLUMNS, strict=True)
-    ]
+    [f"bias_{axis}" for axis in AXES] + [f"scale_factor_{i}" if i == j else f"misalignment_{i}{j}" for i, j in ELEMENTS]
 )
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
 IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
-UNKNOWN = 0.05  # standard uncertainty, g or relative, beyond which nothing of a bias or scale factor is known
-FALSE_ALARM = 1e-3  # probability of calling one of the rests of a sound recording an outlier
+UNKNOWN = 0.05  # standard uncertainty, g or relative, beyond which a bias or scale factor is called undetermined
+FALSE_ALARM = 1e-3  # probability that a recording without outliers has one
 SMALLEST_OUTLIER_G = 1e-6  # rests of a noise-free recording are no outliers
-FEWEST_TO_JUDGE = 18  # rests, two a parameter
-OUTLIER_SHARE = 0.2  # of the rests: where more are off, none can be called wrong
-MOST_ROWS = 600  # of which a covariance is drawn
+FEWEST_TO_JUDGE = 18  # rests, two for each parameter
+OUTLIER_SHARE = 0.2  # of the rests, the most that are called outliers
+MOST_ROWS = 600  # for which errors are drawn from a covariance
 OF_LENGTH = {
     **NOT_INCLUDED,
     "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
@@ -86,16 +83,13 @@ OF_LENGTH = {
 
 @dataclass(frozen=True)
 class _Solved:
-    """A fit of m rows and k pseudo-observations, which come last.
-
-    ``columns`` and ``residual`` are over the standard deviation of each.
-    """
+    """A fit of m rows and then k pseudo-observations; ``columns`` and ``residual`` are over the ``deviation``."""
 
     model: AccelerometerModel
     fit: Fit
     columns: Values  # (m + k, 9)
     residual: Values  # (m + k,)
-    deviation: Values  # (m + k,), g
+    deviation: Values  # (m + k,), g; standard deviation
 
     @property
     def rows(self) -> slice:
@@ -104,12 +98,12 @@ class _Solved:
 
     @property
     def error(self) -> Values:
-        """|u| less its target: (m,) array, g."""
+        """|u| minus its target: (m,) array, g."""
         return -(self.residual * self.deviation)[self.rows]
 
     @property
     def spare(self) -> int:
-        """Rows and pseudo-observations less parameters."""
+        """Rows and pseudo-observations minus parameters."""
         return len(self.residual) - len(NAMES)
 
     @property
@@ -125,7 +119,7 @@ class _Solved:
 
     @property
     def between(self) -> float:
-        """What the rows scatter beyond white noise v, g: ``sum error^2 / (v + s^2) = m - p`` (Mandel & Paule 1970)."""
+        """Scatter s of the rows beyond white noise v, g: ``sum error^2 / (v + s^2) = m - p`` (Mandel & Paule 1970)."""
         spare, squares, variance = self.spare, self.error**2, self.fit.error[self.rows] ** 2
         if spare < 1 or np.sum(squares / variance) <= spare:
             return 0.0
@@ -141,8 +135,8 @@ def fit(
 ) -> SensorCalibration:
     """Fit bias, scale factors and misalignment of the accelerometer (``pipeline.estimation.stages``).
 
-    Rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``). Where the procedure states
-    faces, the full matrix (``pipeline.estimation.multi_position.result``).
+    The recordings are rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``). Where
+    the procedure states faces, the full matrix is fitted (``pipeline.estimation.multi_position.result``).
     """
     if not settings["procedure"].get("faces"):
         return _fit_triangular(recordings, previous, settings)
@@ -175,25 +169,35 @@ def _fit_triangular(
     freedom = float(found.degrees_of_freedom.min())
     details, parameters = _details(rows, solved, freedom), _parameters(solved, covariance)
     gain = (ScaledColumns.of(solved.columns).weights() * (found.error / solved.deviation))[:, solved.rows]
-    told = {"parameters": parameters, "white": PLACED @ np.sum(gain**2, axis=1), "not_included": OF_LENGTH}
-    return after_stage(before, NAME, details, solved.model, found, settings, correction, **told)
+    return after_stage(
+        before,
+        NAME,
+        details,
+        solved.model,
+        found,
+        settings,
+        correction,
+        parameters=parameters,
+        white=PLACED @ np.sum(gain**2, axis=1),
+        not_included=OF_LENGTH,
+    )
 
 
 def _without(rows: Orientations, refused: Mapping[int, str]) -> Orientations:
-    """Return the rows without some of them, which count as left out, each with its reason."""
-    used = rows.used
-    gone = [(used[i][0], replace(used[i][1], accepted=False, reason=reason)) for i, reason in refused.items()]
-    left_out = sorted([*rows.left_out, *gone], key=lambda pair: (pair[0].name, pair[1].start))
-    kept = np.isin(np.arange(len(used)), list(refused), invert=True)
+    """Return the rows without the refused ones, which are listed as left out, each with its reason."""
+    used, kept = rows.used, np.ones(len(rows.rests.time), bool)
+    kept[list(refused)] = False
+    outlying = [(used[i][0], replace(used[i][1], accepted=False, reason=reason)) for i, reason in refused.items()]
+    left_out = sorted([*rows.left_out, *outlying], key=lambda pair: (pair[0].name, pair[1].start))
     return replace(rows, rests=rows.rests.select(kept), left_out=tuple(left_out))
 
 
 def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: float) -> _Solved:
-    """Fit the nine values, with the limit of each misalignment of which the orientations say less."""
+    """Fit the nine values, with the limit of each misalignment that the orientations determine worse."""
     count = len(rows.rests.time)
     if count < 6:
         raise NotObservableError(
-            f"{count} orientations determine neither bias nor scale factors: {_left(rows)}. Record rests in at "
+            f"{count} orientations determine neither bias nor scale factors: {_unused(rows)}. Record rests in at "
             "least 6 orientations, each axis up and down, or better in 24 that are spread evenly"
         )
     try:
@@ -204,7 +208,7 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: f
             solved = _fitted(rows, gravity_g, prior, by_limit, limit)
     except NotObservableError as lack:
         raise NotObservableError(
-            f"the {count} orientations are too much alike: {lack.message} ({_left(rows)}). Record rests "
+            f"the {count} orientations are too much alike: {lack.message} ({_unused(rows)}). Record rests "
             "with each axis up, down and level, spread evenly"
         ) from lack
     u = solved.uncertainty
@@ -213,13 +217,14 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: f
         raise NotObservableError(
             f"the {count} orientations are nearly degenerate: they leave {', '.join(NAMES[weak])} open to "
             f"{float(u[weak].max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled "
-            f"columns; {_left(rows)}). Record rests with each axis up, down and level, spread evenly, not all in one "
+            f"columns; {_unused(rows)}). Record rests with each axis up, down and level, spread evenly, not all in one "
             "plane or direction"
         )
     return solved
 
 
-def _left(rows: Orientations) -> str:
+def _unused(rows: Orientations) -> str:
+    """Return how many rests are not used, and why, as a clause."""
     left_out, held_out = len(rows.left_out), len(rows.held_out)
     unless = " (procedure.holdout_every=0 uses them)" if held_out else ""
     return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation{unless}"
@@ -238,9 +243,9 @@ def _fitted(rows: Orientations, gravity_g: float, prior: Prior, by_limit: Mask, 
     noises = prior_hypotheses(known, float(np.mean(model.white)), model.kinds)
     if known.wander == 0.0:  # on a table the wander follows from all readings
         noises = [noise for noise in noises if noise.bias.ratio == 0.0]
-    if len(equations.residual) - len(NAMES) <= 1:  # too few rows to show a scatter: the believed bias wander stands in
-        own = float(np.median(equations.error[: model.rests_equations]))
-        noises = [NoiseHypothesis(WHITE, (prior.wander / own,))]
+    if len(equations.residual) - len(NAMES) <= 1:  # too few rows to show a scatter: the prior of the wander replaces it
+        white = float(np.median(equations.error[: model.rests_equations]))
+        noises = [NoiseHypothesis(WHITE, (prior.wander / white,))]
     noises = [replace(noise, known=True) for noise in noises]  # by the scatter within the rests
     found = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
     equations = model.equations(found.state)
@@ -268,9 +273,9 @@ def _start(y: Values, gravity_g: float, *, tilted: bool) -> Values:
 
 
 def _outlier(rows: Orientations, solved: _Solved) -> dict[int, str]:
-    """Return the hand-held rest that contradicts the others most, if it does, with the reason.
+    """Return the hand-held rest with the largest error if it is an outlier, with the reason.
 
-    A rest is compared with what the others alone say: with its leverage h, its weighted error r and p parameters,
+    A rest is compared with the fit of the others alone: with its leverage h, its weighted error r and p parameters,
     ``t = r / (s sqrt(1 - h))`` follows Student's t with m - p - 1 degrees of freedom, where s is the scatter of the
     others, ``s^2 = (sum r^2 - r^2 / (1 - h)) / (m - p - 1)`` (Belsley, Kuh & Welsch 1980, section 2.1).
     """
@@ -303,12 +308,12 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
     in the readings of each channel c with the weights ``J^+ (n^T L)_c``.
     """
-    used, count, of_limits = rows.used, rows.rests.count, solved.model.known_by_limit
+    count, of_limits = rows.rests.count, solved.model.known_by_limit
     parts = []
     for i in dict.fromkeys(rows.rests.recording.tolist()):
         keep = np.zeros(rows.recordings[i].samples, bool)
-        for _, rest in (pair for pair in used if pair[0] is rows.recordings[i]):
-            keep[rest.start : rest.stop] = True
+        for start, stop in rows.rests.span[rows.rests.recording == i]:
+            keep[start:stop] = True
         parts.append((rows.recordings[i], keep & sound_samples(rows.recordings[i], "accelerometer")))
     truth = (rows.rests.reading - solved.fit.state.bias) @ solved.fit.state.matrix.T
     along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ solved.fit.state.matrix
@@ -318,11 +323,11 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         x, y, z = ((weights / count)[:, row] * along[row, c] for c in range(3))
         return LinearMap((x, y, z), (derivative, derivative, derivative))
 
-    weights = ScaledColumns.of(solved.columns).weights()
+    weights, share = ScaledColumns.of(solved.columns).weights(), solved.fit.error / solved.deviation
     scatter = noise_contribution(noise, map_of((weights / solved.deviation)[:, solved.rows], PLACED), prior)
     lines = [scatter]
     if of_limits:
-        bent = curvature(solved.model, solved.fit, len(NAMES)) * (solved.fit.error / solved.deviation)[:, None, None]
+        bent = curvature(solved.model, solved.fit) * share[:, None, None]
         lines.append(limit_contribution(weights, list(of_limits), bent, solved.fit.covariance, PLACED)[0])
     details = _details(rows, solved, float(scatter.degrees_of_freedom.min()))
     parameters = _parameters(solved, np.sum([line.covariance for line in lines], axis=0))
@@ -335,11 +340,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     if len(count) > MOST_ROWS:
         reason = f"{len(count)} readings of a continuous turn are too many equations to draw; it is made for rests"
         return replace(complete, budget={**(complete.budget or {}), KEY: {"trials": 0, "reason": reason}})
-    steps = quadratic_results(
-        solved.columns * (solved.deviation / solved.fit.error)[:, None],
-        curvature(solved.model, solved.fit, len(NAMES)),
-        np.diag((solved.fit.error / solved.deviation) ** 2),
-    )
+    steps = quadratic_results(solved.columns / share[:, None], curvature(solved.model, solved.fit), np.diag(share**2))
     estimate, every = np.concatenate([calibration.bias, calibration.matrix.ravel()]), np.eye(len(count))
 
     def results(drawn: Values) -> Values:
@@ -350,6 +351,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
 
 
 def _table_noise(parts: Sequence[tuple[Recording, Mask]], prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
+    """Return the noise on a table from the residuals of ``y = b + K u``."""
     motions = []
     for recording, keep in parts:
         motion = table_motion(recording, table)
@@ -367,11 +369,11 @@ def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]
     """Return b, S and T with their uncertainties; ``L_ij = T_ij S_j``."""
     values = solved.values
     S, J = np.diag(solved.fit.state.matrix)[COLUMNS], np.eye(9)
-    diagonal = {int(i): 3 + k for k, (i, j) in enumerate(zip(ROWS, COLUMNS, strict=True)) if i == j}
-    for k in np.flatnonzero(ROWS != COLUMNS):
-        values[3 + k] /= S[k]
-        J[3 + k, 3 + k], J[3 + k, diagonal[int(COLUMNS[k])]] = 1.0 / S[k], -values[3 + k] / S[k]
-    units = ["g"] * 3 + ["1" if i == j else "rad" for i, j in zip(ROWS, COLUMNS, strict=True)]
+    for k, (i, j) in enumerate(ELEMENTS):
+        if i != j:
+            values[3 + k] /= S[k]
+            J[3 + k, 3 + k], J[3 + k, 3 + ELEMENTS.index((j, j))] = 1.0 / S[k], -values[3 + k] / S[k]
+    units = ["g"] * 3 + ["1" if i == j else "rad" for i, j in ELEMENTS]
     named = zip(NAMES.tolist(), zip(values.tolist(), units, strict=True), strict=True)
     return stage_parameters(dict(named), J @ covariance[np.ix_(PLACE, PLACE)] @ J.T)
 

@@ -1,8 +1,8 @@
 """Fit bias and matrix of the gyroscope to hand-held rests and moves (Tedaldi, Pretto & Menegatti, ICRA 2014).
 
-At rest the reading is the bias. In a move, the integrated reading must rotate gravity before it to gravity after it.
-The accelerometer is calibrated, too, and defines the frame. ``pipeline.estimation.multi_position.gyroscope`` has the
-equations. Rests and moves are weighted by their scatter, and moves that contradict the others have less weight
+At rest the reading is the bias. The integrated rate of a move must rotate gravity before it onto gravity after it. The
+accelerometer is calibrated first, and defines the frame. ``pipeline.estimation.multi_position.gyroscope`` has the
+equations. Rests and moves are weighted by their scatter, and outlying moves have less weight
 (``pipeline.estimation.multi_position.fit``).
 """
 
@@ -25,7 +25,7 @@ from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
-from pipeline.records import Recording, SensorCalibration, Values
+from pipeline.records import Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 NAME = "rests_and_moves"
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
-UNKNOWN = 0.05  # of an element of the matrix: beyond it nothing of it is known
+UNKNOWN = 0.05  # standard uncertainty beyond which an element of the matrix is called undetermined
 ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
@@ -42,9 +42,8 @@ def fit(
 ) -> SensorCalibration:
     """Fit bias and matrix of the gyroscope (``pipeline.estimation.stages``).
 
-    Role ``rests``, with the readings of the accelerometer, which is calibrated on the way. Raises
-    ``CannotCalibrateError`` also where there are too few moves: then the accelerometer keeps its fit. Moves and turns
-    that contradict gravity or the stated angle may have a wrong time base: then the unit fails.
+    Role ``rests``, with the readings of the accelerometer, which is calibrated first. Raises ``CannotCalibrateError``
+    also where there are too few moves: the unit then keeps the calibration of its accelerometer.
     """
     if not is_multi_position("gyroscope", recordings):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
@@ -62,7 +61,11 @@ def fit(
             f"readings{clipped_moves(recordings, rests) if rests else ''}: {advice}"
         )
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
-    _require_determined(model.equations(start).base, advice)
+    base = model.equations(start).base
+    if ScaledColumns.of(base, NEW).rank < base.shape[1]:
+        raise NotObservableError(
+            f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {advice}"
+        )
     prior = prior_of("gyroscope", recordings, settings)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     fitted = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
@@ -73,8 +76,13 @@ def fit(
         model = model_of(recordings, None, noise, settings, moved=moved)
         assert model is not None  # noqa: S101
         model, found, outlying = fit_robustly(model, partial(fitted, start=found.state), recordings)
-    moves = model.moves.count if model.moves else 0
-    _require_known(found.covariance, moves, advice)
+    moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(found.covariance))[3:]
+    if np.any(u > UNKNOWN):
+        weak = [name for name, one in zip(BASE_NAMES[3:], u, strict=True) if one > UNKNOWN]
+        raise NotObservableError(
+            f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u.max()):.2g} "
+            f"(standard uncertainty), as if all were about one axis: {advice}"
+        )
     apart = found.residual[model.of_moves] * found.error[model.of_moves]
     details: dict[str, Any] = {
         "rests": len(model.rests.time),
@@ -96,21 +104,3 @@ def fit(
     correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
     before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
     return after_stage(before, NAME, details, model, found, settings, correction)
-
-
-def _require_known(covariance: Values, moves: int, advice: str) -> None:
-    """Raise ``NotObservableError`` if an uncertainty of the matrix is larger than any sensor's error."""
-    u = np.sqrt(np.diag(covariance))
-    weak = [name for name, one in zip(BASE_NAMES[3:], u[3:], strict=True) if one > UNKNOWN]
-    if weak:
-        raise NotObservableError(
-            f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u[3:].max()):.2g} "
-            f"(standard uncertainty), as if all were about one axis: {advice}"
-        )
-
-
-def _require_determined(base: Values, advice: str) -> None:
-    if ScaledColumns.of(base, NEW).rank < base.shape[1]:
-        raise NotObservableError(
-            f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {advice}"
-        )

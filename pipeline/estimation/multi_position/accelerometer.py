@@ -5,7 +5,7 @@
 
 where
 
-    y   : (3,) mean reading of a rest, g; w its share of a sample's variance s^2
+    y   : (3,) mean reading of a rest, g; w s^2 its variance, s^2 that of a sample
     b, M: bias, g, and matrix ``M = Q L``: |f| determines the lower triangular L, but not the rotation Q, which is fixed
     z   : effects, at the force of the magnitude of gravity; p their parameters
     s_e : standard deviation of |f| by white noise: ``s_e^2 = w sum_c (M^T n)_c^2 s_c^2``
@@ -24,6 +24,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.estimation.multi_position.faces_and_turns import Faces, faces_of
 from pipeline.estimation.multi_position.model import Block, Equations, State, effect_readings, motion_of, stacked
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 ROUNDS = 12  # of effects that depend on the force
 SETTLED = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g
-KNOWN_BY_LIMIT = "known_by_limit"  # in the details of a stage: such misalignments, each with its u
+KNOWN_BY_LIMIT = "known_by_limit"  # in the details of a stage: misalignments with a pseudo-observation, each with its u
 COLUMN = {"misalignment_yx": 4, "misalignment_zx": 6, "misalignment_zy": 7}  # of b and the lower triangle of L
 
 
@@ -76,7 +77,7 @@ class AccelerometerModel:
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
         """Return the linearised equations at given parameters."""
-        rests, K = self.rests, state.K
+        rests = self.rests
         force, v = self.specific_force(state, rests)
         length = np.linalg.norm(force, axis=1)
         n = force / length[:, None]
@@ -84,22 +85,20 @@ class AccelerometerModel:
         error = np.sqrt(rests.share * (along**2 @ self.white**2))
         target = np.sqrt(self.gravity**2 + 2.0 * rests.share * np.mean(self.white**2))
         motion = self._motion(self.gravity * n, rests)
-        full = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
+        base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
 
-        def columns(term: Term) -> Values:
-            Z = term.effect.columns(self.sensor, motion, K, term.values)
-            return np.asarray(np.einsum("nc,ncp->np", -along, Z) / error[:, None])
+        def effect_columns(term: Term) -> Values:
+            return term.effect.columns(self.sensor, motion, state.K, term.values)
 
-        own = slice(self.stretches)
-        hold = np.zeros((3, len(error), self.stretches))
-        hold[:, range(self.stretches), range(self.stretches)] = (along * self.white / error[:, None]).T[:, own]
+        places, H = np.arange(self.stretches), np.zeros((3, len(error), self.stretches))
+        H[:, places, places] = (along * self.white / error[:, None]).T[:, places]
         of_rests = Block(
             (target - length) / error,
-            full / error[:, None],
-            columns,
+            base / error[:, None],
+            lambda term: np.einsum("nc,ncp->np", -along, effect_columns(term)) / error[:, None],
             error,
-            hold,
-            (rests.start[own], rests.length[own], rests.recording[own]),
+            H,
+            (rests.start[places], rests.length[places], rests.recording[places]),
             scattered=True,
         )
         if self.faces is None:
@@ -115,20 +114,15 @@ class AccelerometerModel:
         W = self.faces.weights() / self.gravity
         WM = W @ state.matrix
         wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,m,c->r", WM**2, rests.share, self.white**2))
-        moved = np.einsum("rmi,mj->rij", W, v).reshape(-1, 9)
-
-        def of_faces(term: Term) -> Values:
-            Z = term.effect.columns(self.sensor, motion, K, term.values)
-            return np.asarray(np.einsum("rmc,mcp->rp", -WM, Z) / wide[:, None])
-
-        faces = Block(
+        by_matrix = np.einsum("rmi,mj->rij", W, v).reshape(-1, 9)
+        of_faces = Block(
             -np.einsum("rmc,mc->r", W, force) / wide,
-            np.concatenate([-WM.sum(axis=1), moved], axis=1) / wide[:, None],
-            of_faces,
+            np.concatenate([-WM.sum(axis=1), by_matrix], axis=1) / wide[:, None],
+            lambda term: np.einsum("rmc,mcp->rp", -WM, effect_columns(term)) / wide[:, None],
             self.gravity * wide,
             np.einsum("rmc,c->crm", WM, self.white) / wide[:, None],
         )
-        return stacked([of_rests, faces], self, state, candidates)
+        return stacked([of_rests, of_faces], self, state, candidates)
 
     def specific_force(self, state: State, rests: Rests) -> tuple[Values, Values]:
         """Return the specific force of each rest, g, and v: (m, 3) arrays."""
@@ -156,15 +150,13 @@ class AccelerometerModel:
 
     def without(self, held: Mask) -> AccelerometerModel:
         """Return the model with some of its rests held out."""
-        kept, judged = self.rests.select(~held), self.rests.select(held)
-        faces = self.faces and self.faces.select(~held)
         return AccelerometerModel(
-            kept,
+            self.rests.select(~held),
             self.directions,
             self.gravity,
             self.noise,
-            held=judged,
-            faces=faces,
+            held=self.rests.select(held),
+            faces=self.faces and self.faces.select(~held),
             known_by_limit=self.known_by_limit,
         )
 
@@ -190,10 +182,8 @@ def _directions(calibration: SensorCalibration) -> Values:
     Q = flipped[:, ::-1]
     Q = Q * np.sign(np.diag(Q.T @ calibration.matrix))
     Q = np.eye(3) if np.allclose(Q, np.eye(3), atol=1e-9) else Q
-    directions = [np.eye(12)[i] for i in range(3)]
-    for i, j in zip(*np.tril_indices(3), strict=True):
-        directions.append(np.concatenate([np.zeros(3), np.outer(Q[:, i], np.eye(3)[j]).ravel()]))
-    return np.array(directions).T
+    lower = np.flatnonzero(np.tril(np.ones((3, 3))))
+    return scipy.linalg.block_diag(np.eye(3), np.kron(Q, np.eye(3))[:, lower])
 
 
 def model_of(

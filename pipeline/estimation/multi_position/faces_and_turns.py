@@ -9,24 +9,24 @@ where
     f_k   : specific force of the rests with face f up; E_f: two directions across the axis of the face
     Phi_k : integral of the calibrated rate over a turn, in the body's axes; A_k its stated total angle, about axis a
     s     : standard uncertainties: of a face's mean rest, of a turn's angle, and of the mean direction of the turns
-            about an axis. An error that is common to all rests on a face, or turns about an axis, is not averaged out
+            about an axis. They include errors common to all rests on a face, or turns about an axis, which no mean
+            reduces
 
 For a turn about a fixed axis Phi is angle times axis; a wobble of the axis by w rad changes its length by w^2 / 2. Both
-sensors refer to the case. Source: F. Ferraris, U. Grimaldi & M. Parvis, Procedure for effortless in-field calibration
-of three-axial rate gyro and accelerometers, Sensors and Materials 7 (1995), 311-330.
+sensors then refer to the case. Source: F. Ferraris, U. Grimaldi & M. Parvis, Procedure for effortless in-field
+calibration of three-axial rate gyro and accelerometers, Sensors and Materials 7 (1995), 311-330.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.model import Block, State, effect_readings, motion_of
-from pipeline.estimation.multi_position.moves import sound_span, trapezoids
+from pipeline.estimation.multi_position.moves import sound_span, spans_between, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
 from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, Values
 from pipeline.signal.segments import ACROSS, multiples
@@ -45,7 +45,7 @@ FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]
 class Faces:
     """The faces on which a unit rests."""
 
-    face: Index  # (m,); of each rest, as of ``FACES``; -1 for none
+    face: Index  # (m,); of each rest, an index of ``FACES``; -1 for none
     error: float  # rad; s_f
 
     def select(self, index: Mask) -> Faces:
@@ -56,8 +56,8 @@ class Faces:
         """Return the weights of the rests' forces in the equations: (r, m, 3) array, two rows for each face."""
         rows = []
         for face in np.unique(self.face[self.face >= 0]):
-            own = self.face == face
-            rows += [own[:, None] / own.sum() * e for i, e in enumerate(np.eye(3)) if i != face // 2]
+            rests = self.face == face
+            rows += [rests[:, None] / rests.sum() * e for i, e in enumerate(np.eye(3)) if i != face // 2]
         return np.array(rows).reshape(-1, len(self.face), 3)
 
 
@@ -92,10 +92,11 @@ def face_of(force: Values) -> tuple[Index, Index, Values, Values]:
 
 @dataclass(frozen=True)
 class Turns:
-    """The samples of turns of a stated total angle, padded to the longest, and their equations."""
+    """The samples of t turns of a stated total angle, padded to the longest, and their equations."""
 
     name: tuple[str, ...]  # of each turn's recording
-    stated: Values  # (t, 3), deg; total angle, in the column of its axis
+    axis: Index  # (t,)
+    stated: Values  # (t,), deg; total angle
     # each (t, s, 3), deg/s and g; angular rate as it was read; specific force by the calibrated accelerometer
     reading: Values
     force: Values
@@ -127,37 +128,40 @@ class Turns:
 
     def described(self, state: State) -> list[dict[str, Any]]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""
-        angles = np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T
+        angles = self._angles(state)
         return [
             {
                 "recording": self.name[t],
                 "time_s": float(self.time[t, 0]),
                 "axis": AXES[axis],
-                "stated_deg": float(self.stated[t, axis]),
+                "stated_deg": float(self.stated[t]),
                 "angle_deg": float(angles[t, axis]),
             }
-            for t, axis in zip(*np.nonzero(self.stated), strict=True)
+            for t, axis in enumerate(self.axis.tolist())
         ]
 
     def departures(self, state: State) -> list[str]:
-        """Describe the calibrated turns whose difference to the stated angle is beyond its uncertainty."""
-        angles = np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T
-        off = np.abs(np.einsum("rti,ti->r", self.rows, angles) - self.value)
+        """Describe the calibrated turns that differ from the stated angle by more than its uncertainty."""
+        off = np.abs(np.einsum("rti,ti->r", self.rows, self._angles(state)) - self.value)
         count = len(self.name)
-        across = np.linalg.norm(off[count:].reshape(-1, 2), axis=1)
         turned = [
             (f"the turn at {self.time[t, 0]:.1f} s of {self.name[t]} is", off[t], self.error[t], "accuracy_deg")
             for t in range(count)
         ]
+        across = np.linalg.norm(off[count:].reshape(-1, 2), axis=1)
         turned += [
             (f"the axis of the turns about {AXES[axis]} is", angle, self.error[-1], "axis_accuracy_deg")
-            for axis, angle in zip(np.flatnonzero(np.any(self.stated, axis=0)), across, strict=True)
+            for axis, angle in zip(np.unique(self.axis), across, strict=True)
         ]
         return [
             f"{what} {angle:.1f} deg off, {angle / error:.1f} times procedure.turns.{name}"
             for what, angle, error, name in turned
             if angle > DEPARTS * error
         ]
+
+    def _angles(self, state: State) -> Values:
+        """Return Phi: (t, 3) array, deg."""
+        return np.asarray(np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T)
 
     def _samples(self, state: State) -> tuple[Motion, Values]:
         """Return the motion of all samples, and ``v = y - b - z``."""
@@ -183,60 +187,49 @@ def turns_of(
     ``procedure.turns``. ``role``: of the recordings that may be one turn; empty for none. A move is its recording,
     start in s and integrated readings in deg.
     """
-    spans = [
-        (int(rests.recording[j]), slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1))
-        for i, j in pairwise(range(len(rests.time)))
-        if rests.recording[i] == rests.recording[j] and not rests.held_out[j]
-    ]
+    spans = [(int(rests.recording[j]), span) for _, j, span in spans_between(rests) if not rests.held_out[j]]
     bounded = {index for index, _ in spans}
     spans += [
         (index, slice(0, r.samples))
         for index, r in enumerate(recordings)
         if r.axis is not None and r.role == role and r.gyroscope is not None and index not in bounded
     ]
-    spans = [(index, span) for index, span in spans if sound_span(recordings[index], span)]
-    angle_deg, bias = float(turns["angle_deg"]), np.average(rests.reading, axis=0, weights=rests.count)
-    moves, chosen, angles = [], [], []
-    for index, span in spans:
-        recording = recordings[index]
-        angle = np.asarray(
-            np.trapezoid(np.asarray(recording.gyroscope)[span] - bias, recording.time[span], axis=0), np.float64
-        )
-        axis, count = multiples(angle, angle_deg)
-        moves.append((recording, float(recording.time[span.start]), angle))
-        if count:
-            chosen.append((recording, span))
-            angles.append(count * angle_deg * np.eye(3)[axis])
+    bias = np.average(rests.reading, axis=0, weights=rests.count)
+    moves, chosen, multiple = [], [], []
+    for recording, span in ((recordings[index], span) for index, span in spans):
+        if sound_span(recording, span):
+            rate, time = np.asarray(recording.gyroscope)[span] - bias, recording.time[span]
+            angle = np.asarray(np.trapezoid(rate, time, axis=0), np.float64)
+            axis, count = multiples(angle, float(turns["angle_deg"]))
+            moves.append((recording, float(time[0]), angle))
+            if count:
+                chosen.append((recording, span))
+                multiple.append((axis, count))
     if not chosen:
         return None, moves
-    stated = np.array(angles)
-    shape = (len(chosen), max(span.stop - span.start for _, span in chosen))
+    axes, counts = np.array(multiple).T
+    stated, number = counts * float(turns["angle_deg"]), len(chosen)
+    shape = (number, max(span.stop - span.start for _, span in chosen))
     reading, force = np.zeros((*shape, 3)), np.zeros((*shape, 3))
-    time, temperature, weight = np.zeros(shape), np.full(shape, np.nan), np.zeros(shape)
+    times, temperature, weight = np.zeros(shape), np.full(shape, np.nan), np.zeros(shape)
     for k, (recording, span) in enumerate(chosen):
         at = np.minimum(np.arange(shape[1]) + span.start, span.stop - 1)
-        centred = np.asarray(recording.accelerometer)[at] - accelerometer.bias
-        reading[k], force[k], time[k] = (
-            np.asarray(recording.gyroscope)[at],
-            centred @ accelerometer.matrix.T,
-            recording.time[at],
-        )
+        reading[k], times[k] = np.asarray(recording.gyroscope)[at], recording.time[at]
+        force[k] = (np.asarray(recording.accelerometer)[at] - accelerometer.bias) @ accelerometer.matrix.T
         if recording.temperature is not None:
             temperature[k] = recording.temperature[at]
-        weight[k] = trapezoids(time[k])
-    rows, value, error = [], [], []
-    for k, about in zip(*np.nonzero(stated), strict=True):
-        rows.append(np.outer(np.eye(len(chosen))[k], np.eye(3)[about]))
-        value.append(stated[k, about])
-        error.append(float(turns["accuracy_deg"]))
-    for about in np.flatnonzero(np.any(stated, axis=0)):
-        share = np.degrees(np.sign(stated[:, about]) / np.sum(np.abs(stated[:, about])))
-        rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != about]
+        weight[k] = trapezoids(times[k])
+    rows = [np.outer(turn, np.eye(3)[axis]) for turn, axis in zip(np.eye(number), axes, strict=True)]
+    value, error = stated.tolist(), number * [float(turns["accuracy_deg"])]
+    for axis in np.unique(axes):
+        signed = np.where(axes == axis, np.sign(stated), 0.0)
+        share = np.degrees(signed / np.sum(signed * stated))
+        rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != axis]
         value += [0.0, 0.0]
         error += 2 * [float(turns["axis_accuracy_deg"])]
-    samples = reading, force, time, temperature, weight
+    samples = reading, force, times, temperature, weight
     names = tuple(r.name for r, _ in chosen)
-    return Turns(names, stated, *samples, np.array(rows), np.array(value), np.array(error)), moves
+    return Turns(names, axes, stated, *samples, np.array(rows), np.array(value), np.array(error)), moves
 
 
 def require_turns(
@@ -248,25 +241,23 @@ def require_turns(
         "turn the unit from rest to rest about each body axis, and state the angle in procedure.turns.angle_deg; an "
         "angle that is wrong in all turns shows a wrong unit or range of the gyroscope"
     )
-    stated = np.zeros((0, 3)) if found is None else found.stated
-    names = () if found is None else found.name
+
+    def in_words(angle: Values) -> str:
+        return "(" + ", ".join(f"{a:.1f}" for a in angle) + ") deg about x, y, z"
+
+    pairs = [] if found is None else [(name, AXES[axis]) for name, axis in zip(found.name, found.axis, strict=True)]
     for part in {id(r): r for r, _, _ in moves if r.axis is not None}.values():
-        own = [row for name, row in zip(names, stated, strict=True) if name == part.name]
-        if not any(row[AXES.index(str(part.axis))] for row in own):
-            seen = ", ".join(_angles(angle) for r, _, angle in moves if r is part)
+        if (part.name, str(part.axis)) not in pairs:
+            seen = ", ".join(in_words(angle) for r, _, angle in moves if r is part)
             raise NotObservableError(
                 f"recording {part.name} is no turn about {part.axis} by {expected}: the readings show {seen}; {advice}",
                 part.source.get("file"),
             )
     for axis, name in enumerate(AXES):
-        if not np.any(stated[:, axis]):
+        if name not in {turned for _, turned in pairs}:
             about = [m for m in moves if np.linalg.norm(np.delete(m[2], axis)) < ACROSS * abs(m[2][axis])]
             largest = max(about, key=lambda m: abs(m[2][axis]), default=None)
-            seen = f"{_angles(largest[2])} at {largest[1]:.1f} s of {largest[0].name}" if largest else "none"
+            seen = f"{in_words(largest[2])} at {largest[1]:.1f} s of {largest[0].name}" if largest else "none"
             raise NotObservableError(
                 f"there is no turn about {name} by {expected}; the largest about {name} is {seen}: {advice}"
             )
-
-
-def _angles(angle: Values) -> str:
-    return "(" + ", ".join(f"{a:.1f}" for a in angle) + ") deg about x, y, z"

@@ -7,7 +7,7 @@ restricted likelihood (``pipeline.estimation.engine``),
 
     -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
-where k = 1 if the scatter within the rests determines the white noise, and the scatter of a hypothesis explains the
+where k = 1 if the white noise is known from the scatter within the rests, and the scatter of a hypothesis explains the
 residuals (``NoiseHypothesis.known``).
 
 A few rests do not determine some combinations of parameters: two of the nine cross-axis terms of an accelerometer at
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 ROUNDS = 60  # of Gauss-Newton
 SMALL_STEP = 3e-3  # of a standard uncertainty: the last step taken
 STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
-SAME_SCALE = 1e-4  # relative change of the noise's scale that leaves the weight of the prior as it is
+SAME_SCALE = 1e-4  # relative change of the noise's scale below which the weight of the prior is not changed
 OPEN = 1e-7  # of the largest singular value, below which a combination of parameters takes no step
 NONE = 1e-8  # share of its columns below which a combination of parameters is not determined
 FAR = 12.0  # of log L below the best: a weight of 6e-6
@@ -75,12 +75,11 @@ class Fit:
     # each (n,); residual over the white noise of each equation, and that white noise
     residual: Values
     error: Values
-    rank: int  # directions that the equations determine
+    rank: int  # combinations of parameters that the equations determine
     rounds: int
     converged: bool
-    # of the whitened columns; the largest cosine between the whitened residual and a column
-    condition: float
-    cosine: float
+    condition: float  # of the whitened columns
+    cosine: float  # largest between the whitened residual and a whitened column
     hypotheses: tuple[tuple[NoiseHypothesis, float, float], ...]  # those of the average, the weight of each, and its k
     precision: Values  # (b + p,); P
 
@@ -93,8 +92,8 @@ class Solution:
     covariance: Values
     condition: float
     log_likelihood: float
-    restricted: float
-    scale: float
+    restricted: float  # restricted log likelihood
+    scale: float  # k
     rank: int
     cosine: float
 
@@ -111,23 +110,23 @@ def fit(
     ``freedom``: degrees of freedom of the noise's scale, if other readings determine it; by default of the residuals.
     """
     state, rounds, best, scale = start, 0, -1, 0.0
-    seen: list[tuple[State, Equations]] = []
+    evaluated: list[tuple[State, Equations]] = []
 
-    def at(there: State) -> tuple[Values, Values]:
-        seen.append((there, model.equations(there)))
-        X, residual = seen[-1][1].columns, seen[-1][1].residual
-        white = seen[-1][1].whitened(hypotheses[best], np.concatenate([X, residual[:, None]], axis=1))[0]
-        precision, values = _prior(model, there, limits)
-        root = np.sqrt(scale * precision)
-        believed = np.diag(root)[precision > 0.0]
-        return np.append(white[:, -1], -believed @ values), -np.concatenate([white[:, :-1], believed])
+    def residual_at(state: State) -> tuple[Values, Values]:
+        equations = model.equations(state)
+        evaluated.append((state, equations))
+        values = np.concatenate([equations.columns, equations.residual[:, None]], axis=1)
+        white = equations.whitened(hypotheses[best], values)[0]
+        precision, parameters = _prior(model, state, limits)
+        rows = np.diag(np.sqrt(scale * precision))[precision > 0.0]
+        return np.append(white[:, -1], -rows @ parameters), -np.concatenate([white[:, :-1], rows])
 
     def small(step: Values, factors: ScaledColumns) -> bool:
         uncertainty = np.sqrt(scale * np.diag(factors.covariance()))
         return bool(np.all(np.abs(step) <= np.maximum(SMALL_STEP * uncertainty, 1e-13)))
 
     while True:
-        equations = next((e for s, e in seen if s is state), None) or model.equations(state)
+        equations = next((e for s, e in evaluated if s is state), None) or model.equations(state)
         prior = _prior(model, state, limits)
         likeliest = project_out(equations, hypotheses).of_model()[1]
         solved = solve(equations, hypotheses[likeliest], *prior)
@@ -135,42 +134,43 @@ def fit(
         if (likeliest == best and same) or rounds > ROUNDS // 2:
             break
         best, scale = likeliest, solved.scale
-        seen.clear()
-        state, _, more = gauss_newton(at, state, partial(stepped, model), small, ROUNDS - rounds, OPEN)
+        evaluated.clear()
+        state, _, more = gauss_newton(residual_at, state, partial(stepped, model), small, ROUNDS - rounds, OPEN)
         rounds += more
     uncertainty = np.sqrt(np.diag(solved.covariance))
     converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
     cosine = solved.cosine  # under the weights of the fit, of which it is the minimum
     levels, likelihood = refined(equations, hypotheses, prior)
     every = [solve(equations, noise, *prior) for noise in levels]
-    solved = max(every, key=lambda s: s.log_likelihood)
+    likeliest = int(np.argmax([s.log_likelihood for s in every]))
+    solved = every[likeliest]
     restricted = np.array([s.restricted for s in every])
     weight = np.exp(restricted - restricted.max())
     weight /= weight.sum()
     spare = max(len(equations.residual) - solved.rank, 1) if freedom is None else freedom
     covariance, degrees = Posterior(weight, np.array([s.covariance for s in every]), spare).averaged()
     return Fit(
-        state,
-        covariance,
-        likelihood,
-        next(noise for noise, s in zip(levels, every, strict=True) if s is solved),
-        degrees,
-        equations.residual,
-        equations.error,
-        solved.rank,
-        rounds,
-        converged,
-        solved.condition,
-        cosine,
-        tuple((noise, float(w), s.scale) for noise, w, s in zip(levels, weight, every, strict=True)),
-        prior[0],
+        state=state,
+        covariance=covariance,
+        log_likelihood=likelihood,
+        noise=levels[likeliest],
+        degrees_of_freedom=degrees,
+        residual=equations.residual,
+        error=equations.error,
+        rank=solved.rank,
+        rounds=rounds,
+        converged=converged,
+        condition=solved.condition,
+        cosine=cosine,
+        hypotheses=tuple((noise, float(w), s.scale) for noise, w, s in zip(levels, weight, every, strict=True)),
+        precision=prior[0],
     )
 
 
 def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
     """Return P (its diagonal) and p."""
-    base = model.directions.shape[1]
-    precision, values = [np.zeros(base)], [np.zeros(base)]
+    base = np.zeros(model.directions.shape[1])
+    precision, values = [base], [base]
     for term in state.terms:
         nonlinear = [p.name in term.effect.nonlinear for p in term.effect.parameters(model.sensor)]
         limit = limits.get(term.effect.name, np.full(len(term.values), np.inf))
@@ -197,9 +197,9 @@ def refined(
     def restricted(noise: NoiseHypothesis) -> float:
         return solve(equations, noise, *prior).restricted
 
-    found = np.array([restricted(noise) for noise in near])
-    best, top = near[int(np.argmax(found))], float(found.max())
-    weight = np.exp(found - top)
+    likelihoods = np.array([restricted(noise) for noise in near])
+    best, top = near[int(np.argmax(likelihoods))], float(likelihoods.max())
+    weight = np.exp(likelihoods - top)
     for factor in STEPS:
         for j in (j for j, level in enumerate(best.levels) if level > 0.0):
             for other in (best.scaled(j, factor), best.scaled(j, 1.0 / factor)):
@@ -209,15 +209,15 @@ def refined(
     levels = []
     for j, level in enumerate(best.levels):
         given = np.array([noise.levels[j] for noise in near])
-        own = [float(k) for k in np.unique(given) if weight[given == k].sum() > RARE * weight.sum()]
+        chosen = [float(k) for k in np.unique(given) if weight[given == k].sum() > RARE * weight.sum()]
         if level > 0.0:
             around = [restricted(best.scaled(j, factor)) for factor in (STEPS[-1], 1.0 / STEPS[-1])]
             bend = (2.0 * top - sum(around)) / np.log(STEPS[-1]) ** 2
             if bend > SHARP**-2:
-                own = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
-        levels.append(own)
-    kinds = {n.bias: n for n in near}.values()
-    return [n.at(level) for n in kinds for level in product(*levels)], float(scores.max())
+                chosen = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
+        levels.append(chosen)
+    of_each_bias = {n.bias: n for n in near}.values()
+    return [n.at(level) for n in of_each_bias for level in product(*levels)], float(scores.max())
 
 
 def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, values: Values) -> Solution:
@@ -235,21 +235,20 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
     rank, rss = int(kept.sum()), max(float(r @ r - shown @ shown), 0.0)
     spare = max(n - rank, 1)
     k, k_free = (max(1.0, rss / n), max(1.0, rss / spare)) if noise.free_scale else (1.0, 1.0)
-    believed = k_free * precision
-    w, V = np.linalg.eigh(gram + np.diag(believed / size**2))
+    w, V = np.linalg.eigh(gram + np.diag(k_free * precision / size**2))
     kept = w > 1e-14 * w[-1]
     half = V[:, kept] / np.sqrt(w[kept]) / size[:, None]
     inner = float(np.sum(np.log(w[kept]))) + 2.0 * float(np.sum(np.log(size)))
-    gradient = X.T @ r - believed * values
+    gradient = X.T @ r - k_free * precision * values
     return Solution(
-        half @ (half.T @ gradient),
-        k_free * half @ half.T,
-        float(np.sqrt(w[-1] / max(w[0], 1e-300))),
-        -0.5 * (rss / k + n * float(np.log(k)) + logarithm) + noise.prior,
-        -0.5 * (rss / k_free + spare * float(np.log(k_free)) + logarithm + inner) + noise.prior,
-        k_free,
-        rank,
-        float(np.max(np.abs(gradient) / size)) / max(float(np.linalg.norm(r)), 1e-300),
+        step=half @ (half.T @ gradient),
+        covariance=k_free * half @ half.T,
+        condition=float(np.sqrt(w[-1] / max(w[0], 1e-300))),
+        log_likelihood=-0.5 * (rss / k + n * float(np.log(k)) + logarithm) + noise.prior,
+        restricted=-0.5 * (rss / k_free + spare * float(np.log(k_free)) + logarithm + inner) + noise.prior,
+        scale=k_free,
+        rank=rank,
+        cosine=float(np.max(np.abs(gradient) / size)) / max(float(np.linalg.norm(r)), 1e-300),
     )
 
 
@@ -257,8 +256,8 @@ def plausible(model: Model, found: Fit, limits: Limits) -> bool:
     """Return whether every effect is within its limits, or exceeds them by less than its uncertainty."""
     uncertainty = np.sqrt(np.diag(found.covariance))
     return all(
-        bool(np.all(np.abs(term.values) - 2.0 * uncertainty[own] <= limits.get(name, np.inf)))
-        for name, (term, own) in placed(found.state.terms, model.directions.shape[1]).items()
+        bool(np.all(np.abs(term.values) - 2.0 * uncertainty[place] <= limits.get(name, np.inf)))
+        for name, (term, place) in placed(found.state.terms, model.directions.shape[1]).items()
     )
 
 
@@ -267,26 +266,22 @@ def require_observable(model: Model, found: Fit, limits: Limits) -> None:
     equations = model.equations(found.state)
     limited = _prior(model, found.state, limits)[0] > 0.0
     names = parameter_names(model.sensor, [term.effect for term in found.state.terms])
-    pairs = zip(found.state.terms, equations.effects, strict=True)
-    lost = [term.effect for term, Z in pairs if _explained(equations.base, Z)]
+    Q, _ = np.linalg.qr(equations.base)
+    lost = []
+    for term, Z in zip(found.state.terms, equations.effects, strict=True):
+        size, rest = np.linalg.norm(Z, axis=0), np.linalg.norm(Z - Q @ (Q.T @ Z), axis=0)
+        if np.all(rest <= NEW * np.where(size > 0.0, size, 1.0)):
+            lost.append(term.effect)
     scaled = equations.columns / np.maximum(np.linalg.norm(equations.columns, axis=0), 1e-300)
     weak = np.linalg.eigh(scaled.T @ scaled + np.diag(limited.astype(float)))
-    open_ = np.abs(weak.eigenvectors[:, weak.eigenvalues < NONE])
-    loose = [name for name, row in zip(names, open_[-len(names) :], strict=True) if np.any(row > 0.2)]
+    undetermined = np.abs(weak.eigenvectors[:, weak.eigenvalues < NONE])[-len(names) :]
+    loose = [name for name, row in zip(names, undetermined, strict=True) if np.any(row > 0.2)]
     if lost or loose:
         advice = "; ".join(f"{e.name} needs {e.excitation}" for e in lost or [t.effect for t in found.state.terms])
         raise NotObservableError(
             f"the rests of the {model.sensor} do not determine {', '.join([e.name for e in lost] or loose)}: {advice}; "
             f"or take it out of effects.{model.sensor}"
         )
-
-
-def _explained(base: Values, Z: Values) -> bool:
-    """Return whether base columns explain all columns of an effect."""
-    size = np.linalg.norm(Z, axis=0)
-    Q, _ = np.linalg.qr(base)
-    left = np.linalg.norm(Z - Q @ (Q.T @ Z), axis=0)
-    return bool(np.all(left <= NEW * np.where(size > 0.0, size, 1.0)))
 
 
 def fit_robustly(
@@ -302,15 +297,15 @@ def fit_robustly(
         return model, found, []
     t, error = _over_noise(model, found)
     limit = np.sqrt(2.0 * np.log(len(t) / FALSE_ALARM))
-    excess, weight = np.zeros(len(t)), np.ones(len(t))
-    any_outlying = bool(np.any(t > limit))
-    for _ in range(ROBUST_ROUNDS if any_outlying else 0):
+    if not np.any(t > limit):
+        return model, found, []
+    weight = np.ones(len(t))
+    for _ in range(ROBUST_ROUNDS):
         before, weight = weight, np.minimum(1.0, (FREEDOM + 2.0) / (FREEDOM + t**2))
         if np.abs(weight - before).max() < SETTLED:
             break
         variance = np.where(t > 0.0, (error / np.maximum(t, 1e-12)) ** 2, 0.0)
-        excess = variance * (1.0 / weight - 1.0)
-        model = model.with_excess(excess)
+        model = model.with_excess(variance * (1.0 / weight - 1.0))
         found = fitted(model)
         t, error = _over_noise(model, found)
     outlying = [
@@ -323,7 +318,7 @@ def fit_robustly(
         }
         for k in np.flatnonzero(t > limit)
     ]
-    return model, found, outlying if any_outlying else []
+    return model, found, outlying
 
 
 def _over_noise(model: GyroscopeModel, found: Fit) -> tuple[Values, Values]:

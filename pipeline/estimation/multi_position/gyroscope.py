@@ -6,7 +6,7 @@
 where
 
     y, b, M : reading and bias, deg/s, and matrix
-    z, p    : effects and their parameters; in a move with the specific force of the rest, rotated along the move
+    z, p    : effects and their parameters; in a move at the specific force of the rest, rotated along the move
     w       : creep rate of the unit in a rest, across gravity by the accelerometer (K = M^-1); the rate about gravity
               is unknown and of the same size (``pipeline.signal.quiet_motion.posterior_creep_rates``)
     u       : direction of gravity by the calibrated accelerometer (``gravity``); A_0 as in ``moves``
@@ -15,8 +15,8 @@ where
 
 Two moves share the error of the direction at the rest between them, and all moves share the errors of the
 accelerometer's calibration: ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. The frame is that of the
-accelerometer's matrix. One move does not show a turn about the vertical; other moves do, because the vertical has
-another direction in the body. If the procedure states the total angle of turns, their equations are added
+accelerometer's matrix. One move does not show a turn about the vertical; others do, as the vertical has another
+direction in the body. If the procedure states the total angle of turns, their equations are added
 (``faces_and_turns``).
 
 Source: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12.
@@ -29,6 +29,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.engine import draw_normal
@@ -74,27 +75,18 @@ class GyroscopeModel:
         fewest: int = FEWEST_MOVES,
         turns: Turns | None = None,
     ) -> None:
-        force = gravity.force
+        self.every, self.at_rests, self.noise, self.fewest = rests, gravity, noise, fewest
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
-        self.rests, self.force = rests.select(~rests.held_out), force[~rests.held_out]
-        self.held, self.held_force = rests.select(rests.held_out), force[rests.held_out]
+        self.rests, self.force = rests.select(~rests.held_out), gravity.force[~rests.held_out]
         self.moves, self.turns = moves if moves is not None and moves.count >= fewest else None, turns
         self.kinds = 1 if self.moves is None else 2
         self.directions = np.eye(12)[:, : 3 if self.moves is None and turns is None else 12]
         self.rests_equations = 3 * len(self.rests.time)
         self.of_moves = slice(self.rests_equations, self.rests_equations + (2 * self.moves.count if self.moves else 0))
-        self.gravity = float(np.median(np.linalg.norm(force, axis=1)))
+        self.gravity = float(np.median(np.linalg.norm(gravity.force, axis=1)))
         if self.moves is not None:
             self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
-            u = force / np.linalg.norm(force, axis=1, keepdims=True)
-            across = np.eye(3) - u[:, :, None] * u[:, None, :]
-            self.spread = np.degrees(gravity.spread / self.gravity)[:, None, None] * across
-            self.across = across
-            self.ends = np.degrees(gravity.ends / self.gravity)[:, None, None] * across
-            self.shared = np.degrees(across @ gravity.shared / self.gravity)
             self.excess = np.zeros(self.moves.count)
-        self.every = rests
-        self.known: dict[str, Any] = {"gravity": gravity, "noise": noise, "fewest": fewest, "turns": turns}
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
         """Return the linearised equations at given parameters."""
@@ -111,13 +103,11 @@ class GyroscopeModel:
 
     def held_out_error(self, state: State) -> float | None:
         """Return the rms of the rate at held-out rests, deg/s; None if there are none."""
-        if len(self.held.time) == 0:
+        held = self.every.held_out
+        if not held.any():
             return None
-        nothing = np.zeros_like(self.held_force)
-        motion = motion_of(self.held.time, self.held_force, nothing, self.held.temperature, still=True)
-        left = self.held.reading - state.bias - effect_readings(self.sensor, state.terms, motion, state.K)
-        left -= self.held.creep @ state.K.T
-        return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
+        error, _ = self._rate_at_rest(self.every.select(held), self.at_rests.force[held], state)
+        return float(np.sqrt(np.mean(np.sum((error @ state.matrix.T) ** 2, axis=1))))
 
     def with_excess(self, variance: Values) -> GyroscopeModel:
         """Return the model with an additional independent error of each move; ``variance``: (k,), deg^2."""
@@ -130,20 +120,20 @@ class GyroscopeModel:
         out = self.every.held_out.copy()
         out[~self.every.held_out] = held
         moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
-        return GyroscopeModel(replace(self.every, held_out=out), moves, **self.known)
+        rests = replace(self.every, held_out=out)
+        return GyroscopeModel(rests, moves, self.at_rests, self.noise, fewest=self.fewest, turns=self.turns)
 
     def direction_errors(self, state: State) -> tuple[Values, Values]:
         """Return the angle of each move between integrated and measured gravity, and its mean by noise alone, deg.
 
         The noise is white noise of both sensors and the scatter of the accelerometer's rests; both are (k,) arrays.
         """
-        assert self.moves is not None  # noqa: S101
         A = self._turned(state)[2]
         predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
         across = np.linalg.norm(np.cross(predicted, self.after), axis=1)
         error = np.degrees(np.arctan2(across, np.einsum("ki,ki->k", predicted, self.after)))
-        own = self._of_moves(state).error.reshape(-1, 2)
-        return error, np.sqrt(0.25 * np.pi * np.sum(own**2, axis=1))
+        noise = self._of_moves(state).error.reshape(-1, 2)
+        return error, np.sqrt(0.25 * np.pi * np.sum(noise**2, axis=1))
 
     def largest_direction_error(
         self, state: State, covariance: Values, freedom: Values, scatter: Mapping[str, Any], ratio: float
@@ -153,33 +143,37 @@ class GyroscopeModel:
         Errors of the accelerometer's calibration are drawn both for the directions and in the covariance, as if these
         were independent; so the bound is too large rather than too small.
 
-        ``covariance``: (p, p), of bias and matrix first. ``freedom``: (p,), degrees of freedom. ``scatter``: of moves
-        and of directions over the noise, as the fit found it. ``ratio``: of the bias wander to the white noise.
+        ``covariance``: (p, p), of bias and matrix first. ``freedom``: (p,), degrees of freedom. ``scatter``: details of
+        the fit, with the scatter of moves and of directions over the noise. ``ratio``: of bias wander to white noise.
         """
         block = self._of_moves(state)
-        n = len(block.residual)
+        n, H = len(block.residual), np.asarray(block.bias)
         S = (1.0 + float(scatter.get("scatter_of_moves") or 0.0) ** 2) * np.eye(n) + np.asarray(block.common)
         S = S + float(scatter.get("scatter_of_directions") or 0.0) ** 2 * np.asarray(block.direction)
-        held = np.asarray(block.bias)
-        S = S + ratio**2 * np.einsum("cnk,cmk->nm", held, held)
+        S = S + ratio**2 * np.einsum("cnk,cmk->nm", H, H)
         rng = np.random.default_rng(0)
         drawn = rng.standard_normal((DRAWS, n)) @ np.linalg.cholesky(S).T  # continuous in S, as eigenvectors are not
         errors = draw_normal(rng, covariance[:12, :12], DRAWS)
-        for own in (slice(0, 3), slice(3, 12)):  # the wander makes those of the bias fewer
-            few = min(float(freedom[own].min()), MANY)
-            errors[:, own] *= np.sqrt(few / rng.chisquare(few, (DRAWS, 1)))
+        for part in (slice(0, 3), slice(3, 12)):  # the wander reduces the degrees of freedom of the bias
+            least = min(float(freedom[part].min()), MANY)
+            errors[:, part] *= np.sqrt(least / rng.chisquare(least, (DRAWS, 1)))
         drawn += errors @ block.base.T
         rms = np.sqrt(2.0 * np.mean((drawn * block.error) ** 2, axis=1))
         return float(np.quantile(rms, 1.0 - TAIL))
 
+    def _rate_at_rest(self, rests: Rests, force: Values, state: State) -> tuple[Values, Motion]:
+        """Return the readings at rests minus those that the model predicts, (m, 3), and the motion."""
+        motion = motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
+        predicted = state.bias + effect_readings(self.sensor, state.terms, motion, state.K) + rests.creep @ state.K.T
+        return rests.reading - predicted, motion
+
     def _at_rest(self, state: State) -> Block:
         rests, K = self.rests, state.K
-        motion = motion_of(rests.time, self.force, np.zeros_like(self.force), rests.temperature, still=True)
+        residual, motion = self._rate_at_rest(rests, self.force, state)
         error = np.sqrt(rests.share[:, None]) * self.white
-        left = rests.reading - state.bias - effect_readings(self.sensor, state.terms, motion, K) - rests.creep @ K.T
         m = len(rests.time)
         base = np.zeros((m, 3, 12))
-        base[:, :, :3] = np.eye(3)
+        base[:, :, :3] = np.eye(3) / error[:, :, None]
         bias = np.zeros((3, m, 3, m))
         for c in range(3):
             bias[c, np.arange(m), c, np.arange(m)] = self.white[c] / error[:, c]
@@ -189,8 +183,8 @@ class GyroscopeModel:
             return np.asarray(Z.reshape(3 * m, -1))
 
         return Block(
-            (left / error).ravel(),
-            (base / error[:, :, None]).reshape(3 * m, 12),
+            (residual / error).ravel(),
+            base.reshape(3 * m, 12),
             columns,
             error.ravel(),
             bias.reshape(3, 3 * m, m),
@@ -207,73 +201,55 @@ class GyroscopeModel:
         u = self.force / np.linalg.norm(self.force, axis=1, keepdims=True)
         upward = u[:, :, None] * u[:, None, :]
         rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + about[:, None, None] ** 2 * upward
-        own = K @ rate @ K.T / error[:, :, None] / error[:, None, :]
-        m = len(own)
-        out = np.zeros((m, 3, m, 3))
-        out[np.arange(m), :, np.arange(m)] = own
-        return out.reshape(3 * m, 3 * m)
+        return scipy.linalg.block_diag(*(K @ rate @ K.T / error[:, :, None] / error[:, None, :]))
 
     def _of_moves(self, state: State) -> Block:
-        moves = self.moves
+        moves, gravity = self.moves, self.at_rests
         assert moves is not None  # noqa: S101
+        k, n = np.arange(moves.count), 2 * moves.count
         motion, v, A = self._turned(state)
         predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
         E = tangents(self.after)
         G = (E @ skew(predicted))[:, None] @ A
-        P = moves.weight[:, :, None, None] * G  # of a rate at a sample, deg per deg/s
+        P = moves.weight[:, :, None, None] * G  # deg per deg/s of a sample
         PM = P @ state.matrix
-        directions = self._directions(E, A[:, 0])
-        untold = np.einsum("ksij,ksj->ksi", G @ state.matrix, moves.doubt)
-        own = np.einsum("ksij,j,kslj->kil", PM, self.white**2, PM) + np.einsum("ksi,ksj->kij", untold, untold)
-        means = np.einsum("kimc,mcd->kimd", directions, self.spread)
-        ends = np.einsum("kimc,mcd->kimd", directions, self.ends)
-        variance = own + np.einsum("kimd,klmd->kil", means, means) + np.einsum("kimd,klmd->kil", ends, ends)
+        noise, doubt = PM * self.white, np.einsum("ksij,ksj->ksi", G @ state.matrix, moves.doubt)
+        D = np.zeros((moves.count, 2, len(self.every.time), 3))  # deg per g of each rest's force
+        u = gravity.force / np.linalg.norm(gravity.force, axis=1, keepdims=True)
+        across = np.degrees(np.eye(3) - u[:, :, None] * u[:, None, :]) / self.gravity
+        D[k, :, moves.after] = E @ across[moves.after]
+        D[k, :, moves.before] = -E @ A[:, 0] @ across[moves.before]
+        variance = np.einsum("ksij,kslj->kil", noise, noise) + np.einsum("ksi,ksj->kij", doubt, doubt)
+        variance += np.einsum("kimd,klmd,m->kil", D, D, gravity.spread**2 + gravity.ends**2)
         variance += self.excess[:, None, None] * np.eye(2)
         W = np.asarray(np.linalg.solve(np.linalg.cholesky(variance), np.eye(2)), np.float64)
+        error = np.sqrt(np.einsum("kii->ki", variance)).ravel()
         base = np.concatenate([-PM.sum(axis=1), np.einsum("ksei,ksj->keij", P, v).reshape(moves.count, 2, 9)], axis=2)
-        n = 2 * moves.count
         bias = np.zeros((3, moves.count, 2, moves.count))
-        held = -W @ PM.sum(axis=1) * self.white
-        bias[:, np.arange(moves.count), :, np.arange(moves.count)] = held.transpose(0, 2, 1)
+        bias[:, k, :, k] = (-W @ noise.sum(axis=1)).transpose(0, 2, 1)
 
         def columns(term: Term) -> Values:
-            K = state.K
-            Z = term.effect.columns(self.sensor, motion, K, term.values).reshape(*moves.weight.shape, 3, -1)
+            Z = term.effect.columns(self.sensor, motion, state.K, term.values).reshape(*moves.weight.shape, 3, -1)
             return np.asarray((W @ -np.einsum("ksej,ksjp->kep", PM, Z)).reshape(n, -1))
 
         apart = np.degrees(np.einsum("kej,kj->ke", E, self.after - predicted))
-        error = np.sqrt(np.einsum("kii->ki", variance)).ravel()
-        shared = np.einsum("kij,kjmc,mcp->kip", W, directions, self.shared).reshape(n, -1)
-        leaning = np.einsum("kij,kjmc,mcd->kimd", W, directions, self.across).reshape(n, -1)
+        WD = np.einsum("kij,kjmc->kimc", W, D).reshape(n, -1, 3)
+        shared = np.einsum("nmc,mcp->np", WD, gravity.shared)
+        means = (WD * gravity.spread[:, None]).reshape(n, -1)
+        other_move = np.kron(np.eye(moves.count), np.ones((2, 2))) == 0.0
+        directions = np.median(error) * self.gravity * np.radians(WD).reshape(n, -1)  # by errors of a typical white one
         return Block(
-            np.einsum("kij,kj->ki", W, apart).ravel() - shared @ self.known["gravity"].moved,
+            np.einsum("kij,kj->ki", W, apart).ravel() - shared @ gravity.moved,
             (W @ base).reshape(n, 12),
             columns,
             error,
             bias.reshape(3, n, moves.count),
             (moves.time[:, 0], moves.time[:, -1] - moves.time[:, 0], self.every.recording[moves.after]),
             scattered=True,
-            common=self._common(W, directions) + shared @ shared.T,
-            direction=float(np.median(error)) ** 2 * leaning @ leaning.T,  # errors as large as a typical white one
+            common=np.where(other_move, means @ means.T, 0.0) + shared @ shared.T,
+            direction=directions @ directions.T,
             shared=shared,
         )
-
-    def _directions(self, E: Values, A: Values) -> Values:
-        """Return the derivative of each move's equations with respect to each rest's direction: (k, 2, m, 3) array."""
-        assert self.moves is not None  # noqa: S101
-        out = np.zeros((self.moves.count, 2, len(self.every.time), 3))
-        rows = np.arange(self.moves.count)
-        out[rows, :, self.moves.after] = E
-        out[rows, :, self.moves.before] = -E @ A
-        return out
-
-    def _common(self, W: Values, directions: Values) -> Values:
-        """Return the covariance of the moves' equations by errors of the rests' means: (2 k, 2 k) array."""
-        n = 2 * len(W)
-        directions = np.einsum("kij,kjmc->kimc", W, directions)
-        means = np.einsum("kimc,mcd->kimd", directions, self.spread).reshape(n, -1)
-        apart = np.kron(np.eye(len(W)), np.ones((2, 2))) == 0.0
-        return np.where(apart, means @ means.T, 0.0)
 
     def accelerometer_errors(self, found: Fit) -> Values:
         """Return the estimate of the accelerometer's errors of bias and matrix from the moves: (12,) array."""
@@ -281,35 +257,29 @@ class GyroscopeModel:
         shared = np.zeros((len(equations.residual), 12))
         shared[self.of_moves] = self._of_moves(found.state).shared
         white, _ = equations.whitened(found.noise, np.column_stack([shared, equations.residual]))
-        return np.asarray(-self.known["gravity"].root @ (white[:, :12].T @ white[:, 12]))
+        return np.asarray(-self.at_rests.root @ (white[:, :12].T @ white[:, 12]))
 
     def _turned(self, state: State) -> tuple[Motion, Values, Values]:
         """Return the motion of all samples of the moves, ``v = y - b - z`` and A."""
         moves, K = self.moves, state.K
         assert moves is not None  # noqa: S101
-        plain = moves.reading - state.bias
-        rate, A = self._integrated(plain, state)
-        v = plain
+
+        def integrated(v: Values) -> tuple[Values, Values, Motion]:
+            rate = v @ state.matrix.T
+            A = to_the_end(rate, moves.time)
+            end = np.einsum("kij,kj->ki", A[:, 0], self.before)
+            force = self.gravity * np.einsum("ksij,ki->ksj", A, end)
+            signals = moves.time.ravel(), force.reshape(-1, 3), rate.reshape(-1, 3), moves.temperature.ravel()
+            return rate, A, motion_of(*signals, still=False)
+
+        plain = v = moves.reading - state.bias
+        rate, A, motion = integrated(plain)
         for _ in range(ROUNDS if state.terms else 0):
-            v = plain - effect_readings(self.sensor, state.terms, self._motion(rate, A), K).reshape(plain.shape)
-            before = rate
-            rate, A = self._integrated(v, state)
+            v, before = plain - effect_readings(self.sensor, state.terms, motion, K).reshape(plain.shape), rate
+            rate, A, motion = integrated(v)
             if np.abs(rate - before).max() < SETTLED_DPS:
                 break
-        return self._motion(rate, A), v, A
-
-    def _integrated(self, v: Values, state: State) -> tuple[Values, Values]:
-        assert self.moves is not None  # noqa: S101
-        rate = v @ state.matrix.T
-        return rate, to_the_end(rate, self.moves.time)
-
-    def _motion(self, rate: Values, A: Values) -> Motion:
-        assert self.moves is not None  # noqa: S101
-        end = np.einsum("kij,kj->ki", A[:, 0], self.before)
-        force = self.gravity * np.einsum("ksij,ki->ksj", A, end)
-        shape = (-1, 3)
-        warmth = self.moves.temperature.ravel()
-        return motion_of(self.moves.time.ravel(), force.reshape(shape), rate.reshape(shape), warmth, still=False)
+        return motion, v, A
 
 
 def model_of(
@@ -325,8 +295,8 @@ def model_of(
 
     ``calibration``: of the gyroscope; its outlying moves are not used. ``settings``: sections ``table`` and
     ``procedure``. ``accelerometer``: without it, the accelerometer is calibrated here, which raises
-    ``CannotCalibrateError`` if it fails. ``moved``: (12,), as of ``gravity.observed_rests``; without it, as
-    ``calibration`` states.
+    ``CannotCalibrateError`` if it fails. ``moved``: (12,), see ``moves.observed_rests``; by default that of
+    ``calibration``.
     """
     if accelerometer is None:
         from pipeline.estimation.accelerometer import nonlinear_least_squares  # noqa: PLC0415  (needs this package)
@@ -337,9 +307,9 @@ def model_of(
             raise CannotCalibrateError(
                 f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
             ) from lack
-    told = [stage.details for stage in calibration.stages] if calibration else []
+    details = [stage.details for stage in calibration.stages] if calibration else []
     if moved is None:
-        moved = next((np.array(d[MOVED]) for d in told if MOVED in d), None)
+        moved = next((np.array(d[MOVED]) for d in details if MOVED in d), None)
     observed = observed_rests(recordings, accelerometer, settings, moved=moved)
     if observed is None:
         return None
@@ -349,8 +319,8 @@ def model_of(
         turns, every = turns_of(recordings, rests, accelerometer, stated)
         require_turns(turns, every, stated)
     if moves is not None and calibration is not None:
-        off = {(move["recording"], float(move["time_s"])) for d in told for move in d.get("moves_outlying", ())}
+        outlying = {(move["recording"], float(move["time_s"])) for d in details for move in d.get("moves_outlying", ())}
         names = [recordings[int(i)].name for i in rests.recording[moves.after]]
         keys = zip(names, moves.time[:, 0].tolist(), strict=True)
-        moves = moves.select(np.array([key not in off for key in keys]))
+        moves = moves.select(np.array([key not in outlying for key in keys]))
     return GyroscopeModel(rests, moves, gravity, noise, turns=turns)

@@ -8,7 +8,7 @@ corrected for a variance that only the residuals show (Bartlett 1938):
     gain = (1 - h + (v - 2) / (2 n)) 2 (log L' - log L)
 
 where h is the mean leverage of the model with the effect, over the kinds of equations in which the effect shows.
-delta BIC is the gain less ``v log n``; p follows from chi squared with v degrees of freedom.
+delta BIC is the gain minus ``v log n``; p follows from chi squared with v degrees of freedom.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 NEW = 1e-3  # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
-# closes their steps where the data say more.
+# refines their steps where the data determine the scatter better.
 UNLIKELY = -4.0  # prior log weight of a setting, e^-4 of the likeliest
 FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the bias instability of the prior
 RATIOS = (0.1, 0.3, 1.0)  # of bias instability to white noise where none is stated
@@ -45,7 +45,7 @@ class NoiseHypothesis:
     scatter: tuple[float, ...]  # the a_j: of rests, and of moves
     direction: float = 0.0  # c
     none: float = 0.0  # prior log weight of each kind without scatter
-    known: bool = False  # whether the white noise is known, so that a scatter beyond it is one of the levels
+    known: bool = False  # whether the white noise is known; any excess of the residuals is then scatter
 
     @property
     def prior(self) -> float:
@@ -74,16 +74,14 @@ class NoiseHypothesis:
 def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesis]:
     """Return the hypotheses for the comparison of models: every bias instability with every scatter.
 
-    ``noise``: from a static recording, it determines the bias instability. ``kinds``: number of kinds of scatter: of
-    rests, and of moves.
+    ``noise``: from a static recording, it determines the bias instability. ``kinds``: number of kinds of scatter.
     """
     settings = selection_grid(noise)
-    if kinds > 1:  # two kinds of scatter say nothing about a bias far from that of a static recording
+    if kinds > 1:  # two kinds of scatter do not determine a bias far from that of a static recording
         settings = [s for s in settings if s.prior > UNLIKELY]
-    levels = list(product(*SELECTION_SCATTER[:kinds]))
-    found = [NoiseHypothesis(s, level) for s in settings for level in levels]
-    without = [h for h in found if kinds > 1 and h.scatter[1] == 0.0]
-    return found + [replace(h, direction=c) for h in without for c in SELECTION_SCATTER[1][1:]]
+    hypotheses = [NoiseHypothesis(s, level) for s in settings for level in product(*SELECTION_SCATTER[:kinds])]
+    steady_moves = [h for h in hypotheses if kinds > 1 and h.scatter[1] == 0.0]
+    return hypotheses + [replace(h, direction=c) for h in steady_moves for c in SELECTION_SCATTER[1][1:]]
 
 
 def prior_hypotheses(prior: Prior, white: float, kinds: int) -> list[NoiseHypothesis]:
@@ -94,20 +92,19 @@ def prior_hypotheses(prior: Prior, white: float, kinds: int) -> list[NoiseHypoth
     """
     bias = np.append(0.0, prior.wander * FACTORS if prior.wander > 0.0 else white * np.array(RATIOS))
     pairs = zip((bias / white).tolist(), prior.log_belief(bias).tolist(), strict=True)
-    none = float(np.log(SURE * (len(SCATTER) - 1)))  # nobody states a scatter: none at all is believed first
-    levels = list(product(SCATTER, repeat=kinds))
-    found = [
+    none = float(np.log(SURE * (len(SCATTER) - 1)))  # no scatter is stated, so that none at all is the likeliest
+    hypotheses = [
         NoiseHypothesis(Setting(ratio, prior.time, belief), level, none=none)
         for ratio, belief in pairs
         if np.isfinite(belief)
-        for level in levels
+        for level in product(SCATTER, repeat=kinds)
     ]
-    without = [h for h in found if kinds > 1 and h.scatter[1] in {SCATTER[0], SCATTER[2]}]
-    return found + [replace(h, direction=c) for h in without for c in SCATTER[2:]]
+    steady_moves = [h for h in hypotheses if kinds > 1 and h.scatter[1] in {SCATTER[0], SCATTER[2]}]
+    return hypotheses + [replace(h, direction=c) for h in steady_moves for c in SCATTER[2:]]
 
 
 def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
-    """Return log L of sums of squares of n equations, with ``log det C`` less twice the prior."""
+    """Return log L of sums of squares of n equations; ``log_determinant``: log det C minus twice the prior."""
     k = np.maximum(1.0, rss / n)
     return np.asarray(-0.5 * (rss / k + n * np.log(k) + log_determinant))
 
@@ -117,8 +114,7 @@ class ProjectedCandidates:
     """Whitened candidates and residual with the model's columns projected out, under each of t hypotheses."""
 
     raw: list[Values]  # each (t, n, p); projected columns of each candidate
-    # each (t, p, p); ``raw @ orthonormal`` are orthonormal directions; zeros where a candidate has fewer than
-    # columns
+    # each (t, p, p); ``raw @ orthonormal`` are orthonormal directions, padded with zeros to p columns
     orthonormal: list[Values]
     residual: Values  # (t, n)
     basis: Values  # (t, n, b); orthonormal, of the model's columns
@@ -130,7 +126,7 @@ class ProjectedCandidates:
         return float(scores.max()), int(np.argmax(scores))
 
     def scores(self, explained: Values | float = 0.0) -> Values:
-        """Return log L under each hypothesis, minus explained sums of squares: (t,) array."""
+        """Return log L under each hypothesis, where ``explained`` is subtracted from the sum of squares: (t,) array."""
         rss = np.sum(self.residual**2, axis=1) - explained
         return log_likelihood(rss, self.residual.shape[1], self.log_determinant)
 
@@ -149,7 +145,7 @@ class ProjectedCandidates:
         return np.asarray(self.raw[j][at] @ self.orthonormal[j][at])
 
     def correction(self, j: int, at: int, added: int, kinds: Values) -> float:
-        """Return the factor on the gain by candidate j; 0 if fewer than two equations show it.
+        """Return the factor on the gain by candidate j; 0 if fewer than two equations remain to judge it.
 
         ``j``, ``at``: candidate and hypothesis. ``added``: parameters, also those whose column is zero at their start.
         ``kinds``: (s, n), positive where an equation is of a kind.

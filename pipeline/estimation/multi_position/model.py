@@ -5,12 +5,12 @@
 where
 
 r   : (n,) residuals, each over its standard deviation by white noise
-X   : (n, p) derivatives of the model with respect to its parameters, d their step
-S   : (n, n) errors of the accelerometer that equations of the gyroscope share
+X   : (n, p) derivatives of the model with respect to its parameters; d: a step of the parameters
+S   : (n, n) covariance by errors of the accelerometer, which equations of the gyroscope share
 g_j : (n,) variance of the scatter of the rests, or of the moves, beyond white noise (tremor), in units of the median
       white error; a_j is its size
-D   : (n, n) errors of the direction of gravity at each rest, which two moves share, for errors of the size of the
-      median white error of a move; c is their size (a support that yields, a hand that drifts)
+D   : (n, n) covariance by errors of the direction of gravity at each rest, as large as the median white error of a
+      move; two moves share each error; c is their size (a support that yields, a hand that drifts)
 H   : (n, 3 t) derivatives with respect to the bias of each axis in each of t stretches of time, over its white noise
 R   : (t, t) covariance of a Gauss-Markov bias of unit variance, averaged over each stretch
 q   : standard deviation of that bias over white noise
@@ -18,8 +18,9 @@ k   : at least 1: scatter beyond the hypotheses of a grid
 
 The steadiness of a unit by hand is unknown: a, c, q and k are free in all comparisons (``likelihood``).
 
-Both sensors' models have: ``kinds`` of scatter (1: rests; 2: rests and moves), ``rests_equations`` (they come first),
-``white`` noise of a raw sample, and ``directions``, (12, b): change of bias and matrix by each base parameter.
+The models of both sensors have: ``kinds`` of scatter (1: rests; 2: rests and moves), ``rests_equations`` (their number;
+they come first), ``white`` noise of a raw sample, and ``directions``, (12, b): change of bias and matrix by each base
+parameter.
 """
 
 from __future__ import annotations
@@ -32,7 +33,6 @@ import scipy
 
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import block_covariance
-from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Effect, Owner
 from pipeline.records import Index, Mask, Motion, Values
 
@@ -76,7 +76,7 @@ class Equations:
     # each (t,), s; the stretches of time
     start: Values
     length: Values
-    joined: Mask  # (t, t); whether the time between them is known
+    joined: Mask  # (t, t); whether the time between two stretches is known
     error: Values  # (n,), g, deg/s or deg; standard deviation of each equation by white noise
     # each (n, n); S and D
     common: Values | None = None
@@ -99,17 +99,15 @@ class Equations:
             C += self.common
         if self.direction is not None and noise.direction:
             C += noise.direction**2 * self.direction
-        return C + noise.bias.ratio**2 * self._kernel(noise.bias.time) if noise.bias.ratio else C
-
-    def _kernel(self, time: float) -> Values:
-        """Return ``H R H^T`` for a correlation time: (n, n) array."""
-        if time not in self._kernels:
-            R = np.where(self.joined, block_covariance(self.start, self.length, time), 0.0)
-            self._kernels[time] = np.sum(self.bias @ R @ self.bias.transpose(0, 2, 1), axis=0)
-        return self._kernels[time]
+        if noise.bias.ratio:
+            if noise.bias.time not in self._kernels:
+                R = np.where(self.joined, block_covariance(self.start, self.length, noise.bias.time), 0.0)
+                self._kernels[noise.bias.time] = np.sum(self.bias @ R @ self.bias.transpose(0, 2, 1), axis=0)
+            C += noise.bias.ratio**2 * self._kernels[noise.bias.time]
+        return C
 
     def whitened(self, noise: NoiseHypothesis, values: Values) -> tuple[Values, float]:
-        """Return (n, p) values with ``L^-1`` applied, where ``L L^T = C``, and log det C."""
+        """Return ``L^-1`` times (n, p) values, where ``L L^T = C``, and log det C."""
         if self.common is None and not noise.direction and not noise.bias.ratio:
             variance = self.variance(noise)
             return values / np.sqrt(variance)[:, None], float(np.sum(np.log(variance)))
@@ -130,36 +128,35 @@ class Block:
     error: Values  # (n,)
     bias: Values | None = None  # (3, n, t); None: zeros
     stretches: tuple[Values, Values, Index] | None = None  # start, length, recording; None: those of the rests
-    scattered: bool = False  # whether the scatter of a kind of its own adds to them
+    scattered: bool = False  # whether a separate kind of scatter adds to them
     # each (n, n); None: zeros
     common: Values | None = None
     direction: Values | None = None
-    shared: Values | None = None  # (n, 12); what the errors of the accelerometer's calibration do to moves
+    shared: Values | None = None  # (n, 12); change of moves by errors of the accelerometer's calibration
 
 
 def stacked(blocks: Sequence[Block], model: Model, state: State, candidates: Sequence[Term]) -> Equations:
-    """Return the equations of some blocks, those of the rests first."""
-    rows = np.cumsum([0, *(len(block.residual) for block in blocks)])
-    times = [block.stretches for block in blocks if block.stretches is not None]
-    start, length, recording = (np.concatenate([time[k] for time in times]) for k in range(3))
-    scatter = np.zeros((sum(block.scattered for block in blocks), rows[-1]))
-    bias, column = np.zeros((3, rows[-1], len(start))), 0
-    for kind, (block, own) in enumerate(zip(blocks, map(slice, rows[:-1], rows[1:]), strict=True)):
+    """Stack blocks of equations; the block of the rests is the first."""
+    sizes = [len(block.residual) for block in blocks]
+    edges = np.cumsum([0, *sizes])
+    start, length, recording = (
+        np.concatenate(times) for times in zip(*(b.stretches for b in blocks if b.stretches is not None), strict=True)
+    )
+    scatter = np.zeros((sum(block.scattered for block in blocks), edges[-1]))
+    bias, column = np.zeros((3, edges[-1], len(start))), 0
+    for kind, (block, rows) in enumerate(zip(blocks, map(slice, edges[:-1], edges[1:]), strict=True)):
         if block.scattered:
-            scatter[kind, own] = np.square(np.median(block.error) / block.error)
+            scatter[kind, rows] = np.square(np.median(block.error) / block.error)
         if block.bias is not None:
             first = 0 if block.stretches is None else column
-            bias[:, own, first : first + block.bias.shape[2]] = block.bias
+            bias[:, rows, first : first + block.bias.shape[2]] = block.bias
         column += 0 if block.stretches is None else len(block.stretches[0])
 
-    def together(name: str) -> Values | None:
-        parts = [getattr(block, name) for block in blocks]
+    def diagonal(parts: Sequence[Values | None]) -> Values | None:
         if all(part is None for part in parts):
             return None
-        sizes = [(n, n) for n in np.diff(rows)]
-        return np.asarray(
-            scipy.linalg.block_diag(*(np.zeros(n) if p is None else p for p, n in zip(parts, sizes, strict=True)))
-        )
+        filled = (np.zeros((n, n)) if part is None else part for part, n in zip(parts, sizes, strict=True))
+        return np.asarray(scipy.linalg.block_diag(*filled))
 
     same = recording[:, None] == recording
     return Equations(
@@ -173,8 +170,8 @@ def stacked(blocks: Sequence[Block], model: Model, state: State, candidates: Seq
         length=length,
         joined=np.ones_like(same) if model.rests.clock_shared else same,
         error=np.concatenate([block.error for block in blocks]),
-        common=together("common"),
-        direction=together("direction"),
+        common=diagonal([block.common for block in blocks]),
+        direction=diagonal([block.direction for block in blocks]),
     )
 
 
@@ -188,7 +185,7 @@ def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
 
 
 def motion_of(time: Values, force: Values, rate: Values, temperature: Values, *, still: bool) -> Motion:
-    """Return the motion by the unit's calibrated signals; derivatives are zero."""
+    """Return the motion with the unit's calibrated signals; derivatives are zero."""
     nothing = np.zeros_like(force)
     return Motion(
         time=time,
@@ -207,10 +204,8 @@ def motion_of(time: Values, force: Values, rate: Values, temperature: Values, *,
 
 def effect_readings(sensor: str, terms: Sequence[Term], motion: Motion, K: Values) -> Values:
     """Return what effects add to the readings: (n, 3) array."""
-    total = np.zeros_like(motion.specific_force)
-    for term in terms:
-        total = total + term.effect.reading(sensor, motion, K, term.values)
-    return total
+    readings = (term.effect.reading(sensor, motion, K, term.values) for term in terms)
+    return np.asarray(sum(readings, np.zeros_like(motion.specific_force)))
 
 
 def refusal(this: Effect, sensor: str, rests: Rests) -> str:
@@ -226,16 +221,3 @@ def refusal(this: Effect, sensor: str, rests: Rests) -> str:
         (this.needs_clock and not rests.clock_shared, "the time between the recordings is not known"),
     ]
     return next((reason for applies, reason in checks if applies), "")
-
-
-def candidates_for(sensor: str, rests: Rests, configured: Sequence[str]) -> list[Effect]:
-    """Return the effects that could be missing in the model and that rests and moves can show."""
-    return [e for name, e in catalogue().items() if name not in configured and not refusal(e, sensor, rests)]
-
-
-def parameter_places(model: Model, count: int) -> Values:
-    """Return the map from base and effect parameters to bias, matrix and effect parameters: (12 + p, b + p) array."""
-    base = model.directions.shape[1]
-    place = np.zeros((12 + count - base, count))
-    place[:12, :base], place[12:, base:] = model.directions, np.eye(count - base)
-    return place

@@ -18,7 +18,7 @@ At low sampling rates a hand's accelerations begin and end between two samples. 
 
 It is subtracted from the readings where both exceed the noise. Two bends in one sense make four such differences in a
 row; or three, where they share a sample and cannot be separated: that adds an error of 0.12 d dt (rms, both places
-uniform) with the d that remains. More than four in a row are a rate that bends smoothly, and nothing is done.
+uniform) with the d that remains. More than four in a row are a rate that bends smoothly, and nothing is subtracted.
 
 The direction of gravity before and after every move, by the calibrated accelerometer, is
 
@@ -61,11 +61,11 @@ LONGEST_S = 60.0  # see ``moves_of``
 GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
 ENVELOPE = 10  # samples, of which one at least is stamped without delay
 DROPPED = 0.5  # of an interval, by which a dropped sample makes at least one half of the stamps late
-ROUNDED = 0.1  # of an interval, by which digits of a file take stamps off a regular clock
+ROUNDED = 0.1  # of an interval, by which the digits of a file move stamps off a regular clock
 CLEAR = 20.0  # gain of twice a log likelihood by another clock
 SMOOTH = 4  # bends in a row, see above
-UNTOLD = 0.12  # rms, see above
-BENT = 8.0  # second difference over white noise, 2.4 of which is the noise's own
+SHARED_BEND = 0.12  # rms, see above
+BENT = 8.0  # second difference over white noise; noise alone has 2.4
 NEAR_S = 0.5  # see above
 FEWEST_NEAR = 10  # samples
 SIGNIFICANT = 4.0  # standard deviations, see above
@@ -78,14 +78,14 @@ class Moves:
     # each (k,); rests between which each move lies
     before: Index
     after: Index
-    # (k, s, 3), deg/s; less what the trapezoidal rule is off by bends between samples; the last sample is repeated
+    # (k, s, 3), deg/s; minus the error of the trapezoidal rule by bends between samples; the last sample is repeated
     reading: Values
     time: Values  # (k, s), s
-    # (k, s), degC; as of the rests before and after, in between by straight line; NaN where none was recorded
+    # (k, s), degC; interpolated between the rests before and after; NaN where none was recorded
     temperature: Values
     weight: Values  # (k, s), s; 0 beyond a move's end
-    # (k, s, 3), deg; standard uncertainty, along one direction each, of the angle in the readings' axes: bends that
-    # share a sample
+    # (k, s, 3), deg; standard uncertainty of the angle in the readings' axes by bends that share a sample, along one
+    # direction each
     doubt: Values
 
     def select(self, index: Mask) -> Moves:
@@ -98,52 +98,50 @@ class Moves:
         return len(self.before)
 
 
+def spans_between(rests: Rests) -> list[tuple[int, int, slice]]:
+    """Return the samples between consecutive rests of one recording, with the numbers of both rests."""
+    return [
+        (i, j, slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1))
+        for i, j in pairwise(range(len(rests.time)))
+        if rests.recording[i] == rests.recording[j]
+    ]
+
+
 def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
     """Return the moves that end at a rest of the fit, or None if there are none; ``rests``: all of the gyroscope.
 
     Moves with clipped, stuck or missing readings, with a gap, or longer than a minute are not used.
     """
-    found = []
-    for i, j in zip(range(len(rests.time) - 1), range(1, len(rests.time)), strict=True):
-        recording = recordings[rests.recording[j]]
-        span = slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1)
-        if rests.held_out[j] or rests.recording[i] != rests.recording[j] or not sound_span(recording, span):
-            continue
-        found.append((i, j, span))
+    found = [
+        (i, j, span)
+        for i, j, span in spans_between(rests)
+        if not rests.held_out[j] and sound_span(recordings[rests.recording[j]], span)
+    ]
     if not found:
         return None
-    index = np.array([int(rests.recording[j]) for _, j, _ in found])
-    clocks: dict[int, Values] = {}
-    for i in np.unique(index):
-        rows, recording = np.flatnonzero(index == i), recordings[i]
-        values = recording.gyroscope
-        assert values is not None  # noqa: S101
-        spans = [found[row][2] for row in rows]
-        own = clocks_of(recording.time, values, spans, rests.white)
-        clocks |= dict(zip(rows.tolist(), own, strict=True))
-    longest = max(span.stop - span.start for _, _, span in found)
-    shape = (len(found), longest)
-    reading, time, weight = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
-    for row, (_, j, span) in enumerate(found):
-        n, values = span.stop - span.start, recordings[rests.recording[j]].gyroscope
-        assert values is not None  # noqa: S101
-        reading[row, :n], reading[row, n:] = values[span], values[span.stop - 1]
-        time[row, :n], time[row, n:] = clocks[row], clocks[row][-1]
-        weight[row, :n] = trapezoids(clocks[row])
-    taken, doubt = _bends(reading, weight, BENT * float(np.linalg.norm(rests.white)))
     before, after = np.array([[i, j] for i, j, _ in found]).T
+    spans = [span for *_, span in found]
+    shape = (len(spans), max(span.stop - span.start for span in spans))
+    reading, time, weight = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+    for index in np.unique(rests.recording[after]):
+        rows, recording = np.flatnonzero(rests.recording[after] == index), recordings[index]
+        values = np.asarray(recording.gyroscope)
+        clocks = clocks_of(recording.time, values, [spans[row] for row in rows], rests.white)
+        for row, clock in zip(rows.tolist(), clocks, strict=True):
+            n = len(clock)
+            reading[row, :n], reading[row, n:] = values[spans[row]], values[spans[row].stop - 1]
+            time[row, :n], time[row, n:] = clock, clock[-1]
+            weight[row, :n] = trapezoids(clock)
+    excess, doubt = _bends(reading, weight, BENT * float(np.linalg.norm(rests.white)))
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
     warm = rests.temperature[before][:, None]
     temperature = warm + share * (rests.temperature[after][:, None] - warm)
-    return Moves(before, after, reading - taken, time, temperature, weight, doubt)
+    return Moves(before, after, reading - excess, time, temperature, weight, doubt)
 
 
 def clipped_moves(recordings: Sequence[Recording], rests: Rests) -> str:
     """Return how many of the moves between the rests hold clipped or stuck readings, as a clause; empty for none."""
-    valid = []
-    for i, j in pairwise(range(len(rests.time))):
-        if rests.recording[i] == rests.recording[j]:
-            valid.append(recordings[rests.recording[j]].valid[rests.span[i, 1] - 1 : rests.span[j, 0] + 1].all())
+    valid = [bool(recordings[rests.recording[j]].valid[span].all()) for _, j, span in spans_between(rests)]
     lost = valid.count(False)
     return f", and {lost} of the {len(valid)} moves hold clipped or stuck readings" if lost else ""
 
@@ -163,24 +161,22 @@ def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Value
     both = second[:, :-1] + second[:, 1:]
     product = np.sum(second[:, :-1] * second[:, 1:], axis=2)
     same = product > 0.0
-    place = np.zeros(weight.shape, np.intp)  # of each second difference among those the same way in a row
+    place = np.zeros(weight.shape, np.intp)  # of each second difference in its run of one sense
     for j in range(1, weight.shape[1]):
         place[:, j] = np.where(same[:, j - 1], place[:, j - 1] + 1, 0)
     last = place.copy()
     for j in range(weight.shape[1] - 2, -1, -1):
         last[:, j] = np.where(same[:, j], last[:, j + 1], place[:, j])
     bend = same & (place[:, :-1] % 2 == 0) & (last[:, :-1] < SMOOTH)
-    left = (place == 2) & (last == 2)  # the third of three
+    third = (place == 2) & (last == 2)  # the third of three
     interval = np.max(weight, axis=1)[:, None]
-    shared = np.maximum(
-        weight[:, :-1] + weight[:, 1:], 0.5 * interval
-    )  # of the two samples from which it is subtracted
-    share = np.where(bend, 0.5 * interval * product / shared, 0.0) / np.maximum(np.sum(both**2, axis=2), 1e-300)
+    weights = np.maximum(weight[:, :-1] + weight[:, 1:], 0.5 * interval)  # of the samples from which it is subtracted
+    share = np.where(bend, 0.5 * interval * product / weights, 0.0) / np.maximum(np.sum(both**2, axis=2), 1e-300)
     rate = share[:, :, None] * both
-    taken = np.zeros_like(reading)
-    taken[:, :-1] += rate
-    taken[:, 1:] += rate
-    return taken, UNTOLD * interval[:, :, None] * np.where(left[:, :, None], second, 0.0)
+    excess = np.zeros_like(reading)
+    excess[:, :-1] += rate
+    excess[:, 1:] += rate
+    return excess, SHARED_BEND * interval[:, :, None] * np.where(third[:, :, None], second, 0.0)
 
 
 def _regular_stamps(time: Values) -> Values | None:
@@ -217,15 +213,17 @@ def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values)
         rounded = np.abs(time - whole).max() <= ROUNDED * (whole[1] - whole[0])
         gain = _roughness(time, rate, white) - _roughness(whole, rate, white)
         return [(whole if gain > (-CLEAR if rounded else CLEAR) else time)[span] for span in moves]
-    regular = [_regular_stamps(time[span]) for span in moves]
-    pairs = [(span, line) for span, line in zip(moves, regular, strict=True) if line is not None]
-    gain = sum(_roughness(time[s], rate[s], white) - _roughness(line, rate[s], white) for s, line in pairs)
-    known = zip(moves, regular, strict=True)
-    return [time[span] if line is None or gain <= CLEAR else line for span, line in known]
+    pairs = [(span, _regular_stamps(time[span])) for span in moves]
+    gain = sum(
+        _roughness(time[span], rate[span], white) - _roughness(line, rate[span], white)
+        for span, line in pairs
+        if line is not None
+    )
+    return [time[span] if line is None or gain <= CLEAR else line for span, line in pairs]
 
 
 def sound_span(recording: Recording, span: slice) -> bool:
-    """Return whether the gyroscope's samples can be integrated: none clipped, stuck or missing, no gap, no minute."""
+    """Return whether the gyroscope's samples can be integrated: all valid, without a gap, for less than a minute."""
     time = recording.time[span]
     whole = bool(np.all(sound_samples(recording, "gyroscope")[span]))
     return whole and len(time) > 2 and time[-1] - time[0] < LONGEST_S and np.diff(time).max() < GAP * recording.interval
@@ -258,15 +256,14 @@ class Gravity:
     """Gravity at every rest."""
 
     force: Values  # (m, 3), g; specific force of each rest's mean
-    # each (m, 3); unit vectors along it where the move before ends and where the next one begins
+    # each (m, 3); unit vectors along gravity where the move before ends and where the next one begins
     at_start: Values
     at_end: Values
     spread: Values  # (m,), g; standard deviation by the scatter of the accelerometer's rests
-    ends: Values  # (m,), g; standard deviation of each end beyond that, by what is not known of the creep
-    # (12, 12); errors of the accelerometer's bias and matrix, each of one standard uncertainty and independent, in
-    # columns
+    ends: Values  # (m,), g; additional standard deviation of each end by the uncertainty of the creep
+    # (12, 12); errors of the accelerometer's bias and matrix in columns, independent, each of one standard uncertainty
     root: Values
-    shared: Values  # (m, 3, 12), g; what they do to the force
+    shared: Values  # (m, 3, 12), g; change of the force by each of these errors
     creeping: Mask  # (m,); whether the half second next to a move is off the mean by more than 4 s
     moved: Values  # (12,); by how many of these errors the calibration was moved before all this was computed
 
@@ -299,19 +296,25 @@ def observed_rests(
 def gravity_of(
     recordings: Sequence[Recording], rests: Rests, accelerometer: SensorCalibration, moved: Values | None = None
 ) -> Gravity:
-    """Return gravity at the rests of the accelerometer; ``moved`` as of ``observed_rests``."""
+    """Return gravity at the rests of the accelerometer; ``moved``: see ``observed_rests``."""
     covariance = np.zeros((12, 12)) if accelerometer.covariance is None else accelerometer.covariance[:12, :12]
     root, moved = root_of(covariance), np.zeros(12) if moved is None else moved
     accelerometer = replace(
         accelerometer, bias=accelerometer.bias + moved[:3], matrix=accelerometer.matrix + moved[3:].reshape(3, 3)
     )
+    effects = [e for e in accelerometer.effects if not effect(e.name).moves]
+
+    def force_of(reading: Values) -> Values:
+        motion = motion_of(rests.time, reading, np.zeros_like(reading), rests.temperature, still=True)
+        return compensate(accelerometer, reading, motion, effects)
+
     white = float(np.mean(rests.white**2))
-    force = _force(rests.reading, rests, accelerometer)
+    force = force_of(rests.reading)
     u = _unit(force)
     ends, creeping, noise = [], np.zeros(len(u), bool), rests.share.copy()
     for at_start in (True, False):
         reading, share = _near(recordings, rests, at_start=at_start)
-        near = _unit(_force(reading, rests, accelerometer))
+        near = _unit(force_of(reading))
         half = (0.5 if at_start else -0.5) * rests.length[:, None]
         steady = _unit(u + half * np.cross(np.radians(rests.creep), u))  # du/dt = -w x u
         creeps = np.linalg.norm(near - steady, axis=1) > SIGNIFICANT * np.sqrt(share * white)
@@ -326,12 +329,6 @@ def gravity_of(
     return Gravity(force, ends[0], ends[1], spread, unsure, root, shared, creeping, np.linalg.pinv(root) @ moved)
 
 
-def _force(reading: Values, rests: Rests, accelerometer: SensorCalibration) -> Values:
-    motion = motion_of(rests.time, reading, np.zeros_like(reading), rests.temperature, still=True)
-    known = [e for e in accelerometer.effects if not effect(e.name).moves]
-    return compensate(accelerometer, reading, motion, known)
-
-
 def _unit(force: Values) -> Values:
     return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
 
@@ -340,11 +337,11 @@ def _near(recordings: Sequence[Recording], rests: Rests, *, at_start: bool) -> t
     """Return the mean reading next to a move, (m, 3), and its variance over that of a sample, (m,)."""
     reading, share = rests.reading.copy(), rests.share.copy()
     for index in np.unique(rests.recording):
-        recording, own = recordings[index], np.flatnonzero(rests.recording == index)
+        recording, rows = recordings[index], np.flatnonzero(rests.recording == index)
         size = max(FEWEST_NEAR, round(NEAR_S / recording.interval))
-        spans = [(a, min(a + size, b)) if at_start else (max(b - size, a), b) for a, b in rests.span[own].tolist()]
+        spans = [(a, min(a + size, b)) if at_start else (max(b - size, a), b) for a, b in rests.span[rows].tolist()]
         means, counts = rest_means(recording, [Rest(a, b) for a, b in spans])
         known = counts > 0
-        reading[own[known]] = means[known]
-        share[own[known]] = variance_of_mean(filter_autocovariance(recording), counts[known])
+        reading[rows[known]] = means[known]
+        share[rows[known]] = variance_of_mean(filter_autocovariance(recording), counts[known])
     return reading, share

@@ -5,7 +5,7 @@ hypothesis of the noise by its weight, and solved with the weights of that hypot
 hypotheses. The prior of the parameters is added as equations ``sqrt(P) p = 0 +- 1``.
 
 If the procedure states faces, bias and full matrix of the accelerometer are fitted after the nine parameters of
-gravity's length, with the equations of ``accelerometer`` and ``faces_and_turns``. The matrix refers to the case.
+gravity's length, with the equations of ``accelerometer`` and ``faces_and_turns``. The matrix then refers to the case.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import AUTO, limits_of
@@ -24,7 +25,7 @@ from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
 from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_observable
 from pipeline.estimation.multi_position.likelihood import prior_hypotheses, selection_hypotheses
-from pipeline.estimation.multi_position.model import Model, State, parameter_places, refusal, stepped
+from pipeline.estimation.multi_position.model import Model, State, refusal, stepped
 from pipeline.estimation.multi_position.selection import Selection, fit_configured
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
@@ -69,7 +70,7 @@ def model_of(
     """Return the model of the sensor of a calibration, or None if its recordings have no rest.
 
     ``calibration``: of the sensor's method. ``settings``: sections ``table`` and ``procedure``. ``other``: of the
-    accelerometer, where the sensor is the gyroscope; without it, it is calibrated here.
+    accelerometer, where the sensor is the gyroscope; by default the accelerometer is calibrated here.
     """
     if calibration.sensor == "accelerometer":
         return accelerometer.model_of(recordings, calibration, noise, settings)
@@ -81,8 +82,9 @@ def fit_effects_by_rests(
 ) -> SensorCalibration:
     """Fit the effects of ``settings["effects"]`` together with bias and matrix to rests and moves.
 
-    ``before``: of the sensor's method; returned unchanged where there is nothing to add. Raises ``NotObservableError``
-    if rests and moves do not determine an effect; ``ConfigurationError`` if it is unknown or not one of this sensor.
+    ``before``: of the sensor's method; returned unchanged where there is no effect to add. Raises
+    ``NotObservableError`` if rests and moves do not determine an effect; ``ConfigurationError`` if an effect is unknown
+    or not of this sensor.
     """
     sensor = before.sensor
     wanted, sensor_config = settings["effects"][sensor], settings["sensor"][sensor]
@@ -139,15 +141,14 @@ def with_stage(  # noqa: PLR0917  (what a fit by hand is)
     """Return a calibration after an additional stage, without its uncertainty."""
     at_rest = slice(0, model.rests_equations)
     rms = float(np.sqrt(np.mean((found.residual[at_rest] * found.error[at_rest]) ** 2)))
+    rank = found.rank - len(model.known_by_limit)
     return replace(
         before,
         bias=found.state.bias,
         matrix=found.state.matrix,
         stages=(*before.stages, StageResult(name, parameters, rms, correction, details)),
         converged=found.converged,
-        convergence=certified(
-            found.cosine, found.condition, found.rank - len(model.known_by_limit), len(found.covariance)
-        ),
+        convergence=certified(found.cosine, found.condition, rank, len(found.covariance)),
     )
 
 
@@ -162,42 +163,45 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     *,
     parameters: dict[str, dict[str, Any]] | None = None,
     white: Values | None = None,
-    not_included: Mapping[str, str] | None = None,
+    not_included: Mapping[str, str] = NOT_INCLUDED,
 ) -> SensorCalibration:
     """Convert a fit to a calibration after an additional stage, with its uncertainty budget by the residuals.
 
     ``settings``: sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``), ``uncertainty``.
     ``parameters``: of the stage, where they are not bias and matrix. ``white``: (12,), variance by white noise, where
-    the budget tells it apart.
+    the budget states it separately.
     """
-    place = parameter_places(model, len(found.covariance))
+    sensor, table, place = model.sensor, settings["table"], _places(model, found)
     covariance = place @ found.covariance @ place.T
     freedom = np.min(np.where(place != 0.0, found.degrees_of_freedom, np.inf), axis=1)
-    effects, of_effects = effect_parameters(model.sensor, found.state.terms, covariance)
+    effects, of_effects = effect_parameters(sensor, found.state.terms, covariance)
     parameters = parameters or of_effects
-    parameters = parameters or base_parameters(model.sensor, found.state.bias, found.state.matrix, covariance)
-    calibration = with_stage(before, name, details, model, found, correction, parameters)
-    calibration = replace(calibration, effects=effects)
-    sensor, table = calibration.sensor, settings["table"]
+    parameters = parameters or base_parameters(sensor, found.state.bias, found.state.matrix, covariance)
+    calibration = replace(with_stage(before, name, details, model, found, correction, parameters), effects=effects)
     limit, of_limit = _limit_contribution(model, found, place)
-    own, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
+    variance, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
     if white is not None:
-        white = np.minimum(white, own)
-        parts = {"white noise": np.sqrt(white), "bias wander and scatter of the rests": np.sqrt(own - white)}
+        white = np.minimum(white, variance)
+        parts = {"white noise": np.sqrt(white), "bias wander and scatter of the rests": np.sqrt(variance - white)}
     scatter = scatter_contribution(covariance - of_limit, np.inf, parts, REMARK[sensor])
-    lines = [replace(scatter, degrees_of_freedom=freedom)]
-    missing = dict(not_included or NOT_INCLUDED)
+    lines, missing = [replace(scatter, degrees_of_freedom=freedom)], dict(not_included)
     if sensor == "accelerometer":
         gravity, unstated = gravity_line(calibration, table)
         lines, missing = lines + gravity, missing | unstated
-    elif table.get("clock_accuracy_ppm") is None:
-        missing[TIME_BASE] = "table.clock_accuracy_ppm is not stated"
     else:
-        lines.append(clock_contribution(calibration, float(table["clock_accuracy_ppm"])))
-    if sensor == "gyroscope":
+        if table.get("clock_accuracy_ppm") is None:
+            missing[TIME_BASE] = "table.clock_accuracy_ppm is not stated"
+        else:
+            lines.append(clock_contribution(calibration, float(table["clock_accuracy_ppm"])))
         missing["Earth's rotation"] = "not in the model: by hand nobody knows the heading; up to 0.0042 deg/s of bias"
     complete, trials = combined(calibration, [*lines, *limit], missing), trials_of(settings)
     return _with_monte_carlo(complete, model, found, trials, lines[1:]) if trials else complete
+
+
+def _places(model: Model, found: Fit) -> Values:
+    """Return the map from base and effect parameters to bias, matrix and effect parameters: (12 + p, b + p) array."""
+    base = model.directions
+    return np.asarray(scipy.linalg.block_diag(base, np.eye(len(found.covariance) - base.shape[1])))
 
 
 def _limit_contribution(model: Model, found: Fit, place: Values) -> tuple[list[Contribution], Values]:
@@ -208,8 +212,7 @@ def _limit_contribution(model: Model, found: Fit, place: Values) -> tuple[list[C
     X = equations.columns
     inverse = np.linalg.inv(equations.covariance(found.noise))
     gain = scaled_inverse(X.T @ inverse @ X) @ X.T @ inverse
-    bent = curvature(model, found, X.shape[1])
-    line, first = limit_contribution(gain, list(model.known_by_limit), bent, found.covariance, place)
+    line, first = limit_contribution(gain, list(model.known_by_limit), curvature(model, found), found.covariance, place)
     return [line], first
 
 
@@ -218,38 +221,33 @@ def _with_monte_carlo(
 ) -> SensorCalibration:
     """Return a calibration whose budget also has a Monte Carlo run; ``direct``: its sources of type B."""
     equations = model.equations(found.state)
-    X = equations.columns
-    n, p = X.shape
-    believed = np.flatnonzero(found.precision > 0.0)
-    rows = np.zeros((len(believed), p))
-    rows[np.arange(len(believed)), believed] = np.sqrt(found.precision[believed])
-    X, H = np.concatenate([X, rows]), np.zeros((n + len(believed), p, p))
-    H[:n] = curvature(model, found, p)
-    candidates = [np.eye(len(X)) for _ in found.hypotheses]
-    for covariance, (noise, _, scale) in zip(candidates, found.hypotheses, strict=True):
-        covariance[:n, :n] = scale * equations.covariance(noise)
-    solvers = [quadratic_results(X, H, np.asarray(np.linalg.pinv(c, hermitian=True), float)) for c in candidates]
-    weight = np.array([w for _, w, _ in found.hypotheses])
-    place = parameter_places(model, p)
+    n, p = equations.columns.shape
+    prior = np.diag(np.sqrt(found.precision))[found.precision > 0.0]
+    X, H = np.concatenate([equations.columns, prior]), np.zeros((n + len(prior), p, p))
+    H[:n] = curvature(model, found)
+    covariances = [
+        scipy.linalg.block_diag(scale * equations.covariance(noise), np.eye(len(prior)))
+        for noise, _, scale in found.hypotheses
+    ]
+    solvers = [quadratic_results(X, H, np.asarray(np.linalg.pinv(c, hermitian=True), float)) for c in covariances]
+    weight, place = np.array([w for _, w, _ in found.hypotheses]), _places(model, found)
     effects = [value for term in found.state.terms for value in term.values]
     estimate = np.concatenate([found.state.bias, found.state.matrix.ravel(), effects])
 
     def draw(rng: np.random.Generator, count: int) -> Values:
         chosen, steps = rng.choice(len(weight), count, p=weight), np.empty((count, p))
         for k in np.unique(chosen):
-            own = chosen == k
-            steps[own] = solvers[k](draw_normal(rng, candidates[k], int(np.count_nonzero(own))))
+            rows = chosen == k
+            steps[rows] = solvers[k](draw_normal(rng, covariances[k], int(np.count_nonzero(rows))))
         return np.asarray(estimate + steps @ place.T)
 
     return beside_trials(calibration, draw, trials, direct)
 
 
-def curvature(model: Model, found: Fit, parameters: int) -> Values:
+def curvature(model: Model, found: Fit) -> Values:
     """Return the derivative of the columns with respect to the parameters: (n, p, p) array, symmetric."""
     slopes = []
-    for j, u in enumerate(np.sqrt(np.diag(found.covariance))):
-        step = np.zeros(parameters)
-        step[j] = STEP * u
+    for j, step in enumerate(np.diag(STEP * np.sqrt(np.diag(found.covariance)))):
         (up, more), (down, less) = (stepped(model, found.state, sign * step) for sign in (1.0, -1.0))
         change = model.equations(up).columns - model.equations(down).columns
         slopes.append(change / (more[j] - less[j]) if step[j] > 0.0 else np.zeros_like(change))
@@ -258,7 +256,7 @@ def curvature(model: Model, found: Fit, parameters: int) -> Values:
 
 
 def require_faces(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> None:
-    """Raise ``NotObservableError``, with the faces without a rest, by the raw readings."""
+    """Raise ``NotObservableError`` if there is a face without a rest, by the raw readings."""
     rests = rests_of("accelerometer", recordings, settings)
     if rests is not None:
         used = rests.select(~rests.held_out)
@@ -268,7 +266,7 @@ def require_faces(recordings: Sequence[Recording], settings: Mapping[str, Any]) 
 def fit_faces(
     before: SensorCalibration, recordings: Sequence[Recording], settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Return the calibration of rests and their faces; ``before`` is that of the rests alone.
+    """Fit bias and full matrix to the rests and their faces; ``before``: the calibration by the rests alone.
 
     Raises ``NotObservableError`` if there is no rest on a face.
     """
@@ -279,18 +277,18 @@ def fit_faces(
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     found = fit(model, State(before.bias, before.matrix), noises, {})
     force, _ = model.specific_force(found.state, model.rests)
-    off = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
-    departs = zip(FACES, np.linalg.norm(off, axis=1), strict=True)
+    across = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
+    off = dict(zip(FACES, np.linalg.norm(across, axis=1).tolist(), strict=True))
     accuracy = float(settings["procedure"]["faces"]["accuracy_deg"])
     details = {
         "departures": [
             f"face {name} is {angle:.1f} deg off what the others say, {angle / accuracy:.1f} times "
             "procedure.faces.accuracy_deg"
-            for name, angle in departs
+            for name, angle in off.items()
             if angle > DEPARTS * accuracy
         ],
         "rests_on_faces": {name: int(np.count_nonzero(model.faces.face == i)) for i, name in enumerate(FACES)},
-        "face_off_deg": dict(zip(FACES, np.linalg.norm(off, axis=1).tolist(), strict=True)),
+        "face_off_deg": off,
         "scatter_of_rests": found.noise.scatter[0],
         "condition": found.condition,
         "degrees_of_freedom": float(found.degrees_of_freedom.min()),

@@ -8,8 +8,8 @@ file is not accepted as an explanation of a few rests. A selected effect whose d
 A selected effect that another one replaces with delta BIC > 10 is exchanged.
 
 The posterior over effects is computed for the linear problem of ``pipeline.estimation.evidence``: columns at the fit of
-the selected effects, and readings ``y = r + Z p`` with the residual r and their values p. As in the likelihood of the
-selection, white noise is known and a scatter only adds to it: sigma is at least 1.
+the selected effects, and readings ``y = r + Z p`` with the residual r and their values p. As in the selection, white
+noise is known and a scatter only adds to it: sigma is at least 1.
 """
 
 from __future__ import annotations
@@ -26,18 +26,12 @@ from pipeline.estimation.design import Term
 from pipeline.estimation.evidence import Problem, linear_problem
 from pipeline.estimation.gauss_markov import random_walks
 from pipeline.estimation.multi_position.fit import Fit, fit
-from pipeline.estimation.multi_position.likelihood import (
-    NEW,
-    NoiseHypothesis,
-    ProjectedCandidates,
-    project_out,
-    selection_hypotheses,
-)
-from pipeline.estimation.multi_position.model import Equations, Model, State, candidates_for
+from pipeline.estimation.multi_position.likelihood import NEW, NoiseHypothesis, project_out, selection_hypotheses
+from pipeline.estimation.multi_position.model import Model, State, refusal
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
-from pipeline.model.effects import effect
+from pipeline.model.effects import catalogue, effect
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -49,7 +43,7 @@ if TYPE_CHECKING:
 
 ROUNDS = 3 * MOST
 POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
-FAR = 5.0  # times its limits, which keep an amplitude that goes with a time constant from running away
+FAR = 5.0  # times its limits, which bound an amplitude that a time constant leaves undetermined
 COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
 
 
@@ -60,7 +54,7 @@ class Scored:
     scores: dict[str, Score]  # of those that the equations show
     visible: dict[str, float]  # mean gain of each with its parameters at their limits; infinite without limits
     shown: dict[str, Values]  # orthonormal directions of each under the model's best hypothesis
-    spare: dict[str, float]  # the factor on its gain; 0 where too few equations are left to judge it
+    spare: dict[str, float]  # the factor on its gain; 0 where too few equations remain to judge it
     signal: dict[str, Values]  # its fitted, whitened signal there
 
 
@@ -84,8 +78,8 @@ class Selection:
 
     ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sensor_config``: the
     sensor's section of the configuration. ``names``: in order. ``steps``: score of each when it was accepted. ``fits``:
-    of base and configured effects, then with each further selected one. ``own``: scores given all selected effects but
-    one.
+    of base and configured effects, then with each further selected one. ``own``: for each selected effect, the scores
+    given all others.
     """
 
     def __init__(
@@ -99,14 +93,14 @@ class Selection:
         self.model = model
         self.hypotheses = selection_hypotheses(noise, model.kinds)
         self.limits = limits_of(model.sensor, sensor_config)
-        self.candidates = candidates_for(model.sensor, model.rests, configured)
-        self.kept_near = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}
-        self.base = fit_configured(model, start, configured, self.hypotheses, self.kept_near)
-        self.held = len(self.base.state.terms)
+        effects = catalogue().items()
+        self.candidates = [e for n, e in effects if n not in configured and not refusal(e, model.sensor, model.rests)]
+        self.bounds = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}
+        self.base = fit_configured(model, start, configured, self.hypotheses, self.bounds)
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
-        self.known: dict[tuple[tuple[str, ...], tuple[str, ...]], Scored] = {}
+        self.cache: dict[tuple[tuple[str, ...], tuple[str, ...]], Scored] = {}
         self.first = self.last = self._scored([])
         for _ in range(ROUNDS):
             best = self._best(self.last) if len(self.names) < MOST else None
@@ -116,40 +110,18 @@ class Selection:
             elif not self._exchange():
                 break
             self.last = self._scored(self.names)
-        self.fits, self.own = self._ladder(), {name: self._own(name) for name in self.names}
+        parts = [self._fitted(self._state(self.names[:count])) for count in range(1, len(self.names))]
+        self.fits = [self.base, *parts, self.fit] if self.names else [self.base]
+        self.own = {name: self._without(name) for name in self.names}
 
     def _scored(self, names: Sequence[str]) -> Scored:
         """Score every effect given base, configured and some of the selected effects."""
         key = tuple(self.names), tuple(names)
-        if key not in self.known:
-            self.known[key] = self._score_all(names)
-        return self.known[key]
+        if key not in self.cache:
+            self.cache[key] = self._score_all(names)
+        return self.cache[key]
 
     def _score_all(self, names: Sequence[str]) -> Scored:
-        terms, found, equations = self._projected(names)
-        before, at = found.of_model()
-        out = Scored({}, {}, {}, {}, {})
-        for j, term in enumerate(terms):
-            name, count = term.effect.name, found.count(j, at)
-            if count == 0:
-                continue
-            added = count + len(term.effect.nonlinear)
-            factor = found.correction(j, at, added, equations.scatter)
-            after, own = found.with_candidate(j)
-            gain = factor * max(2.0 * (after - before), 0.0)
-            score = self._score(term, added, gain, found.raw[j][own], found.residual[own])
-            score = replace(score, setting=own, admissible=factor > 0.0)
-            if name in out.scores and out.scores[name].delta_bic >= score.delta_bic:
-                continue
-            shown = found.shown(j, at)
-            out.scores[name], out.spare[name], out.shown[name] = score, factor, shown
-            out.signal[name] = shown @ (shown.T @ found.residual[at])
-            out.visible[name] = self._reach(term, found.raw[j][at], factor)
-        self._refine(out, names, before)
-        return out
-
-    def _projected(self, names: Sequence[str]) -> tuple[list[Term], ProjectedCandidates, Equations]:
-        """Return the candidates with some of the selected effects projected out."""
         fitted = {term.effect.name: term.values for term in self.fit.state.terms}
         terms = []
         for this in self.candidates:
@@ -158,15 +130,37 @@ class Selection:
             elif this.name not in names:
                 terms += [Term(this, values) for values in this.starts(self.model.sensor)]
         equations = self.model.equations(self._state(names), terms)
-        return terms, project_out(equations, self.hypotheses), equations
+        projected = project_out(equations, self.hypotheses)
+        before, at = projected.of_model()
+        out = Scored({}, {}, {}, {}, {})
+        for j, term in enumerate(terms):
+            name, count = term.effect.name, projected.count(j, at)
+            if count == 0:
+                continue
+            added = count + len(term.effect.nonlinear)
+            factor = projected.correction(j, at, added, equations.scatter)
+            after, best = projected.with_candidate(j)
+            gain = factor * max(2.0 * (after - before), 0.0)
+            score = self._score(term, added, gain, projected.raw[j][best], projected.residual[best])
+            score = replace(score, setting=best, admissible=factor > 0.0)
+            if name in out.scores and out.scores[name].delta_bic >= score.delta_bic:
+                continue
+            shown, raw, limit = projected.shown(j, at), projected.raw[j][at], self.limits[name]
+            out.scores[name], out.spare[name], out.shown[name] = score, factor, shown
+            out.signal[name] = shown @ (shown.T @ projected.residual[at])
+            seen = np.linalg.norm(raw, axis=0) > 0.0
+            power = float(np.sum((limit[seen] * np.linalg.norm(raw[:, seen], axis=0)) ** 2))
+            out.visible[name] = factor * len(raw) * float(np.log1p(power / len(raw)))
+        self._refine(out, names, before)
+        return out
 
     def _score(self, term: Term, added: int, gain: float, raw: Values, residual: Values) -> Score:
         """Return the score of a candidate after one linear step."""
         inverse = np.linalg.pinv(raw, rcond=NEW)
         n, step = len(residual), inverse @ residual
-        left = residual - raw @ step
+        rest = residual - raw @ step
         values = term.values + step
-        uncertainty = np.sqrt(max(1.0, float(left @ left) / n) * np.sum(inverse**2, axis=1))
+        uncertainty = np.sqrt(max(1.0, float(rest @ rest) / n) * np.sum(inverse**2, axis=1))
         return Score(
             term.effect.name,
             gain - added * float(np.log(n)),
@@ -177,13 +171,6 @@ class Selection:
             0,
             plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= self.limits[term.effect.name])),
         )
-
-    def _reach(self, term: Term, raw: Values, factor: float) -> float:
-        """Return the gain that an effect at its limits reaches on average."""
-        limit = self.limits[term.effect.name]
-        seen = np.linalg.norm(raw, axis=0) > 0.0
-        power = float(np.sum((limit[seen] * np.linalg.norm(raw[:, seen], axis=0)) ** 2))
-        return factor * len(raw) * float(np.log1p(power / len(raw)))
 
     def _refine(self, scored: Scored, names: Sequence[str], before: float) -> None:
         """Fit the competing nonlinear candidates to their optimum, which one linear step may not reach."""
@@ -203,23 +190,23 @@ class Selection:
 
     def _state(self, names: Collection[str]) -> State:
         """Return the state of the fit with base, configured and some of the selected effects."""
-        terms = (t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names)
+        configured = len(self.base.state.terms)
+        terms = (t for i, t in enumerate(self.fit.state.terms) if i < configured or t.effect.name in names)
         return replace(self.fit.state, terms=tuple(terms))
 
     def _fitted(self, start: State, *further: Term) -> Fit:
         """Fit from a state, with further effects."""
         state = replace(start, terms=(*start.terms, *further))
-        return fit(self.model, state, self.hypotheses, self.kept_near)
+        return fit(self.model, state, self.hypotheses, self.bounds)
 
     def _best(self, scored: Scored) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
         passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s)]
-        worth = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in passing}
-        return max(passing, key=lambda s: worth[s.name], default=None)
+        return max(passing, key=lambda s: s.delta_bic - (0.0 if s.plausible else GATE_BIC), default=None)
 
     def _passes(self, score: Score) -> bool:
-        held = [term.effect.name for term in self.fit.state.terms]
-        if any(score.name in effect(name).contains or name in effect(score.name).contains for name in held):
+        fitted = [term.effect.name for term in self.fit.state.terms]
+        if any(score.name in effect(name).contains or name in effect(score.name).contains for name in fitted):
             return False
         significant = score.delta_bic > GATE_BIC and score.p_value * len(self.candidates) < GATE_P
         return score.admissible and significant and self._possible(score)
@@ -239,32 +226,28 @@ class Selection:
         del self.steps[name]
         self.fit = self._fitted(replace(self.base.state, terms=self._state(self.names).terms))
 
-    def _own(self, name: str) -> Scored:
+    def _without(self, name: str) -> Scored:
         return self._scored([n for n in self.names if n != name])
 
     def _drop(self) -> None:
+        """Remove each selected effect but the last whose delta BIC given the others is negative."""
         for name in self.names[:-1]:
-            own = self._own(name).scores.get(name)
-            if own is None or own.delta_bic < 0.0:
+            score = self._without(name).scores.get(name)
+            if score is None or score.delta_bic < 0.0:
                 self._remove(name)
 
     def _exchange(self) -> bool:
         """Replace a selected effect by another one that explains significantly more."""
         for name in self.names:
-            scores = self._own(name).scores
-            own = scores[name].delta_bic if name in scores else float("-inf")
+            scores = self._without(name).scores
+            threshold = GATE_BIC + (scores[name].delta_bic if name in scores else float("-inf"))
             rivals = [s for s in scores.values() if s.name not in self.names and s.admissible and self._possible(s)]
             rival = max(rivals, key=lambda s: s.delta_bic, default=None)
-            if rival is not None and rival.delta_bic > own + GATE_BIC:
+            if rival is not None and rival.delta_bic > threshold:
                 self._remove(name)
                 self._add(rival)
                 return True
         return False
-
-    def _ladder(self) -> list[Fit]:
-        """Return the fits of the base and with each further selected effect."""
-        further = [self._fitted(self._state(self.names[:count])) for count in range(1, len(self.names))]
-        return [self.base, *further, self.fit] if self.names else [self.base]
 
 
 def _nonlinear(this: Effect, sensor: str) -> Mask:
@@ -279,17 +262,17 @@ def posterior(selection: Selection, hidden: Collection[str]) -> Answers:
 
 
 def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
-    """Return the linear problem at the fit of what was selected."""
+    """Return the linear problem at the fit of the selected effects."""
     model, state = selection.model, selection.fits[-1].state
-    held = len(selection.fits[0].state.terms)
-    fitted = {term.effect.name: term for term in state.terms[held:]}
+    configured = len(selection.base.state.terms)
+    fitted = {term.effect.name: term for term in state.terms[configured:]}
     listed = [
         (name, term, weight)
         for name, this in effects.items()
         for term, weight in time_constants(this, model.sensor, fitted.get(name))
     ]
     equations = model.equations(state, [term for _, term, _ in listed])
-    base = np.concatenate([equations.base, *equations.effects[:held]], axis=1)
+    base = np.concatenate([equations.base, *equations.effects[:configured]], axis=1)
     pairs = zip(listed, equations.candidates, strict=True)
     columns = [Z[:, ~_nonlinear(term.effect, model.sensor)] for (_, term, _), Z in pairs]
     walks = random_walks(h.bias for h in selection.hypotheses)
@@ -298,27 +281,24 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     together = np.concatenate([base, *columns, equations.residual[:, None]], axis=1)
     whitened = [equations.whitened(noise, together) for noise in hypotheses]
     known = base.shape[1]
-    stacked = np.array([white.T @ white for white, _ in whitened])
-    size = np.sqrt(np.maximum(np.einsum("tii->ti", stacked), 1e-300))
-    scaled = stacked / (size[:, :, None] * size[:, None, :])
-    own = np.linalg.eigvalsh(scaled[:, :known, :known])
-    kept = int(np.sum(own[0] > NEW**2))
-    logarithm = np.sum(np.log(np.maximum(own[:, -kept:], 1e-300)), axis=1) + 2.0 * np.sum(
-        np.log(size[:, :known]), axis=1
-    )
-    prior = np.array([h.prior for h in hypotheses]) - 0.5 * (np.array([log for _, log in whitened]) + logarithm)
-    products = without(stacked, np.arange(known))[:, known:, known:]
+    products = np.array([white.T @ white for white, _ in whitened])
+    size = np.sqrt(np.maximum(np.einsum("tii->ti", products), 1e-300))
+    scaled = products / (size[:, :, None] * size[:, None, :])
+    eigenvalues = np.linalg.eigvalsh(scaled[:, :known, :known])
+    rank = int(np.sum(eigenvalues[0] > NEW**2))
+    logarithm = np.sum(np.log(np.maximum(eigenvalues[:, -rank:], 1e-300)), axis=1)
+    logarithm += 2.0 * np.sum(np.log(size[:, :known]), axis=1) + np.array([log for _, log in whitened])
     ends = np.cumsum([0, *(Z.shape[1] for Z in columns)]).tolist()
     samples = len(equations.residual)
     return linear_problem(
         [(name, weight, slice(*span)) for (name, _, weight), span in zip(listed, pairwise(ends), strict=True)],
-        products,
+        without(products, np.arange(known))[:, known:, known:],
         size[0, known:],
-        prior,
+        np.array([h.prior for h in hypotheses]) - 0.5 * logarithm,
         ({name: term.values for name, term in fitted.items()}, selection.limits),
         excluded([*effects.values()]),
         samples=samples,
-        free=float(max(samples - kept, 1)),
+        free=float(max(samples - rank, 1)),
         new=NEW,
         least=1.0,
     )
