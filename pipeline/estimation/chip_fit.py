@@ -218,7 +218,7 @@ class Fits:
     def moving(self) -> Mask:
         """Which rows are in motion."""
         names = [k for k in ("gyroscope", "gyroscope'", "accelerometer'") if k in self.clear]
-        return np.any(np.concatenate([self.clear[k] for k in names], axis=1) > 0.0, axis=1)
+        return np.asarray(np.any(np.concatenate([self.clear[k] for k in names], axis=1) > 0.0, axis=1))
 
 
 def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> Fits:
