@@ -39,18 +39,14 @@ def read_printed(folder: Path, name: str) -> pd.DataFrame:
     if "device" in rows:
         rows["device"] = rows["device"].str.lower()
     if "rate_table" in rows:
-        rows["procedure"] = [_procedure(row) for row in rows.to_dict("records")]
-        rows["set"] = (
-            rows["device"] + rows["rate_table"].map({"acutronic": "-", "mark2": "-mark2-"}) + rows["procedure"]
-        )
+        kinds = rows["procedure"] if "procedure" in rows else ["gyro_rate"] * len(rows)
+        rows["procedure"] = [
+            f"stop-{row['dwell_s']:g}s" if kind == "stop" else f"{kind.removesuffix('_rate')}-{row['speed_dps']:g}dps"
+            for kind, row in zip(kinds, rows.to_dict("records"), strict=True)
+        ]
+        table = rows["rate_table"].map({"acutronic": "-", "mark2": "-mark2-"})
+        rows["set"] = rows["device"] + table + rows["procedure"]
     return rows
-
-
-def _procedure(row: Mapping[str, Any]) -> str:
-    if row.get("dwell_s", np.nan) > 0.0:
-        return f"stop-{row['dwell_s']:g}s"
-    kind = "gyro" if "M11" in row or row.get("procedure") == "gyro_rate" else "continuous"
-    return f"{kind}-{row['speed_dps']:g}dps"
 
 
 def in_words(procedure: str) -> str:

@@ -165,9 +165,16 @@ class Drawn:
             self.filtered(recording.select(kept)) for recording, kept in self.turns_set.drawn(self.seed, self.cause)
         ]
 
-    def staged_accelerometer(self, *, as_printed: bool, judge: bool = True) -> Row:
-        """Return the parameters from the stages and, with ``judge``, the error after them."""
-        turns = self._accelerometer_turns(as_printed=as_printed)
+    def staged_accelerometer(self, *, as_printed: bool) -> tuple[Row, Row]:
+        """Return the parameters from the stages, and the error after them."""
+        turns = []
+        drawn = self.turns_set.drawn(self.seed, self.cause)
+        for part, (recording, kept) in zip(self.turns_set.parts, drawn, strict=True):
+            filtered = self.filtered(recording.select(kept))
+            late = replace(part, recording=replace(part.recording, filter=filtered.filter))
+            used = samples_of(late, as_printed=as_printed)
+            reading = np.asarray(filtered.accelerometer)[used[kept]]
+            turns.append(Turn(np.asarray(part.motion.angle)[kept & used], reading, [], []))
         fitted = [[s.coefficients for s in fits] for fits in ([] if as_printed else sinusoids_of(turns))]
         extremes = extremes_of_samples(turns, 1.0) if as_printed else extremes_of_sinusoids(fitted, 1.0)
         found: dict[str, float] = {}
@@ -178,33 +185,19 @@ class Drawn:
         row = {f"b_{a}": found[f"b_{a}"] for a in AXES}
         row |= {f"{q}_{a}": (found[f"{q}_P_{a}"] + found[f"{q}_N_{a}"]) / 2.0 for q in "OS" for a in AXES}
         row["M"] = (found["M_P_x"] + found["M_N_x"]) / 2.0  # the same on all axes
-        if judge:
-            row["error"] = self._accelerometer_error(partial(apply_correction, {"steps": chain.steps}))
-        return row
+        return row, self._accelerometer_error(partial(apply_correction, {"steps": chain.steps}))
 
     def least_squares_accelerometer(self) -> Row:
         """Return the error after nonlinear least squares."""
         table, sensor = (read_config(group, getattr(self.turns_set.unit, group)) for group in ("table", "sensor"))
         settings = {"table": table, "sensor": sensor, "procedure": {"holdout_every": 0}}
         fitted = nonlinear_least_squares.fit(self.turns(), None, settings)
-        return {"error": self._accelerometer_error(partial(linear_truth, fitted))}
+        return self._accelerometer_error(partial(linear_truth, fitted))
 
-    def _accelerometer_error(self, correct: Callable[[Values], Values]) -> float:
+    def _accelerometer_error(self, correct: Callable[[Values], Values]) -> Row:
         """Return the mean |e| of the held-out motion, corrected."""
         reading = self.filtered(self.held_out).accelerometer
-        return float(np.mean(np.abs(np.linalg.norm(correct(np.asarray(reading)), axis=1) - 1.0)))
-
-    def _accelerometer_turns(self, *, as_printed: bool) -> list[Turn]:
-        """Return the turns as the staged method uses them; their motion is the same for every seed."""
-        turns = []
-        drawn = self.turns_set.drawn(self.seed, self.cause)
-        for part, (recording, kept) in zip(self.turns_set.parts, drawn, strict=True):
-            filtered = self.filtered(recording.select(kept))
-            late = replace(part, recording=replace(part.recording, filter=filtered.filter))
-            used = samples_of(late, as_printed=as_printed)
-            reading = np.asarray(filtered.accelerometer)[used[kept]]
-            turns.append(Turn(np.asarray(part.motion.angle)[kept & used], reading, [], []))
-        return turns
+        return {"error": float(np.mean(np.abs(np.linalg.norm(correct(np.asarray(reading)), axis=1) - 1.0)))}
 
     def gyroscope(self) -> Iterator[tuple[str, Row]]:
         """Yield method and error of the staged method, and of Cholesky and LU as printed and inverted."""
@@ -248,20 +241,17 @@ def _rows(drawn: Drawn) -> Iterator[tuple[str, str, Row]]:
         for method, row in drawn.gyroscope():
             yield LOST, method, row
         return
-    yield LOST, "printed", drawn.staged_accelerometer(as_printed=True)
-    yield LOST, "staged", _error_alone(drawn.staged_accelerometer(as_printed=False))
+    parameters, error = drawn.staged_accelerometer(as_printed=True)
+    yield LOST, "printed", parameters | error
+    yield LOST, "staged", drawn.staged_accelerometer(as_printed=False)[1]
     if drawn.turns_set.unit.table == "acutronic":
         for cause in (c for c in CAUSES if c != LOST):
-            yield cause, "printed", replace(drawn, cause=cause).staged_accelerometer(as_printed=True, judge=False)
+            yield cause, "printed", replace(drawn, cause=cause).staged_accelerometer(as_printed=True)[0]
     if "-continuous-" in name:
         for method in ("zero-phase", "same-gain", "unfiltered"):
-            yield LOST, method, _error_alone(replace(drawn, filter=method).staged_accelerometer(as_printed=False))
+            yield LOST, method, replace(drawn, filter=method).staged_accelerometer(as_printed=False)[1]
     if name.endswith("-stop-1s") or name == "stim300-continuous-0.5dps":
         yield LOST, "least-squares", drawn.least_squares_accelerometer()
-
-
-def _error_alone(row: Row) -> Row:
-    return {"error": row["error"]}
 
 
 def device_of(name: str) -> str:

@@ -170,19 +170,20 @@ def _method_tables(printed: Path, results: Results) -> Cells:
 
 def _paper_tables(printed: Path, results: Results) -> Cells:
     """Yield the cells of tables 1 to 4 of the conference paper."""
-    made = "GY-521, 24 orientations"
     by_table = dict(iter(read_printed(printed, "conference_paper").groupby("table")))
     positions = read_printed(printed, "conference_paper_six_positions")
-    for table, title, found in (
-        ("paper 1", f"{made}: nonlinear least squares", _paper_1(by_table["1"], results)),
-        ("paper 2", f"{made}, judged in six positions", _paper_2(positions, results)),
+    for table, title, rows in (
+        ("paper 1", "GY-521, 24 orientations: nonlinear least squares", _paper_1(by_table["1"], results)),
+        ("paper 2", "GY-521, 24 orientations, judged in six positions", _paper_2(positions, results)),
         ("paper 3", "GY-521, gyroscope: Cholesky and LU", _paper_3(by_table["3"], results)),
+        (
+            *("paper 4", "GY-521, gyroscope: error of the integrated angle, row i in the turn about axis i"),
+            _paper_4(by_table["4"], results),
+        ),
     ):
-        for row, printed_values, ours, digits in found:
-            yield from _cells((table, title, "", row), ["GY-521"], [printed_values], [ours], digits)
-    title = "GY-521, gyroscope: error of the integrated angle, row i in the turn about axis i"
-    for row, errors, our_values in _paper_4(by_table["4"], results):
-        yield from _cells(("paper 4", title, "", row), AXES, errors, our_values, 4)
+        columns = AXES if table == "paper 4" else ["GY-521"]
+        for row, printed_values, ours, digits in rows:
+            yield from _cells((table, title, "", row), columns, np.ravel(printed_values), np.ravel(ours), digits)
 
 
 def _paper_1(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float, int]]:
@@ -205,19 +206,15 @@ def _paper_1(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float,
 
 def _paper_2(positions: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float, int]]:
     """Yield the mean reading of the vertical axis, before and after calibration by the 24 orientations."""
-    means = _rest_means(results.recordings(f"{PAPER}-six-positions", "rests"))
+    rests = [(r, rest) for r in results.recordings(f"{PAPER}-six-positions", "rests") for rest in find_rests(r)]
+    means = [np.asarray(r.accelerometer)[rest.start : rest.stop].mean(axis=0) for r, rest in rests]
+    mean_readings = np.array(means or [np.full(3, np.nan)])
     bias, matrix = results.calibration(f"{PAPER}-orientations", "accelerometer")
     for row in positions.to_dict("records"):
         ideal = values(row, "{}_ideal_g")
-        reading = means[np.argmax(means @ ideal)]
+        reading = mean_readings[np.argmax(mean_readings @ ideal)]
         yield f"{row['axis']} up: before, g", row["mean_before_g"], reading @ np.abs(ideal), 3
         yield f"{row['axis']} up: after, g", row["mean_after_g"], (matrix @ (reading - bias)) @ np.abs(ideal), 3
-
-
-def _rest_means(recordings: list[Recording]) -> Values:
-    rests = [(r, rest) for r in recordings for rest in find_rests(r)]
-    means = [np.asarray(r.accelerometer)[rest.start : rest.stop].mean(axis=0) for r, rest in rests]
-    return np.array(means or [np.full(3, np.nan)])
 
 
 def _paper_3(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float, int]]:
@@ -232,14 +229,14 @@ def _paper_3(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float,
             yield name.replace("_", ""), row[axis], ours, 4
 
 
-def _paper_4(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, Values, Values]]:
+def _paper_4(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, Values, Values, int]]:
     bias, matrix = results.calibration(f"{PAPER}-gyro-20dps", "gyroscope")
     turns = {r.axis: r for r in results.recordings(f"{PAPER}-gyro-20dps", "gyroscope")}
     for row in rows.to_dict("records"):
         about, when = AXES[int(row["row"]) - 1], row["quantity"].rpartition("_")[2]
         used = matrix if when == "after" else np.eye(3)
         ours = _angle_errors(turns[about], bias, used) if about in turns else np.full(3, np.nan)
-        yield f"about {about}: {when}, deg", values(row, "{}"), ours
+        yield f"about {about}: {when}, deg", values(row, "{}"), ours, 4
 
 
 def _angle_errors(recording: Recording, bias: Values, matrix: Values) -> Values:
