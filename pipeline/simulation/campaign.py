@@ -9,14 +9,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from pipeline.errors import ConfigurationError
 from pipeline.io.arrow import write_canonical_csv
@@ -82,7 +81,11 @@ def write_campaign(
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({**truth, "unit": unit.unit}, indent=1) + "\n", encoding="utf-8")
         progress(f"{unit.unit}: {sum(r.samples for r in recordings)} samples in {len(recordings)} recordings")
-    (directory / "units.csv").write_text(_table(_sheet_rows(description)), encoding="utf-8")
+    table = pd.DataFrame(_sheet_rows(description), dtype=object)
+    columns = [*(c for c in COLUMNS if c in table), *(c for c in table if c not in COLUMNS)]
+    (directory / "units.csv").write_text(
+        table.to_csv(columns=columns, index=False, lineterminator="\n"), encoding="utf-8"
+    )
     if not (directory / "campaign.yaml").exists():
         (directory / "campaign.yaml").write_text(CAMPAIGN, encoding="utf-8")
 
@@ -96,11 +99,11 @@ def _sheet_rows(description: Description) -> list[dict[str, Any]]:
         for unit in description.units
     ]
     variants = []
-    for variant, row in product(description.variants, rows):
-        changed = {**row, **(variant.get("columns") or {}), "unit": f"{row['unit']}{variant['suffix']}"}
+    for variant, row in product(description.variants or (), rows):
+        changed = {**row, **variant.columns, "unit": f"{row['unit']}{variant.suffix}"}
         overrides = [changed.get("overrides"), f"procedure.folder=raw/{row['unit']}"]
         variants.append(changed | {"overrides": "; ".join(o for o in overrides if o)})
-    return rows + variants + [{str(k): v for k, v in row.items()} for row in description.rows]
+    return rows + variants + list(description.rows or ())
 
 
 def simulate_unit(
@@ -138,8 +141,8 @@ def simulate_unit(
     planned = [*_selected(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
     total = sum(p.trajectory.duration + course.pause_s for p in planned)
     ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
-    environment = random_environment(streams["room"], ramp=ramp, ramp_period=total / 1.5)
-    environment = replace(environment, **unit.temperature)
+    of_ramp = {"ramp": ramp, "ramp_period": total / 1.5}
+    environment = replace(random_environment(streams["room"]), **{**of_ramp, **unit.temperature})
     pause = unit.interval_s if unit.procedure == ONE_RECORDING else course.pause_s
     truth = {
         "seed": [seed, number],
@@ -194,14 +197,3 @@ def _truth(sensor: SimulatedSensor, effects: Hidden, interval: float) -> dict[st
             "correlation_time": sensor.sensor_config["wander_time_s"],
         },
     }
-
-
-def _table(rows: list[dict[str, Any]]) -> str:
-    """Return the text of units.csv: the known columns that any row has, then the others."""
-    found = dict.fromkeys(key for row in rows for key in row)
-    columns = [c for c in COLUMNS if c in found] + [c for c in found if c not in COLUMNS]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()

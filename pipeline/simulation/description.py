@@ -20,16 +20,27 @@ from __future__ import annotations
 
 import os
 from copy import deepcopy
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import CONFIGS
 from pipeline.io.files import wrong_name
 from pipeline.io.yaml_file import read_yaml
 from pipeline.model.sensor_file import completed
-from pipeline.simulation.procedures import FERRARIS, ONE_RECORDING, TABLE_PROCEDURES, Course, fit_to_samples
+from pipeline.simulation.procedures import (
+    FERRARIS,
+    ONE_RECORDING,
+    TABLE_PROCEDURES,
+    Course,
+    Described,
+    Positive,
+    fit_to_samples,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -47,36 +58,36 @@ FACES_AND_TURNS = replace(BY_HAND, dwell_s=5.0, rates_dps=(120.0,), both_directi
 RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
 
 
-@dataclass(frozen=True)
-class TableLog:
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class TableLog(Described):
     """How the table is logged."""
 
-    kind: str = "rows"  # rows: in the sensor's rows; file: in a separate file; program: not at all
-    interval_s: float = 0.01  # of a file
+    PART: ClassVar[str] = "table_log"
+
+    kind: Literal["rows", "file", "program"] = (
+        "rows"  # rows: in the sensor's rows; file: in a separate file; program: not at all
+    )
+    interval_s: Positive = 0.01  # of a file
     offset_s: float | None = None  # of the file's clock; None: at random, 0 to 100 s
     drift_ppm: float | None = None  # of the file's clock; None: at random, standard deviation 50 ppm
     wrapped: bool = False  # whether the encoder restarts at 360 deg
 
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ConfigurationError(f"table_log.kind is {self.kind!r}; it is {', '.join(KINDS)}")
 
-
-@dataclass(frozen=True)
-class UnitDescription:
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class UnitDescription(Described):
     """One unit to be simulated."""
 
     unit: str
-    count: int = 1  # above 1, ``unit`` is a prefix
+    count: Annotated[int, Field(ge=1)] = 1  # above 1, ``unit`` is a prefix
     sensor: str = "mpu6050"
     table: str = "acutronic"
     procedure: str = "three_axis_turns"
     columns: dict[str, Any] = field(default_factory=dict)  # of units.csv: serial, lot, date, method, overrides ...
     course: dict[str, Any] = field(default_factory=dict)  # attributes of ``procedures.Course``
     samples: int | None = None  # approximate total number of rows of the recordings
-    interval_s: float = 0.12
-    lost: float = 0.0  # share of the samples that the radio link loses
-    format: str = "csv"
+    interval_s: Positive = 0.12
+    lost: Annotated[float, Field(ge=0.0, lt=0.9)] = 0.0  # share of the samples that the radio link loses
+    format: Literal["csv", "mcap"] = "csv"
     # bias (g or deg/s), matrix, or instead of it scale_factor (of the correction), non_orthogonality_deg (yx, zx, zy),
     # mounting_deg (turns about x, then y, then z); noise_density, bias_wander, wander_time_s replace the sensor file's
     accelerometer: dict[str, Any] = field(default_factory=dict)
@@ -84,7 +95,7 @@ class UnitDescription:
     # sensor.effect, or effect alone for both sensors, to null (a typical size, at random), a number (that size, with
     # random signs), the list of the parameters' values, or a new formula (``sensor``)
     effects: dict[str, Any] = field(default_factory=dict)
-    # errors of the table: tilt_deg (2,) and the settings of ``rate_table.random_errors``, by default from the
+    # errors of the table: tilt_deg (2,) and the settings of ``trajectory.random_errors``, by default from the
     # accuracies of the table's configuration. And the mounting of the unit: mounting_deg (recording to a rotation
     # vector, body frame), zero_deg (recording to the logged angle at the convention's angle 0), sense (-1: the table
     # counts the other way)
@@ -100,48 +111,54 @@ class UnitDescription:
     def __post_init__(self) -> None:
         wrong = wrong_name(self.unit)
         if wrong:
-            raise ConfigurationError(f"unit {self.unit[:60]!r}: {wrong}")
-        if self.format not in FORMATS:
-            raise ConfigurationError(f"unit {self.unit}: format {self.format!r} is not known; use csv or mcap")
-        if not 0.0 <= self.lost < 0.9:
-            raise ConfigurationError(f"unit {self.unit}: lost is {self.lost}; it is a share from 0 to 0.9")
-        if not self.interval_s > 0.0:
-            raise ConfigurationError(f"unit {self.unit}: interval_s is {self.interval_s}; it must be above 0")
-        _refuse_unknown(self.course, {f.name for f in fields(Course)}, f"unit {self.unit}: course")
-        _refuse_unknown(self.table_log, {f.name for f in fields(TableLog)}, "table_log")
+            raise ConfigurationError(f"unit is {self.unit[:60]!r}; {wrong}")
+        self.whole_course()
         log = self.log.kind
         if log != "rows" and self.format != "csv":
-            raise ConfigurationError(f"unit {self.unit}: a separate table_log is written in csv only")
+            raise ConfigurationError("a separate table_log is written in csv only")
         if log != "rows" and self.procedure not in TABLE_PROCEDURES:
-            raise ConfigurationError(f"unit {self.unit}: procedure {self.procedure} has no table to log")
+            raise ConfigurationError(f"procedure {self.procedure} has no table to log")
         if log == PROGRAM and self.procedure == ONE_RECORDING:
-            raise ConfigurationError(f"unit {self.unit}: procedure {ONE_RECORDING} has moves that no program describes")
+            raise ConfigurationError(f"procedure {ONE_RECORDING} has moves that no program describes")
 
     @property
     def log(self) -> TableLog:
         """How the table is logged."""
         return TableLog(**self.table_log)
 
+    def whole_course(self) -> Course:
+        """Return how the procedure is run, with its default lengths."""
+        base = FACES_AND_TURNS if self.procedure == FERRARIS else BY_HAND
+        return replace(Course() if self.procedure in TABLE_PROCEDURES else base, **self.course)
+
 
 def course_of(unit: UnitDescription) -> Course:
     """Return how the unit's procedure is run, with lengths that give its number of samples."""
-    base = Course() if unit.procedure in TABLE_PROCEDURES else BY_HAND
-    base = FACES_AND_TURNS if unit.procedure == FERRARIS else base
-    wanted: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in unit.course.items()}
-    course = replace(base, **wanted)
+    course = unit.whole_course()
     if unit.samples is None:
         return course
     return fit_to_samples(unit.procedure, course, unit.samples, unit.interval_s, keep_step="step_deg" in unit.course)
 
 
-@dataclass(frozen=True)
-class Description:
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Variant(Described):
+    """Every unit again: the suffix of their names, and changed columns of ``units.csv``."""
+
+    PART: ClassVar[str] = "variants"
+
+    suffix: Annotated[str, Field(min_length=1)]
+    columns: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Description(Described):
     """A campaign to simulate; ``rows``: further rows of ``units.csv``."""
 
-    seed: int
-    units: tuple[UnitDescription, ...]
-    rows: tuple[dict[str, Any], ...] = ()
-    variants: tuple[dict[str, Any], ...] = ()
+    seed: int = 0
+    defaults: dict[str, Any] | None = None
+    units: tuple[UnitDescription, ...] = ()
+    rows: tuple[dict[str, Any], ...] | None = None
+    variants: tuple[Variant, ...] | None = None
 
 
 def read_description(path: Path) -> Description:
@@ -154,24 +171,25 @@ def read_description(path: Path) -> Description:
 
 def description_from(data: dict[str, Any], origin: str) -> Description:
     """Return the description from a mapping; ``origin`` is named in messages."""
-    _refuse_unknown(data, {"seed", "defaults", "units", "variants", "rows"}, origin)
-    known = {f.name for f in fields(UnitDescription)}
-    units = []
-    for entry in data.get("units") or ():
-        merged = {**(data.get("defaults") or {}), **entry}
-        _refuse_unknown(merged, known, f"{origin}: unit {entry.get('unit')}")
+    units, defaults = [], data.get("defaults") or {}
+    entries = data.get("units") or []
+    if not isinstance(defaults, dict) or not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
+        raise ConfigurationError(f"{origin}: defaults is a mapping of the keys of a unit, and units a list of them")
+    for entry in entries:
+        merged = {str(key): value for key, value in {**defaults, **entry}.items()}
         if "unit" not in merged:
             raise ConfigurationError(f"{origin}: a unit has no name; give it one with the key unit")
-        units += _units_of_entry(merged)
-    names = [u.unit for u in units]
-    if not names or len(set(names)) < len(names):
+        try:
+            units += _units_of_entry(UnitDescription(**merged))
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{origin}: unit {merged['unit']}: {error.message}") from None
+    try:
+        description = Description(**{str(key): value for key, value in data.items()} | {"units": units})
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{origin}: {error.message}") from None
+    if not units or len({u.unit for u in units}) < len(units):
         raise ConfigurationError(f"{origin}: there must be at least one unit, and each needs a unique name")
-    variants = tuple(data.get("variants") or ())
-    for variant in variants:
-        _refuse_unknown(variant, {"suffix", "columns"}, f"{origin}: variants")
-        if not variant.get("suffix"):
-            raise ConfigurationError(f"{origin}: variants: each needs a suffix for the names of its units")
-    return Description(int(data.get("seed", 0)), tuple(units), tuple(data.get("rows") or ()), variants)
+    return description
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:
@@ -204,21 +222,16 @@ def read_option(group: str, name: str) -> dict[str, Any]:
     return _read_mapping(path)
 
 
-def _units_of_entry(entry: dict[str, Any]) -> list[UnitDescription]:
+def _units_of_entry(entry: UnitDescription) -> list[UnitDescription]:
     """Return the units of an entry; with a count, its name is the prefix of their names."""
-    count = entry.get("count", 1)
-    if count == 1:
-        return [UnitDescription(**entry)]
-    names = [f"{entry['unit']}{number:0{max(3, len(str(count)))}d}" for number in range(1, count + 1)]
+    if entry.count == 1:
+        return [entry]
+    digits = max(3, len(str(entry.count)))
+    names = [f"{entry.unit}{number:0{digits}d}" for number in range(1, entry.count + 1)]
     lots = [{"serial": name, "lot": f"L{k // UNITS_OF_A_LOT + 1}"} for k, name in enumerate(names)]
-    own = [{"unit": name, "columns": lot | entry.get("columns", {})} for name, lot in zip(names, lots, strict=True)]
-    return [UnitDescription(**{**entry, "count": 1, **each}) for each in own]
-
-
-def _refuse_unknown(data: dict[str, Any], known: set[str], origin: str) -> None:
-    unknown = sorted(set(data) - known)
-    if unknown:
-        raise ConfigurationError(f"{origin}: {', '.join(unknown)} is not known; known: {', '.join(sorted(known))}")
+    return [
+        replace(entry, unit=name, count=1, columns=lot | entry.columns) for name, lot in zip(names, lots, strict=True)
+    ]
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:

@@ -8,17 +8,18 @@ up and down. ``multi_position``: rests in random attitudes. ``ferraris``: six fa
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import fields, replace
 from functools import cache
 from itertools import pairwise, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
+from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
 
 from pipeline.errors import ConfigurationError
 from pipeline.io.commanded_motion import Program
 from pipeline.records import AXES
-from pipeline.simulation.rate_table import rest, turn, turn_with_plateau
 from pipeline.simulation.trajectory import (
     Gimbals,
     Moves,
@@ -28,8 +29,11 @@ from pipeline.simulation.trajectory import (
     orientations_24,
     random_attitudes,
     random_gimbals,
+    rest,
     rotation_by,
     six_positions,
+    turn,
+    turn_with_plateau,
 )
 
 if TYPE_CHECKING:
@@ -44,52 +48,58 @@ TRANSIT = "transit"  # name and role of a move between recordings
 TRANSIT_RATE_DPS = 20.0  # as between stops
 LEAST_ANGLE_DEG = 1e-6  # below it nothing moves: rounding
 TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp", ONE_RECORDING)
-ABOVE_ZERO = (
-    "step_deg", "dwell_s", "accelerometer_rates_dps", "rates_dps", "turns", "acceleration_dps2", "step_rate_dps",
-    "validation_rate_dps",
-)  # fmt: skip
-ZERO_OR_MORE = (
-    "warm_up_rest_s", "rest_s", "validation_s", "static_s", "pause_s", "thermal_ramp_degc",
-    "turn_error_deg", "turn_axis_error_deg",
-)  # fmt: skip
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 STEPS_DEG = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)  # divisors of a turn
 
 
-@dataclass(frozen=True)
-class Course:
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Described:
+    """A part of the description of a simulation; an invalid value raises ``ConfigurationError``."""
+
+    PART: ClassVar[str] = ""  # its name in messages
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _refuse(cls, given: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401
+        try:
+            return handler(given)
+        except ValidationError as errors:
+            error = errors.errors()[0]
+        key, where = ".".join(map(str, error["loc"])), cls.PART and f"{cls.PART}: "
+        if error["type"] == "unexpected_keyword_argument":
+            known = ", ".join(sorted(f.name for f in fields(cls)))
+            raise ConfigurationError(f"{where}{key} is not known; known: {known}")
+        if error["type"] == "missing":
+            raise ConfigurationError(f"{where}{key} is missing")
+        reason = error["msg"].replace("Input should be", "it must be")
+        raise ConfigurationError(f"{where}{key} is {error['input']!r}; {reason[0].lower()}{reason[1:]}")
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Course(Described):
     """How a procedure is run."""
 
-    step_deg: float = 5.0  # of stop-and-go
-    dwell_s: float = 1.0  # rest at each stop, orientation or position
-    accelerometer_rates_dps: tuple[float, ...] = ()  # continuous turns instead of stop-and-go
-    rates_dps: tuple[float, ...] = (60.0,)  # of the gyroscope's turns
-    both_directions: bool = False  # each turn of the gyroscope and each continuous one is also made backwards
-    turns: int = 1  # whole turns at each rate
-    warm_up_rest_s: float = 30.0  # before the first turn of a recording for the gyroscope
-    rest_s: float = 3.0  # after each turn
-    acceleration_dps2: float = 100.0  # of the table
-    step_rate_dps: float = 20.0  # of the table between stops
-    validation_s: float = 120.0  # length of held-out motion; 0: none
-    validation_rate_dps: float = 40.0  # largest |rate| in it
-    static_s: float = 120.0  # length of the long rest; 0: none
-    pause_s: float = 30.0  # between recordings, and before the first
-    positions: int = 40  # rests of multi_position
-    thermal_ramp_degc: float = 15.0  # amplitude of the chamber's ramp in thermal_ramp
-    turn_error_deg: float = 3.0  # by hand in ferraris, standard deviation of the total angle of each turn
-    turn_axis_error_deg: float = 1.5  # and of each of the two angles between a body axis and the turns about it
+    PART: ClassVar[str] = "course"
 
-    def __post_init__(self) -> None:
-        for name in ABOVE_ZERO:
-            value = getattr(self, name)
-            if not all(v > 0.0 for v in (value if isinstance(value, tuple) else (value,))):
-                raise ConfigurationError(f"course: {name} is {value}; it must be above 0")
-        for name in ZERO_OR_MORE:
-            if not getattr(self, name) >= 0.0:
-                raise ConfigurationError(f"course: {name} is {getattr(self, name)}; it cannot be below 0")
-        if not self.rates_dps or self.positions < 2 or self.step_deg > 360.0:
-            raise ConfigurationError(
-                "course: give at least one rate in rates_dps, 2 positions, and steps up to 360 deg"
-            )
+    step_deg: Annotated[Positive, Field(le=360.0)] = 5.0  # of stop-and-go
+    dwell_s: Positive = 1.0  # rest at each stop, orientation or position
+    accelerometer_rates_dps: tuple[Positive, ...] = ()  # continuous turns instead of stop-and-go
+    rates_dps: Annotated[tuple[Positive, ...], Field(min_length=1)] = (60.0,)  # of the gyroscope's turns
+    both_directions: bool = False  # each turn of the gyroscope and each continuous one is also made backwards
+    turns: Annotated[int, Field(ge=1)] = 1  # whole turns at each rate
+    warm_up_rest_s: NonNegative = 30.0  # before the first turn of a recording for the gyroscope
+    rest_s: NonNegative = 3.0  # after each turn
+    acceleration_dps2: Positive = 100.0  # of the table
+    step_rate_dps: Positive = 20.0  # of the table between stops
+    validation_s: NonNegative = 120.0  # length of held-out motion; 0: none
+    validation_rate_dps: Positive = 40.0  # largest |rate| in it
+    static_s: NonNegative = 120.0  # length of the long rest; 0: none
+    pause_s: NonNegative = 30.0  # between recordings, and before the first
+    positions: Annotated[int, Field(ge=2)] = 40  # rests of multi_position
+    thermal_ramp_degc: NonNegative = 15.0  # amplitude of the chamber's ramp in thermal_ramp
+    turn_error_deg: NonNegative = 3.0  # by hand in ferraris, standard deviation of the total angle of each turn
+    turn_axis_error_deg: NonNegative = 1.5  # and of each of the two angles between a body axis and the turns about it
 
     @property
     def signs(self) -> tuple[float, ...]:
@@ -104,7 +114,11 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
     if there is no such procedure.
     """
     if procedure in TABLE_PROCEDURES:
-        planned = _turns(course) + _heldout(course, rng)
+        planned = _turns(course)
+        if course.validation_s > 0.0:
+            motion = random_gimbals(course.validation_s, course.validation_rate_dps, rng)
+            planned.append(Planned("validation", "validation", None, motion))
+        planned += _static(course)
         return _with_transits(planned, course) if procedure == ONE_RECORDING else planned
     attitudes: dict[str, Callable[[], Values]] = {
         "orientations_24": orientations_24,
@@ -115,10 +129,10 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
         known = ", ".join((*TABLE_PROCEDURES, *attitudes, FERRARIS))
         raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
     if procedure == FERRARIS:
-        motion = _faces_and_turns(course, rng, hand_accuracy)
+        moves = _faces_and_turns(course, rng, hand_accuracy)
     else:
-        motion = _rests(attitudes[procedure](), course, rng, hand_accuracy)
-    planned = [Planned("recording", "rests", None, motion)]
+        moves = _rests(attitudes[procedure](), course, rng, hand_accuracy)
+    planned = [Planned("recording", "rests", None, moves)]
     if course.validation_s > 0.0:
         count = max(2, int(course.validation_s / (course.dwell_s + 2.0)))
         held_out = _rests(random_attitudes(count, rng), replace(course, warm_up_rest_s=0.0), rng, 0.0)
@@ -159,17 +173,17 @@ def fit_to_samples(procedure: str, course: Course, samples: int, interval: float
 
 
 def _turns(course: Course) -> list[Planned]:
-    accelerometer = [Planned(f"accel_{a}", "accelerometer", i, _accelerometer(i, course)) for i, a in enumerate(AXES)]
-    turns = [_continuous(i, course, course.warm_up_rest_s, course.rates_dps) for i in range(3)]
-    gyroscope = [Planned(f"gyro_{a}", "gyroscope", i, t) for i, (a, t) in enumerate(zip(AXES, turns, strict=True))]
-    return accelerometer + gyroscope
-
-
-def _accelerometer(axis: int, course: Course) -> Turn:
-    if course.accelerometer_rates_dps:
-        return _continuous(axis, course, course.rest_s, course.accelerometer_rates_dps)
+    """Return the turns about each axis: for the accelerometer, then for the gyroscope."""
     stay, step = rest(course.dwell_s), turn(course.step_deg, course.step_rate_dps, course.acceleration_dps2)
-    return Turn(axis, Program([stay, *[step, stay] * round(360.0 / course.step_deg)]))
+    stops = Program([stay, *[step, stay] * round(360.0 / course.step_deg)])
+    rates = course.accelerometer_rates_dps
+    accelerometer = [_continuous(i, course, course.rest_s, rates) if rates else Turn(i, stops) for i in range(3)]
+    gyroscope = [_continuous(i, course, course.warm_up_rest_s, course.rates_dps) for i in range(3)]
+    return [
+        Planned(f"{prefix}_{AXES[turn.axis]}", role, turn.axis, turn)
+        for prefix, role, turns in (("accel", "accelerometer", accelerometer), ("gyro", "gyroscope", gyroscope))
+        for turn in turns
+    ]
 
 
 def _continuous(axis: int, course: Course, before_s: float, rates: Sequence[float]) -> Turn:
@@ -178,13 +192,6 @@ def _continuous(axis: int, course: Course, before_s: float, rates: Sequence[floa
     for rate, sign in product(rates, course.signs):
         steps += [turn_with_plateau(sign * 360.0 * course.turns, rate, course.acceleration_dps2), rest(course.rest_s)]
     return Turn(axis, Program(steps))
-
-
-def _heldout(course: Course, rng: np.random.Generator) -> list[Planned]:
-    if course.validation_s <= 0.0:
-        return _static(course)
-    motion = random_gimbals(course.validation_s, course.validation_rate_dps, rng)
-    return [Planned("validation", "validation", None, motion), *_static(course)]
 
 
 def _static(course: Course) -> list[Planned]:

@@ -67,8 +67,13 @@ if TYPE_CHECKING:
     Alteration = Callable[["Scene", Values], "Scene"]
     Hidden = dict[str, tuple[Effect, Values]]  # by name: an effect and the values of its parameters
 
-# Edges of the panels in time constants: exp(-20) is 2e-9.
+# Edges of the panels in time constants: exp(-20) is 2e-9. The rule: nodes s and weights of the integral of
+# ``exp(-s) u(s)``, two a panel; the weights sum to 1.
 PANELS = np.concatenate([np.linspace(0.0, 2.0, 21), np.linspace(2.25, 6.0, 16), np.linspace(7.0, 20.0, 14)])
+
+MIDDLE, HALF = (PANELS[1:] + PANELS[:-1]) / 2.0, np.diff(PANELS) / 2.0
+NODES = np.concatenate([MIDDLE - HALF / np.sqrt(3.0), MIDDLE + HALF / np.sqrt(3.0)])
+LAG_RULE = NODES, np.tile(HALF, 2) * np.exp(-NODES) / np.sum(np.tile(HALF, 2) * np.exp(-NODES))
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class Scene:
     axis: int | None = None  # of the turn
     gravity: float = 1.0  # g
     up: Values = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # the true vertical in the level frame
-    earth: Values | None = None  # (3,), deg/s, Earth's rotation in the level frame
+    earth: Values = field(default_factory=lambda: np.zeros(3))  # deg/s, Earth's rotation in the level frame
     lever_arm: Values = field(default_factory=lambda: np.zeros(3))  # r, m
     offset: float = 0.0  # tau, s
     clock: float = 0.0  # epsilon
@@ -92,7 +97,7 @@ class Scene:
         shown = time + self.offset + self.clock * time
         motion = self._without_lag(shown, temperature)
         if self.lag > 0.0:
-            nodes, weights = _lag_rule()
+            nodes, weights = LAG_RULE
             past = [self._without_lag(shown - self.lag * node, None) for node in nodes]
             names = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate")
             motion = replace(
@@ -111,7 +116,7 @@ class Scene:
             force = force + acceleration / STANDARD_GRAVITY
         if pose.force is not None:
             force = force + pose.force
-        omega = pose.omega if self.earth is None else pose.omega + self.earth @ pose.level
+        omega = pose.omega + self.earth @ pose.level if np.any(self.earth) else pose.omega
         return Motion(
             time=time,
             specific_force=force,
@@ -126,24 +131,6 @@ class Scene:
             level=pose.level,
             direction=pose.direction,
         )
-
-
-def _lag_rule() -> tuple[Values, Values]:
-    """Return nodes s and weights of the integral of ``exp(-s) u(s)``, two a panel: (m,) arrays; weights sum to 1."""
-    middle, half = (PANELS[1:] + PANELS[:-1]) / 2.0, np.diff(PANELS) / 2.0
-    nodes = np.concatenate([middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)])
-    weights = np.tile(half, 2) * np.exp(-nodes)
-    return nodes, weights / weights.sum()
-
-
-def _earth_rotation(scene: Scene, values: Values) -> Scene:
-    before = np.zeros(3) if scene.earth is None else scene.earth
-    return replace(scene, earth=before + np.pad(values, (0, 3 - len(values))))
-
-
-def _table_tilt(scene: Scene, values: Values) -> Scene:
-    """Tilt the table about its level x and y; deg."""
-    return replace(scene, up=scene.up @ rotation_by(np.append(values, 0.0)))
 
 
 def _added(field_name: str, factor: float = 1.0) -> Alteration:
@@ -175,8 +162,9 @@ ALTERATIONS: dict[str, Alteration] = {
     "time_offset": _added("offset"),
     "clock_rate": _added("clock", 1e-6),
     "low_pass_lag": _added("lag"),
-    "earth_rotation": _earth_rotation,
-    "table_tilt": _table_tilt,
+    "earth_rotation": lambda scene, values: replace(scene, earth=scene.earth + np.pad(values, (0, 3 - len(values)))),
+    # about level x and y, deg
+    "table_tilt": lambda scene, values: replace(scene, up=scene.up @ rotation_by(np.append(values, 0.0))),
     "table_axis_nonorthogonality": _of_turn("direction"),
     "table_encoder_error": _of_turn("encoder"),
     "table_rate_ripple": _of_turn("ripple"),

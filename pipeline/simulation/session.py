@@ -31,9 +31,8 @@ from pipeline.records import AXES, SENSORS, Recording, continuous
 from pipeline.simulation import procedures
 from pipeline.simulation.description import FILE, PROGRAM, course_of, read_config
 from pipeline.simulation.procedures import ONE_RECORDING
-from pipeline.simulation.rate_table import random_errors
 from pipeline.simulation.sensor import Scene, alter, bias_wander, decimals_of
-from pipeline.simulation.trajectory import Gimbals, Moves, Turn, rotation_by
+from pipeline.simulation.trajectory import Gimbals, Moves, Turn, random_errors, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -95,7 +94,7 @@ class Environment:
         return self.temperature(time) + self.noise * rng.standard_normal(len(time))
 
 
-def random_environment(rng: np.random.Generator, *, ramp: float = 0.0, ramp_period: float = 3600.0) -> Environment:
+def random_environment(rng: np.random.Generator) -> Environment:
     """Return a room at about 25 degC (Sudsanguan 2019, 5.1) in which the unit warms up by a few degrees."""
     return Environment(
         ambient=25.0 + rng.uniform(-1.0, 1.0),
@@ -104,8 +103,6 @@ def random_environment(rng: np.random.Generator, *, ramp: float = 0.0, ramp_peri
         drift=0.3,  # of an air-conditioned room
         periods=rng.uniform(1800.0, 7200.0, 2),
         phases=rng.uniform(0.0, 2.0 * np.pi, 2),
-        ramp=ramp,
-        ramp_period=ramp_period,
     )
 
 
@@ -189,7 +186,7 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
         trajectory = Turn(trajectory.axis, trajectory.program, errors, shaft)
     up = rotation_by(np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0))[2]
     placed = table["latitude_deg"] is not None and table["azimuth_deg"] is not None
-    earth = earth_rate(table["latitude_deg"], table["azimuth_deg"]) if placed else None
+    earth = earth_rate(table["latitude_deg"], table["azimuth_deg"]) if placed else np.zeros(3)
     mounting = rotation_by(np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float))
     return Scene(trajectory, start, plan.axis, table["gravity_g"], up, earth, mounting=mounting)
 
@@ -242,14 +239,14 @@ def with_table_log(
     log = unit.log
     starts = [float(r.time[0]) for r in recordings]
     if unit.procedure == ONE_RECORDING:
-        groups = [(_joined(recordings, planned, starts, wrapped=log.wrapped), planned, starts)]
+        groups = [(_joined(recordings, planned, starts), planned, starts)]
     else:
         groups = [(r, [p], [s]) for r, p, s in zip(recordings, planned, starts, strict=True)]
-    whole = [_wrapped(r) if log.wrapped else r for r, _, _ in groups]
+    whole = [recording for recording, _, _ in groups]
     if log.kind == PROGRAM:
         return [replace(r, **NO_TABLE) if r.axis is not None else r for r in whole], None
     if log.kind != FILE:
-        return whole, None
+        return [_wrapped(r) if log.wrapped else r for r in whole], None
     offset, ppm = rng.uniform(0.0, LARGEST_OFFSET_S), DRIFT_PPM * rng.standard_normal()
     offset = float(offset if log.offset_s is None else log.offset_s)
     drift = 1e-6 * float(ppm if log.drift_ppm is None else log.drift_ppm)
@@ -258,13 +255,14 @@ def with_table_log(
         last = plan_starts[-1] + plans[-1].trajectory.duration
         begin, end = (t + offset + drift * t for t in (plan_starts[0] - MARGIN_S, last + MARGIN_S))
         tau: Values = begin + log.interval_s * np.arange(int((end - begin) / log.interval_s), dtype=float)
-        channels: dict[str, Any] = _logged(plans, plan_starts, (tau - offset) / (1.0 + drift), wrapped=log.wrapped)
+        channels: dict[str, Any] = _logged(plans, plan_starts, (tau - offset) / (1.0 + drift))
         if unit.procedure != ONE_RECORDING:  # a turn has the encoder, other motion the attitude
             turn = isinstance(plans[0].trajectory, Turn)
             known = ("table_angle", "table_rate") if turn else ("table_attitude",)
             channels = {name: channels[name] for name in known}
         time_ns = np.rint(tau * NANOSECONDS).astype(np.int64)
-        logs.append(Recording(f"{recording.name}_table", "table", None, time_ns, **channels))
+        logged = Recording(f"{recording.name}_table", "table", None, time_ns, **channels)
+        logs.append(_wrapped(logged) if log.wrapped else logged)
     return [*(replace(r, **NO_TABLE) for r in whole), *logs], {"offset_s": offset, "drift_ppm": 1e6 * drift}
 
 
@@ -273,20 +271,18 @@ def _wrapped(recording: Recording) -> Recording:
     return recording if angle is None else replace(recording, table_angle=np.mod(angle, 360.0))
 
 
-def _joined(
-    recordings: Sequence[Recording], planned: Sequence[Planned], starts: Sequence[float], *, wrapped: bool
-) -> Recording:
+def _joined(recordings: Sequence[Recording], planned: Sequence[Planned], starts: Sequence[float]) -> Recording:
     """Join successive recordings to one, with the table's angle, rate and attitude throughout."""
     blocks: dict[str, Any] = {
         name: np.concatenate([getattr(r, name) for r in recordings])
         for name in ("time_ns", "accelerometer", "gyroscope", "temperature")
     }
     whole = replace(recordings[0], name="recording", role="session", axis=None, **blocks, **NO_TABLE)
-    table: dict[str, Any] = _logged(planned, starts, whole.time, wrapped=wrapped)
+    table: dict[str, Any] = _logged(planned, starts, whole.time)
     return replace(whole, **table)
 
 
-def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values, *, wrapped: bool) -> dict[str, Values]:
+def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values) -> dict[str, Values]:
     """Return angle, rate and attitude of a table at increasing times of a session, in which ``planned`` start."""
     angle, rate, level = np.zeros(len(time)), np.zeros(len(time)), np.zeros((len(time), 3, 3))
     which = np.clip(np.searchsorted(starts, time, side="right") - 1, 0, None)
@@ -299,17 +295,13 @@ def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values, *
         level[here] = pose.level
         last = float(angle[here][-1])
     attitude = continuous(np.roll(scipy.spatial.transform.Rotation.from_matrix(level).as_quat(), 1, axis=1))
-    return {"table_angle": angle % 360.0 if wrapped else angle, "table_rate": rate, "table_attitude": attitude}
+    return {"table_angle": angle, "table_rate": rate, "table_attitude": attitude}
 
 
 def as_program(program: Program) -> list[dict[str, Any]]:
-    """Return a table's program as the steps of a procedure's ``program``, with repeated pairs folded."""
+    """Return a table's program as the steps of a procedure's ``program``; a repeated pair of steps has a count."""
     steps = [{key: round(float(value), 9) for key, value in step.items()} for step in program.steps]
-    return _folded([step for step in steps if step.get("rest_s") != 0.0])
-
-
-def _folded(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Replace repetitions of a pair of steps by one pair with its count."""
+    steps = [step for step in steps if step.get("rest_s") != 0.0]
     out: list[dict[str, Any]] = []
     i = 0
     while i < len(steps):

@@ -105,7 +105,7 @@ def test_a_campaigns_description_is_planned(capsys: pytest.CaptureFixture[str], 
     [
         (["--sensor", "mpu9999"], "no sensor is called 'mpu9999'; known: adis16448, adis16470"),
         (["--procedure", "dance"], "no procedure is called 'dance'"),
-        (["--rate", "0"], "rates_dps is (0.0,); it must be above 0"),
+        (["--rate", "0"], "rates_dps.0 is 0.0; it must be greater than 0"),
         (["--samples", "100"], "cannot be recorded in 100 samples"),
         (["--unit", "A"], "--unit chooses a unit of a description"),
         (["--against", "--frobnicate"], "--frobnicate is not known"),

@@ -8,7 +8,7 @@ import pytest
 from pipeline.io.commanded_motion import Program
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import Motion, Recording
-from pipeline.simulation.rate_table import rest, turn, turn_with_plateau
+from pipeline.simulation.trajectory import rest, turn, turn_with_plateau
 
 INTERVAL = 0.12
 

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.io.commanded_motion import Program
 from pipeline.model.encoder_trajectory import EncoderTrajectory, nearest_slope
-from pipeline.simulation.rate_table import rest, turn_with_plateau
+from pipeline.simulation.trajectory import rest, turn_with_plateau
 
 
 @pytest.fixture(scope="module")

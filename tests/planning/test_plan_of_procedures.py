@@ -100,11 +100,11 @@ def test_rates_beyond_the_full_scale_and_tables_without_encoders_are_noted() -> 
 @pytest.mark.parametrize(
     ("course", "message"),
     [
-        ({"dwell_s": 0.0}, "dwell_s is 0.0; it must be above 0"),
-        ({"rates_dps": [60.0, -1.0]}, "must be above 0"),
-        ({"rates_dps": []}, "at least one rate"),
-        ({"static_s": -1.0}, "static_s is -1.0; it cannot be below 0"),
-        ({"step_deg": 400.0}, "steps up to 360 deg"),
+        ({"dwell_s": 0.0}, "dwell_s is 0.0; it must be greater than 0"),
+        ({"rates_dps": [60.0, -1.0]}, "rates_dps.1 is -1.0; it must be greater than 0"),
+        ({"rates_dps": []}, r"rates_dps is \[\]; tuple should have at least 1 item"),
+        ({"static_s": -1.0}, "static_s is -1.0; it must be greater than or equal to 0"),
+        ({"step_deg": 400.0}, "step_deg is 400.0; it must be less than or equal to 360"),
     ],
 )
 def test_a_course_that_cannot_be_run_is_refused(course: dict[str, Any], message: str) -> None:

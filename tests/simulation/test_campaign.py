@@ -224,9 +224,9 @@ def test_a_fleet_is_drawn_from_the_data_sheet() -> None:
         ({"procedure": "dance"}, "no procedure is called 'dance'"),
         ({"samples": 100}, "cannot be recorded in 100 samples"),
         ({"accelerometer": {"scale": 1.0}}, "accelerometer: scale is not known"),
-        ({"format": "xlsx"}, "format 'xlsx' is not known"),
-        ({"lost": 1.0}, "a share from 0 to 0.9"),
-        ({"interval_s": 0.0}, "must be above 0"),
+        ({"format": "xlsx"}, "format is 'xlsx'; it must be 'csv' or 'mcap'"),
+        ({"lost": 1.0}, "lost is 1.0; it must be less than 0.9"),
+        ({"interval_s": 0.0}, "interval_s is 0.0; it must be greater than 0"),
         ({"course": {"dwel": 1.0}}, "course: dwel is not known; known: acceleration_dps2"),
     ],
 )
@@ -251,6 +251,11 @@ def test_descriptions_are_refused_where_they_are_wrong(tmp_path: Path) -> None:
         ({"units": [{"sensor": "mpu6050"}]}, "a unit has no name"),
         ({"units": [{"unit": "A"}, {"unit": "A"}]}, "a unique name"),
         ({"units": [{"unit": "A", "speed": 1}]}, "unit A: speed is not known"),
+        ({"units": [{"unit": "A", "lost": "few"}]}, "test: unit A: lost is 'few'; it must be a valid number"),
+        ({"units": [{"unit": 3}]}, "test: unit 3: unit is 3; it must be a valid string"),
+        ({"units": [{"unit": "A", "course": {"turns": 0.5}}]}, "unit A: course: turns is 0.5; it must be a valid int"),
+        ({"units": ["A"]}, "test: defaults is a mapping of the keys of a unit, and units a list of them"),
+        ({"units": [{"unit": "A"}], "variants": [{}]}, "test: variants: suffix is missing"),
     ):
         with pytest.raises(ConfigurationError, match=message):
             description_from(data, "test")

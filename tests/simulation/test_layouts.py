@@ -123,7 +123,7 @@ def test_a_sheet_alone_comes_with_the_programs_that_it_names(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"table_log": {"kind": "tape"}}, "table_log.kind is 'tape'; it is rows, file, program"),
+        ({"table_log": {"kind": "tape"}}, "table_log: kind is 'tape'; it must be 'rows', 'file' or 'program'"),
         ({"table_log": {"offset": 1.0}}, "table_log: offset is not known; known: drift_ppm"),
         ({"table_log": {"kind": "file"}, "format": "mcap"}, "written in csv only"),
         ({"table_log": {"kind": "file"}, "procedure": "multi_position", "table": "hand"}, "has no table to log"),

@@ -14,7 +14,6 @@ from pipeline.model.effects.base import Owner, truth
 from pipeline.model.effects.formula_effect import FormulaEffect
 from pipeline.model.kinematics import earth_rate
 from pipeline.simulation.description import read_config
-from pipeline.simulation.rate_table import TurnErrors, rest, turn_with_plateau
 from pipeline.simulation.sensor import (
     ALTERATIONS,
     STANDARD_GRAVITY,
@@ -24,7 +23,7 @@ from pipeline.simulation.sensor import (
     bias_wander,
     decimals_of,
 )
-from pipeline.simulation.trajectory import Turn, random_gimbals, rotation_by
+from pipeline.simulation.trajectory import Turn, TurnErrors, random_gimbals, rest, rotation_by, turn_with_plateau
 
 if TYPE_CHECKING:
     from pipeline.records import Motion

@@ -9,8 +9,17 @@ import pytest
 from pipeline.io.commanded_motion import Program
 from pipeline.model.kinematics import UP_AT_ZERO, attitude_matrix, turn_about_axis
 from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.rate_table import TurnErrors, rest, turn, turn_with_plateau
-from pipeline.simulation.trajectory import Moves, Turn, axis_and_angle, random_gimbals, rotation_about
+from pipeline.simulation.trajectory import (
+    Moves,
+    Turn,
+    TurnErrors,
+    axis_and_angle,
+    random_gimbals,
+    rest,
+    rotation_about,
+    turn,
+    turn_with_plateau,
+)
 
 STEP = 1e-5
 
