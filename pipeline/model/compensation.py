@@ -113,7 +113,14 @@ class CompensationStream:
         """Return the calibrated readings of the next sample or block; parameters as of ``Compensation.apply``."""
         given = {"accelerometer": accelerometer, "gyroscope": gyroscope, "temperature": temperature, "time": time}
         arrays, single = _checked(given)
-        self._require(arrays)
+        for sensor in set(self.steps) & set(arrays):
+            for effect in self.steps[sensor].fields:
+                missing = sorted(self.steps[sensor].needs(effect) - set(arrays))
+                if missing:
+                    raise InputError(
+                        f"the {sensor} of unit {self.unit} was calibrated with the effect {effect}, "
+                        f"which needs {' and '.join(missing)}: give that too, or calibrate without the effect"
+                    )
         sensors = [s for s in SENSORS if s in arrays]
         n = len(arrays[sensors[0]])
         found = {s: np.empty((n, 3)) if s in self.steps else arrays[s] for s in sensors}
@@ -172,17 +179,6 @@ class CompensationStream:
             truths |= without_effects(once, readings, motion)
         self._ends = ends or self._ends
         return truths
-
-    def _require(self, arrays: Mapping[str, Any]) -> None:
-        """Refuse a log that lacks what an effect needs."""
-        for sensor in set(self.steps) & set(arrays):
-            for effect in self.steps[sensor].fields:
-                missing = sorted(self.steps[sensor].needs(effect) - set(arrays))
-                if missing:
-                    raise InputError(
-                        f"the {sensor} of unit {self.unit} was calibrated with the effect {effect}, "
-                        f"which needs {' and '.join(missing)}: give that too, or calibrate without the effect"
-                    )
 
 
 def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[Any]], bool]:

@@ -73,14 +73,9 @@ class EncoderTrajectory:
         first = np.searchsorted(self.time, self.time - MEMORY_S, side="right") - 1
         past = lost - lost[np.maximum(first, 0)] == 0
         known: Mask = np.logical_and(past, np.append(self.valid, True))
-        known[1:-1] &= ~self._corners()
+        jump = np.abs(self._before[1:] - self._after[:-1])  # of the acceleration, where a stretch ends
+        known[1:-1] &= ~(self.explained[1:] & self.explained[:-1] & (jump > CORNER_DPS2))
         return known
-
-    def _corners(self) -> Mask:
-        """Return at which inner samples a stretch ends: the acceleration jumps there."""
-        jump = np.abs(self._before[1:] - self._after[:-1])
-        both = self.explained[1:] & self.explained[:-1]
-        return np.asarray(both & (jump > CORNER_DPS2))
 
     def _bends(self, even: Mask) -> tuple[Values, Values, Values, Mask]:
         """Return for each interval the time of its bend, the acceleration before and after it, and whether it bends."""

@@ -142,47 +142,38 @@ def _motion_of_turn(
     home, still = level_at_zero(axis, recording.up, shaft), still_samples(time, rate)
 
     def at(before: float | Values, lag: float = 0.0, offset: float | Values = 0.0) -> Motion:
+        """Return the motion at ``time + before + offset``, filtered by a first-order lag in s."""
         offset = before + offset
-        turn = _turn(log, axis, home, gravity_g, offset, lag)
-        if earth is not None:
-            assert turn.level is not None  # noqa: S101
-            turn = replace(turn, angular_rate=turn.angular_rate + np.einsum("i,nij->nj", earth, turn.level))
-        later, lagged = partial(at, offset, lag), partial(at, offset)
-        return logged(replace(turn, still=still, at_offset=later, at_lag=lagged))
+        moved = bool(np.any(offset))
+        angle, rate, acceleration = log.at(time + offset) if moved else (log.angle, log.rate, log.acceleration)
+        level = turn_about_axis(home, axis, -angle)
+        if lag > 0.0:
+            rate, acceleration = log.lagged(time + offset, lag)
+            past = [turn_about_axis(home, axis, -log.at(time + offset - lag * node)[0]) for node in NODES]
+            level = np.tensordot(WEIGHTS, np.array(past), 1)
+        force = gravity_g * level[:, 2, :]
+        omega, alpha = np.zeros_like(force), np.zeros_like(force)
+        omega[:, axis], alpha[:, axis] = rate, acceleration
+        return logged(
+            Motion(
+                time=time,
+                specific_force=force,
+                angular_rate=omega if earth is None else omega + np.einsum("i,nij->nj", earth, level),
+                angular_acceleration=alpha,
+                specific_force_rate=-np.radians(rate)[:, None] * (force @ ABOUT[axis].T),
+                temperature=None,
+                angle=angle,
+                rate=rate,
+                axis=axis,
+                still=still,
+                at_offset=partial(at, offset, lag),
+                at_lag=partial(at, offset),
+                level=level,
+                reference_valid=log.known_at(time + offset) if moved else log.valid_samples,
+            )
+        )
 
     return at(0.0)
-
-
-def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
-    log: EncoderTrajectory, axis: int, home: Values, gravity_g: float,
-    offset: float | Values, lag: float,
-) -> Motion:  # fmt: skip
-    """Return the motion of a turn at ``time + offset``, filtered by a first-order lag in s."""
-    angle, rate, acceleration = log.angle, log.rate, log.acceleration
-    if np.any(offset):
-        angle, rate, acceleration = log.at(log.time + offset)
-    level = turn_about_axis(home, axis, -angle)
-    if lag > 0.0:
-        rate, acceleration = log.lagged(log.time + offset, lag)
-        past = [turn_about_axis(home, axis, -log.at(log.time + offset - lag * node)[0]) for node in NODES]
-        level = np.tensordot(WEIGHTS, np.array(past), 1)
-    force = gravity_g * level[:, 2, :]
-    omega, alpha = np.zeros_like(force), np.zeros_like(force)
-    omega[:, axis], alpha[:, axis] = rate, acceleration
-    return Motion(
-        time=log.time,
-        specific_force=force,
-        angular_rate=omega,
-        angular_acceleration=alpha,
-        specific_force_rate=-np.radians(rate)[:, None] * (force @ ABOUT[axis].T),
-        temperature=None,
-        angle=angle,
-        rate=rate,
-        axis=axis,
-        still=np.zeros(len(log.time), bool),
-        level=level,
-        reference_valid=log.known_at(log.time + offset) if np.any(offset) else log.valid_samples,
-    )
 
 
 def level_at_zero(axis: int, up: str = "", shaft: int = 0) -> Values:

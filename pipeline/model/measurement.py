@@ -112,8 +112,13 @@ def solve(parts: Mapping[str, Part], readings: Truths, motion_at: Callable[[Trut
         truths |= moved
         if settled.all():
             return truths
-    _raise_divergence(truths, readings)
-    return truths
+    sensor = max(truths, key=lambda s: float(np.max(np.nan_to_num(np.abs(truths[s]), posinf=1e300))))
+    size = np.nan_to_num(np.abs(readings[sensor]).max(axis=1))
+    row = int(np.argmax(size))
+    raise ConvergenceError(
+        f"the fitted effects of the {sensor} cannot be subtracted from a reading of {size[row]:g} (sample {row + 1} of "
+        "the block): it is far outside the range that was calibrated; remove such readings from the log"
+    )
 
 
 def without_effects(parts: Mapping[str, Part], readings: Truths, motion: Motion) -> Truths:
@@ -143,14 +148,3 @@ def _near(new: Values, old: Values) -> Mask:
     """Return which samples have converged, relative to their size; missing ones (NaN) count as such: (n,) array."""
     far = np.abs(new - old) > TOLERANCE * np.maximum(np.abs(new), 1.0)
     return np.logical_not(far[:, 0] | far[:, 1] | far[:, 2])
-
-
-def _raise_divergence(truths: Truths, readings: Truths) -> None:
-    """Raise ``ConvergenceError`` with the largest reading of the sensor that diverged."""
-    sensor = max(truths, key=lambda s: float(np.max(np.nan_to_num(np.abs(truths[s]), posinf=1e300))))
-    size = np.nan_to_num(np.abs(readings[sensor]).max(axis=1))
-    row = int(np.argmax(size))
-    raise ConvergenceError(
-        f"the fitted effects of the {sensor} cannot be subtracted from a reading of {size[row]:g} (sample {row + 1} of "
-        "the block): it is far outside the range that was calibrated; remove such readings from the log"
-    )

@@ -14,8 +14,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, lru_cache, partial
 from importlib import import_module
-from importlib.abc import InspectLoader
-from importlib.util import decode_source
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -115,7 +113,8 @@ def effect(name: str) -> Effect:
         return _built_in(name)
     if not name.partition("@")[2]:
         raise ConfigurationError(f"no effect is called {name!r}; known: {', '.join(catalogue())}")
-    return _in_session(name)
+    base = name.partition("@")[0]
+    return in_session(name, OWN.get(base) or effect(base))
 
 
 def effect_of(fitted: FittedEffect) -> Effect:
@@ -155,12 +154,6 @@ def _built_in(name: str) -> Effect:
 @lru_cache(maxsize=256)
 def _defined(definition: str) -> Effect:
     return effect_from(json.loads(definition), "a calibration's own definition")
-
-
-@cache
-def _in_session(name: str) -> Effect:
-    base = name.partition("@")[0]
-    return in_session(name, OWN.get(base) or effect(base))
 
 
 @cache
@@ -243,7 +236,7 @@ def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
     module = ModuleType(f"imu_calibration_user_effect_{file.stem}")
     sys.modules[module.__name__] = module  # dataclasses and pickle look a class up there
     try:
-        _ThisContent(content).exec_module(module)
+        exec(compile(content, str(file), "exec"), vars(module))  # noqa: S102  (exactly the content that was hashed)
     except PipelineError:
         raise
     except Exception as error:
@@ -254,17 +247,6 @@ def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
         raise ConfigurationError(problem, str(file))
     found.definition = {"python": file.name, "sha256": digest, "owner": str(found.owner)}
     return found
-
-
-class _ThisContent(InspectLoader):
-    """Loads exactly the bytes that were hashed; reads and writes no cache of compiled code."""
-
-    def __init__(self, content: bytes) -> None:
-        self.content = content
-
-    def get_source(self, fullname: str) -> str:
-        del fullname
-        return decode_source(self.content)
 
 
 def _problem_of(found: object, name: str) -> str:

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -289,6 +289,7 @@ class _InSession(Effect):
         return np.zeros((len(motion.time), 3))
 
 
+@cache
 def in_session(name: str, base: Effect) -> Effect:
     """Return the effect ``<base>@<session>``.
 
