@@ -297,27 +297,15 @@ def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: AN
 
 def _explain(error: Any, config: dict[str, Any]) -> str:  # noqa: ANN401  (pydantic's TypedDict)
     """Describe an error of pydantic in a sentence with key, value and nearest valid name."""
-    path = [str(p) for p in error["loc"]]
-    key = ".".join(path)
-    if error["type"] == "extra_forbidden":
-        parent: Any = config
-        for part in path[:-1]:
-            parent = parent.get(part, {}) if isinstance(parent, dict) else {}
-        known = [k for k in _keys_of_schema(path[:-1]) or parent if k != path[-1]]
-        return f"{key}={_short(error['input'])}: unknown key{nearest(path[-1], known)}"
-    return f"{key}={_short(error['input'])}: {error['msg'][0].lower()}{error['msg'][1:]}"
-
-
-def _keys_of_schema(path: list[str]) -> list[str]:
+    *above, last = path = [str(p) for p in error["loc"]]
+    shown = json.dumps(error["input"], default=str)
+    setting = f"{'.'.join(path)}={shown if len(shown) <= 60 else f'{shown[:57]}...'}"
+    if error["type"] != "extra_forbidden":
+        return f"{setting}: {error['msg'][0].lower()}{error['msg'][1:]}"
     model: Any = Unit
-    for part in path:
-        field = getattr(model, "model_fields", {}).get(part)
-        if field is None:
-            return []
-        model = field.annotation
-    return [k for k in getattr(model, "model_fields", {}) if k != "unit"]
-
-
-def _short(value: Any) -> str:  # noqa: ANN401
-    text = json.dumps(value, default=str)
-    return text if len(text) <= 60 else text[:57] + "..."
+    parent: Any = config
+    for part in above:
+        model = getattr(getattr(model, "model_fields", {}).get(part), "annotation", None)
+        parent = parent.get(part, {}) if isinstance(parent, dict) else {}
+    known = getattr(model, "model_fields", parent)
+    return f"{setting}: unknown key{nearest(last, [k for k in known if k not in ('unit', last)])}"

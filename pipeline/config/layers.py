@@ -65,10 +65,7 @@ def read_units_table(path: Path) -> UnitsTable:
     lines: dict[str, int] = {}
     by_lower_case: dict[str, str] = {}
     problems = [f"line 1: column {c!r} stands twice" for c in sorted({c for c in columns if columns.count(c) > 1})]
-    problems += [
-        f"line 1: column {c!r} is not known; nearest: {m}; correct it, or rename a column of your own"
-        for c, m in _misspelt(columns)
-    ]
+    problems += _misspelt(columns)
     for line, raw in rows:
         if None in raw or any(v is None for v in raw.values()):
             problems.append(f"line {line}: {len(columns)} columns expected, as in the header")
@@ -123,15 +120,16 @@ def _hint(columns: list[str]) -> str:
     return (f"; nearest: {close[0]}" if close else "") + f"; its columns are {names or 'none'}"
 
 
-def _misspelt(columns: list[str]) -> list[tuple[str, str]]:
-    """Return the misspelt columns, each with the nearest known column; a short name (plot, lot) must differ by an s."""
-    misspelt = []
+def _misspelt(columns: list[str]) -> list[str]:
+    """Return a line for each misspelt column; a short name must differ from a known one by an s: plot is not lot."""
+    problems = []
     for column in columns:
-        close = difflib.get_close_matches(column.casefold(), KNOWN_COLUMNS, 1, SIMILARITY)
-        is_near = close and (len(close[0]) > 4 or column.casefold() in (close[0], close[0] + "s"))
+        near = difflib.get_close_matches(column.casefold(), KNOWN_COLUMNS, 1, SIMILARITY)
+        is_near = near and (len(near[0]) > 4 or column.casefold() in (near[0], near[0] + "s"))
         if column not in KNOWN_COLUMNS and is_near:
-            misspelt.append((column, close[0]))
-    return misspelt
+            hint = f"nearest: {near[0]}; correct it, or rename a column of your own"
+            problems.append(f"line 1: column {column!r} is not known; {hint}")
+    return problems
 
 
 DEVICES = "devices"
@@ -196,19 +194,23 @@ class Layers:
         row, line = self.units_table.rows[unit], f"units.csv line {self.units_table.lines[unit]}"
         of_row = [o for o in map(str.strip, BETWEEN_OVERRIDES.split(row.get("overrides", ""))) if o]
         lot = row.get("lot", "")
-        below = _layers("campaign.yaml", self.campaign.overrides)
-        above = _layers(f"campaign.yaml, lots, {lot}", self.campaign.lots.get(lot, ()))
-        for name in dict.fromkeys([row.get("serial", ""), unit]):
-            above += _layers(f"{DEVICES}/{name}.yaml", self.devices.get(name, ()))
-        above += [Layer(f"{line}, column {g}", f"{g}={row[g]}") for g in GROUPS if row.get(g)]
-        above += _layers(f"{line}, column overrides", of_row)
-        above += _layers("command line, overrides=", self.command)
-        above += _layers("command line, unit_overrides=", self.per_unit.get(unit, ()))
+        origins: dict[str, Sequence[str]] = {
+            "campaign.yaml": self.campaign.overrides,
+            f"campaign.yaml, lots, {lot}": self.campaign.lots.get(lot, ()),
+            **{f"{DEVICES}/{name}.yaml": self.devices.get(name, ()) for name in (row.get("serial", ""), unit)},
+            **{f"{line}, column {g}": [f"{g}={row[g]}"] for g in GROUPS if row.get(g)},
+            f"{line}, column overrides": of_row,
+            "command line, overrides=": self.command,
+            "command line, unit_overrides=": self.per_unit.get(unit, ()),
+        }
+        found = [Layer(origin, text) for origin, texts in origins.items() for text in texts]
         if self.campaign.models:
-            sensors = [text.partition("=")[2].strip() for _, text in [*below, *above] if key_of(text) == "sensor"]
+            sensors = [text.partition("=")[2].strip() for _, text in found if key_of(text) == "sensor"]
             model = sensors[-1] if sensors else default_option("sensor")
-            below += _layers(f"campaign.yaml, models, {model}", self.campaign.models.get(model, ()))
-        return [*below, *above]
+            of_model = [Layer(f"campaign.yaml, models, {model}", o) for o in self.campaign.models.get(model, ())]
+            place = len(self.campaign.overrides)
+            found[place:place] = of_model
+        return found
 
 
 def load_layers(directory: Path, settings: Mapping[str, Any], sensors: Iterable[str]) -> Layers:
@@ -258,10 +260,6 @@ def as_list(value: Any, where: str, what: str = LIST) -> list[str]:  # noqa: ANN
 def key_of(text: str) -> str:
     """Return the key of an override ``KEY=VALUE``."""
     return str(text).partition("=")[0].strip().lstrip("+")
-
-
-def _layers(origin: str, texts: Iterable[str]) -> list[Layer]:
-    return [Layer(origin, text) for text in texts]
 
 
 def _split(overrides: Sequence[str]) -> tuple[list[str], list[str]]:

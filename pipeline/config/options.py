@@ -57,10 +57,6 @@ def parse(text: str) -> tuple[str, Any]:
     if number:
         key, value, fraction = number.groups()
         return key, float(value) if fraction else int(value)
-    return _parse_with_hydra(text)
-
-
-def _parse_with_hydra(text: str) -> tuple[str, Any]:
     hint = "; write KEY=VALUE, for example filter.cutoff_hz=5"
     if text.startswith("["):
         raise Problem(f'{text!r} is not a list of overrides; quote each one: \'overrides=["a=1","b=[x,y]"]\'')
