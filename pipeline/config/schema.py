@@ -6,7 +6,7 @@ of effects, whose keys are names of channels and effects.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -17,6 +17,7 @@ SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 AxisMap = Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
 Sense = Literal[1, -1]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Setting = TypeVar("Setting")
 
 
 class Section(BaseModel):
@@ -189,11 +190,11 @@ class Filter(Section):
     zero_phase: bool
 
 
-class Effects(Section):
-    """The effects fitted together with the base model."""
+class OfSensors(Section, Generic[Setting]):
+    """A setting of each sensor."""
 
-    accelerometer: list[str] | Literal["auto"]
-    gyroscope: list[str] | Literal["auto"]
+    accelerometer: Setting
+    gyroscope: Setting
 
 
 class Uncertainty(Section):
@@ -216,13 +217,6 @@ class SensorLimits(Section):
     held_out_max_abs_error: Positive | None
     bias: Positive | None
     scale_factor: Positive | None
-
-
-class Limits(Section):
-    """Limits of both sensors."""
-
-    accelerometer: SensorLimits
-    gyroscope: SensorLimits
 
 
 class Ingest(Section):
@@ -331,10 +325,10 @@ class Unit(Section):
     method: Method
     filter: Filter
     ingest: Ingest
-    effects: Effects
+    effects: OfSensors[list[str] | Literal["auto"]]
     uncertainty: Uncertainty
     diagnosis: Diagnosis
-    limits: Limits
+    limits: OfSensors[SensorLimits]
     certificate: Certificate
 
 

@@ -81,18 +81,6 @@ class Function(NamedTuple):
     c: str
 
 
-def _cube(x: Values) -> Values:
-    return x * x * x
-
-
-def _step(x: Values) -> Values:
-    return np.where(np.isnan(x), x, np.heaviside(x, 1.0))
-
-
-def _band(x: Values, low: Values, high: Values) -> Values:
-    return np.where(np.isnan(x), x, np.logical_and(x >= low, x <= high))
-
-
 _LIBRARY_FUNCTIONS = (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt)
 FUNCTIONS: dict[str, Function] = {
     **{f.__name__: Function(1, f, f"(imu_real){f.__name__}({{}})") for f in _LIBRARY_FUNCTIONS},
@@ -101,8 +89,12 @@ FUNCTIONS: dict[str, Function] = {
     "abs": Function(1, np.abs, "(imu_real)fabs({})"),
     "minimum": Function(2, np.minimum, "(imu_real)imu_minimum({}, {})"),
     "maximum": Function(2, np.maximum, "(imu_real)imu_maximum({}, {})"),
-    "step": Function(1, _step, "(imu_real)imu_step({})"),
-    "band": Function(3, _band, "(imu_real)imu_band({}, {}, {})"),
+    "step": Function(1, lambda x: np.where(np.isnan(x), x, np.heaviside(x, 1.0)), "(imu_real)imu_step({})"),
+    "band": Function(
+        3,
+        lambda x, low, high: np.where(np.isnan(x), x, np.logical_and(x >= low, x <= high)),
+        "(imu_real)imu_band({}, {}, {})",
+    ),
 }
 OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {
     ast.Add: (np.add, "+"),
@@ -112,7 +104,7 @@ OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {
 }
 POWERS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of a name, and of what is longer
     2.0: (np.square, "({0} * {0})", "imu_square({0})"),
-    3.0: (_cube, "({0} * {0} * {0})", "imu_cube({0})"),
+    3.0: (lambda x: x * x * x, "({0} * {0} * {0})", "imu_cube({0})"),
 }
 IN_C_ONCE = {f"(m->temperature - (imu_real){25.0!r})": "dt"}  # calibration.h has a name for it
 SIMPLE_IN_C = re.compile(r"[\w\[\]{}>-]+")  # a name: to evaluate it twice costs nothing

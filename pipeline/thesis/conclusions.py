@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.report.comparison import Estimate, mean_of
-from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, in_words
 from pipeline.thesis.seeds import CAUSES, INTERVAL_S, LOST, TIME_CONSTANT_S
+from pipeline.thesis.tables import CONTINUOUS, DEVICES, RATES, STOPS, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -31,9 +31,19 @@ import pandas as pd
 
 from pipeline.model.effects.base import STANDARD_GRAVITY
 from pipeline.thesis.conclusions import Errors, gain_of_filter
-from pipeline.thesis.results import AXES, DEVICES, JSON, RATES, Results, matrix_of, read_printed, values
 from pipeline.thesis.seeds import CAUSES, LOST, TIME_CONSTANT_S
-from pipeline.thesis.tables import ACCELEROMETER, GYROSCOPE
+from pipeline.thesis.tables import (
+    ACCELEROMETER,
+    AXES,
+    DEVICES,
+    GYROSCOPE,
+    JSON,
+    RATES,
+    Results,
+    matrix_of,
+    read_printed,
+    values,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

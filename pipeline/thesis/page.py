@@ -25,9 +25,18 @@ from pipeline.report.numbers import MINUS, NOTHING, number
 from pipeline.report.pages import template
 from pipeline.thesis.conclusions import KINDS, Errors, conclusions, verdict_of
 from pipeline.thesis.errata import agreements, evidence, scatters
-from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, SILENT, STOPS, Results, in_words, read_printed
 from pipeline.thesis.seeds import CAUSES, device_of
-from pipeline.thesis.tables import all_tables
+from pipeline.thesis.tables import (
+    CONTINUOUS,
+    DEVICES,
+    RATES,
+    SILENT,
+    STOPS,
+    Results,
+    all_tables,
+    in_words,
+    read_printed,
+)
 from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:

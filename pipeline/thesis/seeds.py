@@ -48,7 +48,7 @@ from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import Description, UnitDescription, read_config, read_description
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
 from pipeline.simulation.session import received
-from pipeline.thesis.results import AXES, DEVICES, SILENT
+from pipeline.thesis.tables import AXES, DEVICES, SILENT
 from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:

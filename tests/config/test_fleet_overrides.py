@@ -7,16 +7,18 @@ from typing import Any
 
 import pytest
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.__main__ import main
 from pipeline.config import Campaign, load_campaign
-from pipeline.config.options import _parse_with_hydra, parse
+from pipeline.config.options import parse
 from pipeline.config.stage_settings import in_common, select_settings
 from pipeline.errors import ConfigurationError
 from pipeline.stages.batch import merge_common
 
+HYDRA = OverridesParser.create()
 SHEET = """unit,serial,lot,sensor,filter,overrides
 U1,S1,L1,mpu6050,,
 U2,S2,L1,stim300,,
@@ -170,8 +172,8 @@ def test_config_says_where_an_unknown_unit_or_a_refused_override_stands(
 @settings(max_examples=40)
 @given(st.from_regex(r"[a-z_]{1,8}(\.[a-z_]{1,8}){0,2}=-?[0-9]{1,20}(\.[0-9]{0,20})?", fullmatch=True))
 def test_numbers_are_read_as_hydra_reads_them(text: str) -> None:
-    (key, value), (expected_key, expected) = parse(text), _parse_with_hydra(text)
-    assert (key, type(value), value) == (expected_key, type(expected), expected)
+    (key, value), override = parse(text), HYDRA.parse_override(text)
+    assert (key, type(value), value) == (override.key_or_group, type(override.value()), override.value())
 
 
 JSON = st.recursive(

@@ -13,9 +13,8 @@ from pipeline.signal.filters import apply_filter
 from pipeline.thesis.conclusions import CONFIRMED, REFUTED, conclusions, gain_of_filter
 from pipeline.thesis.errata import agreements, scatters
 from pipeline.thesis.page import key_of, render
-from pipeline.thesis.results import Results
 from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S, sets_of
-from pipeline.thesis.tables import all_tables, with_differences
+from pipeline.thesis.tables import Results, all_tables, with_differences
 
 CAMPAIGN = Path(__file__).parents[2] / "data" / "thesis"
 ROWS = pd.read_csv(CAMPAIGN / "seeds.csv")

@@ -14,7 +14,6 @@ for polynomials of degree 7 in time.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -179,8 +178,4 @@ class LowPassLag(_Timing):
         nodes = [shifted(motion, -values[0] * node) for node in NODES]
         names = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate")
         means = {name: sum(w * getattr(n, name) for w, n in zip(WEIGHTS, nodes, strict=True)) for name in names}
-        return replace(motion, **means, at_offset=partial(self._moved_at, motion, values))
-
-    def _moved_at(self, motion: Motion, values: Values, offset: float | Values) -> Motion:
-        """Return the motion behind the lag at ``time + offset``."""
-        return self.moved(shifted(motion, offset), values)
+        return replace(motion, **means, at_offset=lambda offset=0.0: self.moved(shifted(motion, offset), values))
