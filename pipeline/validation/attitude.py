@@ -1,16 +1,17 @@
 """Errors of an attitude that is integrated from the readings of held-out motion, before and after calibration.
 
-Of the gyroscope alone, from the table's attitude at the start, with the rotation vector a[n] over one interval, of
-rates w in rad/s that are interpolated by a cubic (Magnus expansion: A. Iserles et al., Lie-group methods, Acta Numerica
-9, 2000):
+The attitude q by the gyroscope alone starts at the table's attitude. Over one interval it turns by the rotation vector
+a[n], with rates w in rad/s that are interpolated by a cubic (Magnus expansion: A. Iserles et al., Lie-group methods,
+Acta Numerica 9, 2000):
 
     q[n+1] = q[n] exp(a[n] / 2)
     a[n] = dt (13 w[n] + 13 w[n+1] - w[n-1] - w[n+2]) / 24 + dt^2 (w[n] x w[n+1]) / 12
 
-The drift is the angle between integrated and logged rotation over any minute, root mean square over its starts. The
-tilt of an attitude fused with the accelerometer (complementary filter of ``imufusion``; S. Madgwick, PhD thesis,
-Bristol 2014, chapter 7) is the angle between the verticals. By hand, each held-out move is integrated from the rest
-before it to the rest after it: the error is the angle between turned and observed direction of gravity.
+The drift is the angle between integrated and logged rotation over one minute, root mean square over many starts. The
+tilt is the angle between the verticals of the logged attitude and of one that is fused with the accelerometer
+(complementary filter of ``imufusion``; S. Madgwick, PhD thesis, Bristol 2014, chapter 7). By hand, each held-out move
+is integrated from the rest before it to the rest after it: the error is the angle between the turned direction of
+gravity and the observed one.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ if TYPE_CHECKING:
 
 
 DRIFT_TIME_S = 60.0  # s over which a drift is stated
-DRIFT_STARTS = 60  # of the minutes over which a drift is averaged
-SHORTEST_DRIFT_S = 10.0  # s: a drift over less than that is mostly noise
+DRIFT_STARTS = 60  # starts over which a drift is averaged
+SHORTEST_DRIFT_S = 10.0  # s: a drift over a shorter time is mostly noise
 CURVE_POINTS = 120  # points of the published curves
-STEP_S, STEP_DEG = 0.1, 5.0  # of the complementary filter, which integrates to first order
+STEP_S, STEP_DEG = 0.1, 5.0  # largest steps of the complementary filter, which integrates to first order
 FILTER_GAIN = 0.5  # of the complementary filter: its library's default
 SETTLING_S = 10.0  # s after which the tilt counts
 
@@ -48,10 +49,10 @@ SETTLING_S = 10.0  # s after which the tilt counts
 def attitude(
     accelerometer: SensorCalibration | None, gyroscope: SensorCalibration | None, recordings: Sequence[Recording]
 ) -> dict[str, Any]:
-    """Return the part ``attitude`` of ``validations/<unit>.json``, by the first held-out recording of the attitude.
+    """Return the part ``attitude`` of ``validations/<unit>.json``, from the first held-out recording of an attitude.
 
     It has ``reason`` (why there is none, else None), ``recording``, ``seconds`` (60, or the recording's length),
-    ``drift_deg`` and ``tilt_rms_deg`` (each ``before`` and ``after``) and ``curve``: ``time_s`` and, deg, the angle of
+    ``drift_deg`` and ``tilt_rms_deg`` (each ``before`` and ``after``) and ``curve``: ``time_s`` and, deg, the error of
     the gyroscope alone (``drift_before``, ``drift_after``) and the tilt of the fused attitude (``tilt_...``).
     """
     recording = next((r for r in recordings if r.role == "validation" and r.table_attitude is not None), None)
@@ -70,31 +71,30 @@ def attitude(
         return {"reason": str(error)}
     reference = (logged / np.linalg.norm(logged, axis=1, keepdims=True)).T
     time = known.time * known.table_seconds  # by the clock of the reference
-    found: dict[str, Any] = {"reason": None, "recording": recording.name}
-    found["seconds"] = float(min(DRIFT_TIME_S, time[-1] - time[0]))
-    found |= {"drift_deg": {}, "tilt_rms_deg": {} if accelerometer and known.accelerometer is not None else None}
     shown = np.unique(np.linspace(0, known.samples - 1, CURVE_POINTS).astype(int))
-    found["curve"] = {"time_s": _rounded(time[shown] - time[0])}
-    pairs = {
-        "before": (known.accelerometer, known.gyroscope),
-        "after": (compensated.accelerometer, compensated.gyroscope),
-    }
-    for name, (force, rate) in pairs.items():
+    seconds, curve = float(min(DRIFT_TIME_S, time[-1] - time[0])), {"time_s": _rounded(time[shown] - time[0])}
+    drifts: dict[str, float] = {}
+    tilts: dict[str, float] | None = {} if accelerometer and known.accelerometer is not None else None
+    for name, readings in (("before", known), ("after", compensated)):
+        force, rate = readings.accelerometer, readings.gyroscope
         assert rate is not None  # noqa: S101
         alone = integrate(time, rate, reference[:, 0])
-        found["drift_deg"][name] = drift(time, alone, reference, found["seconds"])
-        found["curve"][f"drift_{name}"] = _rounded(angle_between(alone, reference)[shown])
-        if found["tilt_rms_deg"] is not None:
+        drifts[name] = drift(time, alone, reference, seconds)
+        curve[f"drift_{name}"] = _rounded(angle_between(alone, reference)[shown])
+        if tilts is not None:
             assert force is not None  # noqa: S101
-            at, fused = _fuse(time, force, alone)
-            tilt, since = _tilt_between(fused, reference[:, at].T), time[at] - time[0]
-            found["tilt_rms_deg"][name] = float(np.sqrt(np.mean(tilt[since >= min(SETTLING_S, 0.5 * since[-1])] ** 2)))
-            found["curve"][f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
-    return found
+            steps, fused = _fuse(time, force, alone)
+            up, true_up = level_in_body(fused), level_in_body(reference[:, steps].T)
+            sine, cosine = np.linalg.norm(np.cross(up, true_up), axis=1), np.einsum("ij,ij->i", up, true_up)
+            tilt, since = np.degrees(np.arctan2(sine, cosine)), time[steps] - time[0]
+            tilts[name] = float(np.sqrt(np.mean(tilt[since >= min(SETTLING_S, 0.5 * since[-1])] ** 2)))
+            curve[f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
+    found = {"reason": None, "recording": recording.name, "seconds": seconds}
+    return found | {"drift_deg": drifts, "tilt_rms_deg": tilts, "curve": curve}
 
 
 def integrate(time: Values, rate: Values, start: Values) -> Values:
-    """Return the attitude that angular rates, deg/s, add up to from ``start`` on: unit quaternions (4, n)."""
+    """Return the attitude by integration of angular rates, deg/s, from ``start`` on: unit quaternions (4, n)."""
     w, dt = np.radians(rate), np.diff(time)[:, None]
     mean = 0.5 * (w[:-1] + w[1:])
     mean[1:-1] += (w[1:-2] + w[2:-1] - w[:-3] - w[3:]) / 24.0
@@ -109,7 +109,7 @@ def integrate(time: Values, rate: Values, start: Values) -> Values:
 
 
 def _product(p: Values, q: Values) -> Values:
-    """Return the products of quaternions, (4, n) arrays; four times as fast as those of scipy's ``Rotation``."""
+    """Return the products of quaternions, (4, n) arrays; four times as fast as scipy's ``Rotation``."""
     a, b, c, d = p
     e, f, g, h = q
     rows = a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g, a * g - b * h + c * e + d * f
@@ -117,7 +117,7 @@ def _product(p: Values, q: Values) -> Values:
 
 
 def drift(time: Values, estimate: Values, reference: Values, seconds: float) -> float:
-    """Return by how much an attitude (4, n) is off after so many seconds, root mean square over starts, deg."""
+    """Return the error of an attitude (4, n) after a time of ``seconds``, root mean square over starts, deg."""
     last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
     start = np.unique(np.linspace(0, max(last, 0), DRIFT_STARTS).astype(int))
     interval = float(np.median(np.diff(time)))
@@ -133,22 +133,23 @@ def angle_between(p: Values, q: Values) -> Values:
 
 
 def _between(p: Values, q: Values) -> Values:
-    """Return the rotations from some attitudes to others: (4, n) arrays."""
+    """Return the rotations from attitudes p to attitudes q: (4, n) arrays."""
     return _product(p * [[1.0], [-1.0], [-1.0], [-1.0]], q)
 
 
 def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]:
-    """Return samples about 0.1 s or 5 deg apart, and the attitude of the complementary filter there.
+    """Return indices of samples about 0.1 s or 5 deg apart, and the attitude of the complementary filter there.
 
-    Its rates are those of the attitude ``alone`` of the gyroscope between these samples; the first attitude is given.
+    The rates are those of the attitude ``alone`` of the gyroscope between these samples. The filter starts at its first
+    attitude.
     """
-    import imufusion  # noqa: PLC0415  (only units with a logged attitude pay for it)
+    import imufusion  # noqa: PLC0415  (only units with a logged attitude need it)
 
     turns = angle_between(alone[:, :-1], alone[:, 1:])
     within = min(STEP_S / float(np.median(np.diff(time))), STEP_DEG / max(float(turns.max()), 1e-9))
-    at = np.arange(0, len(time), max(1, int(within)))
-    intervals = np.diff(time[at])
-    w, *v = _between(alone[:, at[:-1]], alone[:, at[1:]])
+    chosen = np.arange(0, len(time), max(1, int(within)))
+    intervals = np.diff(time[chosen])
+    w, *v = _between(alone[:, chosen[:-1]], alone[:, chosen[1:]])
     sine = np.maximum(np.linalg.norm(v, axis=0), np.finfo(float).tiny)
     angles = np.degrees(2.0 * np.arctan2(np.copysign(sine, w), np.abs(w)))
     rates = (angles / sine * v / intervals).T
@@ -161,26 +162,19 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
         magnetic_rejection=0.0,
         rejection_timeout=0.0,
     )
-    q = np.empty((len(at), 4))
+    q = np.empty((len(chosen), 4))
     q[0] = alone[:, 0]
     fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(q[0])
     # The filter compares the force with the attitude before its step.
-    for n, (interval, rate, reading) in enumerate(zip(intervals.tolist(), rates, force[at[:-1]], strict=True), 1):
+    for n, (interval, rate, reading) in enumerate(zip(intervals.tolist(), rates, force[chosen[:-1]], strict=True), 1):
         fusion.set_sample_period(interval)
         fusion.update_no_magnetometer(rate, reading)
         q[n] = fusion.get_quaternion()
-    return at, q
-
-
-def _tilt_between(p: Values, q: Values) -> Values:
-    """Return the angle between the verticals of two attitudes, quaternions (n, 4): (n,) array, deg."""
-    up, other = level_in_body(p), level_in_body(q)
-    across = np.linalg.norm(np.cross(up, other), axis=1)
-    return np.asarray(np.degrees(np.arctan2(across, np.einsum("ij,ij->i", up, other))))
+    return chosen, q
 
 
 def _with_reference(recording: Recording) -> tuple[Recording, Values]:
-    """Return the samples whose readings and attitude are known, and the attitude (n, 4) a filter delay before."""
+    """Return the samples of known readings and attitude, and the attitude (n, 4) one delay of the filter earlier."""
     q = recording.table_attitude
     assert q is not None  # noqa: S101
     readings = [v for v in (recording.accelerometer, recording.gyroscope) if v is not None]
@@ -206,11 +200,11 @@ def gravity_direction(
 ) -> dict[str, Any]:
     """Return the part ``gravity_direction`` of ``validations/<unit>.json``, with the noise of the gyroscope.
 
-    It has ``reason`` (why there is none, else None), ``moves`` (how many), ``mean_deg``, ``rms_deg`` and ``max_deg``
-    (each ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean that white noise alone
-    gives), ``largest_expected_rms_deg`` (by noise and uncertainties, exceeded with a probability of 0.5 %; where the
-    fit determines the matrix) and ``creeping_rests`` (in which the unit went on turning). Where the procedure states
-    turns, ``turns``: ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``) of each.
+    It has ``reason`` (why there is none, else None), ``moves`` (number), ``mean_deg``, ``rms_deg`` and ``max_deg``
+    (each ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean by white noise alone),
+    ``largest_expected_rms_deg`` (by noise and uncertainties, exceeded with a probability of 0.5 %; where the fit
+    determines the matrix) and ``creeping_rests`` (number of rests in which the unit turned slowly). Where the procedure
+    states turns, ``turns``: ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``).
     """
     if not is_multi_position("gyroscope", recordings):
         return {"reason": "not recorded by hand"}
@@ -228,30 +222,27 @@ def gravity_direction(
     if model.moves is None:
         return {"reason": "no move is held out"}
     terms = tuple(Term(effect(e.name), e.values) for e in gyroscope.effects)
-    raw, calibrated = State(np.zeros(3), np.eye(3)), State(gyroscope.bias, gyroscope.matrix, terms)
-    before = model.direction_errors(raw)[0]
-    after, floor = model.direction_errors(calibrated)
-    own: dict[str, Any] = {}
+    states = {
+        "before": State(np.zeros(3), np.eye(3)),
+        "after": State(gyroscope.bias, gyroscope.matrix, terms),
+    }
+    errors = {name: model.direction_errors(state) for name, state in states.items()}
+    found: dict[str, Any] = {"reason": None, "moves": model.moves.count}
+    found["mean_deg"] = {name: float(np.mean(error)) for name, (error, _) in errors.items()}
+    found["rms_deg"] = {name: float(np.sqrt(np.mean(error**2))) for name, (error, _) in errors.items()}
+    found["max_deg"] = {name: float(np.max(error)) for name, (error, _) in errors.items()}
+    found["noise_floor_deg"] = float(np.mean(errors["after"][1]))
+    found["creeping_rests"] = int(np.count_nonzero(gravity.creeping))
     if gyroscope.covariance is not None and gyroscope.covariance[3:12, 3:12].any():
         ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
-        freedom = gyroscope.effective_freedom()
         details = gyroscope.stages[-1].details if gyroscope.stages else {}
-        covariance = covariance_beside_reference(gyroscope)
-        largest = model.largest_direction_error(calibrated, covariance, freedom, details, ratio)
-        own["largest_expected_rms_deg"] = largest
+        covariance, freedom = covariance_beside_reference(gyroscope), gyroscope.effective_freedom()
+        found["largest_expected_rms_deg"] = model.largest_direction_error(
+            states["after"], covariance, freedom, details, ratio
+        )
     if turns:
-        pairs = (turns.described(state) for state in (raw, calibrated))
-        own["turns"] = [
-            {**last, "angle_deg": {"before": first["angle_deg"], "after": last["angle_deg"]}}
-            for first, last in zip(*pairs, strict=True)
+        found["turns"] = [
+            {**after, "angle_deg": {"before": before["angle_deg"], "after": after["angle_deg"]}}
+            for before, after in zip(*map(turns.described, states.values()), strict=True)
         ]
-    return {
-        "reason": None,
-        "moves": model.moves.count,
-        "mean_deg": {"before": float(np.mean(before)), "after": float(np.mean(after))},
-        "rms_deg": {name: float(np.sqrt(np.mean(e**2))) for name, e in (("before", before), ("after", after))},
-        "max_deg": {"before": float(np.max(before)), "after": float(np.max(after))},
-        "noise_floor_deg": float(np.mean(floor)),
-        "creeping_rests": int(np.count_nonzero(gravity.creeping)),
-        **own,
-    }
+    return found
