@@ -1,4 +1,4 @@
-"""The axes of charts: places of values on a linear, logarithmic or symmetric logarithmic scale, and round ticks."""
+"""The axes of charts: positions of values on a linear, logarithmic or symmetric logarithmic scale, and round ticks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Tick = tuple[float, str]
 def round_ticks(low: float, high: float, count: int = 5, kind: str = "") -> list[Tick]:
     """Return about ``count`` round values from ``low`` to ``high`` with their text.
 
-    ``kind``: "angle" (deg) at parts of a turn, "count" at whole numbers.
+    ``kind``: "angle" (deg) for parts of a turn, "count" for whole numbers.
     """
     coarse = max((high - low) / count, 1.0 if kind == "count" else 0.0)
     if kind == "angle" and coarse > 5.0:
@@ -41,7 +41,7 @@ def round_ticks(low: float, high: float, count: int = 5, kind: str = "") -> list
 
 
 def tick_label(value: float, step: float) -> str:
-    """Return the text of a tick with the decimals that the distance of two ticks needs."""
+    """Return the text of a tick with the decimals that the step between two ticks needs."""
     if value == 0:
         return "0"
     if step < 2e-4 or abs(value) >= 1e6:
@@ -56,7 +56,7 @@ def tick_label(value: float, step: float) -> str:
 
 
 def log_ticks(low: float, high: float) -> list[Tick]:
-    """Return the powers of ten from ``low`` to ``high``; where they are few, also 2 and 5, or round values."""
+    """Return the powers of ten from ``low`` to ``high``; of fewer than two, also 2 and 5, or round values."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for factors in ((1,), (1, 2, 5)):
         values = [s * 10.0**k for k in decades for s in factors if low * 0.999 <= s * 10.0**k <= high * 1.001]
@@ -68,8 +68,7 @@ def log_ticks(low: float, high: float) -> list[Tick]:
 def scaled(values: Any, kind: str) -> Values:  # noqa: ANN401  (numbers or an array)
     """Return values on the scale of an axis.
 
-    ``log``: log10, -inf where they are not positive. ``symlog``: v / 10 where |v| <= 10, else sign(v) (1 + log10(|v| /
-    10)).
+    ``log``: log10, -inf where v <= 0. ``symlog``: v / 10 where |v| <= 10, else sign(v) (1 + log10(|v| / 10)).
     """
     v = np.asarray(values, np.float64)
     if kind == "log":
@@ -82,7 +81,7 @@ def scaled(values: Any, kind: str) -> Values:  # noqa: ANN401  (numbers or an ar
 
 @dataclass(frozen=True)
 class Axis:
-    """From values ``low`` to ``high`` (on the scale of the axis) to pixels ``start`` to ``stop``."""
+    """Maps values from ``low`` to ``high`` (on the scale of the axis) to pixels from ``start`` to ``stop``."""
 
     low: float
     high: float
@@ -103,34 +102,34 @@ class Axis:
         return cls(low - wider, high + wider, start, stop, kind)
 
     def pixels(self, value: float) -> float:
-        """Return the place of a value, px; a value below the axis stands at its start."""
-        at = float(scaled(value, self.kind)) if "log" in self.kind else value
-        return self.start + (max(at, self.low) - self.low) / (self.high - self.low) * (self.stop - self.start)
+        """Return the position of a value, px; a value below the axis is drawn at its start."""
+        v = float(scaled(value, self.kind)) if "log" in self.kind else value
+        return self.start + (max(v, self.low) - self.low) / (self.high - self.low) * (self.stop - self.start)
 
     def units(self, values: Values) -> Integers:
-        """Return the places of values in whole drawing units; values beyond the axis stand at its end."""
-        at = np.minimum(np.maximum(scaled(values, self.kind), self.low), self.high)
+        """Return the positions of values in whole drawing units; values beyond the axis are drawn at its end."""
+        v = np.minimum(np.maximum(scaled(values, self.kind), self.low), self.high)
         slope = SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
-        return np.asarray(np.rint((at - self.low) * slope + SUBDIVISION * self.start).astype(np.int64))
+        return np.asarray(np.rint((v - self.low) * slope + SUBDIVISION * self.start).astype(np.int64))
 
     def ticks(self, count: int, names: Sequence[str] = ()) -> list[Tick]:
-        """Return at least two ticks as place (px) and text; ``names`` are those of the values 1, 2, ..."""
+        """Return at least two ticks as position (px) and text; ``names``: texts of the values 1, 2, ..."""
         if names:
-            found = [(float(i), name) for i, name in enumerate(names, 1)]
+            ticks = [(float(i), name) for i, name in enumerate(names, 1)]
         elif self.kind == "log":
-            found = log_ticks(10.0**self.low, 10.0**self.high)
+            ticks = log_ticks(10.0**self.low, 10.0**self.high)
         elif self.kind == "symlog":
             decades = [sign * 10.0**k for sign in (-1, 1) for k in range(1, 9)]
             values = [v for v in (0.0, *decades) if self.low <= scaled(v, self.kind) <= self.high]
-            found = [(v, tick_label(v, LINEAR_TO)) for v in values]
+            ticks = [(v, tick_label(v, LINEAR_TO)) for v in values]
         else:
-            found = round_ticks(self.low, self.high, count, self.kind)
-            if len(found) < 2:
-                found = round_ticks(self.low, self.high, count + 2)
-        return [(self.pixels(value), label) for value, label in found]
+            ticks = round_ticks(self.low, self.high, count, self.kind)
+            if len(ticks) < 2:
+                ticks = round_ticks(self.low, self.high, count + 2)
+        return [(self.pixels(value), label) for value, label in ticks]
 
     def attribute(self, label: str, names: Sequence[str] = ()) -> str:
-        """Return the attributes from which the page's script knows the axis."""
+        """Return the attributes that describe the axis to the script of the page."""
         ticks = f' data-ticks="{escape("|".join(names))}"' if names else ""
         ends = f"{self.low:.9g},{self.high:.9g},{self.start:g},{self.stop:g}"
         return f' data-scale="{ends},{self.kind},{escape(typeset(label))}"{ticks}'

@@ -1,14 +1,14 @@
 """Charts as inline SVG: panels one above the other on a common axis x, with lines, samples, dots, bands and levels.
 
 Colours are CSS classes of the page (``c0`` to ``c5``), so that a chart follows the page's dark mode. The chart (axis x)
-and each panel (axis y) have an attribute ``data-scale``: low, high, their places in pixels, kind and label of the axis.
-From it the page's script reads values and zooms.
+and each panel (axis y) have an attribute ``data-scale``: low, high, their positions in pixels, kind and label of the
+axis. The script of the page uses it to read values and to zoom.
 
-Coordinates are whole tenths of a pixel and paths are written as differences, which keeps a page small. Where samples
-are many, they are drawn as the range from the smallest to the largest of equal buckets, so that no extreme is lost
-(S. Steinarsson, Downsampling Time Series for Visual Representation, University of Iceland 2013, section 4.1). Each such
-path has all its samples as ``data-full``, from which the page's script draws what a zoom shows: 16-bit numbers (base64)
-from -32767 at the low end of the axis to 32767, -32768 where there is no value; ``data-full`` of the chart is x.
+Coordinates are whole tenths of a pixel and paths are written as differences, which keeps a page small. Many samples are
+drawn as the range from the smallest to the largest of equal buckets, so that no extreme is lost (S. Steinarsson,
+Downsampling Time Series for Visual Representation, University of Iceland 2013, section 4.1). Each such path has all its
+samples in ``data-full``, from which the script draws a zoom: 16-bit numbers (base64) from -32767 at the low end of the
+axis to 32767 at the high end, -32768 for no value. ``data-full`` of the chart is x.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
 WIDTH = 420  # px, of the drawing; the page scales it
 LEFT, RIGHT, TOP, BOTTOM, GAP = 64, 14, 8, 36, 14  # px, margins of the panels and the gap between two
 UPRIGHT = 28  # px, of height for each tick of axis y
-MAXIMUM_DOTS = 240  # samples that are drawn as dots; about one in 1.4 px
-BUCKETS = 140  # ranges that are drawn of more samples; about one in 2.4 px
-MAXIMUM_FULL = 20_000  # samples that a page holds of a curve (53 kB); of more, the ends of half as many buckets
+MAXIMUM_DOTS = 240  # samples drawn as dots; about one in 1.4 px
+BUCKETS = 140  # ranges drawn for more samples; about one in 2.4 px
+MAXIMUM_FULL = 20_000  # samples of a curve in a page (53 kB); of more samples, the ends of half as many buckets
 LARGE_DOTS, LARGE_MEANS = 300, 40  # dots, and dots with intervals, that have room to be large
 LETTER = 6.2  # px, width of a letter
 
@@ -47,9 +47,9 @@ LETTER = 6.2  # px, width of a letter
 class Figure:
     """The texts of a chart, and the chart once it is drawn.
 
-    ``name``: identifier, unique on its page; ``finding``: what the chart shows, in one sentence above it; ``caption``:
-    what is drawn, below it; ``legend``: CSS class and text of each colour; ``quiet``: nothing is seen beyond noise, so
-    that the page folds it.
+    ``name``: identifier, unique on its page; ``finding``: the sentence above the chart, which states its result;
+    ``caption``: the text below it, which explains its elements; ``legend``: CSS class and text of each colour;
+    ``quiet``: nothing exceeds the noise, so the page folds the chart.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Figure:
     svg: str = ""
 
     def drawn(self, description: str, height: float, content: str, attributes: str = "") -> Figure:
-        """Return the figure with its ``svg`` element around drawn content; the description is for screen readers."""
+        """Return the figure with drawn content as its ``svg`` element; the description is for screen readers."""
         name, finding = escape(self.name), typeset(self.finding)
         svg = Markup(  # noqa: S704  (every text in it is escaped where it is written)
             f'<svg class="chart" viewBox="0 0 {WIDTH} {height:g}" role="img" aria-labelledby="{name}-t {name}-d"'
@@ -72,8 +72,8 @@ class Figure:
 
 def sentences(figure: str, **values: Any) -> tuple[str, str, str]:  # noqa: ANN401
     """Return the sentences of a chart by its macro in ``templates/figures.txt``: finding, caption, description."""
-    told = str(getattr(template("figures.txt").module, figure)(**values))
-    finding, caption, *description = (re.sub(r"[ \n]+", " ", part).strip() for part in told.split("---\n"))
+    text = str(getattr(template("figures.txt").module, figure)(**values))
+    finding, caption, *description = (re.sub(r"[ \n]+", " ", part).strip() for part in text.split("---\n"))
     return finding, caption, " ".join(description)
 
 
@@ -89,7 +89,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples in their order, (n,) or (n, k) with a colour for each column: dots, or ranges of buckets.
+    """Samples in order, (n,) or (n, k) with a colour for each column, drawn as dots or as ranges of buckets.
 
     ``mean`` adds the line of the buckets' means, which shows slow changes below the noise.
     """
@@ -102,9 +102,9 @@ class Samples:
 
 @dataclass(frozen=True)
 class Dots:
-    """Values that each count by themselves, with an upright interval ``low`` to ``high`` where it is given.
+    """Separate values, with an upright interval ``low`` to ``high`` where it is given.
 
-    ``units``: the place of each in the list of the chart's units, counted from 1, where x does not tell it.
+    ``units``: index of each value in the list of the chart's units, counted from 1, where it is not x.
     """
 
     x: Values
@@ -132,9 +132,8 @@ Layer = Line | Samples | Dots | Area
 class Panel:
     """One field of a chart: layers in the order in which they are drawn, and its axis y.
 
-    ``height``: px; ``levels``: horizontal lines by their text; ``limits``: of the axis, from the layers where not
-    given; ``names``: x, y and text beside points, left out where it would cover another; ``rows``: names of y = 1, 2,
-    ...
+    ``height``: px; ``levels``: horizontal lines by their text; ``limits``: of the axis, by default from the layers;
+    ``names``: x, y and text of points, left out where texts would overlap; ``rows``: names of y = 1, 2, ...
     """
 
     layers: list[Layer]
@@ -159,11 +158,12 @@ def chart(
     columns: Sequence[str] = (),
     units: str = "",
 ) -> Figure:
-    """Return a figure, whose texts are given, with its chart: panels that share the axis x.
+    """Return a figure with its chart: panels that share the axis x.
 
-    ``description``: what the chart shows, for screen readers; ``x_label, kind, margin``: of the axis x, its label, "",
-    "angle" (deg), "count" or "log", and by which share of their range it exceeds the values; ``left``: room for the
-    ticks of the axes y, px; ``columns``: names of x = 1, 2, ...; ``units``: list of the page's script that names them.
+    ``description``: for screen readers; ``x_label``: of the axis x; ``kind``: of the axis x, "", "angle" (deg),
+    "count" or "log"; ``margin``: share of the values' range by which the axis x exceeds it; ``left``: space for the
+    ticks of the axes y, px; ``columns``: names of x = 1, 2, ...; ``units``: list in the script of the page that names
+    the units.
     """
     values = {id(layer.x): layer.x for p in panels for layer in p.layers if layer.x is not None}
     x = Axis.over(values.values(), left, WIDTH - RIGHT, kind, margin)
@@ -189,7 +189,10 @@ def text(x: float, y: float, content: str, kind: str = "") -> str:
 def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
     bottom = top + panel.height
     kind, margin = "log" if panel.logarithmic else "", 0.04 if panel.limits is None else 0.0
-    values = [np.array(panel.limits)] if panel.limits else [v for layer in panel.layers for v in _heights(layer)]
+    values = [np.array(panel.limits)]
+    if not panel.limits:
+        heights = (getattr(layer, end, None) for layer in panel.layers for end in ("y", "low", "high"))
+        values = [np.asarray(v) for v in heights if v is not None]
     levels = panel.levels or {}
     y = Axis.over([*values, np.array([*levels.values()], float)], bottom, top, kind, margin)
     ticks = y.ticks(max(3, panel.height // UPRIGHT), panel.rows)
@@ -210,14 +213,6 @@ def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
         f'<text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(typeset(panel.label))}</text>'
         f'<g class="layers" transform="scale({1 / SUBDIVISION:g})">{drawn}</g>{names}</g>'
     )
-
-
-def _heights(layer: Layer) -> list[Values]:
-    """Return the values of a layer along axis y."""
-    if isinstance(layer, Area):
-        return [np.asarray(layer.low), np.asarray(layer.high)]
-    ends = (layer.low, layer.high) if isinstance(layer, Dots) else ()
-    return [layer.y, *(end for end in ends if end is not None)]
 
 
 def _draw(layer: Layer, x: Axis, y: Axis) -> str:
@@ -247,67 +242,67 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
 
 def _samples(layer: Samples, values: Values, colour: str, x: Axis, y: Axis) -> str:
     """Return one column of samples as dots, or as the ranges of buckets."""
-    column, known = values, np.isfinite(layer.x) & np.isfinite(values)
-    at, values = layer.x[known], values[known]
-    if len(at) <= MAXIMUM_DOTS:
-        return f'<path class="dots {colour}" d="{_dots(x.units(at), y.units(values))}"/>'
-    start, count = _buckets(len(at), BUCKETS)
-    centre = x.units(np.add.reduceat(at, start) / count)
-    low, high = (y.units(end.reduceat(values, start)) for end in (np.minimum, np.maximum))
+    known = np.isfinite(layer.x) & np.isfinite(values)
+    known_x, known_y = layer.x[known], values[known]
+    if len(known_x) <= MAXIMUM_DOTS:
+        return f'<path class="dots {colour}" d="{_dots(x.units(known_x), y.units(known_y))}"/>'
+    start, count = _buckets(len(known_x), BUCKETS)
+    centre = x.units(np.add.reduceat(known_x, start) / count)
+    low, high = (y.units(end.reduceat(known_y, start)) for end in (np.minimum, np.maximum))
     faint = " faint-strokes" * layer.mean
-    full = _full(layer.x, column, y)
+    full = _full(layer.x, values, y)
     out = f'<path class="strokes {colour}{faint}" d="{_path("M%d %dV%d", centre, low, high)}"{full}/>'
     if layer.mean:
-        means = y.units(np.add.reduceat(values, start) / count)
+        means = y.units(np.add.reduceat(known_y, start) / count)
         out += f'<path class="line mean {colour}" d="{_line(centre, means)}"/>'
     return out
 
 
 def _buckets(samples: int, most: int) -> tuple[Integers, Integers]:
-    """Return start and length of equal buckets; the last one also takes the remainder."""
+    """Return start and length of equal buckets; the last one also contains the remainder."""
     size = -(-samples // most)
     start = np.arange(0, samples // size * size, size)
     return start, np.diff(np.append(start, samples))
 
 
 def _full(x: Values, values: Values, axis: Axis) -> str:
-    """Return all values of a curve as the attribute ``data-full``; of too many, both ends of each bucket."""
+    """Return all values of a curve as the attribute ``data-full``; of too many values, both ends of each bucket."""
     if len(values) > MAXIMUM_FULL:
         start, _ = _buckets(len(values), MAXIMUM_FULL // 2)
         ends = (x[start], x[start]) if values is x else (end.reduceat(values, start) for end in (np.fmin, np.fmax))
         values = np.stack([*ends], 1).ravel()
-    at = (2.0 * (np.clip(values, axis.low, axis.high) - axis.low) / (axis.high - axis.low) - 1.0) * 32767.0
-    numbers = np.where(np.isfinite(at), np.rint(at), -32768.0).astype("<i2")
+    share = (np.clip(values, axis.low, axis.high) - axis.low) / (axis.high - axis.low)
+    numbers = np.where(np.isfinite(share), np.rint((2.0 * share - 1.0) * 32767.0), -32768.0).astype("<i2")
     return f' data-full="{b64encode(numbers.tobytes()).decode()}"'
 
 
 def _line(x: Integers, y: Integers) -> str:
-    """Return the path through points, as differences."""
+    """Return the path through points, written as differences."""
     if len(x) < 2:
         return _dots(x, y)
-    if len(x) == 2:  # most are rests, which are many
+    if len(x) == 2:  # faster: a chart of rests has many of these
         return f"M{x[0]} {y[0]}l{x[1] - x[0]} {y[1] - y[0]}"
     return f"M{x[0]} {y[0]}l{_path(' %d %d', x[1:] - x[:-1], y[1:] - y[:-1])[1:]}"
 
 
 def _dots(x: Integers, y: Integers) -> str:
-    """Return a path of dots: lines of length zero, which round line ends make visible."""
+    """Return a path of dots: lines of length zero, which are visible by their round ends."""
     return f"M{x[0]} {y[0]}h0{_path('m%d %dh0', x[1:] - x[:-1], y[1:] - y[:-1])}" if len(x) else ""
 
 
 def _path(form: str, *columns: Integers) -> str:
-    """Return the form once for each row of the columns."""
+    """Return the form, filled once for each row of the columns."""
     return form * len(columns[0]) % tuple(np.array(columns).T.ravel().tolist())
 
 
 def _names(points: Sequence[tuple[float, float, str]], x: Axis, y: Axis) -> str:
-    """Return the names of points; a name takes 11 px of height."""
-    taken: list[tuple[float, float, float]] = []
+    """Return the names of points, each 11 px high, without those that would overlap an earlier one."""
+    drawn: list[tuple[float, float, float]] = []
     out = []
     for px, py, name in points:
-        width, left, at = LETTER * len(name), x.pixels(px) + 6.0, y.pixels(py) - 5.0
+        width, left, base = LETTER * len(name), x.pixels(px) + 6.0, y.pixels(py) - 5.0
         left = left if left + width <= WIDTH - 2 else x.pixels(px) - 6.0 - width
-        if all(abs(at - b) > 11.0 or left > a + w or a > left + width for a, b, w in taken):
-            taken.append((left, at, width))
-            out.append(text(left, at, name, "b"))
+        if all(abs(base - b) > 11.0 or left > a + w or a > left + width for a, b, w in drawn):
+            drawn.append((left, base, width))
+            out.append(text(left, base, name, "b"))
     return "".join(out)

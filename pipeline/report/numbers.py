@@ -1,6 +1,6 @@
-"""Numbers as people read them.
+"""Format numbers for pages and terminals.
 
-A measured value is written to two digits of its expanded uncertainty, as the GUM asks (JCGM 100:2008, 7.2.6).
+A measured value is written to two digits of its expanded uncertainty (JCGM 100:2008, 7.2.6).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 NOTHING = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
-PRINTED = {
+TYPOGRAPHIC = {
     "+-": "±",
     "delta BIC": "ΔBIC",
     "degC": "°C",
@@ -28,15 +28,14 @@ PRINTED = {
 
 
 def number(value: object, digits: int = 3) -> str:
-    """Return a value to so many significant digits, without an exponent from 1e-4 to 1e5; a dash where it is none."""
+    """Return a value to ``digits`` significant digits, with an exponent beyond 1e-4 to 1e5; a dash for no number."""
     if not isinstance(value, int | float) or not math.isfinite(value):
         return NOTHING
     if value == 0:
         return "0"
     if 1e-4 <= abs(value) < 1e5:
         decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-        text = f"{value:.{decimals}f}"
-        return text if value > 0 else text.replace("-", MINUS)
+        return f"{value:.{decimals}f}".replace("-", MINUS)
     return f"{value:.{digits - 1}e}".replace("-", MINUS).replace("e+", "e")
 
 
@@ -54,7 +53,7 @@ def measured(value: float | None, expanded: float | None) -> str:
 
 
 def span(low: float, high: float) -> str:
-    """Return an interval of positive values, both to the decimals of the high end; without a low end that is 0 then."""
+    """Return an interval of positive values to the decimals of its high end; "at most" where the low one is 0."""
     if not 1e-4 <= high < 1e5:
         return f"{number(low)} to {number(high)}"
     upper = number(high)
@@ -70,7 +69,7 @@ def percent(share: object) -> str:
 def percent_change(logarithm: float, largest: float) -> str:
     """Return a ratio, given by its logarithm, as a change in percent, or as a factor.
 
-    It is a factor where the largest of the ratios beside it, which are written alike, is more than twofold.
+    All ratios of one cell have the same form: a factor where the logarithm of the largest is above log 2.
     """
     if largest > math.log(2.0):
         return f"× {number(math.exp(logarithm))}"
@@ -78,7 +77,7 @@ def percent_change(logarithm: float, largest: float) -> str:
 
 
 def probability(value: object) -> str:
-    """Return a p-value; tiny ones as a bound."""
+    """Return a p-value; below 1e-12 as a bound."""
     if not isinstance(value, int | float):
         return NOTHING
     return "< 1e\N{MINUS SIGN}12" if value < 1e-12 else number(value, 2)
@@ -86,11 +85,10 @@ def probability(value: object) -> str:
 
 @lru_cache(4096)  # ticks, units and names of effects are the same on many charts and pages
 def typeset(sentence: str) -> str:
-    """Return a sentence or a unit as a terminal prints it with the signs of print: ``±``, ``−``, ``ΔBIC``, ``°C``."""
-    signs = sentence
-    for told, sign in PRINTED.items():
-        signs = signs.replace(told, sign)
-    return re.sub(r"(?<![\w.-])-(?=\d)|(?<=\de)-(?=\d)", MINUS, signs)
+    """Return a sentence or a unit of the terminal with typographic signs: ``±``, ``−``, ``ΔBIC``, ``°C``."""
+    for ascii_text, sign in TYPOGRAPHIC.items():
+        sentence = sentence.replace(ascii_text, sign)
+    return re.sub(r"(?<![\w.-])-(?=\d)|(?<=\de)-(?=\d)", MINUS, sentence)
 
 
 def plain(name: str) -> str:
@@ -99,12 +97,12 @@ def plain(name: str) -> str:
 
 
 def unit_text(unit: object) -> str:
-    """Return a unit as it stands behind a number: nothing for 1."""
+    """Return a unit as text behind a number; empty for the unit 1."""
     return "" if unit in (None, "1") else typeset(str(unit))
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows as lines of a terminal whose columns begin at the same place."""
+    """Return rows as lines of a terminal with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     cells = ([cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows)
     return [f"  {'  '.join(line)}".rstrip() for line in cells]
