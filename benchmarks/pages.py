@@ -24,8 +24,7 @@ from pipeline.pack import Pack
 from pipeline.records import SENSORS
 from pipeline.report import campaign_page
 from pipeline.report.certificate import certificate, certificate_page
-from pipeline.report.recording_section import sensor_temperature
-from pipeline.report.unit_page import render
+from pipeline.report.unit_page import render, sensor_temperature
 from pipeline.stages.batch import merge_common
 from pipeline.stages.unit_files import load_fits, recordings_of
 from pipeline.validation.attitude import attitude

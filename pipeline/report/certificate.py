@@ -24,7 +24,7 @@ from pipeline.records import SENSORS
 from pipeline.report.held_out_section import first_and_last_step
 from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters
-from pipeline.report.recording_section import files_read
+from pipeline.report.unit_page import files_read
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,9 +1,9 @@
-"""The evidence of a diagnosis as charts and rows: the ranking of effects, added-variable plots, and the unexplained.
+"""The evidence of a diagnosis as charts and rows: ranking of effects, added-variable plots, unexplained residuals.
 
-Ranking: bars of delta BIC. Brackets join effects whose signals are nearly the same: the data identify the group, not
-which of its members acts. Added-variable plot: readings against the column of one coefficient, both less what
-everything else explains; the slope through the origin is the coefficient. Points that leave the line show that the
-effect has another shape. All points are the binned data of the diagnosis: nothing is fitted here.
+Ranking: bars of delta BIC. Brackets join effects with nearly equal signals: the data identify the group, but not the
+effect within it. Added-variable plot: readings against the column of one coefficient, both minus their regression on
+all other columns; the slope through the origin is the coefficient. If the points leave the line, the effect has another
+shape. All points are the binned data of the diagnosis: nothing is fitted here.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 GATE = LINEAR_TO  # delta BIC, strong evidence: A. E. Raftery, Sociological Methodology 25 (1995) 139, table 6
-CLOSE = 0.8  # share of the selected effect's delta BIC from which another effect is named as a rival
-MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart or its caption has room for
+CLOSE = 0.8  # share of the selected effect's delta BIC above which another effect is named as a rival
+MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart or its caption shows
 EXCLUDED = 0.5  # of the upper limit by the prior alone, below which the recordings exclude an effect: convention
-MOST_LIMITS = 8  # upper limits that a chart has room for
-ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, bins being correlated
+MOST_LIMITS = 8  # upper limits that a chart shows
+ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, more for correlated bins
 MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they leave it by more
 SIGNALS = {
     "temperature": "temperature, degC",
@@ -46,23 +46,23 @@ SIGNALS = {
 
 
 def evidence_figures(sensor: str, found: JSON) -> list[Figure | None]:
-    """Return the charts of a sensor's diagnosis; None in the place of one that it has no data for."""
+    """Return the charts of a sensor's diagnosis; None in place of a chart without data."""
     return [ranking(sensor, found), added_variable(sensor, found), *unexplained(sensor, found)]
 
 
 def limit_rows(sensor: str, found: JSON, sensor_config: JSON) -> list[JSON]:
-    """Return for each effect that was not selected its upper limits as text, and its share of the sensor file's limit.
+    """Return the upper limits of each effect that was not selected as text, and as share of the sensor file's limit.
 
     ``share`` is None where the sensor file has no limit; the largest come first. ``excluded``: whether the recordings
-    exclude an effect at that limit.
+    exclude an effect of the size of that limit.
     """
     rows = []
     for name, limits in (found.get("upper_limit") or {}).items():
-        this = catalogue().get(name)
+        effect = catalogue().get(name)
         stated: dict[str, float] = {}
-        if this is not None:
-            values = parameter_limits(this, sensor, sensor_config.get("effects") or {}).tolist()
-            stated = dict(zip((p.name for p in this.parameters(sensor)), values, strict=True))
+        if effect is not None:
+            values = parameter_limits(effect, sensor, sensor_config.get("effects") or {}).tolist()
+            stated = dict(zip((p.name for p in effect.parameters(sensor)), values, strict=True))
         text = ", ".join(f"{number(v, 2)} {unit_text(unit)}".rstrip() for unit, v in largest_by_unit(limits).items())
         shares = {key: v["value"] / stated[key] for key, v in limits.items() if np.isfinite(stated.get(key, np.inf))}
         share = max(shares.values(), default=None)
@@ -73,14 +73,14 @@ def limit_rows(sensor: str, found: JSON, sensor_config: JSON) -> list[JSON]:
             "excluded": share is not None and share < EXCLUDED * prior_limit(),
         }
         if shares:
-            most = limits[max(shares, key=lambda key: shares[key])]
+            most = limits[max(shares, key=shares.__getitem__)]
             row["label"] = f"{plain(name)}: below {number(most['value'], 2)} {unit_text(most['unit'])}".rstrip()
         rows.append(row)
     return sorted(rows, key=lambda row: -(row["share"] or 0.0))
 
 
 def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
-    """Draw upper limits as shares of the sensor file's limits; None where there is none."""
+    """Draw upper limits as shares of the sensor file's limits; None without any."""
     shown = [row for row in rows if row["share"]]
     if not shown:
         return None
@@ -99,20 +99,14 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
 
 
 def ranking_rows(found: JSON) -> list[JSON]:
-    """Return the ranked effects with their parameters as text; ``supported`` are those with evidence for them."""
-    selected = found.get("selected") or []
-    return [
-        {
-            **r,
-            "selected": r["effect"] in selected,
-            "supported": r["effect"] in selected or _evidence(r) > 0.0,
-        }
-        for r in found.get("ranking") or []
-    ]
+    """Return the ranked effects, whether each is ``selected``, and ``supported``: selected or with evidence for it."""
+    chosen = found.get("selected") or []
+    rows = [(r, r["effect"] in chosen) for r in found.get("ranking") or []]
+    return [{**r, "selected": selected, "supported": selected or _evidence(r) > 0.0} for r, selected in rows]
 
 
 def ranking(sensor: str, found: JSON) -> Figure | None:
-    """Draw the ranking of a diagnosis, and name the effects that are not observable; None where it ranked nothing."""
+    """Draw the ranking of a diagnosis, and list the effects that are not observable; None without ranked effects."""
     entries, hidden = found.get("ranking") or [], found.get("not_observable") or []
     selected = found.get("selected") or []
     if not entries:
@@ -152,7 +146,7 @@ def _ranking_row(entry: JSON, selected: Sequence[str]) -> Point:
 
 
 def _brackets(shown: Sequence[JSON], selected: Sequence[str]) -> list[dict[int, str]]:
-    """Return the groups of similar effects, selected ones first: row of each member, and its share."""
+    """Return the groups of similar effects, selected ones first: row of each member, and its share as text."""
     rows = {r["effect"]: i for i, r in enumerate(shown)}
     brackets: list[dict[int, str]] = []
     joined: set[frozenset[str]] = set()
@@ -166,28 +160,26 @@ def _brackets(shown: Sequence[JSON], selected: Sequence[str]) -> list[dict[int, 
 
 
 def added_variable(sensor: str, found: JSON) -> Figure | None:
-    """Draw the added-variable plot of the first selected effect; None where the diagnosis holds none."""
+    """Draw the added-variable plot of the first selected effect; None where the diagnosis has none."""
     shown = (found.get("pictures") or {}).get("added_variable")
     if not shown or not shown["panels"]:
         return None
     unit, effect, panels = shown["unit"], plain(shown["effect"]), []
     points = [_points(p) for p in shown["panels"]]
     ends = np.array([min(x.min() for x, _, _ in points), max(x.max() for x, _, _ in points)])
-    scatter, left, total = [], 0.0, 0.0
+    scatter, residual, total = [], 0.0, 0.0
     for panel, (x, mean, error) in zip(shown["panels"], points, strict=True):
-        own = np.array([x.min(), x.max()]) if panel["value"] else ends
-        line = Line(own, panel["value"] * own, 5, "model")
+        line_x = np.array([x.min(), x.max()]) if panel["value"] else ends
+        line = Line(line_x, panel["value"] * line_x, 5, "model")
         panels.append(Panel([line, _binned(panel)], f"{panel['axis']}, {unit}", 92, {"": 0.0}))
-        off = ((mean - panel["value"] * x) / error) ** 2
-        scatter.append(float(np.mean(off)))
-        left, total = left + float(off.sum()), total + float(np.sum((mean / error) ** 2))
-    straight = max(scatter) < ON_THE_LINE or 1.0 - left / max(total, 1e-300) > MOST_EXPLAINED
+        squares = ((mean - panel["value"] * x) / error) ** 2
+        scatter.append(float(np.mean(squares)))
+        residual, total = residual + float(squares.sum()), total + float(np.sum((mean / error) ** 2))
+    straight = max(scatter) < ON_THE_LINE or 1.0 - residual / max(total, 1e-300) > MOST_EXPLAINED
     best = max(shown["panels"], key=lambda p: abs(p["value"]) / max(p["standard_uncertainty"], 1e-300))
     what = best["parameter"] if len({p["parameter"] for p in shown["panels"]}) == 1 else "each parameter"
-    slopes, x_unit = (
-        "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"])),
-        _column_unit(best["unit"], unit),
-    )
+    slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
+    x_unit = _column_unit(best["unit"], unit)
     finding, caption, description = sentences(
         "added_variable",
         effect=effect,
@@ -235,30 +227,28 @@ def _column_unit(parameter: str, unit: str) -> str:
 def unexplained(sensor: str, found: JSON) -> list[Figure]:
     """Draw the residual against each covariate on which it depends, with the suggested shape."""
     entries = {e["covariate"]: e for e in found.get("unexplained") or []}
-    pictures = (found.get("pictures") or {}).get("unexplained") or []
-    return [_unexplained(sensor, shown, entries.get(shown["covariate"], {})) for shown in pictures]
-
-
-def _unexplained(sensor: str, shown: JSON, entry: JSON) -> Figure:
-    unit, panels, off = shown["unit"], [], []
-    for panel in shown["panels"]:
-        x, mean, error = _points(panel)
-        layers: list[Layer] = [_binned(panel)]
-        if "curve" in panel:
-            curve_x, curve = (np.array(panel[key], float) for key in ("curve_x", "curve"))
-            layers.insert(0, Line(curve_x, curve, 5, "model"))
-            off.append(float(np.mean(((mean - np.interp(x, curve_x, curve)) / error) ** 2)))
-        panels.append(Panel(layers, f"{panel['axis']}, {unit}", 76, {"": 0.0}))
-    reaches = [f"{p['axis']} up to {number(float(np.abs(p['mean']).max()))} {unit}" for p in shown["panels"]]
-    follow = all(mean_square < ON_THE_LINE for mean_square in off)
-    finding, caption, description = sentences(
-        "unexplained", covariate=shown["covariate"], entry=entry, fitted=off, follow=follow, reaches=reaches
-    )
-    legend = (("c5", "suggested shape"),) if off else ()
-    return chart(
-        Figure(f"{sensor}-unexplained-{shown['covariate']}", finding, caption, legend),
-        description,
-        panels,
-        SIGNALS.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}"),
-        kind="angle" if shown["signal"] == "angle" else "",
-    )
+    figures = []
+    for shown in (found.get("pictures") or {}).get("unexplained") or []:
+        unit, covariate, panels, scatter = shown["unit"], shown["covariate"], [], []
+        for panel in shown["panels"]:
+            x, mean, error = _points(panel)
+            layers: list[Layer] = [_binned(panel)]
+            if "curve" in panel:
+                curve_x, curve = (np.array(panel[key], float) for key in ("curve_x", "curve"))
+                layers.insert(0, Line(curve_x, curve, 5, "model"))
+                scatter.append(float(np.mean(((mean - np.interp(x, curve_x, curve)) / error) ** 2)))
+            panels.append(Panel(layers, f"{panel['axis']}, {unit}", 76, {"": 0.0}))
+        finding, caption, description = sentences(
+            "unexplained",
+            covariate=covariate,
+            entry=entries.get(covariate, {}),
+            fitted=bool(scatter),
+            follow=all(mean_square < ON_THE_LINE for mean_square in scatter),
+            reaches=[f"{p['axis']} up to {number(float(np.abs(p['mean']).max()))} {unit}" for p in shown["panels"]],
+        )
+        legend = (("c5", "suggested shape"),) if scatter else ()
+        figure = Figure(f"{sensor}-unexplained-{covariate}", finding, caption, legend)
+        label = SIGNALS.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}")
+        kind = "angle" if shown["signal"] == "angle" else ""
+        figures.append(chart(figure, description, panels, label, kind=kind))
+    return figures

@@ -18,8 +18,8 @@ from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.samples import OTHER, samples_of_motion
 
 JSON = dict[str, Any]
-ALIKE = 1.2  # the diagnosis's held-out error may continue the validation's steps where both agree within this factor
-FAR = 3.0  # error over noise floor from which a unit is marked, and no verdict is shown as good
+ALIKE = 1.2  # held-out errors of diagnosis and validation that agree within this factor are shown as one series
+FAR = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
 SOURCES = {
     "static": "the static recording",
     "rests": "the rests",
@@ -31,7 +31,7 @@ SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # errors are drawn, not
 
 
 def checks(validation: JSON | None) -> list[JSON]:
-    """Return each limit of the configuration with its figure: ``sensor, name, value, limit, unit, pass``."""
+    """Return each limit of the configuration and its result: ``sensor, name, value, limit, unit, pass``."""
     return [
         {**check, "sensor": sensor, "unit": "" if check["name"] == "scale_factor" else SENSOR_UNITS[sensor]}
         for sensor in SENSORS
@@ -40,7 +40,7 @@ def checks(validation: JSON | None) -> list[JSON]:
 
 
 def passes(calibration: JSON, validation: JSON | None) -> bool | None:
-    """Return whether a unit keeps its limits; None where it has none."""
+    """Return whether a unit is within its limits; None without limits."""
     if calibration.get("status") != "ok":
         return False
     results = [bool(check["pass"]) for check in checks(validation)]
@@ -59,13 +59,13 @@ def step_label(name: str) -> str:
 
 
 def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Figure | None:
-    """Draw the held-out error after each step, with the noise floor; None where it is not known.
+    """Draw the held-out error after each step, with the noise floor; None where it is unknown.
 
     ``held_out, found``: the sensor's parts of validation and diagnosis; effects that the diagnosis selected are further
     steps. ``vector``: the error of the vector instead of the magnitude.
     """
-    key, floor_key = ("vector_rms_error", "vector_noise_floor") if vector else ("rms_error", "noise_floor")
-    steps, floor, unit = held_out.get("steps", []), held_out.get(floor_key), SENSOR_UNITS[sensor]
+    prefix, unit = "vector_" if vector else "", SENSOR_UNITS[sensor]
+    key, steps, floor = f"{prefix}rms_error", held_out.get("steps", []), held_out.get(f"{prefix}noise_floor")
     if not steps or all(s.get(key) is None for s in steps):
         return None
     rows = [Point(step_label(s["name"]), s.get(key), 3 if s["name"] == "raw" else 2) for s in steps]
@@ -90,7 +90,7 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
 
 
 def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
-    """Return the errors with each selected effect added, where the diagnosis starts from the error reached so far."""
+    """Return the errors with each selected effect added; empty if the diagnosis starts from another error."""
     entries = {r["effect"]: r for r in found.get("ranking") or []}
     chosen = [entries[name] for name in found.get("selected") or [] if name in entries]
     if not chosen or not reached or any(r.get("held_out_error_after") is None for r in chosen):
@@ -104,27 +104,23 @@ def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
 def held_out_figures(
     sensor: str, calibration: JSON, held_out: JSON, recordings: list[Recording], table: JSON
 ) -> list[Figure]:
-    """Draw the error of the magnitude over each held-out recording with a reference, as the validation computes it.
+    """Draw the error of the magnitude in each held-out recording with a reference, as in the validation.
 
     ``held_out``: the sensor's part of the validation; ``table``: this section of the unit's configuration.
     """
     fits = {s: SensorCalibration.from_json(s, calibration[s]) for s in SENSORS if calibration.get(s)}
-    out = []
-    for recording in recordings:
-        if recording.role != "validation":
-            continue
+    floor, by_hand, figures = held_out.get("noise_floor"), table.get("motion") == "none", []
+    for recording in (r for r in recordings if r.role == "validation"):
         logged = sensor == "accelerometer" or (recording.table_rate is not None and table.get("latitude_deg") is None)
-        needed = fits[sensor].effects or not logged  # else the attitude, slow to follow, changes nothing
-        seen = recording if needed else replace(recording, table_attitude=None)
-        samples = samples_of_motion(sensor, seen, SILENT, table, other=fits.get(OTHER[sensor]))
+        needed = fits[sensor].effects or not logged  # otherwise the attitude, which costs time, changes no magnitude
+        reference = recording if needed else replace(recording, table_attitude=None)
+        samples = samples_of_motion(sensor, reference, SILENT, table, other=fits.get(OTHER[sensor]))
         if samples is not None:
-            vector, reference, _ = with_known_effects(fits[sensor], samples)
+            vector, magnitude, _ = with_known_effects(fits[sensor], samples)
             raw = np.linalg.norm(samples.reading, axis=1) - samples.magnitude
-            after = np.linalg.norm(vector, axis=1) - reference
-            name, floor = f"{sensor}-held-out-{recording.name}", held_out.get("noise_floor")
-            by_hand = table.get("motion") == "none"
-            out.append(held_out_over_time(name, sensor, recording, raw, after, floor=floor, by_hand=by_hand))
-    return out
+            after, name = np.linalg.norm(vector, axis=1) - magnitude, f"{sensor}-held-out-{recording.name}"
+            figures.append(held_out_over_time(name, sensor, recording, raw, after, floor=floor, by_hand=by_hand))
+    return figures
 
 
 def held_out_over_time(
@@ -140,7 +136,7 @@ def held_out_over_time(
     """Draw the error of the magnitude in held-out motion before and after calibration.
 
     ``raw, calibrated``: (n,) arrays of magnitude minus reference, g or deg/s; ``floor``: rms error by noise alone;
-    ``by_hand``: the unit's own acceleration is in the readings while it moves.
+    ``by_hand``: the reference lacks the acceleration of the moving unit.
     """
     unit, x = SENSOR_UNITS[sensor], recording.time - recording.time[0]
     after: list[Layer] = [Samples(x, calibrated, 2, mean=True)]
@@ -156,7 +152,7 @@ def held_out_over_time(
 
 
 def attitude_over_time(found: JSON) -> Figure | None:
-    """Draw the attitude error of the integrated gyroscope and the tilt error of the fused attitude, of a validation."""
+    """Draw the attitude error of the integrated gyroscope and the tilt error of the fused attitude."""
     curve = found.get("curve")
     if not curve:
         return None
@@ -168,10 +164,10 @@ def attitude_over_time(found: JSON) -> Figure | None:
 
 
 def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:
-    """Return the angles before and after; the axis leaves out the start, where both are nearly zero."""
+    """Return the panel of the angles before and after; its limits ignore the start, where both are nearly zero."""
     time = np.array(curve["time_s"], float)
     angles = {colour: np.array(curve[f"{name}_{when}"], float) for when, colour in (("before", 3), ("after", 2))}
-    seen = np.concatenate([v[len(v) // 50 + 1 :] for v in angles.values()])
-    seen = seen[seen > 0]
-    limits = (float(seen.min()) / 1.2, float(seen.max()) * 1.2) if seen.size else (1e-3, 1.0)
+    later = np.concatenate([v[len(v) // 50 + 1 :] for v in angles.values()])
+    later = later[later > 0]
+    limits = (float(later.min()) / 1.2, float(later.max()) * 1.2) if later.size else (1e-3, 1.0)
     return Panel([Line(time, v, c) for c, v in angles.items()], label, 110, limits=limits, logarithmic=True)

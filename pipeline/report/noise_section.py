@@ -1,4 +1,4 @@
-"""Noise at rest: Allan deviation of each axis, the terms identified in it with their 95 % band, and the sensor file.
+"""Noise at rest: Allan deviation of each axis, the identified terms with their 95 % band, and the sensor file.
 
 The terms and their conventions are those of ``pipeline.estimation.noise_terms``; the white noise of a data sheet is
 one-sided, ``N = noise_density / sqrt(2)``. Source: IEEE Std 952-1997, annex C.
@@ -18,11 +18,11 @@ from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, 
 from pipeline.report.numbers import number, percent, plain
 
 JSON = dict[str, Any]
-# Factor between white noise and data sheet from which a cause is named: the digital filters of an MPU-6050 (5 to
+# Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
 # 260 Hz) change the white noise of a sample by sqrt(52) = 7 at one sampling rate, its ranges by 2 to 8.
 FAR = 5.0
-NEAR = 1.3  # factor between both that counts as the same: data sheets state typical values to about 30 %
-SURE = 0.9  # probability above which other compositions are not worth a sentence
+NEAR = 1.3  # factor between both below which they count as equal: data sheets state typical values to about 30 %
+SURE = 0.9  # probability of a set of terms above which no other set is named
 SYMBOLS = dict(zip(UNITS, "QNBKGRA", strict=True))
 
 
@@ -30,7 +30,7 @@ def allan(sensor: str, noise: JSON | None, sensor_config: JSON, wander: JSON | N
     """Draw the Allan deviation of each axis; None where no noise was identified.
 
     ``noise``: the sensor's part of ``noise`` in its calibration; ``sensor_config``: the sensor's section of the
-    configuration; ``wander``: that which the fit of the diagnosis needed.
+    configuration; ``wander``: the bias wander in the fit of the diagnosis.
     """
     axes = {a: part for a, part in ((noise or {}).get("axes") or {}).items() if part["terms"]}
     if not noise or not axes:
@@ -46,7 +46,11 @@ def allan(sensor: str, noise: JSON | None, sensor_config: JSON, wander: JSON | N
     legend, tau = list(AXES_LEGEND), np.array(next(iter(axes.values()))["allan"]["tau_s"])
     if sensor_config.get("noise_density"):
         legend.append(("c3", "sensor file"))
-        layers.append(Line(tau, _stated_deviation(sensor_config, tau), 3, "dashed"))
+        white = {"value": float(sensor_config["noise_density"]) / np.sqrt(2.0)}
+        time = {"value": float(sensor_config.get("wander_time_s") or DEFAULT_TIME_S)}
+        stated = {"value": float(sensor_config.get("bias_wander") or 0.0), "correlation_time_s": time}
+        variance = allan_variance("white", white, tau) + allan_variance("gauss_markov", stated, tau)
+        layers.append(Line(tau, np.sqrt(variance), 3, "dashed"))
     mean = np.mean([part["allan"]["deviation"] for part in axes.values()], axis=0)
     finding, caption, description = sentences(
         "allan",
@@ -66,7 +70,7 @@ def allan(sensor: str, noise: JSON | None, sensor_config: JSON, wander: JSON | N
 
 
 def term_rows(noise: JSON | None) -> list[JSON]:
-    """Return a row for each term: its name, unit, and a text with interval or upper limit for each of the three axes.
+    """Return a row for each term: its name, unit, and a text with interval or upper limit for each axis.
 
     An axis whose noise was not identified has the text of an unknown number.
     """
@@ -86,11 +90,11 @@ def term_rows(noise: JSON | None) -> list[JSON]:
 
 
 def remarks(noise: JSON | None) -> list[str]:
-    """Return why a term or all are missing, what else fits, and what is in doubt."""
+    """Return sentences on terms that are missing, on the second best set of terms, and on doubts."""
     if not noise:
         return []
-    said = [f"Not identified: {noise['reason']}."] if noise["reason"] else []
-    said += [f"In doubt: {doubt}." for doubt in noise.get("doubts") or []]
+    texts = [f"Not identified: {noise['reason']}."] if noise["reason"] else []
+    texts += [f"In doubt: {doubt}." for doubt in noise.get("doubts") or []]
     by_axis: dict[str, list[str]] = {}
     for axis, part in (noise["axes"] or {}).items():
         lines = [f"not identified: {part['reason']}"] if part["reason"] else []
@@ -107,7 +111,7 @@ def remarks(noise: JSON | None) -> list[str]:
                 lines.append(f"{' and '.join(plain(n) for n, r in reasons.items() if r == reason)}: {reason}")
         for line in lines:
             by_axis.setdefault(line, []).append(axis)
-    return said + [f"{', '.join(axes)}: {line}." for line, axes in by_axis.items()]
+    return texts + [f"{', '.join(axes)}: {line}." for line, axes in by_axis.items()]
 
 
 def _text(part: JSON | None) -> str:
@@ -122,19 +126,10 @@ def _text(part: JSON | None) -> str:
     return text
 
 
-def _stated_deviation(
-    sensor_config: JSON, tau: np.ndarray[Any, np.dtype[np.float64]]
-) -> np.ndarray[Any, np.dtype[np.float64]]:
-    variance = allan_variance("white", {"value": float(sensor_config["noise_density"]) / np.sqrt(2.0)}, tau)
-    time = {"value": float(sensor_config.get("wander_time_s") or DEFAULT_TIME_S)}
-    wander = {"value": float(sensor_config.get("bias_wander") or 0.0), "correlation_time_s": time}
-    return np.asarray(np.sqrt(variance + allan_variance("gauss_markov", wander, tau)))
-
-
 def _white(axes: JSON, sensor_config: JSON) -> JSON:
-    """Return the white noise, its ratio to that of the sensor file with a likely cause, and the other terms."""
+    """Return the white noise, its ratio to the sensor file's white noise with a likely cause, and the other terms."""
     terms = [part["terms"] for part in axes.values()]
-    seen = [name for name in SYMBOLS if name != "white" and any(n == name for t in terms for n, _ in each_term(t))]
+    names = {name for t in terms for name, _ in each_term(t)}
     densities = [t["white"]["value"] for t in terms if t["white"]["value"]]
     white = float(np.sqrt(np.mean(np.square(densities)))) if densities else None
     stated = float(sensor_config.get("noise_density") or 0.0) / np.sqrt(2.0)
@@ -143,5 +138,6 @@ def _white(axes: JSON, sensor_config: JSON) -> JSON:
         cause = ": vibration at rest, another range, or a column in another unit"
     elif ratio and ratio < 1.0 / FAR:
         cause = ": a filter in the sensor, smoothed or repeated samples, or a column in another unit"
+    others = [name for name in SYMBOLS if name != "white" and name in names]
     as_stated = ratio is not None and 1.0 / NEAR < ratio < NEAR
-    return {"white": white, "ratio": ratio, "as_stated": as_stated, "cause": cause, "others": seen}
+    return {"white": white, "ratio": ratio, "as_stated": as_stated, "cause": cause, "others": others}

@@ -1,4 +1,4 @@
-"""The templates of the pages in ``templates``: HTML, CSS and JavaScript, every value escaped; Markdown as it is."""
+"""Load the templates of pages and texts. Values are escaped in HTML, but not in Markdown, plain text and YAML."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent / "templates"
 OF_NUMBERS = ("aligned", "measured", "number", "percent", "percent_change", "probability", "span", "typeset")  # filters
-PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # of a campaign's page
+PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
 
 
 def _figure(value: object) -> str:
-    """Return a number for a cell, empty where there is none."""
+    """Return a number for a cell, empty for another value."""
     return numbers.number(value) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
 
 
@@ -52,7 +52,7 @@ def template(name: str) -> Template:
 
 
 def compile_templates() -> None:
-    """Compile all templates, for the processes that are forked from this one."""
+    """Compile all templates before processes are forked from this one."""
     for file in (*FOLDER.glob("*.html"), *FOLDER.glob("*.txt")):
         template(file.name)
 
@@ -64,17 +64,17 @@ def asset(name: str) -> Markup:
 
 
 def unit_link(unit: str, published: Container[str] | None) -> Markup:
-    """Return a unit's name with the link to its page, which ``published`` units have; None: all of them."""
-    link = published is None or unit in published
-    address = f' href="reports/{quote(unit)}.html"' if link else ""
+    """Return a unit's name with a link to its page if it is one of the ``published`` units; None: all have a page."""
+    address = f' href="reports/{quote(unit)}.html"' if published is None or unit in published else ""
     return Markup(f"<a{address}>{escape(unit)}</a>")  # noqa: S704  (the name is escaped)
 
 
 def linked(page: str, units: Iterable[str]) -> str:
-    """Return a campaign's page with links to units whose pages have been published after it was made."""
+    """Return a campaign's page with links to units whose pages were published later."""
     for unit in units:
-        name, link = str(unit_link(unit, ())), str(unit_link(unit, None))
-        page = page.replace(name, link).replace(_in_json(name), _in_json(link))
+        name, link = unit_link(unit, ()), unit_link(unit, None)
+        for without, with_link in ((name, link), (script_data(name)[1:-1], script_data(link)[1:-1])):
+            page = page.replace(str(without), str(with_link))
     found = PUBLISHED.search(page)
     if found:
         names = [*json.loads(found[1]), *units]
@@ -82,18 +82,14 @@ def linked(page: str, units: Iterable[str]) -> str:
     return page
 
 
-def _in_json(text: str) -> str:
-    return str(script_data(text))[1:-1]
-
-
 def script_data(value: object) -> Markup:
-    """Return a value as JSON that may stand within a script element; ``ValueError``: a number is not finite."""
+    """Return a value as JSON for a script element; raises ``ValueError`` if a number is not finite."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False)
     return Markup(text.replace("<", "\\u003c"))  # noqa: S704  (no tag can begin)
 
 
 def failure_page(unit: str, failure: Mapping[str, Any]) -> str:
-    """Return a page that needs no template and no results: for a unit whose page could not be made."""
+    """Return a page for a unit whose page cannot be rendered; it needs no template and no results."""
     where = f"{failure['file']}: " if failure["file"] else ""
     cause = escape(f"{where}{failure['message']}")
     return (

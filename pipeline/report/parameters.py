@@ -1,7 +1,8 @@
-"""The fitted parameters of a sensor with their uncertainties, and what pages say of the fit.
+"""The fitted parameters of a sensor with their uncertainties, and texts of the pages about the fit.
 
-The calibration file holds the matrix M of ``truth = M (reading - bias - effects)``. A sensor file states scale factor
-errors and cross-axis sensitivities, which are elements of ``K = M^-1`` in ``reading = bias + K truth + effects``:
+The calibration file contains the matrix M of ``truth = M (reading - bias - effects)``. A sensor file states scale
+factor errors and cross-axis sensitivities, which are elements of ``K = M^-1`` in ``reading = bias + K truth +
+effects``:
 
     dK = -K dM K,    cov(K) = J cov(M) J^T,    J = K (x) K^T    (rows of M one after the other)
 """
@@ -21,14 +22,16 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 JSON = dict[str, Any]
-LEFT_OUT = "marked ones, and those that the method does not use: beside rests or steady turns, or of a vague log"
+LEFT_OUT = (
+    "marked samples, and samples that the method does not use: outside of rests or steady turns, or of a vague log"
+)
 CROSS_AXIS = "cross_axis"  # elements of K outside its diagonal, as a sensor file limits them
-NAMED = 5  # parameters beyond the limits of the sensor file that the top of a page names
+NAMED = 5  # parameters beyond the limits of the sensor file that a page lists at its top
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
 
 
 class Parameter(NamedTuple):
-    """A value with its unit; the uncertainty is None where the method states none."""
+    """A value with its unit; without an uncertainty where the method states none."""
 
     name: str
     value: float
@@ -53,35 +56,34 @@ class Parameter(NamedTuple):
 def fitted_parameters(part: JSON) -> list[Parameter]:
     """Return bias, matrix and effects of a sensor's part of a calibration, in the order of the covariance's rows.
 
-    ``bias_x``, ``matrix_xy`` (row, column) and ``<effect>.<parameter>``. Each has its own coverage factor,
-    as the effective degrees of freedom differ between parameters.
+    Their names are ``bias_x``, ``matrix_xy`` (row, column) and ``<effect>.<parameter>``. The effective degrees of
+    freedom, and so the coverage factors, differ between parameters.
     """
-    of_base = part.get("expanded_uncertainty") or NO_UNCERTAINTY
+    U = part.get("expanded_uncertainty") or NO_UNCERTAINTY
     k = part.get("coverage_factor") or NO_UNCERTAINTY
     budget = part.get("uncertainty_budget") or {"parameters": [], "coverage_factor": []}
-    own = dict(zip(budget["parameters"], budget["coverage_factor"], strict=True))
+    k_of_effects = dict(zip(budget["parameters"], budget["coverage_factor"], strict=True))
     found = [
-        Parameter(f"bias_{a}", part["bias"][i], part["unit"], of_base["bias"][i], k["bias"][i])
-        for i, a in enumerate(AXES)
+        Parameter(f"bias_{a}", part["bias"][i], part["unit"], U["bias"][i], k["bias"][i]) for i, a in enumerate(AXES)
     ]
     found += [
-        Parameter(f"matrix_{a}{b}", part["matrix"][i][j], "1", of_base["matrix"][i][j], k["matrix"][i][j])
+        Parameter(f"matrix_{a}{b}", part["matrix"][i][j], "1", U["matrix"][i][j], k["matrix"][i][j])
         for i, a in enumerate(AXES)
         for j, b in enumerate(AXES)
     ]
     for effect in part.get("effects") or []:
         for symbol, p in effect["parameters"].items():
-            name = f"{effect['name']}.{symbol}"
-            U = p.get("expanded_uncertainty")
-            found.append(Parameter(name, p["value"], p["unit"], U, None if U is None else own.get(name)))
+            name, expanded = f"{effect['name']}.{symbol}", p.get("expanded_uncertainty")
+            factor = None if expanded is None else k_of_effects.get(name)
+            found.append(Parameter(name, p["value"], p["unit"], expanded, factor))
     return found
 
 
 def reading_errors(part: JSON) -> list[Parameter]:
-    """Return the elements of K that a sensor file states, of a sensor's part of a calibration.
+    """Return the elements of K that a sensor file limits, from a sensor's part of a calibration.
 
-    ``scale_factor_error_x`` is ``K_xx - 1``; ``cross_axis_xy`` is what axis x reads of a truth along y. Each has the
-    coverage factor of the same element of the matrix.
+    ``scale_factor_error_x`` is ``K_xx - 1``; ``cross_axis_xy`` is ``K_xy``, the reading of axis x for a truth along y.
+    Each has the coverage factor of the same element of the matrix.
     """
     K = np.linalg.inv(np.array(part["matrix"], float))
     k = (part.get("coverage_factor") or NO_UNCERTAINTY)["matrix"]
@@ -104,7 +106,7 @@ def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
     """Return bias, scale factor errors, cross-axis terms and effects.
 
     A row has ``p``, ``name``, ``limit`` (or None) and ``share`` of the limit. ``part``: the sensor's part of the
-    calibration; ``sensor_config``: its section of the configuration with the limits.
+    calibration; ``sensor_config``: the sensor's section of the configuration, with the limits.
     """
     fitted, effects = fitted_parameters(part), sensor_config.get("effects") or {}
     found = [(p, p.words.capitalize(), sensor_config.get("bias")) for p in fitted[:3]]
@@ -114,7 +116,10 @@ def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
             found.append((p, f"{axes[0]} reads of {axes[1]}", sensor_config.get(CROSS_AXIS)))
         else:
             found.append((p, f"Scale factor error {axes}", sensor_config.get("scale_factor")))
-    found += [(p, _of_effect(p), effects.get(p.name.partition(".")[0])) for p in fitted[12:]]
+    for p in fitted[12:]:
+        held = is_held(p.name, {"value": p.value, "unit": p.unit, "standard_uncertainty": p.standard_uncertainty})
+        name = f"{p.words} (not determined, held at 0)" if held else p.words
+        found.append((p, name, effects.get(p.name.partition(".")[0])))
     bounds = (limit if isinstance(limit, int | float) and limit > 0 else None for *_, limit in found)
     return [
         {"p": p, "name": name, "limit": bound, "share": abs(p.value) / bound if bound else 0.0}
@@ -123,24 +128,17 @@ def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
 
 
 def beyond_limits(rows: Sequence[JSON], *, mounted: bool) -> list[str]:
-    """Return the parameters beyond the limits of the sensor file with their share of it, the largest first.
+    """Return the parameters beyond the limits of the sensor file with their shares of them, the largest first.
 
-    ``rows``: of ``parameter_rows``; ``mounted``: cross-axis terms include how the unit sits on a table, and are left
-    out.
+    ``rows``: of ``parameter_rows``; ``mounted``: cross-axis terms contain the mounting on a table, and are left out.
     """
     beyond = (row for row in rows if row["share"] > 1.0 and not (mounted and row["p"].name.startswith(CROSS_AXIS)))
     largest = sorted(beyond, key=lambda row: -row["share"])
     return first([f"{row['name'].lower()} ({percent(row['share'])})" for row in largest], NAMED)
 
 
-def _of_effect(p: Parameter) -> str:
-    """Return the name of an effect's parameter, and whether it was held."""
-    held = is_held(p.name, {"value": p.value, "unit": p.unit, "standard_uncertainty": p.standard_uncertainty})
-    return f"{p.words} (not determined, held at 0)" if held else p.words
-
-
 def stage_details(stage: JSON) -> list[str]:
-    """Return the details of a stage of the fit that are one value each, in words."""
+    """Return the details of a stage of the fit that have one value, as texts."""
     details = {k: v for k, v in (stage.get("details") or {}).items() if isinstance(v, int | float | str | bool)}
     shown = {k: number(v, 4) if isinstance(v, float) else f"{v:,}" if type(v) is int else v for k, v in details.items()}
     texts = {k: f"{plain(k)}: {text}" for k, text in shown.items()}
@@ -150,7 +148,7 @@ def stage_details(stage: JSON) -> list[str]:
 
 
 def parameter_texts(parameters: JSON | None, *, uncertain: bool = True) -> list[str]:
-    """Return ``name = value ± uncertainty unit`` of an effect, or of a stage without its uncertainty.
+    """Return ``name = value ± uncertainty unit`` for each parameter of an effect or a stage.
 
     Where only a standard uncertainty is stated, twice its value is shown, which covers about 95 %.
     """
@@ -168,7 +166,7 @@ def parameter_texts(parameters: JSON | None, *, uncertain: bool = True) -> list[
 
 
 def monte_carlo_of(budget: JSON) -> JSON | None:
-    """Return what the page shows of the Monte Carlo run beside the uncertainty budget; None where there is none.
+    """Return the result of the Monte Carlo run of an uncertainty budget for the page; None without a run.
 
     ``finding``: a sentence; ``rows``: the index of each uncertain parameter.
     """

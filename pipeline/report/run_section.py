@@ -1,6 +1,6 @@
-"""What changed from run to run: a section of a unit's page, and the data with which the campaign's page compares runs.
+"""The changes from run to run: a section of a unit's page, and the data for the comparison on the campaign's page.
 
-The page of a unit that only one run has changed has no such section.
+The page of a unit has the section from the second run on that changed the unit.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
-SHOWN = 12  # runs that a chart has room for: the first, and the last ones
+SHOWN = 12  # runs in a chart: the first, and the last ones
 LABEL = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
-STATES = 10_000  # of units in runs after the first that a campaign's page holds: 2 MB at 0.2 kB each
-SAME = 0.02  # relative change of an error that is too small to be significant
-NEAR_FLOOR = 1.5  # of the noise floor, up to which a bar is green
+STATES = 10_000  # of units in runs after the first that a campaign's page contains: 2 MB at 0.2 kB each
+SAME = 0.02  # relative change of an error that is not significant
+NEAR_FLOOR = 1.5  # error over noise floor below which a bar is green
 
 
 def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[int, str]) -> str:
@@ -38,8 +38,8 @@ def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[i
         change = difference(before, state) if before else None
         words = change.words() if change else []
         for sensor in SENSORS:
-            told = uncertainty_words(before.get(sensor) or {}, state.get(sensor) or {}, SENSOR_UNITS[sensor])
-            words += [f"{sensor}: {told.replace('->', '→')}"] if told else []
+            change_of_u = uncertainty_words(before.get(sensor) or {}, state.get(sensor) or {}, SENSOR_UNITS[sensor])
+            words += [f"{sensor}: {change_of_u.replace('->', '→')}"] if change_of_u else []
         entries.append({"run": run, "time": times[run], "state": state, "change": change, "words": words})
         before = state
     figures = [figure for sensor in SENSORS if (figure := _chart(sensor, entries))]
@@ -50,7 +50,7 @@ def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[i
 
 
 def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
-    """Draw the held-out error of a sensor run by run with its noise floor; None where it never changed."""
+    """Draw the held-out error of a sensor by run, with its noise floor; None where it never changed."""
     known: list[tuple[JSON, JSON]] = [(e, part) for e in entries if (part := e["state"].get(sensor)) and part["error"]]
     if len({part["error"] for _, part in known}) < 2:
         return None
@@ -84,38 +84,31 @@ def times_of(entries: Sequence[JSON]) -> dict[int, str]:
 
 
 def runs_data(entries: Sequence[JSON], settings: JSON) -> JSON | None:
-    """Return what the campaign's page needs to compare any two runs; None while there is one run."""
+    """Return the data with which the campaign's page compares any two runs; None if there is one run.
+
+    Of many runs, the first and the last ones can be compared, as many as ``STATES`` allows.
+    """
     if len(entries) < 2:
         return None
-    kept, times = _kept(entries), times_of(entries)
-    units = [
-        [unit, [[run, _short(state)] for run, state in shown]]
-        for unit, states in of_units(entries).items()
-        if len(shown := _states_after(states, [e["run"] for e in kept])) > 1
-    ]
-    runs = [[e["run"], f"run {e['run']}, {times[e['run']]}: {_count(e)}"] for e in kept]
+    last, count = [entries[-1]], len(entries[-1]["units"])
+    for entry in reversed(entries[1:-1]):
+        count += len(entry["units"])
+        if count > STATES:
+            break
+        last.append(entry)
+    compared, times = [entries[0], *reversed(last)], times_of(entries)
+    units = []
+    for unit, states in of_units(entries).items():
+        after = [next((s for s in reversed(states) if s[0] <= e["run"]), None) for e in compared]
+        shown = dict(filter(None, after))
+        if len(shown) > 1:
+            units.append([unit, [[run, _short(state)] for run, state in shown.items()]])
+    runs = [[e["run"], f"run {e['run']}, {times[e['run']]}: {_count(e)}"] for e in compared]
     gone = [
         {"unit": unit, "run": run, "effects": effects, "add": add_command(settings, unit, effects)}
         for (unit, run), effects in dropped(entries).items()
     ]
     return {"runs": runs, "units": units, "dropped": gone, "number": entries[-1]["run"]}
-
-
-def _kept(entries: Sequence[JSON]) -> list[JSON]:
-    """Return the runs that can be compared: the first, and the last ones, as many as ``STATES`` allows."""
-    kept, count = [entries[-1]], len(entries[-1]["units"])
-    for entry in reversed(entries[1:-1]):
-        count += len(entry["units"])
-        if count > STATES:
-            break
-        kept.append(entry)
-    return [entries[0], *reversed(kept)]
-
-
-def _states_after(states: Sequence[tuple[int, JSON]], runs: Sequence[int]) -> list[tuple[int, JSON]]:
-    """Return the states that hold after some runs, each once."""
-    found = [next((s for s in reversed(states) if s[0] <= run), None) for run in runs]
-    return list({s[0]: s for s in found if s}.values())
 
 
 def _count(entry: JSON) -> str:

@@ -1,7 +1,7 @@
-"""What a unit adds to the tables of the campaign: its row, and its parameters.
+"""The row of a unit in the tables of the campaign, and its parameters.
 
-Columns: those of every campaign in the order of ``COLUMNS``, then the user's own columns of ``units.csv``. A column of
-the user's whose name is taken gets ``sheet_`` before it.
+The columns of every campaign (``COLUMNS``) come first, then the other columns of ``units.csv``. If such a column has
+the name of one in ``COLUMNS``, it gets the prefix ``sheet_``.
 """
 
 from __future__ import annotations
@@ -21,24 +21,14 @@ SENSOR_COLUMNS = (
 )  # fmt: skip
 OF_CALIBRATION = tuple(f"{s}_{c}" for c in ("implausible", "not_in_uncertainty", "not_held_out") for s in SENSORS)
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, "left_out")
-PARAMETERS = (
-    "sensor",
-    "parameter",
-    "label",
-    "measure",
-    "value",
-    "u",
-    "U",
-    "limit",
-    "fitted",
-)  # value u U limit: figures
+PARAMETERS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "fitted")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 
 
 def summary_row(
     unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, units_table_row: dict[str, str]
 ) -> JSON:
-    """Return a unit's row: a dict from column to value, None where there is none.
+    """Return a unit's row: a dict from column to value, or None.
 
     ``calibration, validation, diagnosis``: as in their files; ``units_table_row``: the unit's row of ``units.csv``.
     """
@@ -75,14 +65,14 @@ def summary_row(
 
 
 def sheet_columns(row: JSON) -> dict[str, str]:
-    """Return what ``summary_row`` took from ``units.csv``."""
+    """Return the values of a row that are from ``units.csv``."""
     return {k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in COLUMNS)}
 
 
 def unit_parameters(calibration: JSON, sensor_configs: JSON) -> list[tuple[Any, ...]]:
-    """Return the parameters of a unit, a row each with the figures of ``PARAMETERS``; none of a failed unit.
+    """Return a row with the columns ``PARAMETERS`` for each parameter of a unit; none for a failed unit.
 
-    They are those that are fitted, and the elements of K that a sensor file limits. ``sensor_configs``: the section
+    These are the fitted parameters, and the elements of K that a sensor file limits. ``sensor_configs``: the section
     ``sensor`` of the configuration.
     """
     rows = []

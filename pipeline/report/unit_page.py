@@ -12,7 +12,8 @@ import numpy as np
 from pipeline.files import json_text
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
 from pipeline.outcome import VERDICTS, commands_of, place, run_command
-from pipeline.records import SENSOR_UNITS, SENSORS, Recording
+from pipeline.records import SENSOR_UNITS, SENSORS, Recording, Values
+from pipeline.report.chart import Figure, Layer, Line, Panel, chart
 from pipeline.report.diagnosis_section import evidence_figures, limit_rows, ranking_rows, upper_limits
 from pipeline.report.held_out_section import (
     FAR,
@@ -25,19 +26,21 @@ from pipeline.report.held_out_section import (
     step_label,
 )
 from pipeline.report.noise_section import allan, remarks, term_rows
+from pipeline.report.numbers import NOTHING, number
 from pipeline.report.pages import template
 from pipeline.report.parameters import beyond_limits, fitted_parameters, parameter_rows
-from pipeline.report.recording_section import (
-    environment,
-    files_read,
-    recording_rows,
-    rest_rows,
-    rests_logged,
-    segments,
-)
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
+from pipeline.signal.rests import Rest, rests_from_table
 
 JSON = dict[str, Any]
+LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name
+USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found in the readings, with their colours
+LOGGED = 4  # colour of rests from a table's log
+NARROWEST = 0.002  # of the axis: the smallest width of a rest
+ANGLE_STEP_S = 0.2  # over which a rate is computed from an angle: an encoder of 0.01 deg gives it to 0.05 deg/s
+STILL_ANGLE = 0.1  # deg/s, two steps of such an encoder
+STILL = 0.02  # deg/s, below which a table's log is noise of its rate
+MARKS = ("after a gap", "clipped", "stuck", "repaired")  # of samples, by the bits of their flags
 
 
 def render(
@@ -57,7 +60,13 @@ def render(
     """
     validation, diagnosis, words = validation or {}, diagnosis or {}, words or {}
     attitude, moves = validation.get("attitude") or {}, validation.get("gravity_direction") or {}
-    ok, rests = calibration.get("status") == "ok", rests_logged(recordings)
+    ok, rests = calibration.get("status") == "ok", {r.name: rests_from_table(r) for r in recordings}
+    environment = {
+        "temperature": sensor_temperature(recordings),
+        "recorded_s": sum(_duration(r) for r in recordings if r.samples),
+        "table": settings.get("table") or {},
+        "filter": (settings.get("filter") or {}).get("name", "none"),
+    }
     sensors = []
     for sensor in SENSORS if ok else ():
         shown = {"name": sensor, "unit": SENSOR_UNITS[sensor], "part": calibration.get(sensor)}
@@ -82,7 +91,7 @@ def render(
         recordings=recording_rows(recordings, rests),
         segments=segments(recordings, rests, calibration),
         rests=rest_rows(calibration),
-        environment=environment(recordings, settings) if recordings else None,
+        environment=environment if recordings else None,
         row={k: v for k, v in (settings.get("row") or {}).items() if v},
         command=run_command(settings["run"]) if settings.get("run") else None,
         settings_text=json_text({k: v for k, v in settings.items() if k not in ("row", "run", "certificate")}),
@@ -94,16 +103,13 @@ def _sensor(
     sensor: str, calibration: JSON, held_out: JSON, found: JSON, *, recordings: list[Recording], settings: JSON
 ) -> JSON:
     """Return what the template shows of a calibrated sensor, from its parts of validation and diagnosis."""
-    part, sensor_config, table = (
-        calibration[sensor],
-        (settings.get("sensor") or {}).get(sensor) or {},
-        settings["table"],
-    )
+    part, table = calibration[sensor], settings["table"]
+    sensor_config = (settings.get("sensor") or {}).get(sensor) or {}
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
     limits, kind = limit_rows(sensor, found, sensor_config), VERDICTS.get(found.get("verdict", ""), "")
-    held, likely = held_out.get("held_out", True), (found.get("answer_set") or [{}])[0].get("effects")
+    likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
     parameters = parameter_rows(part, sensor_config)
@@ -130,8 +136,126 @@ def _sensor(
         "limits": limits,
         "implausible": sentences(sensor, part),
         "beyond": beyond_uncertainty(part),
-        "kind": "warn" if not held else "" if (far or likely) and kind == "good" else kind,
+        "kind": "warn" if not held_out.get("held_out", True) else "" if (far or likely) and kind == "good" else kind,
         "of_rests": table.get("motion") == "none" and not logged,
         "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),
     }
+
+
+def files_read(inputs: list[JSON] | None) -> list[JSON]:
+    """Return name, hash and rows of each file in ``inputs`` of a calibration, including joined files."""
+    files = [file for entry in inputs or [] for file in (entry, *entry.get("joined", []))]
+    return [{key: file.get(key) for key in ("file", "sha256", "rows")} for file in files]
+
+
+def rest_rows(part: JSON) -> list[JSON]:
+    """Return the rests that were found in the readings, in order of time: used, held out or left out, and why.
+
+    ``part`` contains them in ``rests``, or in the ``details`` of the stages of a fit.
+    """
+    found = [part.get("rests") or {}, *(stage.get("details") or {} for stage in part.get("stages") or [])]
+    rows = [
+        {**rest, "use": use}
+        for rests in found
+        for use in USES
+        for rest in rests.get(f"rests_{use.replace(' ', '_')}") or []
+    ]
+    return sorted(rows, key=lambda row: (row["recording"], row["time_s"]))
+
+
+def recording_rows(recordings: list[Recording], rests: dict[str, list[Rest]]) -> list[JSON]:
+    """Return a row for each recording with its role, length, rate, motion, rests and temperature."""
+    return [
+        {
+            "name": r.name,
+            "role": r.role + (f", {r.axis} axis" if r.axis else ""),
+            "samples": r.samples,
+            "duration": number(_duration(r) if r.samples else None, 4),
+            "rate": number(1.0 / r.interval if r.samples > 1 and r.interval > 0 else None, 4),
+            "motion": _motion(r, len(rests[r.name])),
+            "temperature": _range(r.temperature),
+            "flagged": ", ".join(
+                f"{count} {mark}"
+                for bit, mark in enumerate(MARKS)
+                if r.flags is not None and (count := np.count_nonzero(r.flags & (1 << bit)))
+            ),
+        }
+        for r in recordings
+    ]
+
+
+def _duration(recording: Recording) -> float:
+    return float(recording.time[-1] - recording.time[0])
+
+
+def _motion(recording: Recording, rests: int) -> str:
+    rate, by = recording.table_rate, ""
+    if rate is None and recording.table_angle is not None and recording.samples > 1:
+        every = max(1, round(ANGLE_STEP_S / recording.interval)) if recording.interval > 0 else 1
+        angle, time = recording.table_angle[::every], recording.time[::every]
+        rate, by = np.diff(angle) / np.maximum(np.diff(time), every * 1e-9), ", by its angle"
+    if rate is None:
+        logged = "the attitude is logged" if recording.table_attitude is not None else "by hand or not logged"
+        return "at rest" if recording.role == "static" else logged
+    fastest = float(np.max(np.abs(rate), initial=0.0))
+    if fastest < (STILL_ANGLE if by else STILL):
+        return "at rest"
+    kind = "stop-and-go" if rests > 2 else "continuous"
+    return f"{kind}, {rests} rest{'s' if rests != 1 else ''}, up to {number(fastest)} deg/s{by}"
+
+
+def _range(values: Values | None) -> str:
+    if values is None or not np.isfinite(values).any():
+        return NOTHING
+    return f"{np.nanmin(values):.1f} to {np.nanmax(values):.1f}"
+
+
+def sensor_temperature(recordings: list[Recording]) -> str | None:
+    """Return the range of the sensor's temperature in all recordings, degC; None where it was not recorded."""
+    known = [r.temperature for r in recordings if r.temperature is not None and np.isfinite(r.temperature).any()]
+    return _range(np.concatenate(known)) if known else None
+
+
+def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibration: JSON) -> Figure | None:
+    """Draw the rests of each recording, by the calibration or the table's log; None where no rest is known."""
+    drawn = [r for r in recordings if r.samples > 1]
+    spans = {r.name: _spans(r, rests[r.name], calibration) for r in drawn}
+    if not any(spans.values()):
+        return None
+    one_file = len({r.source.get("file") for r in drawn}) == 1 < len(drawn)
+    first = min(float(r.time[0]) for r in drawn)
+    begin = {r.name: float(r.time[0]) - first if one_file else 0.0 for r in drawn}
+    narrowest = NARROWEST * max(begin[r.name] + _duration(r) for r in drawn)
+    lanes = drawn[::-1]  # the first at the top
+    layers: list[Layer] = []
+    for y, r in enumerate(lanes, 1):
+        layers.append(Line(np.array([0.0, _duration(r)]) + begin[r.name], np.full(2, float(y)), 3))
+        for colour in sorted({c for *_, c in spans[r.name]}):
+            ends = [(a, max(b, a + narrowest), np.nan) for a, b, c in spans[r.name] if c == colour]
+            x = np.ravel(ends) + begin[r.name]
+            layers.append(Line(x, np.full(len(x), float(y)), colour, "thick"))
+    count, colours = sum(map(len, spans.values())), {c for of in spans.values() for *_, c in of}
+    finding = f"{count} rest{'s' if count != 1 else ''} in {len(drawn)} recording{'s' if len(drawn) != 1 else ''}"
+    legend = tuple((f"c{c}", f"rest, {use}") for use, c in USES.items() if c in colours) or ((f"c{LOGGED}", "rest"),)
+    names = [r.name if len(r.name) <= LETTERS else f"{r.name[: LETTERS - 1]}…" for r in lanes]
+    return chart(
+        Figure("segments", finding, "Thick: rests that were found; thin: the remaining time.", legend),
+        f"Rests of each recording. {'; '.join(f'{name}: {len(of)}' for name, of in spans.items())}.",
+        [Panel(layers, "", LANE * len(lanes), limits=(0.5, len(lanes) + 0.5), rows=names)],
+        "time since the start of the recording, s",
+        left=LEFT,
+    )
+
+
+def _spans(recording: Recording, logged: list[Rest], calibration: JSON) -> list[tuple[float, float, int]]:
+    """Return start, end (s since the recording's start) and colour of each rest."""
+    start = float(recording.time[0])
+    found = {
+        (r["time_s"] - start, r["time_s"] - start + r["duration_s"], USES[r["use"]])
+        for part in (calibration, *(calibration.get(s) or {} for s in SENSORS))
+        for r in rest_rows(part)
+        if r["recording"] == recording.name
+    }
+    time = recording.time - start
+    return sorted(found) or [(float(time[r.start]), float(time[r.stop - 1]), LOGGED) for r in logged]

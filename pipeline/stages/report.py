@@ -10,8 +10,7 @@ from pipeline.estimation.rest_means import rests_by_use
 from pipeline.records import SENSORS
 from pipeline.report.certificate import certificate, certificate_page, digital_certificate
 from pipeline.report.pages import failure_page
-from pipeline.report.recording_section import sensor_temperature
-from pipeline.report.unit_page import render
+from pipeline.report.unit_page import render, sensor_temperature
 from pipeline.stages.calibration import header, inputs
 from pipeline.stages.unit_files import recordings_of
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.records import Recording
-from pipeline.report.recording_section import recording_rows
+from pipeline.report.unit_page import recording_rows
 
 
 @pytest.mark.parametrize(
