@@ -3,17 +3,17 @@
     x_i = theta + d_i + e_i + b,    cov(e_i) = A_i,  cov(d_i) = diag(r^2),  cov(b) = B
     theta = (sum W_i)^-1 sum W_i x_i,    W_i = (A_i + diag(r^2))^-1,    cov(theta) = (sum W_i)^-1 + B
 
-where x_i holds bias, matrix and effects of calibration i; A_i is the part of its covariance by its own readings
-(type A), and B that by stated accuracies of the bench (type B), taken as common to all. The recordings of the
-calibrations are different, so that none is used twice. r is the standard deviation from one calibration to the next
-that the scatter shows beyond A_i, one for each kind of parameter (bias, scale factors, cross-axis elements, effect):
+x_i contains bias, matrix and effects of calibration i. A_i is the part of its covariance by its readings (type A), B
+the part by stated accuracies of the bench (type B), which is assumed common to all. The calibrations have different
+recordings, so that none is used twice. r is the standard deviation between calibrations in addition to A_i, one for
+each kind of parameter (bias, scale factors, cross-axis elements, effect):
 
     sum_i sum_kind (x_i - mean)^2 / (A_i + r^2) = k (n - 1),    r = 0 where the sum is smaller at 0
 
 with k parameters of the kind.
 
-The calibration of the device in its next use includes one more d. What r adds to the covariance, in theta and in the
-next use, is a line of the budget, ``repeatability``, of k (n - 1) degrees of freedom.
+In its next use the device has another d. The contribution of r to the covariance, in theta and in the next use, is the
+line ``repeatability`` of the budget, with k (n - 1) degrees of freedom.
 
 Source: Paule & Mandel, Consensus values and weighting factors, J. Res. NBS 87 (1982) 377.
 """
@@ -47,29 +47,30 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and other elements of the matrix
 BENCH = "stated accuracies of the bench"
-SAME = ("sensor", "method", "table")  # what the calibrations of one estimate have in common
+SAME = ("sensor", "method", "table")  # equal in the calibrations of one estimate
 
 
 def combined_calibrations(
     rows: Sequence[Mapping[str, Any]], read: Callable[[str], JSON]
 ) -> tuple[dict[str, JSON], list[JSON]]:
-    """Return a calibration for each serial with several calibrations, and what was combined or why it was not.
+    """Return the calibration of each serial with several calibrations, and a list of these serials for ``fleet.json``.
 
-    ``rows``: ``unit``, ``serial`` and ``status`` of each unit. ``read`` returns ``calibrations/<unit>.json`` of a unit.
+    Its entries have ``serial, units, refused``. ``rows``: ``unit``, ``serial`` and ``status`` of each unit; ``read``
+    returns ``calibrations/<unit>.json`` of a unit.
     """
     devices: dict[str, list[str]] = {}
     for row in rows:
         if row.get("serial") and row["status"] == "ok":
             devices.setdefault(str(row["serial"]), []).append(row["unit"])
-    found, told = {}, []
+    found, entries = {}, []
     for serial, units in devices.items():
         if len(units) > 1:
             documents = [read(unit) for unit in units]
             reason = f"the serial {wrong}" if (wrong := wrong_name(serial)) else _refused(documents)
-            told.append({"serial": serial, "units": units, "refused": reason})
+            entries.append({"serial": serial, "units": units, "refused": reason})
             if not reason:
                 found[serial] = _combined(serial, documents)
-    return found, told
+    return found, entries
 
 
 def _refused(documents: Sequence[JSON]) -> str | None:
@@ -95,37 +96,29 @@ def _combined(serial: str, documents: Sequence[JSON]) -> JSON:
     units = [document["unit"] for document in documents]
     inputs = [entry for document in documents for entry in document["inputs"]]
     sensors = {s: _sensor(s, [d[s] for d in documents]) if documents[0][s] else None for s in SENSORS}
-    known = _ranges([document.get("calibrated_range") or {} for document in documents])
-    return {**documents[0], "unit": serial, "combined": units, "inputs": inputs, "calibrated_range": known, **sensors}
-
-
-def _ranges(ranges: Sequence[JSON]) -> JSON:
-    """Return the range that all calibrations together contain."""
-    found: JSON = {}
+    ranges, union = [document.get("calibrated_range") or {} for document in documents], {}
     for key in sorted({key for known in ranges for key in known}):
         values = [known[key] for known in ranges if key in known]
-        together = isinstance(values[0], list)
-        found[key] = [min(v[0] for v in values), max(v[1] for v in values)] if together else max(values)
-    return found
+        is_pair = isinstance(values[0], list)
+        union[key] = [min(v[0] for v in values), max(v[1] for v in values)] if is_pair else max(values)
+    return {**documents[0], "unit": serial, "combined": units, "inputs": inputs, "calibrated_range": union, **sensors}
 
 
 def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
     each = [SensorCalibration.from_json(sensor, part) for part in parts]
-    x = np.stack([values_of(c) for c in each])
-    found = [own_and_bench(c) for c in each]
-    own, common = [A for A, _ in found], np.mean([B for _, B in found], axis=0)
-    kind = kinds_of(each[0])
-    r2 = repeatability(x, np.stack([np.diag(A) for A in own]), kind) ** 2
-    weights = [scaled_inverse(A + np.diag(r2)) for A in own]
+    x, kind = np.stack([values_of(c) for c in each]), kinds_of(each[0])
+    by_readings, by_bench = zip(*(own_and_bench(c) for c in each), strict=True)
+    r2 = repeatability(x, np.stack([np.diag(A) for A in by_readings]), kind) ** 2
+    weights = [scaled_inverse(A + np.diag(r2)) for A in by_readings]
     covariance = scaled_inverse(np.sum(weights, axis=0))
-    mean = x.mean(axis=0)  # a parameter that all state exactly stays as it is
+    mean = x.mean(axis=0)  # a parameter that all calibrations state exactly is not changed
     theta = mean + covariance @ np.sum([W @ (xi - mean) for W, xi in zip(weights, x, strict=True)], axis=0)
     freedom = np.sum([c.effective_freedom() for c in each], axis=0)
-    alone = scaled_inverse(np.sum([scaled_inverse(A) for A in own], axis=0))
+    alone = scaled_inverse(np.sum([scaled_inverse(A) for A in by_readings], axis=0))
     scatter = np.where(r2 > 0.0, np.bincount(kind)[kind] * (len(x) - 1.0), np.inf)
     lines = [
         Contribution(NOISE, "A", "Student's t", alone, freedom),
-        Contribution(BENCH, "B", NORMAL, common, np.full(len(theta), np.inf)),
+        Contribution(BENCH, "B", NORMAL, np.mean(by_bench, axis=0), np.full(len(theta), np.inf)),
         Contribution("repeatability", "A", "Student's t", covariance - alone + np.diag(r2), scatter),
     ]
     result = StageResult("combined", {}, None, None, {"calibrations": len(each), "repeatability": np.sqrt(r2).tolist()})
@@ -144,7 +137,7 @@ def kinds_of(calibration: SensorCalibration) -> Index:
 
 
 def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[Contribution]) -> SensorCalibration:
-    """Return a calibration with other values, as of ``values_of``, and the budget of these contributions."""
+    """Return a calibration with other values, in the order of ``values_of``, and a budget of these contributions."""
     effects, at = [], 12
     for effect in calibration.effects:
         values = theta[at : at + len(effect.parameters)].tolist()
@@ -156,10 +149,10 @@ def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[C
 
 
 def repeatability(x: Values, variance: Values, kind: Index) -> Values:
-    """Return r, the standard deviation beyond the stated variances, of (n, p) values: (p,) array.
+    """Return r, the standard deviation in addition to the stated variances, of (n, p) values: (p,) array.
 
-    ``variance``: (n, p). ``kind``: (p,), 0 ..; parameters of one kind have one r. The sum falls as r grows, so that
-    bisection finds it.
+    ``variance``: (n, p). ``kind``: (p,), 0 ..; parameters of one kind have one r. The sum decreases with r, which
+    is found by bisection.
     """
     n = len(x)
 

@@ -1,16 +1,16 @@
-"""Residuals of the fit: reading minus model, and what they depend on.
+"""Residuals of the fit, reading minus model, and their dependence on covariates.
 
     e[n] = reading[n] - predicted[n],    predicted = bias + matrix^-1 truth + effects
 
-The prediction passes the filter of the readings, so that the filter's lag is no residual.
+The prediction passes the filter of the readings, so that the lag of the filter causes no residual.
 
-Covariates: e is averaged in bins of angle, rate, force, temperature and time, with the standard error of white noise.
-The mean of ``(mean / standard error)^2`` is about 1 where e does not depend on the covariate, and orders the charts.
+Covariates: e is averaged in bins of angle, rate, force, temperature and time, with the standard error by white noise.
+The mean of ``(mean / standard error)^2`` is about 1 where e does not depend on the covariate; the charts are in the
+order of this mean.
 
 Harmonics of the turn: ``e = sum_k a_k cos kA + b_k sin kA`` over the angle A of the rate table, with the amplitude
-``sqrt(a_k^2 + b_k^2)``.
-1 cycle a turn is misalignment, tilt or encoder, 2 and 4 are quadratic nonlinearity or scale factor asymmetry, 3 is
-cubic nonlinearity; more are gears and steps of the rate table.
+``sqrt(a_k^2 + b_k^2)``. Causes of 1 cycle a turn are misalignment, tilt and encoder; of 2 and 4 cycles quadratic
+nonlinearity and scale factor asymmetry; of 3 cycles cubic nonlinearity; of more cycles gears and steps of the table.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 BINS = 36  # of a covariate, and of a turn: 10 deg each
-FEWEST = 5  # samples of a bin, below which it counts as empty: its scatter is not known
-HARMONICS = 12  # cycles a turn; averaging over 36 bins takes 16 % of the amplitude of the last one
+FEWEST = 5  # samples of a bin, below which it counts as empty: its scatter is unknown
+HARMONICS = 12  # cycles a turn; averaging over 36 bins reduces the amplitude of the last one by 16 %
 ONE_IN_A_THOUSAND = float(np.sqrt(2.0 * np.log(1000.0)))  # quantile 0.999 of the Rayleigh distribution
 FLAT = 2.0  # mean square of the means over noise and wander, below which the page calls them flat
-NOISE = 1.1  # residual over noise up to which the page says that nothing is left
-MODEL_POINTS = 150  # of a model's line: as many as the ranges of a chart
+NOISE = 1.1  # residual over noise below which the page states that the residual is noise
+MODEL_POINTS = 150  # of a model's line: about the number of ranges in a chart
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Residual:
     motion: Motion
     reading: Values
     predicted: Values
-    reference_noise: Values  # (3,), rms of what a coarse encoder leaves open of the rate, by axis
+    reference_noise: Values  # (3,), rms error of the rate by a coarse encoder, by axis
 
     @cached_property
     def error(self) -> Values:
@@ -61,31 +61,29 @@ class Residual:
 
 
 def residuals(sensor: str, part: JSON, recordings: list[Recording], table: JSON) -> list[Residual]:
-    """Return the residuals of the recordings that were made for a sensor and whose motion is known.
+    """Return the residuals of the recordings for a sensor whose motion is known.
 
     ``part``: the sensor's part of the calibration; ``table``: this section of the unit's configuration.
     """
     calibration = SensorCalibration.from_json(sensor, part)
     out = []
     for recording in recordings:
-        reading = recording.reading(sensor)
-        if recording.role != sensor or reading is None:
-            continue
-        motion = table_motion(recording, table)
-        if motion is not None:
+        reading = recording.reading(sensor) if recording.role == sensor else None
+        motion = None if reading is None else table_motion(recording, table)
+        if reading is not None and motion is not None:
             predicted = filtered(predicted_reading(calibration, motion), recording)
-            vague = np.zeros(3)
+            by_encoder = np.zeros(3)
             by_angle = rate_by_angle(recording) if sensor == "gyroscope" else None
             if by_angle is not None and motion.axis is not None:
-                vague[motion.axis] = np.sqrt(np.mean(by_angle.noise**2))
-            out.append(Residual(recording, motion, reading, predicted, vague))
+                by_encoder[motion.axis] = np.sqrt(np.mean(by_angle.noise**2))
+            out.append(Residual(recording, motion, reading, predicted, by_encoder))
     return out
 
 
 def white_noise(residual: Residual, noise: JSON | None) -> Values:
-    """Return the standard deviation of a sample's white noise after the filter, and of the reference's: (3,) array.
+    """Return the standard deviation of a sample by white noise after the filter and by the reference: (3,) array.
 
-    Without a noise model ``1.4826 median |e[n+1] - e[n]| / sqrt(2)``, which slow errors and outliers do not change.
+    Without a noise model it is ``1.4826 median |e[n+1] - e[n]| / sqrt(2)``, robust to slow errors and outliers.
     """
     if noise and noise.get("white"):
         gain = float(residual.recording.filter.get("noise_gain", 1.0))
@@ -102,14 +100,17 @@ class _BinnedMean:
     error: Values
 
     def excess(self, wander: Values) -> float:
-        """Return the mean square of the means over that of noise and wander (standard deviations), worst axis."""
+        """Return the mean square of the means over the variance of noise and wander, of the worst axis.
+
+        ``wander``: standard deviations by axis.
+        """
         filled = np.isfinite(self.mean[:, 0])
         ratio = self.mean[filled] ** 2 / (self.error[filled] ** 2 + wander**2)
         return float(ratio.mean(axis=0).max())
 
 
 def _binned_mean(covariate: Values, error: Values) -> _BinnedMean | None:
-    """Return means of ``error`` (n, 3) in 36 equal bins of the covariate (n,); None where it does not vary."""
+    """Return the means of ``error`` (n, 3) in 36 equal bins of the covariate (n,); None where it does not vary."""
     known = np.isfinite(covariate) & np.isfinite(error).all(axis=1)
     if not known.all():
         covariate, error = covariate[known], error[known]
@@ -157,7 +158,7 @@ def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
 
 
 def _angle_bins(angle: Values) -> tuple[Integers, Integers]:
-    """Return in which of 36 bins of a turn each of (n,) angles (deg) is, and how many are in each bin."""
+    """Return the bin, of 36 in a turn, of each of (n,) angles (deg), and the number of angles in each bin."""
     cell = (np.mod(angle, 360.0) * (BINS / 360.0)).astype(np.int64) % BINS
     return cell, np.bincount(cell, minlength=BINS)
 
@@ -165,7 +166,7 @@ def _angle_bins(angle: Values) -> tuple[Integers, Integers]:
 def harmonics(residual: Residual) -> Values | None:
     """Return the amplitudes of 0 to 12 cycles a turn: (13, 3) array, None where a bin of the turn has no sample.
 
-    From means in 36 bins of the angle; the division by ``sinc`` restores what averaging over a bin takes away.
+    They are computed from means in 36 bins of the angle; the division by ``sinc`` corrects for averaging over a bin.
     """
     angle = residual.motion.angle
     if angle is None:
@@ -180,11 +181,11 @@ def harmonics(residual: Residual) -> Values | None:
 
 
 def harmonic_noise(residual: Residual, white: Values, wander: Values, time: float) -> Values:
-    """Return the amplitude that noise alone exceeds once in a thousand, by cycles a turn: (13,) array.
+    """Return the amplitude that noise alone exceeds with a probability of 0.001, by cycles a turn: (13,) array.
 
     The mean of ``a^2 + b^2`` of a harmonic is ``2 (2 white^2 / n + 2 S(f) / D)`` with the two-sided spectrum of the
-    wander ``S = 2 s^2 T / (1 + (2 pi f T)^2)``, the recorded time D and the effective number of samples n, for which
-    ``1 / n`` is the mean of ``1 / (36 n_bin)``. ``white, wander``: (3,) standard deviations, the largest axis counts;
+    wander ``S = 2 s^2 T / (1 + (2 pi f T)^2)``, the recorded time D and the effective number of samples n, where
+    ``1 / n`` is the mean of ``1 / (36 n_bin)``. ``white, wander``: (3,) standard deviations, the largest one is used;
     ``time``: correlation time of the wander, s.
     """
     motion = residual.motion
@@ -200,7 +201,7 @@ def harmonic_noise(residual: Residual, white: Values, wander: Values, time: floa
 
 
 def residual_figures(sensor: str, found: list[Residual], noise: JSON | None) -> list[Figure]:
-    """Draw binned means of the residual against each covariate (worst first), and its harmonics of the turn."""
+    """Draw binned means of the residuals against each covariate (worst first), and their harmonics of the turn."""
     wander = np.array((noise or {}).get("wander") or [0.0] * 3, float)
     time = float((noise or {}).get("correlation_time_s") or 100.0)
     figures = [_covariate(sensor, label, mean, wander) for label, mean in covariates(found, wander).items()]
@@ -242,17 +243,17 @@ def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: Values) -> Fi
 
 
 def _harmonics(sensor: str, name: str, amplitudes: Values, level: Values) -> Figure:
-    """Draw the amplitudes by cycles a turn, with the level of noise."""
+    """Draw the amplitudes by cycles a turn, with the level of the noise."""
     unit = SENSOR_UNITS[sensor]
     ratio = amplitudes / np.maximum(level[:, None], 1e-300)
     ratio[0] = 0.0  # a bias
     cycles, axis = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    loud = bool(ratio.max() > 1.0)
+    significant = bool(ratio.max() > 1.0)
     finding = f"{name}: no harmonic of the turn above the noise"
-    if loud:
+    if significant:
         size, plural = number(float(amplitudes[cycles, axis]), 2), "s" if cycles != 1 else ""
         finding = f"{name}: {cycles} cycle{plural} a turn on {AXES[axis]}, {size} {unit}, above the noise"
-    figure = Figure(f"{sensor}-harmonics-{name}", finding, legend=AXES_LEGEND, quiet=not loud)
+    figure = Figure(f"{sensor}-harmonics-{name}", finding, legend=AXES_LEGEND, quiet=not significant)
     groups = {str(k): row for k, row in enumerate(amplitudes.tolist())}
     return stems(figure, groups, f"amplitude, {unit}", "cycles a turn", level.tolist())
 
@@ -260,14 +261,14 @@ def _harmonics(sensor: str, name: str, amplitudes: Values, level: Values) -> Fig
 def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -> Figure:
     """Draw readings and model over a turn, and below them the residual of each axis with the band of +-2 sigma.
 
-    Without a noise model, sigma is from the residual's own scatter.
+    Without a noise model, sigma follows from the scatter of the residual.
     """
     unit, motion, name = SENSOR_UNITS[sensor], residual.motion, residual.recording.name
     turns = motion.angle is not None and np.ptp(motion.angle) > 1.0
     x = motion.angle if turns and motion.angle is not None else motion.time
     known = bool(noise and noise.get("white"))
     sigma = np.hypot(white_noise(residual, noise), ((noise or {}).get("wander") or 0.0) if known else 0.0)
-    every = slice(None, None, -(-len(x) // MODEL_POINTS))  # the model has no noise whose extremes could be lost
+    every = slice(None, None, -(-len(x) // MODEL_POINTS))  # of the model, which has no noise, few points are enough
     layers: list[Layer] = [Samples(x, residual.reading)]
     layers += [Line(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
     top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
@@ -277,13 +278,13 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
         panels.append(Panel(layers, f"{axis}, {unit}", height=56, limits=(-top, top)))
     rms = np.sqrt(np.mean(residual.error**2, axis=0))
     ratio, outside = float((rms / sigma).max()), float(np.mean(np.abs(residual.error) > 2 * sigma))
-    most, vague = AXES[int(np.argmax(residual.reference_noise))], float(residual.reference_noise.max())
+    by_encoder = float(residual.reference_noise.max())
     finding, caption, description = sentences(
         "model",
         name=name,
         ratio=ratio,
         outside=outside,
-        reference=(most, vague) if known and vague else None,
+        reference=(AXES[int(np.argmax(residual.reference_noise))], by_encoder) if known and by_encoder else None,
         known=known,
         rms=rms.tolist(),
         unit=unit,
