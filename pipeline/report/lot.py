@@ -1,8 +1,9 @@
-"""Calibrations with the prior of their lot (``combine=lot``): which units are siblings, their documents, the card.
+"""Calibrations with the prior of their lot (``combine=lot``): siblings of a unit, its document, the part of its page.
 
 A lot is the units of a sensor model with one value of the column ``lot``. Siblings have the same table, procedure,
-method, axes and parameters: these then mean the same, in one frame, and contain the same error of the table. Effects of
-the recording, the mounting and the table have no prior. The estimate is that of ``pipeline.estimation.lot_prior``.
+method, axes and parameters: so their parameters have the same meaning in the same frame, and contain the same error of
+the table. Effects of the recording, the mounting and the table have no prior. ``pipeline.estimation.lot_prior``
+computes the estimate.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 LINE = "prior of the lot"
-LACK_OF_FIT = "lack of fit"  # a table's errors are part of it: no estimate shows whether siblings share it
+LACK_OF_FIT = "lack of fit"  # errors of a table are part of it: siblings may have it in common
 SHARED = f"{BENCH}, and {LACK_OF_FIT}"
 NONE = np.empty(0)
 MOST_FREEDOM = 1e12  # instead of infinitely many degrees of freedom, for which JSON has no number
-DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: the uncertainty does not hold the error
+DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: the uncertainty is too small
 
 
 class Estimate(NamedTuple):
-    """What the prior of a lot needs of a sensor of a unit; units with the same ``comparable`` may be siblings.
+    """The estimate of a sensor of a unit, from which the prior of a lot is computed.
 
-    As an entry of a file its arrays are lists.
+    Units with the same ``comparable`` may be siblings. In a file the arrays are lists.
     """
 
     unit: str
@@ -55,11 +56,11 @@ class Estimate(NamedTuple):
     freedom: Values
     shared: Values
     kind: Index
-    known: Mask  # the sensor's own parameters, of a stated uncertainty
+    known: Mask  # parameters of the sensor itself with a stated uncertainty
 
     @classmethod
     def read(cls, data: JSON) -> Estimate:
-        """Return the estimate of an entry; units of a fleet share its texts."""
+        """Return the estimate of an entry of a file; equal texts of all units share their memory."""
         texts = {k: sys.intern(data[k]) for k in ("sensor", "lot", "comparable")}
         arrays = {k: np.array(data[k]) for k in ("values", "own", "freedom", "shared", "kind", "known")}
         return cls(**{**data, **texts, **arrays})
@@ -73,10 +74,10 @@ class Prior(NamedTuple):
     refused: str | None = None
     outlier: bool = False
     probability: float | None = None
-    worst: str = ""  # what an outlier differs in most
+    worst: str = ""  # the parameter with the largest difference of an outlier
     predicted: Prediction = Prediction(NONE, NONE, NONE)
     known: Mask = NONE.astype(bool)
-    shared: Values = NONE  # mean standard uncertainty of the siblings by what they may share
+    shared: Values = NONE  # mean standard uncertainty of the siblings by errors that they may have in common
 
     @classmethod
     def read(cls, data: JSON) -> Prior:
@@ -86,7 +87,7 @@ class Prior(NamedTuple):
 
 
 def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> list[Estimate]:
-    """Return what a calibrated unit brings to the priors of its lot: one estimate for each sensor.
+    """Return the estimate of each sensor of a calibrated unit for the prior of its lot.
 
     ``row``: of ``units.csv``; ``calibration``, ``diagnosis``: as published.
     """
@@ -95,7 +96,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
         part = calibration[sensor]
         fit = SensorCalibration.from_json(sensor, part)
         own, shared, (freedom, _) = _divided(fit)
-        mine = [True] * 12 + [owner_of(e) == Owner.SENSOR for e in fit.effects for _ in e.parameters]
+        of_sensor = [True] * 12 + [owner_of(e) == Owner.SENSOR for e in fit.effects for _ in e.parameters]
         same = [calibration[key] for key in ("table", "procedure")] + [calibration["methods"][sensor]]
         verdict = (diagnosis.get(sensor) or {}).get("verdict")
         refused = f"the diagnosis of its {sensor}: {plain(verdict)}" if verdict in DOUBTFUL else None
@@ -114,16 +115,17 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
                 freedom=np.minimum(freedom, MOST_FREEDOM),
                 shared=np.sqrt(np.diag(shared)),
                 kind=kinds_of(fit),
-                known=np.array(mine) & (np.diag(own) > 0.0),
+                known=np.array(of_sensor) & (np.diag(own) > 0.0),
             )
         )
     return found
 
 
 def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Values]]:
-    """Return the covariance by the unit's own noise, that by what siblings may share, and degrees of freedom of both.
+    """Return the covariance by the noise of the unit, the one by errors that siblings may share, and both freedoms.
 
-    By Welch and Satterthwaite, those of the readings follow from the effective ones: the bench has infinitely many.
+    The degrees of freedom of the readings follow from the effective ones by Welch and Satterthwaite, because the bench
+    has infinitely many.
     """
     readings, _ = own_and_bench(fit)
     own, shared = own_and_bench(fit, LACK_OF_FIT)
@@ -135,26 +137,26 @@ def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Valu
 
 
 def priors_of(found: Iterable[Estimate]) -> tuple[dict[tuple[str, str], Prior], list[JSON]]:
-    """Return the prior of each unit and sensor, and for each lot and sensor what ``fleet.json`` tells."""
+    """Return the prior of each unit and sensor, and the description of each lot and sensor in ``fleet.json``."""
     lots: dict[tuple[str, str], dict[str, list[Estimate]]] = {}
     for estimate in found:
         lots.setdefault((estimate.lot, estimate.sensor), {}).setdefault(estimate.comparable, []).append(estimate)
     priors: dict[tuple[str, str], Prior] = {}
-    told = []
+    described = []
     for (lot, sensor), kinds in lots.items():
-        own = {e.unit: p for kind in kinds.values() for e, p in zip(kind, _priors(kind, len(kinds)), strict=True)}
-        priors |= {(unit, sensor): prior for unit, prior in own.items()}
-        without = {unit: p.refused for unit, p in own.items() if p.refused}
-        outliers = [unit for unit, p in own.items() if p.outlier]
-        told.append(
-            {"lot": lot, "sensor": sensor, "units": list(own), "with_prior": len(own) - len(without),
+        of_lot = {e.unit: p for kind in kinds.values() for e, p in zip(kind, _priors(kind, len(kinds)), strict=True)}
+        priors |= {(unit, sensor): prior for unit, prior in of_lot.items()}
+        without = {unit: p.refused for unit, p in of_lot.items() if p.refused}
+        outliers = [unit for unit, p in of_lot.items() if p.outlier]
+        described.append(
+            {"lot": lot, "sensor": sensor, "units": list(of_lot), "with_prior": len(of_lot) - len(without),
              "outliers": outliers, "without": without}
         )  # fmt: skip
-    return priors, told
+    return priors, described
 
 
 def _priors(kind: list[Estimate], kinds: int) -> list[Prior]:
-    """Return the priors of units that may be siblings; ``kinds``: how many such groups the lot has."""
+    """Return the priors of units that may be siblings; ``kinds``: number of such groups in the lot."""
     able, known = np.array([e.refused is None for e in kind]), np.all([e.known for e in kind], axis=0)
     names = {device: i for i, device in enumerate(dict.fromkeys(e.device for e in kind))}
     device = np.array([names[e.device] for e in kind])
@@ -188,7 +190,7 @@ def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, shared: Valu
 def calibration_with_prior(calibration: JSON, priors: Mapping[str, Prior]) -> JSON | None:
     """Return a calibration with the priors of its sensors, in the form of ``calibrations/<unit>.json``.
 
-    ``lot_prior`` of each sensor holds the prior, or the reason why the sensor has none. None where no sensor has one.
+    ``lot_prior`` states the prior of each sensor, or the reason why it has none. Returns None if no sensor has a prior.
     """
     if all(prior.refused for prior in priors.values()):
         return None
@@ -206,12 +208,12 @@ def _sensor(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSON]:
     own, shared, (freedom, of_shared) = _divided(fit)
     known, u = prior.known, np.sqrt(np.diag(shared))
     found = with_prior(values_of(fit), own, prior.predicted, known)
-    grown = np.divide(np.maximum(u, prior.shared), u, out=np.ones(len(u)), where=u > 0.0)
+    growth = np.divide(np.maximum(u, prior.shared), u, out=np.ones(len(u)), where=u > 0.0)
     remark = f"of {prior.lot}: mean and spread of {prior.siblings} siblings"
     lines = [
         Contribution(NOISE, "A", "Student's t", found.own, freedom),
         Contribution(LINE, "A", "Student's t", found.lot, found.lot_freedom, remark=remark),
-        Contribution(SHARED, "B", NORMAL, shared * np.outer(grown, grown), of_shared),
+        Contribution(SHARED, "B", NORMAL, shared * np.outer(growth, growth), of_shared),
     ]
     stage = StageResult("lot_prior", {}, None, None, {"lot": prior.lot, "siblings": prior.siblings})
     after = with_values(replace(fit, stages=(*fit.stages, stage)), found.values, lines)
@@ -229,12 +231,12 @@ def _sensor(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSON]:
 
 
 def with_card(page: str, calibration: JSON, document: JSON | None, priors: Mapping[str, Prior]) -> str:
-    """Return a unit's page with the card on its prior, before the section on its runs."""
+    """Return a unit's page with the section on its prior, before the section on its runs."""
     rows: dict[str, list[Any]] = {}
-    found = document or {"lot_prior": {}}
-    for sensor, added in found["lot_prior"].items():
-        both = [{p.name: p for p in fitted_parameters(of[sensor])} for of in (calibration, found)]
+    with_priors = document or {"lot_prior": {}}
+    for sensor, added in with_priors["lot_prior"].items():
+        both = [{p.name: p for p in fitted_parameters(d[sensor])} for d in (calibration, with_priors)]
         shown = (added.get(key, []) for key in ("parameters", "mean", "standard_deviation", "share"))
-        rows[sensor] = [(*(of[name] for of in both), *rest) for name, *rest in zip(*shown, strict=True)]
+        rows[sensor] = [(*(d[name] for d in both), *rest) for name, *rest in zip(*shown, strict=True)]
     section = template("lot.html").render(calibration=calibration, document=document, priors=priors, rows=rows)
     return page.replace(MARK, section + MARK, 1)
