@@ -1,8 +1,8 @@
 """The page of a campaign: failures first, then every unit, the fleet in charts, comparisons and statistics.
 
-Strip plots show fitted parameters, each unit a dot, as a share of the sensor file's limit, ``value / limit``, beside
-its siblings: units of one sensor model that were calibrated by one method. A row is a parameter of the measurement:
-bias, error of a scale factor, or what one axis reads of another.
+Strip plots show fitted parameters as a share of the sensor file's limit, ``value / limit``, with one dot for each of
+the siblings: units of one sensor model that were calibrated by one method. A row is a parameter of the measurement:
+bias, error of a scale factor, or cross-axis sensitivity.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from pipeline.report.parameters import CROSS_AXIS
 from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Sequence
 
 
 JSON = dict[str, Any]
-Told = tuple[Figure, dict[str, list[str]]]  # a chart of units, and the text of each dot by its colour
-FIRST = 100  # rows that a browser shows at once; it shows the others when asked
+UnitChart = tuple[Figure, dict[str, list[str]]]  # a chart of units, and the text of each dot by its colour
+FIRST = 100  # rows in the page; the script adds the others when they come into view
 NAMED = 3  # units that the finding of a chart names
-FEWEST_UNITS, FAR_SHOWN = 3, 30  # units, below which a distribution says nothing; units far from the others
-MOST_DOTS, FARTHEST = 2000, 50  # units, above which only the farthest from the noise are drawn as dots, and how many
+FEWEST_UNITS, FAR_SHOWN = 3, 30  # units of the smallest distribution; most units far from the others that are listed
+MOST_DOTS, FARTHEST = 2000, 50  # units above which dots show only the farthest from the noise, and their number
 PARTS = 100  # of the fleet, each with its quantiles: one in 3.5 px
 MOST_GROUPS = 50  # serials of several units, and joint estimates, that are listed
-MOST_LOTS = 60  # of which medians are shown lot by lot
+MOST_LOTS = 60  # lots above which no medians lot by lot are shown
 
 
 def render(
@@ -54,20 +54,23 @@ def render(
 ) -> str:
     """Return ``index.html``.
 
-    ``rows``: one a unit, as of ``summary_row``, in the order of ``units.csv``; ``failures``: ``unit, stage, code,
-    message, file`` of each failed unit; ``comparisons``: as of ``comparison_section.section``; ``page``: name of a
-    further page; ``twins``: as of ``gather.same_files``; ``statistics``: as of ``fleet_statistics``; ``parameters``:
-    of ``parameter_table`` of all units; ``history``: as of ``runs_data``; ``settings``: of the run, for the commands to
-    continue with; ``published``: units that have a page of their own where pages are published on request only, None:
-    all.
+    ``rows``: of ``summary_row``, one a unit, in the order of ``units.csv``; ``failures``: ``unit, stage, code,
+    message, file`` of each failed unit; ``comparisons``: of ``comparison.section``; ``page``: name of a further page;
+    ``twins``: of ``gather.same_files``; ``statistics``: of ``fleet_statistics``; ``parameters``: of
+    ``parameter_table`` for all units; ``history``: of ``runs_data``; ``settings``: of the run, for the proposed
+    commands; ``published``: units with a page where pages are published on request only, None: all.
     """
     findings = findings_of(rows)
     frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
-    fleet = [told for sensor in SENSORS for told in _fleet_figure(sensor, frame)]
+    fleet = [unit_chart for sensor in SENSORS if (unit_chart := _fleet_figure(sensor, frame))]
     fitted = parameter_table({}) if parameters is None else parameters
     plots = strips(rows, fitted)
+    causes: dict[str, list[str]] = {}
+    for failure in failures:
+        cause = f"{failure.get('code')} in stage {failure.get('stage') or 'unknown'}"
+        causes.setdefault(cause, []).append(str(failure.get("unit")))
     text: str = template("campaign.html").render(
         campaign=campaign,
         published=published,
@@ -90,7 +93,7 @@ def render(
         strips=[figure for figure, _ in plots],
         far_shown=FAR_SHOWN,
         far=FAR,
-        causes=_causes(failures),
+        causes=sorted(causes.items(), key=lambda cause: -len(cause[1])),
         found=verdict_groups(findings) + _beyond_limits(fitted) + _not_held_out(rows),
         commands=next_commands(findings, settings or {"campaign": campaign}),
         history=history,
@@ -111,30 +114,21 @@ def render(
 def _beyond_limits(parameters: pd.DataFrame) -> list[tuple[str, list[str]]]:
     """Return the units with a parameter beyond a limit of the sensor file, by sensor.
 
-    Cross-axis terms, which may include how a unit sits on a table, are left to the strip plots.
+    Cross-axis terms are left out, because they may contain the mounting of a unit on a table.
     """
-    own = parameters[~parameters["parameter"].str.contains(CROSS_AXIS)]
-    beyond = own[own["value"].abs() > own["limit"]].groupby("sensor")["unit"].unique()
+    others = parameters[~parameters["parameter"].str.contains(CROSS_AXIS)]
+    beyond = others[others["value"].abs() > others["limit"]].groupby("sensor")["unit"].unique()
     return [(f"{sensor}, beyond the sensor file's limits", list(units)) for sensor, units in beyond.items()]
 
 
 def _not_held_out(rows: Sequence[JSON]) -> list[tuple[str, list[str]]]:
     """Return the units with errors on the samples of the fit instead of held-out motion, by sensor."""
-    found = [(s, [row["unit"] for row in rows if row.get(f"{s}_not_held_out")]) for s in SENSORS]
-    return [(f"{sensor}, not checked on held-out motion", units) for sensor, units in found if units]
-
-
-def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:
-    """Return the units that failed by their kind of failure and stage, the most frequent first."""
-    causes: dict[str, list[str]] = {}
-    for failure in failures:
-        cause = f"{failure.get('code')} in stage {failure.get('stage') or 'unknown'}"
-        causes.setdefault(cause, []).append(str(failure.get("unit")))
-    return sorted(causes.items(), key=lambda c: -len(c[1]))
+    by_sensor = [(s, [row["unit"] for row in rows if row.get(f"{s}_not_held_out")]) for s in SENSORS]
+    return [(f"{sensor}, not checked on held-out motion", units) for sensor, units in by_sensor if units]
 
 
 def _medians(name: str, frame: pd.DataFrame) -> list[JSON]:
-    """Return for each sensor the medians of the errors, the verdicts and the missing effects of some units."""
+    """Return the medians of the errors, the verdicts and the missing effects of some units for each sensor."""
     found = []
     for sensor in SENSORS:
         known = frame[frame[f"{sensor}_error_after"].notna()]
@@ -151,23 +145,24 @@ def _medians(name: str, frame: pd.DataFrame) -> list[JSON]:
 
 
 def _missing(sensor: str, frame: pd.DataFrame) -> list[tuple[str, int]]:
-    """Return in how many units each effect is missing, the most frequent first."""
+    """Return the number of units in which each effect is missing, the most frequent first."""
     names = Counter(name for names in frame[f"{sensor}_selected"].dropna() for name in names.split(";") if name)
     return sorted(((plain(name), count) for name, count in names.items()), key=lambda c: (-c[1], c[0]))
 
 
 def _lots(frame: pd.DataFrame) -> list[JSON]:
-    lots = {lot: of for lot, of in frame.groupby("lot", sort=False) if lot}
+    lots = {lot: units for lot, units in frame.groupby("lot", sort=False) if lot}
     if not 1 < len(lots) <= MOST_LOTS:
         return []
-    found = [medians for lot, of in lots.items() for medians in _medians(f"lot {lot}", of)]
+    found = [medians for lot, units in lots.items() for medians in _medians(f"lot {lot}", units)]
     return sorted(found, key=lambda medians: SENSORS.index(medians["sensor"]))
 
 
-def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Iterator[Told]:
-    """Draw the errors before and after, in the order of ``units.csv``, and give the value of each dot by its colour.
+def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
+    """Draw the errors before and after in the order of ``units.csv``, and return the value of each dot by its colour.
 
-    Each unit is a dot. Of more than ``MOST_DOTS`` units the farthest from the noise are; quantiles show all.
+    Each unit is a dot. Of more than ``MOST_DOTS`` units, only the farthest from the noise are dots, and quantiles show
+    all. None for fewer than ``FEWEST_UNITS`` units.
     """
     unit, order = SENSOR_UNITS[sensor], np.arange(1.0, len(frame) + 1)
     errors = (pd.to_numeric(frame[f"{sensor}_{name}"]) for name in ("error_before", "error_after", "noise_floor"))
@@ -175,10 +170,10 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Iterator[Told]:
     known = np.isfinite(after)
     count = int(known.sum())
     if count < FEWEST_UNITS:
-        return
+        return None
     many = count > MOST_DOTS
     complete = known & (frame[f"{sensor}_verdict"] == "nothing_missing").to_numpy(bool)
-    first, last = (before, order > 0, 3, "before"), (floor, order > 0, 4, "noise floor")  # the floor over the dots
+    first, last = (before, order > 0, 3, "before"), (floor, order > 0, 4, "noise floor")  # the floor on top of the dots
     judged = [(after, complete, 2, "after, nothing missing"), (after, known & ~complete, 0, "after, any other verdict")]
     dotted = [first, *judged, last]
     layers: list[Layer] = []
@@ -202,21 +197,26 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Iterator[Told]:
     effects = ", ".join(f"{name} ({n} unit{'s' if n != 1 else ''})" for name, n in _missing(sensor, frame))
     words = f"Missing effects: {effects}." if effects else "No effect is named as missing."
     middle = [number(float(np.nanmedian(v))) if np.isfinite(v).any() else "not known" for v in (before, after, floor)]
-    finding = f"{sensor.capitalize()}: {_farthest(frame['unit'].tolist(), after / floor, count)}"
-    each = f"the {FARTHEST} farthest from the noise as dots, median and 5 to 95 % of all" if many else "each unit a dot"
-    yield (
-        chart(
-            Figure(f"fleet-{sensor}", finding, f"Error on held-out motion, {each}. {words}", tuple(legend)),
-            f"Held-out error of {count} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
-            f"{middle[2]}. {words}",
-            [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
-            "unit, in the order of units.csv",
-            kind="count",
-            margin=0.03,
-            units="units",
-        ),
-        values,
+    ratio, units = after / floor, frame["unit"].tolist()
+    far = [int(i) for i in np.argsort(-np.nan_to_num(ratio)) if ratio[i] > FAR]
+    finding = f"{sensor.capitalize()}: all {count} units are within {FAR:g} × the noise floor"
+    if far:
+        named = ", ".join(f"{units[i]} ({number(float(ratio[i]))} ×)" for i in far[:NAMED])
+        finding = (
+            f"{sensor.capitalize()}: {len(far)} of {count} units are beyond {FAR:g} × the noise floor; worst: {named}"
+        )
+    dots = f"the {FARTHEST} farthest from the noise as dots, median and 5 to 95 % of all" if many else "each unit a dot"
+    figure = chart(
+        Figure(f"fleet-{sensor}", finding, f"Error on held-out motion, {dots}. {words}", tuple(legend)),
+        f"Held-out error of {count} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
+        f"{middle[2]}. {words}",
+        [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
+        "unit, in the order of units.csv",
+        kind="count",
+        margin=0.03,
+        units="units",
     )
+    return figure, values
 
 
 def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Layer]:
@@ -227,69 +227,62 @@ def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Layer
     return [Area(low, high, colour, x), Line(x, middle, colour)]
 
 
-def _farthest(units: list[str], ratio: np.ndarray, known: int) -> str:
-    """Return how many units have errors far above the noise, with the names of the worst."""
-    far = [int(i) for i in np.argsort(-np.nan_to_num(ratio)) if ratio[i] > FAR]
-    if not far:
-        return f"all {known} units are within {FAR:g} × the noise floor"
-    named = ", ".join(f"{units[i]} ({number(float(ratio[i]))} ×)" for i in far[:NAMED])
-    return f"{len(far)} of {known} units are beyond {FAR:g} × the noise floor; worst: {named}"
-
-
-EDGE = 3.0  # share at which a dot stands at most: one unit in a wrong unit of measurement must not hide the others
-FEWEST_SIBLINGS, MOST = 3, 60  # siblings, below which there is no plot, and above which only the farthest are drawn
-ENDS = 20  # units that are drawn of each parameter then, on either side
+EDGE = 3.0  # largest share that is drawn: one unit in a wrong unit of measurement must not hide the others
+FEWEST_SIBLINGS, MOST = 3, 60  # siblings below which there is no plot, and above which only the farthest are drawn
+ENDS = 20  # farthest units of each parameter that are then drawn, on either side
 ROW, LEFT = 17, 130  # px
-SPREAD, HALF = 0.6, 0.42  # of a row: over which the units stand in their order, and half of its bar's height
+SPREAD, HALF = 0.6, 0.42  # of a row: range over which the units are distributed in their order; half height of a bar
 
 
-def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[Told]:
+def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[UnitChart]:
     """Return the strip plots of a campaign, each with the text of its dots.
 
-    ``rows``: one a unit, as of ``summary_row``, in the order of the page; ``parameters``: of ``parameter_table``.
+    ``rows``: of ``summary_row``, one a unit, in the order of the page; ``parameters``: of ``parameter_table``.
     """
     siblings: dict[tuple[str, str], list[int]] = {}
     for i, row in enumerate(rows):
         if row["status"] == "ok":
             siblings.setdefault((row.get("sensor") or "", row.get("method") or ""), []).append(i)
-    out: list[Told] = []
+    out: list[UnitChart] = []
     units = [row["unit"] for row in rows]
     for (model, method), members in siblings.items():
         placed = parameters[parameters["limit"].notna() & parameters["unit"].isin([units[i] for i in members])]
-        for sensor, own in placed.groupby("sensor"):
-            known = set(own["unit"])
+        for sensor, table in placed.groupby("sensor"):
+            known = set(table["unit"])
             numbers = np.array([i for i in members if units[i] in known])
             if len(numbers) >= FEWEST_SIBLINGS:
                 title = f"{str(sensor).capitalize()}, {model}, {plain(method)}"
-                out.append(_strip(f"strip-{len(out) + 1}", title, units, numbers, own))
+                out.append(_strip(f"strip-{len(out) + 1}", title, units, numbers, table))
     return out
 
 
-def _strip(name: str, title: str, units: list[str], numbers: Index, own: pd.DataFrame) -> Told:
-    """Return the plot of some siblings and the text of each dot; ``own``: their parameters with limits."""
-    frames = wide(own, [units[i] for i in numbers], "label", "value", "limit")
+def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.DataFrame) -> UnitChart:
+    """Return the plot of some siblings and the text of each dot; ``table``: their parameters with limits."""
+    frames = wide(table, [units[i] for i in numbers], "label", "value", "limit")
     labels, (value, limit) = [*frames[0]], (frame.to_numpy(float) for frame in frames)
-    measures = dict(zip(own["label"], map(unit_text, own["measure"]), strict=True))
+    measures = dict(zip(table["label"], map(unit_text, table["measure"]), strict=True))
     share = value / limit
-    at = len(labels) - np.arange(len(labels), dtype=float)  # the first row on top
-    down = SPREAD * (0.5 - (np.arange(len(numbers)) + 0.5) / len(numbers))
+    height = len(labels) - np.arange(len(labels), dtype=float)  # the first row on top
+    offset = SPREAD * (0.5 - (np.arange(len(numbers)) + 0.5) / len(numbers))
     drawn = np.isfinite(share)
-    layers = [_bar(np.array([-1.0, 1.0]), 0.4, at[0] + 0.6, 4)]
+    layers = [_bar(np.array([-1.0, 1.0]), 0.4, height[0] + 0.6, 4)]
     if many := len(numbers) > MOST:
         rank = np.argsort(np.argsort(share, axis=0), axis=0)
         drawn &= (rank < ENDS) | (rank >= drawn.sum(axis=0) - ENDS)
         ends = np.nanquantile(share, [0.05, 0.95], axis=0).T
-        layers += [_bar(each, row - HALF, row + HALF, 3) for row, each in zip(at, ends, strict=True)]
+        layers += [_bar(each, row - HALF, row + HALF, 3) for row, each in zip(height, ends, strict=True)]
     beyond, values, legend = np.abs(share) > 1.0, {}, []
     dots: list[Layer] = []
     for chosen, colour, words in ((drawn & ~beyond, 2, "within the limit"), (drawn & beyond, 0, "beyond the limit")):
         i, j = np.nonzero(chosen)
         if len(i):
             x = 100.0 * np.clip(share[i, j], -EDGE, EDGE)
-            dots.append(Dots(x, at[j] + down[i], colour, units=tuple((numbers[i] + 1).tolist())))
+            dots.append(Dots(x, height[j] + offset[i], colour, units=tuple((numbers[i] + 1).tolist())))
             legend.append((f"c{colour}", words))
             values[f"c{colour}"] = [
-                _told(labels[b], value[a, b], limit[a, b], measures[labels[b]]) for a, b in zip(i, j, strict=True)
+                f"{labels[b]}: {number(value[a, b], 4)} {measures[labels[b]]}".rstrip()
+                + f", {percent(share[a, b])} of ±{number(limit[a, b])}"
+                for a, b in zip(i, j, strict=True)
             ]
     worst, column = np.unravel_index(np.nanargmax(np.abs(share)), share.shape)
     finding, caption, description = sentences(
@@ -304,15 +297,10 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, own: pd.Data
         medians=[*zip(labels, np.nanmedian(share, axis=0).tolist(), strict=True)],
     )
     figure = Figure(name, finding, caption, tuple(legend))
-    panel = Panel([*layers, *dots], "", ROW * len(labels), limits=(0.4, at[0] + 0.6), rows=labels[::-1])
+    panel = Panel([*layers, *dots], "", ROW * len(labels), limits=(0.4, height[0] + 0.6), rows=labels[::-1])
     label = "share of the sensor file's limit, %"
     return chart(figure, description, [panel], label, margin=0.03, left=LEFT, units="units"), values
 
 
 def _bar(ends: Values, low: float, high: float, colour: int) -> Layer:
     return Area(low, high, colour, 100.0 * np.clip(ends, -EDGE, EDGE))
-
-
-def _told(label: str, value: float, limit: float, unit: str) -> str:
-    """Return the text of a dot: value, and its share of the limit."""
-    return f"{label}: {number(value, 4)} {unit}".rstrip() + f", {percent(value / limit)} of ±{number(limit)}"

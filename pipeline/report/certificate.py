@@ -1,12 +1,13 @@
-"""The calibration report of a laboratory: what ISO/IEC 17025:2017 asks for in 7.8.2.1, 7.8.4.1 and 7.8.6.
+"""The calibration report of a laboratory, as ISO/IEC 17025:2017 requires in 7.8.2.1, 7.8.4.1 and 7.8.6.
 
-It holds the measured results and what the laboratory states in its ``certificate`` config. What is missing is listed,
-and the report is then stamped as no calibration certificate. Traceability is printed as stated, or as not stated. Names
-follow the Digital Calibration Certificate (PTB, DCC 3) where it has one; units are g (9.80665 m/s^2) and deg/s.
+It contains the measured results and the statements of the laboratory in its ``certificate`` config. If statements are
+missing, the report lists them and has a stamp that it is no calibration certificate. Traceability is printed as stated,
+or as not stated. Names follow the Digital Calibration Certificate (PTB, DCC 3) where it has one; units are g (9.80665
+m/s^2) and deg/s.
 
-As XML it is the Digital Calibration Certificate (PTB, DCC 3.2.1 with D-SI 2.1.0), in units of the SI: an acceleration
-in m/s^2, a rate in deg/s, a temperature difference in K. What its schema demands and nobody stated is not invented:
-then there is no such file, and the report says why.
+In XML it is a Digital Calibration Certificate (PTB, DCC 3.2.1 with D-SI 2.1.0), in units of the SI: accelerations in
+m/s^2, rates in deg/s, temperature differences in K. If a statement is missing that its schema requires, this file is
+not written, and the report states the reason.
 """
 
 from __future__ import annotations
@@ -55,14 +56,14 @@ ASKED = (
     ("conditions of influence", "7.8.4.1 b", "certificate.environment"),
     ("reference equipment", "7.8.4.1 c", "certificate.equipment"),
     ("traceability", "7.8.4.1 c", "certificate.traceability"),
-)  # what the standard asks for: what, its clause and the key to set
+)  # statements that the standard requires: name, clause and the key to set
 
 
 def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temperature: str | None) -> JSON:
     """Return the report of one calibrated unit.
 
     ``settings``: the unit's resolved configuration, with ``row`` (serial, lot, date of ``units.csv``); ``temperature``:
-    the range of the sensor's, degC, None where it was not recorded.
+    range of the sensor's temperature, degC, None where it was not recorded.
     """
     stated = settings["certificate"]
     document: JSON = {
@@ -174,7 +175,7 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
 
 
 def _quantities(part: JSON) -> list[JSON]:
-    """Return each parameter with its uncertainty: None where the method does not fit it, or states none."""
+    """Return each parameter with its uncertainty, None where the method fixes the parameter or states none."""
     budget = part.get("uncertainty_budget")
     keys = ("expanded_uncertainty", "standard_uncertainty", "coverage_factor", "effective_degrees_of_freedom")
     known = zip(*(budget[key] for key in keys), strict=True) if budget else repeat((None, 0.0, None, None))
@@ -187,15 +188,15 @@ def _quantities(part: JSON) -> list[JSON]:
 
 
 def _wanted(document: JSON, stated: JSON) -> Iterator[tuple[str, str, str, Any]]:
-    """Yield what the standard asks for: what, its clause, the key to set, and what is known of it."""
+    """Yield the statements that the standard requires: name, clause, the key to set, and the statement if known."""
     core, results = document["administrativeData"]["coreData"], document["measurementResults"]
     conditions = [r["influenceConditions"] for r in results]
-    warm = all(c["temperature of the sensor, degC"] is not None for c in conditions)
+    measured = all(c["temperature of the sensor, degC"] is not None for c in conditions)
     known = {
         "certificate.number": core["uniqueIdentifier"],
         "certificate.performed.begin": core["beginPerformanceDate"],
         "certificate.customer.contact": stated["customer"]["contact"] or stated["customer"]["address"],
-        "certificate.environment": stated["environment"] or warm,
+        "certificate.environment": stated["environment"] or measured,
         "serial in units.csv": document["administrativeData"]["items"][0]["identifications"][0]["value"],
     }
     for what, clause, key in ASKED:
@@ -213,23 +214,19 @@ def _wanted(document: JSON, stated: JSON) -> Iterator[tuple[str, str, str, Any]]
 
 
 def certificate_page(unit: str, report: JSON) -> str:
-    """Return the report of ``certificate`` as a page that prints well: its identification is on every sheet."""
+    """Return the report of ``certificate`` as a page to print, with its identification on every sheet."""
     core = report["administrativeData"]["coreData"]
     sheet = f"{core['title']} {core['uniqueIdentifier'] or unit}"
-    lacking = missing_for_dcc(report)
     if report["stamp"]:
         sheet += " \N{MIDDLE DOT} NOT A CALIBRATION CERTIFICATE"
-    page: str = template("certificate.html").render(unit=unit, report=report, sheet=_css_text(sheet), lacking=lacking)
+    # A string of a style sheet: all characters but letters and digits are written by their number.
+    codes = Markup("".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in sheet))  # noqa: S704
+    lacking = missing_for_dcc(report)
+    page: str = template("certificate.html").render(unit=unit, report=report, sheet=codes, lacking=lacking)
     return page
 
 
-def _css_text(text: str) -> Markup:
-    """Return text for a string of a style sheet: everything but letters and digits as its number."""
-    codes = "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)
-    return Markup(codes)  # noqa: S704  (no markup left)
-
-
-# What the schema (https://www.ptb.de/dcc/v3.2.1/dcc.xsd) demands, in addition to what ISO/IEC 17025 does.
+# Required by the schema (https://www.ptb.de/dcc/v3.2.1/dcc.xsd), in addition to ISO/IEC 17025.
 DEMANDED = {"certificate.country": "countryCodeISO3166_1"}
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")  # of performance, by the schema
 # Units of this product: factor to the SI, and powers of the units of D-SI (D-SI 2.1.0, BIPM SI brochure, table 8: deg).
@@ -246,13 +243,13 @@ TOKEN = re.compile(r"(\([^()]*\)|[^/()^]+)(?:\^(\d+))?")
 
 
 def missing_for_dcc(report: JSON) -> list[str]:
-    """Return the settings without which there is no Digital Calibration Certificate of a report."""
+    """Return the missing settings that the Digital Calibration Certificate of a report needs."""
     core = report["administrativeData"]["coreData"]
     return [m["key"] for m in report["missing"]] + [key for key, name in DEMANDED.items() if not core[name]]
 
 
 def digital_certificate(unit: str, report: JSON) -> str | None:
-    """Return ``certificates/<unit>.xml`` of a report (``pipeline.report.certificate``), None where something lacks."""
+    """Return ``certificates/<unit>.xml`` of a report of ``certificate``; None where a statement is missing."""
     if missing_for_dcc(report):
         return None
     place = report["administrativeData"]["coreData"]["performanceLocation"]
@@ -269,7 +266,7 @@ def digital_certificate(unit: str, report: JSON) -> str | None:
 
 
 def dsi_unit(unit: str) -> tuple[float, str] | None:
-    r"""Return the factor to the SI and the unit in D-SI's notation; None for a unit that is not known.
+    r"""Return the factor to the SI and the unit in D-SI's notation; None for an unknown unit.
 
     ``deg/s/g`` is ``\degree\metre\tothe{-1}\second`` times 1/9.80665.
     """
@@ -295,7 +292,7 @@ def _powers(unit: str) -> tuple[float, dict[str, int]] | None:
 
 
 def _quantity(q: JSON) -> JSON:
-    """Return a result in units of the SI; without a unit of D-SI as a text."""
+    """Return a result in units of the SI, or as a text where D-SI does not have its unit."""
     known = dsi_unit(q["unit"])
     if known is None:
         return {"name": q["name"], "text": f"{q['value']!r} {q['unit']}"}

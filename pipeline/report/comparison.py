@@ -1,17 +1,30 @@
-"""Comparison of groups of units: means and differences with their uncertainties.
+"""Comparison of groups of units on the campaign's page: means and differences with uncertainties, charts and tables.
 
-Errors are positive and differ by factors, so their logarithms are compared: the mean of a group is the geometric mean,
-a difference is a ratio. Of n units with values v_i, the mean and its standard uncertainty are
+The groups are those that the configuration resolves (``pipeline.config.comparisons``). Errors are positive and differ
+by factors, so their logarithms are compared: the mean of a group is the geometric mean, a difference is a ratio. Of n
+units with values v_i, the mean and its standard uncertainty are
 
     m = sum(v_i) / n,    u^2 = sum((v_i - m)^2) / (n (n - 1)),    n - 1 degrees of freedom,
 
-and of one unit its own value and uncertainty. The difference of two groups is
+and of one unit its value and uncertainty. The difference of two groups is
 
     d = m_1 - m_2,    u^2 = u_1^2 + u_2^2,    (u_1^4 / (n_1 - 1) + u_2^4 / (n_2 - 1)) / u^4 = 1 / degrees of freedom,
 
-or, where units come in pairs (one device, calibrated in two ways), the mean of the differences within the pairs. Where
-a group has one unit only, or there is one pair, the units' own uncertainties replace the scatter. The p-value is that
-of Student's t = d / u, multiplied as Holm asks for where several groups are compared with one.
+or, for pairs of units (one device, calibrated in two ways), the mean of the differences within the pairs. Where a group
+has one unit only, or there is one pair, the stated uncertainties replace the scatter. The p-value is that of Student's
+t = d / u, adjusted by Holm's method where several groups are compared with one.
+
+Errors are compared on held-out motion, and for simulated recordings also against the true parameters, without the noise
+of the held-out samples. The noise sigma of N held-out samples makes their rms error e uncertain by
+
+    u(e)^2 = sigma^2 (2 e^2 - sigma^2) / (2 N e^2),
+
+because the mean of (d_k + n_k)^2 has the variance (4 mean(d^2) sigma^2 + 2 sigma^4) / N, where mean(d^2) is
+e^2 - sigma^2. It does not contain the variation between recordings. The error against the truth is
+
+    e^2 = a^2 |M K - 1|_F^2 / 3 + |M (b - b_hat)|^2
+
+with the calibration M, b_hat, the truth K, b of ``reading = b + K truth`` and the rms motion a (g or deg/s).
 
 Sources: B. L. Welch, Biometrika 34 (1947) 28-35 (degrees of freedom); S. Holm, Scandinavian Journal of Statistics 6
 (1979) 65-70; JCGM 100:2008, 4.2.3 (mean of repeated observations).
@@ -20,27 +33,39 @@ Sources: B. L. Welch, Biometrika 34 (1947) 28-35 (degrees of freedom); S. Holm, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from pipeline.report.numbers import number
+from pipeline.records import SENSOR_UNITS, SENSORS
+from pipeline.report.chart import Figure
+from pipeline.report.group_charts import COLOURS, Point, bars, curves
+from pipeline.report.held_out_section import first_and_last_step
+from pipeline.report.numbers import measured, number
+from pipeline.report.parameters import fitted_parameters
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
+JSON = dict[str, Any]
 LEVEL = 0.05  # of a test, and 1 minus the coverage of an interval (JCGM 100:2008, 6.2.2: about 95 %)
+MEASURES = {"after": "rms error, held out", "truth": "rms error against the truth"}
+FIGURES = (
+    "unit", "sensor", "before", "u_before", "after", "u_after", "truth", "u_truth", "noise_floor", "table_time",
+    "verdict", "parameters",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean or a difference with its standard uncertainty; NaN where it is not known.
+    """A mean or a difference with its standard uncertainty; NaN where it is unknown.
 
-    The degrees of freedom are infinite where the units' own uncertainties were used instead of their scatter.
+    The degrees of freedom are infinite where the stated uncertainties were used instead of the scatter.
     """
 
     value: float
@@ -50,14 +75,14 @@ class Estimate:
 
     @property
     def expanded_uncertainty(self) -> float:
-        """Half the interval that covers 95 %."""
+        """Half the width of the 95 % interval."""
         from scipy.special import stdtrit  # noqa: PLC0415  (only where a campaign compares)
 
         return self.standard_uncertainty * float(stdtrit(self.degrees_of_freedom, 1.0 - LEVEL / 2.0))
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The interval that covers 95 %; without an uncertainty the value alone."""
+        """The 95 % interval; without an uncertainty both ends are the value."""
         half = float(np.nan_to_num(self.expanded_uncertainty))
         return self.value - half, self.value + half
 
@@ -68,16 +93,16 @@ class Estimate:
 
     @property
     def p_value(self) -> float:
-        """The probability of so large a value where the truth is zero."""
+        """The probability of a value of this size or larger where the truth is zero."""
         from scipy.special import stdtr  # noqa: PLC0415  (as above)
 
         return 2.0 * float(stdtr(self.degrees_of_freedom, -abs(self.significance)))
 
 
 def mean_of(values: ArrayLike, uncertainties: ArrayLike = math.nan) -> Estimate:
-    """Return the mean of (n,) values from their scatter, or the only one with its own standard uncertainty.
+    """Return the mean of (n,) values with the uncertainty by their scatter; a single value keeps its uncertainty.
 
-    An unknown uncertainty is NaN, as is the mean of no values.
+    An unknown uncertainty and the mean of no values are NaN.
     """
     v = np.asarray(values, float)
     if v.size < 2:
@@ -87,12 +112,13 @@ def mean_of(values: ArrayLike, uncertainties: ArrayLike = math.nan) -> Estimate:
 
 
 def difference(first: pd.DataFrame, second: pd.DataFrame, pairs: Mapping[str, str] | None = None) -> Estimate:
-    """Return the mean of ``first`` minus that of ``second``: columns ``value`` and ``u`` (NaN: unknown) by unit.
+    """Return the mean of ``first`` minus the mean of ``second``: columns ``value`` and ``u`` (NaN: unknown) by unit.
 
-    ``pairs``: unit to what it shares with its pair; differences are then taken within the pairs.
+    ``pairs``: unit to device; with it the differences are those within the devices, each by the mean of its units.
     """
     if pairs is not None:
-        a, b = (_averages(group, pairs) for group in (first, second))
+        by_device = (group.groupby(group.index.map(pairs), sort=False) for group in (first, second))
+        a, b = (pd.DataFrame({"value": g["value"].mean(), "u": g["u"].agg(_of_mean)}) for g in by_device)
         devices = a.index.intersection(b.index, sort=False)
         return mean_of((a["value"] - b["value"])[devices], np.hypot(a["u"], b["u"])[devices])
     means = [mean_of(group["value"], group["u"]) for group in (first, second)]
@@ -102,14 +128,8 @@ def difference(first: pd.DataFrame, second: pd.DataFrame, pairs: Mapping[str, st
         total = sum(squares)
         terms = sum(square**2 / m.degrees_of_freedom for square, m in zip(squares, means, strict=True))
         return Estimate(value, math.sqrt(total), total**2 / terms if total else math.inf, count)
-    own = math.hypot(*(_of_mean(group["u"]) for group in (first, second)))
-    return Estimate(value, own, math.inf, count)
-
-
-def _averages(values: pd.DataFrame, pairs: Mapping[str, str]) -> pd.DataFrame:
-    """Return the mean of the units of each device, with what their own uncertainties make of it."""
-    devices = values.groupby(values.index.map(pairs), sort=False)
-    return pd.DataFrame({"value": devices["value"].mean(), "u": devices["u"].agg(_of_mean)})
+    stated = math.hypot(*(_of_mean(group["u"]) for group in (first, second)))
+    return Estimate(value, stated, math.inf, count)
 
 
 def _of_mean(uncertainties: pd.Series[float]) -> float:
@@ -118,7 +138,7 @@ def _of_mean(uncertainties: pd.Series[float]) -> float:
 
 
 def adjusted(p_values: Sequence[float]) -> list[float]:
-    """Return the p-values of several comparisons, adjusted by Holm's step-down method; NaN does not count."""
+    """Return the p-values of several comparisons, adjusted by Holm's step-down method; NaN is ignored."""
     known = pd.Series(p_values, dtype=float).dropna().sort_values()
     holm = (known * np.arange(len(known), 0, -1)).clip(upper=1.0).cummax()
     adjusted_values: list[float] = holm.reindex(range(len(p_values))).tolist()
@@ -140,13 +160,13 @@ class Compared:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The interval of the mean that covers 95 %, g or deg/s."""
+        """The 95 % interval of the mean, g or deg/s."""
         low, high = self.logarithm.interval
         return math.exp(low), math.exp(high)
 
     @property
     def result(self) -> str:
-        """What the difference shows; empty where its uncertainty is not known."""
+        """The result of the test of the difference; empty where its uncertainty is unknown."""
         if self.difference is None or math.isnan(self.p_value):
             return ""
         if self.p_value > LEVEL:
@@ -155,7 +175,7 @@ class Compared:
 
 
 def logarithms(figures: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return ``value`` and ``u`` of ln(measure) for each unit that has it; ``figures``: a row a unit."""
+    """Return ``value`` and ``u`` of ln(measure) for each unit with this measure; ``figures``: one row a unit."""
     value, u = (pd.to_numeric(figures[name]) for name in (measure, f"u_{measure}"))
     known = value > 0.0
     return pd.DataFrame({"value": np.log(value[known]), "u": u[known] / value[known]})
@@ -164,7 +184,7 @@ def logarithms(figures: pd.DataFrame, measure: str) -> pd.DataFrame:
 def compare(
     groups: Mapping[str, pd.DataFrame], against: str, pairs: Mapping[str, str] | None = None
 ) -> dict[str, Compared]:
-    """Compare the logarithms of each group, as of ``logarithms``, with those of the group ``against``.
+    """Compare the logarithms of each group (``logarithms``) with those of the group ``against``.
 
     Groups without values are left out; without a group of that name there are no differences.
     """
@@ -181,17 +201,174 @@ def compare(
 
 
 def finding(groups: Mapping[str, pd.DataFrame], pairs: Mapping[str, str] | None) -> str:
-    """Return which group has the smallest mean, and which are not told apart from it."""
+    """Return a sentence: the group with the smallest mean, and the groups that are not significantly larger."""
     compared = compare(groups, "")
     best = min(compared, key=lambda name: compared[name].mean)
     low, high = compared[best].interval
-    said = f"Smallest with {best}: {number(compared[best].mean)}"
-    said += f" ({number(low)} to {number(high)})" if low < high else ""
+    text = f"Smallest with {best}: {number(compared[best].mean)}"
+    text += f" ({number(low)} to {number(high)})" if low < high else ""
     others = {name: c for name, c in compare(groups, best, pairs).items() if c.result}
     near = [name for name, c in others.items() if c.p_value > LEVEL]
     if not others:
-        return said
+        return text
     if not near:
-        return f"{said}; all others are larger"
+        return f"{text}; all others are larger"
     named = ", ".join(near) if len(near) <= 4 else f"{len(near)} of {len(others)} others"
-    return f"{said}; not told apart from it: {named}"
+    return f"{text}; not told apart from it: {named}"
+
+
+def unit_figures(calibration: JSON, validation: JSON, diagnosis: JSON | None) -> list[JSON]:
+    """Return the figures of a unit for comparisons, a dict for each calibrated sensor.
+
+    It has ``unit, sensor``; rms errors ``before`` and ``after`` with the standard uncertainty ``u_<name>`` (g or
+    deg/s); ``truth`` (None; see ``against_truth``); ``noise_floor``; ``reference_rms``; ``table_time``, the length of
+    the recordings of the fit (s); ``verdict``; ``parameters``: name to Parameter.
+    """
+    rows = []
+    for sensor in SENSORS:
+        part, held_out = calibration.get(sensor), validation.get(sensor)
+        if part and held_out:
+            before, after = (step.get("rms_error") for step in first_and_last_step(held_out))
+            inputs = [i for i in calibration.get("inputs") or [] if i.get("role") in (sensor, "rests")]
+            rows.append({
+                "unit": calibration["unit"],
+                "sensor": sensor,
+                "before": before,
+                "u_before": _noise_of_error(before, held_out),
+                "after": after,
+                "u_after": _noise_of_error(after, held_out),
+                "truth": None,
+                "u_truth": None,
+                "noise_floor": held_out.get("noise_floor"),
+                "reference_rms": held_out.get("reference_rms"),
+                "table_time": sum(i.get("duration_s") or 0.0 for i in inputs) or None,
+                "verdict": ((diagnosis or {}).get(sensor) or {}).get("verdict") or "",
+                "parameters": {p.words: p for p in fitted_parameters(part)},
+            })  # fmt: skip
+    return rows
+
+
+def _noise_of_error(error: float | None, held_out: JSON) -> float | None:
+    """Return the standard uncertainty of a held-out error by the noise of its samples."""
+    floor, samples = held_out.get("noise_floor"), held_out.get("samples")
+    if not error or not floor or not samples:
+        return None
+    noise = min(floor, error) ** 2
+    return math.sqrt(noise * (2.0 * error**2 - noise) / (2.0 * samples)) / error
+
+
+def against_truth(figures: JSON, truth: JSON) -> float | None:
+    """Return the rms error against the true parameters of a simulated sensor (its part of ``truth/<unit>.json``)."""
+    if figures["reference_rms"] is None:
+        return None
+    values = np.array([p.value for p in figures["parameters"].values()][:12])
+    matrix = values[3:].reshape(3, 3)
+    error = matrix @ np.linalg.inv(np.array(truth["matrix"], float)) - np.eye(3)
+    bias = matrix @ (np.array(truth["bias"], float) - values[:3])
+    return float(np.sqrt(figures["reference_rms"] ** 2 * np.sum(error**2) / 3.0 + np.sum(bias**2)))
+
+
+def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
+    """Return the data of a comparison, as ``pipeline.config.comparisons`` resolves it, for the page.
+
+    ``figures``: ``unit_figures`` of all units, none of failed ones; ``name``: an identifier, unique on the page.
+    """
+    frame = pd.DataFrame(list(figures), columns=list(FIGURES)).set_index("unit")
+    against, pairs, sensors = comparison["against"], comparison["pairs"], []
+    for sensor in comparison["sensors"]:
+        known, unit = frame[frame["sensor"] == sensor], SENSOR_UNITS[sensor]
+        units = {g["name"]: known.loc[[u for u in g["units"] if u in known.index]] for g in comparison["groups"]}
+        measures = []
+        for m, title in MEASURES.items():
+            groups = {group: logarithms(members, m) for group, members in units.items()}
+            compared = compare(groups, against, pairs)
+            rows = [_row(g, units[g["name"]], c, m) for g in comparison["groups"] if (c := compared.get(g["name"]))]
+            if rows:
+                sentence = finding(groups, pairs)
+                figure = _figure(rows, sentence, comparison, f"{title}, {unit}", f"{name}-{sensor}-{m}")
+                measures.append({"name": m, "title": title, "figure": figure, "rows": rows})
+        if measures:
+            parameters = _parameters(units, against, pairs)
+            sensors.append({"sensor": sensor, "unit": unit, "measures": measures, "parameters": parameters})
+    return {
+        "title": comparison["title"],
+        "against": against,
+        "paired": pairs is not None,
+        "sensors": sensors,
+        "groups": [(g["name"], g["units"]) for g in comparison["groups"]],
+        "single": all(len(g["units"]) == 1 for g in comparison["groups"]),
+    }
+
+
+def _row(group: JSON, units: pd.DataFrame, compared: Compared, measure: str) -> JSON:
+    """Return the row of a group and a measure on the page; ``units``: the figures of its calibrated units."""
+    verdicts = units["verdict"]
+    return {
+        "name": group["name"],
+        "measure": measure,
+        "group": group,
+        "units": units,
+        "compared": compared,
+        "verdicts": verdicts[verdicts != ""].value_counts(sort=False),
+        "floor": _mean(units["noise_floor"]) if measure == "after" else None,
+        **{name: _mean(units[name]) for name in ("before", "table_time")},
+    }
+
+
+def _mean(values: pd.Series[float]) -> float | None:
+    """Return the geometric mean of the positive values."""
+    values = pd.to_numeric(values)
+    values = values[values > 0.0]
+    return float(np.exp(np.log(values).mean())) if len(values) else None
+
+
+def _figure(rows: Sequence[JSON], sentence: str, comparison: JSON, title: str, name: str) -> Figure:
+    """Draw a measure: along the axis of the comparison, where the position of a group on it is known, or in rows."""
+    x, points = comparison["x"], []
+    for row in rows:
+        units, at, group = row["units"], 0.0, row["group"]
+        if x is not None:
+            at = row["table_time"] if x["values"] is None else fmean(x["values"][u] for u in units.index)
+        each, compared = tuple(v for v in units[row["measure"]] if v and v > 0.0), row["compared"]
+        point = (group["label"], compared.mean, 0, compared.interval, each, row["floor"], at, group["series"])
+        points += [Point(*point)] if at is not None else []
+    words = ["Mean of each group with its 95 % interval; faint, its units."] * any(len(p.units) > 1 for p in points)
+    words += ["Dashed: the error that noise alone gives."] * any(p.floor for p in points)
+    figure = Figure(name, sentence, " ".join(words))
+    if x is None:
+        return bars(figure, points, title)
+    series = list(dict.fromkeys(p.series for p in points))
+    legend = tuple((f"c{i % COLOURS}", s) for i, s in enumerate(series)) if len(series) > 1 else ()
+    return curves(replace(figure, legend=legend), points, title, x["label"], named=x["named"])
+
+
+def _parameters(units: Mapping[str, pd.DataFrame], against: str, pairs: Mapping[str, str] | None) -> JSON:
+    """Return the mean parameters of each group, and their differences over the standard uncertainty.
+
+    The result has ``names`` of the parameters, and ``rows`` of ``name`` and ``cells``: value, difference over its
+    standard uncertainty, and whether equal parameters would exceed it in less than 5 % of cases.
+    """
+    names = list(dict.fromkeys(n for members in units.values() for each in members["parameters"] for n in each))
+    rows = []
+    for group, members in units.items():
+        cells = []
+        for name in names:
+            values = _of_units(members, name)
+            mean = mean_of(values["value"], values["u"])
+            change, U = difference(values, _of_units(units[against], name), pairs), mean.expanded_uncertainty
+            if group == against:
+                change = replace(change, standard_uncertainty=math.nan)
+            cells.append({
+                "value": measured(mean.value, U) if U > 0.0 else number(mean.value),
+                "significance": "" if math.isnan(change.significance) else number(change.significance, 2),
+                "beyond": change.p_value < LEVEL,
+            })  # fmt: skip
+        rows.append({"name": group, "cells": cells})
+    return {"names": names, "rows": rows}
+
+
+def _of_units(figures: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Return ``value`` and ``u`` of a fitted parameter for each unit with this parameter."""
+    found = {unit: each[name] for unit, each in figures["parameters"].items() if name in each}
+    rows = [(p.value, p.standard_uncertainty) for p in found.values()]
+    return pd.DataFrame(rows, list(found), ["value", "u"], dtype=float)

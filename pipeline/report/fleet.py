@@ -1,19 +1,19 @@
-"""The tables of a campaign: its summary, a row a unit, and statistics over its units.
+"""The tables of a campaign: its summary, one row a unit, and statistics of its units.
 
 Units of one sensor model that were calibrated by one method are compared with each other. For each parameter
 
     z = (value - median) / (1.4826 median(|value - median|))
 
-is a unit's distance in robust standard deviations. A unit is far where |z| > 6, with 20 units or more. A parameter
-drifts with the date where Spearman's rank correlation differs from zero, and differs between lots by the test of
-Kruskal and Wallis, both at 0.001 after Bonferroni's correction for the number of parameters. The drift is the slope of
-Theil and Sen. Repeatability is the pooled standard deviation of units that share a serial. It is compared with the
-stated uncertainties: with weights ``w = 1 / u^2`` and the weighted mean m of each device,
+is a unit's distance in robust standard deviations. A unit is far if |z| > 6, with 20 units or more. A parameter drifts
+with the date if Spearman's rank correlation differs from zero, and differs between lots by the test of Kruskal and
+Wallis, both at 0.001 after Bonferroni's correction for the number of parameters. The drift is the slope of Theil and
+Sen. Repeatability is the pooled standard deviation of units that share a serial. It is compared with the stated
+uncertainties: with weights ``w = 1 / u^2`` and the weighted mean m of each device,
 
     chi^2 = sum(w (value - m)^2),    E_n = |a - b| / sqrt(U_a^2 + U_b^2)
 
-E_n is the largest of two calibrations of one device. At a p-value of chi^2 below 0.001, after the same correction, the
-calibrations of a device scatter more than they state.
+E_n is the largest of all pairs of calibrations of one device. If the p-value of chi^2 is below 0.001 after the same
+correction, the calibrations of a device scatter more than their stated uncertainties.
 
 References
 ----------
@@ -42,23 +42,23 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 JSON = dict[str, Any]
-FEWEST = 20  # units, below which a median absolute deviation says little: its own spread is 17 % of it there
-FAR = 6.0  # robust standard deviations: of 10,000 units with 24 parameters, noise alone puts none there
+FEWEST = 20  # units, below which a median absolute deviation is too uncertain: its standard deviation is 17 % of it
+FAR = 6.0  # robust standard deviations, which noise does not exceed in 10,000 units with 24 parameters
 LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
-MOST_PAIRED = 1000  # units that the slope is taken from: it needs all pairs of them, 50 MB
+MOST_PAIRED = 1000  # units from which the slope is computed: it needs all pairs of them, 50 MB
 DAYS_OF_A_YEAR = 365.25
 SIBLINGS = ["sensor", "method"]
 
 
 def parameter_table(units: Mapping[str, Sequence[Sequence[Any]]]) -> pd.DataFrame:
-    """Return the parameters of some units, as of ``unit_parameters``, as one table: ``unit`` and ``PARAMETERS``."""
-    rows = [(unit, *row) for unit, own in units.items() for row in own]
+    """Return the parameters of some units (``unit_parameters``) as one table: ``unit`` and ``PARAMETERS``."""
+    rows = [(unit, *row) for unit, of_unit in units.items() for row in of_unit]
     kinds = dict.fromkeys(("value", "u", "U", "limit"), float) | {"fitted": bool}
     return pd.DataFrame(rows, columns=["unit", *PARAMETERS]).astype(kinds)
 
 
 def wide(parameters: pd.DataFrame, units: Sequence[str], name: str, *figures: str) -> list[pd.DataFrame]:
-    """Return a frame for each figure: a row a unit, a column a parameter, which the column ``name`` names."""
+    """Return a frame for each figure: one row a unit, one column a parameter, named by the column ``name``."""
     names = parameters.drop_duplicates(name).sort_values("sensor", kind="stable")[name].tolist()
     cells = parameters.set_index(["unit", name]).reindex(pd.MultiIndex.from_product([units, names]))
     return [pd.DataFrame(cells[f].to_numpy().reshape(len(units), len(names)), units, names) for f in figures]
@@ -67,7 +67,7 @@ def wide(parameters: pd.DataFrame, units: Sequence[str], name: str, *figures: st
 def fleet_statistics(rows: Sequence[JSON], parameters: pd.DataFrame) -> JSON:
     """Return the statistics of a fleet, ``fleet.json``: a list of dicts for each statistic, and ``missing``.
 
-    ``rows``: one a unit, as of ``summary_row``; ``parameters``: of ``parameter_table``, none of units that failed.
+    ``rows``: of ``summary_row``, one a unit; ``parameters``: of ``parameter_table``, without failed units.
     """
     units = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).replace("", None)
     units = units.rename(columns={"sensor": "model"}).dropna(subset=["model", "method"])
@@ -76,10 +76,10 @@ def fleet_statistics(rows: Sequence[JSON], parameters: pd.DataFrame) -> JSON:
     out: JSON = {key: [] for key in STATISTICS}
     for (model, method), siblings in known.groupby(["model", "method"], sort=False):
         of_siblings = siblings.sort_values("sensor", kind="stable").groupby("parameter", sort=False)
-        for name, own in of_siblings:
-            about = {"sensor": model, "method": method, "parameter": name, "unit": own["measure"].iloc[0]}
+        for name, table in of_siblings:
+            about = {"sensor": model, "method": method, "parameter": name, "unit": table["measure"].iloc[0]}
             for key, statistic in STATISTICS.items():
-                out[key] += [about | found for found in statistic(own, len(of_siblings))]
+                out[key] += [about | found for found in statistic(table, len(of_siblings))]
     out["far"].sort(key=lambda f: -abs(f["z"]))
     out["missing"] = _missing_effects(rows)
     return out
@@ -90,24 +90,24 @@ def _spread(values: pd.Series[float]) -> float:
     return float(MEDIAN_SIZE * (values - values.median()).abs().median())
 
 
-def _distributions(own: pd.DataFrame, _: int) -> Iterable[JSON]:
-    v = own["value"]
+def _distributions(table: pd.DataFrame, _: int) -> Iterable[JSON]:
+    v = table["value"]
     low, middle, high = v.quantile([0.05, 0.5, 0.95]).tolist()
     found = {"units": int(v.count()), "median": middle, "robust_standard_deviation": _spread(v)}
     yield found | {"quantile_05": low, "quantile_95": high, "smallest": float(v.min()), "largest": float(v.max())}
 
 
-def _far(own: pd.DataFrame, _: int) -> Iterable[JSON]:
-    v, spread = own["value"], _spread(own["value"])
+def _far(table: pd.DataFrame, _: int) -> Iterable[JSON]:
+    v, spread = table["value"], _spread(table["value"])
     if v.count() >= FEWEST and spread > 0.0:
-        far = own.assign(z=(v - v.median()) / spread)
+        far = table.assign(z=(v - v.median()) / spread)
         for unit in far[far["z"].abs() > FAR].to_dict("records"):
             lot = unit["lot"] if isinstance(unit["lot"], str) else None
             yield {"name": unit["unit"], "lot": lot, "value": unit["value"], "z": unit["z"]}
 
 
-def _drift(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
-    known = own[["day", "value"]].dropna()
+def _drift(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
+    known = table[["day", "value"]].dropna()
     if len(known) < FEWEST or known.nunique().min() == 1:  # dates or values that are all the same
         return
     from scipy import stats  # noqa: PLC0415  (0.3 s that few fleets need)
@@ -120,7 +120,7 @@ def _drift(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
         yield found | {"units": len(known)}
 
 
-def _lots(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
+def _lots(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
     """Find the parameters that differ between lots, by the test of Kruskal and Wallis (JASA 47, 1952, 583-621).
 
     Its statistic, with the correction for ties, is ``(n - 1)`` times the share of the variance of all n ranks that the
@@ -128,8 +128,8 @@ def _lots(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
     """
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only lots need)
 
-    values = own["value"].dropna()
-    lots = {lot: v for lot, v in values.groupby(own["lot"]) if len(v) >= 3}
+    values = table["value"].dropna()
+    lots = {lot: v for lot, v in values.groupby(table["lot"]) if len(v) >= 3}
     if len(values) < FEWEST or len(lots) < 2 or np.ptp(values) == 0.0:
         return
     ranks = pd.concat(lots).rank()
@@ -141,16 +141,16 @@ def _lots(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
         yield {"p_value": p, "lot": lot, "lot_median": medians[lot], "median": middle}
 
 
-def _repeatability(own: pd.DataFrame, parameters: int) -> Iterable[JSON]:
-    """Return how the calibrations of a device scatter, where some were calibrated more than once."""
-    own = own.dropna(subset=["serial", "value"])
-    own = own[own["serial"].duplicated(keep=False)]
-    if own.empty:
+def _repeatability(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
+    """Return the scatter of the calibrations of one device, pooled over devices with several calibrations."""
+    table = table.dropna(subset=["serial", "value"])
+    table = table[table["serial"].duplicated(keep=False)]
+    if table.empty:
         return
-    devices = own.groupby("serial")["value"]
-    squares, freedom = float(((own["value"] - devices.transform("mean")) ** 2).sum()), len(own) - devices.ngroups
-    found = {"devices": devices.ngroups, "calibrations": len(own), "standard_deviation": math.sqrt(squares / freedom)}
-    yield found | _against_stated(own.dropna(subset=["u", "U"]), parameters)
+    devices = table.groupby("serial")["value"]
+    squares, freedom = float(((table["value"] - devices.transform("mean")) ** 2).sum()), len(table) - devices.ngroups
+    found = {"devices": devices.ngroups, "calibrations": len(table), "standard_deviation": math.sqrt(squares / freedom)}
+    yield found | _against_stated(table.dropna(subset=["u", "U"]), parameters)
 
 
 def _against_stated(known: pd.DataFrame, parameters: int) -> JSON:
@@ -182,7 +182,7 @@ STATISTICS = {
 
 
 def _missing_effects(rows: Sequence[JSON]) -> list[str]:
-    """Return a sentence for each missing effect: in how many units, and from which lots."""
+    """Return a sentence for each missing effect, with the number of units and their lots."""
     frame = pd.DataFrame(rows).reindex(columns=["lot", *(f"{s}_{c}" for s in SENSORS for c in ("verdict", "selected"))])
     lots = frame["lot"].replace("", None).value_counts()
     sentences = []
@@ -191,20 +191,20 @@ def _missing_effects(rows: Sequence[JSON]) -> list[str]:
         effects = judged[f"{sensor}_selected"].fillna("").astype(str).str.split(";").explode()
         for name, count in effects[effects != ""].value_counts().items():
             of = judged.loc[effects.index[effects == name], "lot"].replace("", None).value_counts()
-            said = f"missing effect: {name} ({count} of {len(judged)} units, {sensor})"
+            sentence = f"missing effect: {name} ({count} of {len(judged)} units, {sensor})"
             if len(lots) > 1 and len(of):
                 lot, most = of.index[0], int(of.iloc[0])
                 share = f"from lot {lot} ({most} of its {lots[lot]})"
                 if most == count:
-                    said += f", all {share}"
+                    sentence += f", all {share}"
                 else:
-                    said += f", {most} of them {share}" if most > count / 2 else f", from {len(of)} lots"
-            sentences.append(said)
+                    sentence += f", {most} of them {share}" if most > count / 2 else f", from {len(of)} lots"
+            sentences.append(sentence)
     return sentences
 
 
 def write_parameters(path: Path, rows: Sequence[JSON], parameters: pd.DataFrame) -> None:
-    """Write ``parameters.parquet``: a row a unit with everything of ``summary.csv`` and every fitted parameter.
+    """Write ``parameters.parquet``: one row a unit with all columns of ``summary.csv`` and every fitted parameter.
 
     Columns of a parameter: ``<name>`` and ``<name>_expanded_uncertainty``, with the unit in the column's metadata.
     """
@@ -226,7 +226,7 @@ def write_parameters(path: Path, rows: Sequence[JSON], parameters: pd.DataFrame)
 
 
 def write_summary(path: Path, rows: list[JSON]) -> None:
-    """Write ``summary.csv`` from rows of ``summary_row``; own columns may differ from unit to unit."""
+    """Write ``summary.csv`` from rows of ``summary_row``; other columns may differ from unit to unit."""
     columns = list(dict.fromkeys([*COLUMNS, *(key for row in rows for key in row)]))
     frame = pd.DataFrame([{key: _cell(value) for key, value in row.items()} for row in rows], columns=columns)
     write_atomically(path, frame.to_csv(index=False, lineterminator="\n"))

@@ -18,7 +18,7 @@ from pipeline.files import flushed_together, read_json, write_atomically, write_
 from pipeline.history import of_units, record
 from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes
 from pipeline.report.campaign_page import render
-from pipeline.report.comparison_section import against_truth, section
+from pipeline.report.comparison import against_truth, section
 from pipeline.report.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
 from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history

@@ -26,7 +26,7 @@ def summary_unit(job: Job, unit: str, settings: JSON) -> Files:
     calibration, _, diagnosis = documents
     found = summary(settings, None, *documents)
     if settings["compared"]:
-        from pipeline.report.comparison_section import unit_figures  # noqa: PLC0415  (pandas, where units are compared)
+        from pipeline.report.comparison import unit_figures  # noqa: PLC0415  (pandas, where units are compared)
 
         found["figures"] = unit_figures(*documents)
     if settings["lot_prior"]:

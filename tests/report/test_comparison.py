@@ -9,8 +9,17 @@ import pytest
 from scipy import stats
 
 from pipeline.report.campaign_page import render
-from pipeline.report.comparison import adjusted, compare, difference, finding, logarithms, mean_of
-from pipeline.report.comparison_section import against_truth, section, unit_figures
+from pipeline.report.comparison import (
+    adjusted,
+    against_truth,
+    compare,
+    difference,
+    finding,
+    logarithms,
+    mean_of,
+    section,
+    unit_figures,
+)
 from pipeline.report.numbers import number
 from pipeline.report.parameters import Parameter
 

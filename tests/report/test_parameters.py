@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.records import FittedEffect, SensorCalibration
-from pipeline.report.comparison_section import unit_figures
+from pipeline.report.comparison import unit_figures
 from pipeline.report.parameters import fitted_parameters, reading_errors
 
 
