@@ -109,22 +109,25 @@ def resting_log(file: Path, still_s: float) -> Path:
     return file
 
 
-def without_effects(calibration: Path) -> None:
+def without_effects(calibration: Path, matrix: np.ndarray | None = None) -> None:
+    """Take off the effects; ``matrix``: of the gyroscope."""
     data = json.loads(calibration.read_text(encoding="utf-8"))
     for sensor in ("accelerometer", "gyroscope"):
         data[sensor]["effects"] = []
+    if matrix is not None:
+        data["gyroscope"]["matrix"] = matrix.tolist()
     calibration.write_text(json.dumps(data), encoding="utf-8")
 
 
 @pytest.mark.parametrize("block_bytes", [1000, 1 << 20])
 def test_a_rest_of_the_log_renews_the_bias(calibration: Path, tmp_path: Path, block_bytes: int) -> None:
-    without_effects(calibration)
+    matrix = np.array([[1.2, 0.3, 0.0], [-0.1, 0.8, 0.2], [0.1, 0.0, 1.1]])  # far from one: the bias is not in its axes
+    without_effects(calibration, matrix)
     log, out = resting_log(tmp_path / "rest.csv", 12.0), tmp_path / "out.csv"
     result = compensate_log(load(calibration), log, out, rest=(0.0, 12.0), block_bytes=block_bytes)
     table = columns(out)
     time, rate = np.array(table["time_s"], float) - 100.0, vectors(table, "gyroscope")
-    matrix = np.eye(3) + 0.01  # of the calibration; its bias is 0.2 to 0.4 deg/s off that of the log
-    within = 5.0 * 0.1 / np.sqrt(1000)
+    within = 5.0 * 0.1 * np.linalg.norm(matrix, axis=1).max() / np.sqrt(1000)
     assert rate[(time > 2.0) & (time < 11.0)].mean(axis=0) == pytest.approx(np.zeros(3), abs=within)
     assert rate[time > 12.5].mean(axis=0) == pytest.approx(matrix @ [0.0, 0.0, 30.0], abs=2 * within)
     assert "mean rate of the rest from 1." in result.notes[0]

@@ -159,6 +159,12 @@ def test_every_message_is_kept_and_a_topic_of_calibrated_ones_is_added(
         made = {"unit": "U1", "topic": "/imu/data_calibrated", "readings": "/imu/data", "warnings": ""}
         assert [m.metadata for m in reader.iter_metadata()] == [{"driver": "somebody"}, made]
         by_topic = {c.topic: c for c in summary.channels.values()}
+    later = added[COUNT // 2][0]
+    with out.open("rb") as stream:  # by the index of the chunks
+        kept = [
+            m.log_time for _, c, m in make_reader(stream).iter_messages(starting_at=later) if c.topic.endswith("ted")
+        ]
+    assert len(kept) == COUNT - COUNT // 2
     assert by_topic["/imu/data_calibrated"].schema_id == by_topic["/imu/data"].schema_id
     assert by_topic["/imu/data_calibrated"].metadata == {"offered_qos_profiles": "some"}
 

@@ -9,7 +9,7 @@ import pytest
 from bench_session import Session, record
 
 from pipeline.diagnosis.diagnose import diagnose, doubts_of, held_out_of
-from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged
+from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged, verdict_of_selection
 from pipeline.estimation.noise import estimate_noise
 from pipeline.outcome import commands_of
 from pipeline.records import Note, Recording
@@ -46,6 +46,7 @@ def held_out(after: float) -> dict[str, float]:
         (replace(BY_HAND, moves=(2.9, 3.5)), "nothing_missing", ""),
         (replace(NOTHING, published=ABOVE, over_noise=4.0), "unexplained", "4 times the noise"),
         (replace(NOTHING, published=BELOW), "floor_in_doubt", "estimate is too large"),
+        (replace(NOTHING, static=ABOVE), "reference_in_doubt", "static"),
         (replace(NOTHING, agreement=OFF), "reference_in_doubt", "x reads +0.0003 of the truth along y"),
         (replace(NOTHING, agreement={**OFF, "p_value": 1e-3}), "nothing_missing", ""),
         (replace(MISSING, agreement=OFF), "missing_effect", ""),
@@ -98,6 +99,35 @@ def test_the_first_that_applies_is_said_with_its_numbers(evidence: Evidence, ver
         assert "table" not in step + reason
     if evidence.method == "reference_least_squares":
         assert "reference_least_squares" not in step + reason
+
+
+UNKNOWN = [{"covariate": "time", "delta_bic": 50.0}]
+BETTER, SAME, BAD = ({"error_before": 1.0, "error_after": a, "floor": 0.3} for a in (0.3, 0.5, 1.1))
+
+
+@pytest.mark.parametrize(
+    ("names", "unknown", "share", "gain", "changes", "verdict"),
+    [
+        ([], [], 0.0, 0.0, {}, "nothing_missing"),
+        ([], [], 0.0, 0.0, {"above_noise": True}, "unexplained"),
+        ([], UNKNOWN, 0.0, 0.0, {}, "unexplained"),
+        (["a"], [], 0.2, 900.0, {}, "missing_effect"),
+        (["a"], [], 0.2, 900.0, {"above_noise": True}, "unexplained"),
+        (["a"], [], 0.8, 900.0, {"above_noise": True}, "missing_effect"),
+        (["a"], UNKNOWN, 0.8, 900.0, {}, "unexplained"),
+        (["a"], UNKNOWN, 0.8, 9000.0, {}, "missing_effect"),
+        (["a"], [], 0.8, 900.0, {"held_out": BAD}, "unexplained"),
+        (["a"], [], 0.8, 900.0, {"held_out": SAME, "beyond": 0.6}, "unexplained"),
+        (["a"], [], 0.8, 900.0, {"held_out": BETTER, "beyond": 0.6}, "missing_effect"),
+        (["a"], [], 0.8, 900.0, {"held_out": BETTER, "beyond": 0.95}, "unexplained"),
+        (["a", "b", "c", "d"], [], 1.0, 900.0, {"held_out": BETTER}, "unexplained"),
+    ],
+)
+def test_a_selection_that_leaves_a_residual_is_no_explanation(  # noqa: PLR0917  (what a selection found)
+    names: list[str], unknown: list[dict[str, Any]], share: float, gain: float, changes: dict[str, Any], verdict: str
+) -> None:
+    given: dict[str, Any] = {"above_noise": False, "held_out": None} | changes
+    assert verdict_of_selection(names, unknown, share, gain, **given) == verdict
 
 
 def test_a_recording_of_another_unit_is_unexplained_with_a_reason_and_nothing_is_offered() -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr, stdtrit
 
-from pipeline.estimation.engine import Posterior
+from pipeline.estimation.engine import Posterior, assess_noise
+from pipeline.estimation.gauss_markov import Blocks, Prior
 
 
 def test_one_candidate_keeps_its_covariance_and_its_degrees_of_freedom() -> None:
@@ -42,3 +43,19 @@ def test_a_parameter_without_uncertainty_stays_without() -> None:
     assert found[0, 0] == 0.0
     assert np.isinf(freedom[0])
     assert freedom[1] < 10.0
+
+
+def test_white_noise_is_not_underestimated_where_most_blocks_are_used_up_by_parameters() -> None:
+    rng, blocks, each, sigma = np.random.default_rng(11), 12, 20, 0.3
+    time = np.repeat(40.0 * np.arange(blocks), each) + np.tile(np.arange(each), blocks)
+    of_blocks = Blocks.of_rows([(time, np.ones(len(time)))], [0], 40.0)
+    assert len(of_blocks.weight) == blocks
+    design = np.repeat(rng.standard_normal((blocks, 8)), each, axis=0)
+    basis = np.linalg.qr(design)[0]
+    seen = []
+    for _ in range(60):
+        y = sigma * rng.standard_normal((len(time), 3))
+        noise = assess_noise(y - basis @ (basis.T @ y), design, of_blocks, Prior())
+        seen.append(float(np.mean(noise.white**2)))
+    # four contrasts a channel: the relative standard deviation of a mean of 180 is sqrt(2 / 4 / 180), 5 %
+    assert np.mean(seen) == pytest.approx(sigma**2, rel=0.2)

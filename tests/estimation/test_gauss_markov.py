@@ -8,6 +8,7 @@ from scipy.integrate import dblquad
 
 from pipeline.estimation.gauss_markov import (
     SLOW,
+    STATED_WIDTH,
     Blocks,
     GaussMarkov,
     Prior,
@@ -111,6 +112,19 @@ def test_a_stated_instability_leaves_no_hypothesis_without_any() -> None:
     free = Prior().grid(1e-2)
     none = sum(np.exp(s.prior) for s in free if s.ratio == 0.0)
     assert none / sum(np.exp(s.prior) for s in free) == pytest.approx(0.9)
+
+
+def test_what_a_static_recording_tells_counts_once_beside_what_the_sensor_file_states() -> None:
+    tried = np.geomspace(1e-5, 1e-1, 30)
+    likelihood = -0.5 * (np.log(tried / 2e-3) / 0.4) ** 2 + np.zeros((5, 1))
+    stated, white = Prior(1e-3, 80.0), 1e-2
+    grid = Prior(2e-3, 100.0, 0.4, stated, (tried, likelihood)).grid(white)
+    wander = np.array([s.ratio * white for s in grid])
+    near = (np.abs(np.log(wander / 1e-3)) < 2.5 * STATED_WIDTH) & np.isin([s.time for s in grid], [100.0])
+    expected = -0.5 * (np.log(wander[near] / 1e-3) / STATED_WIDTH) ** 2 + np.interp(wander[near], tried, likelihood[0])
+    found = np.array([s.prior for s in grid])[near]
+    assert np.count_nonzero(near) > 10
+    np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-9)
 
 
 def test_a_bias_counts_as_constant_while_its_spectrum_is_below_that_of_white_noise() -> None:

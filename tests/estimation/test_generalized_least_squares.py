@@ -62,6 +62,25 @@ def test_the_order_of_the_effects_is_kept_with_units_and_expanded_uncertainties(
     assert SensorCalibration.from_json("accelerometer", calibration.to_json()).effects == calibration.effects
 
 
+def test_the_uncertainty_of_a_matrix_far_from_one_is_that_of_drawn_inverses() -> None:
+    """Turned by 40 deg: to first order ``dM = -M dK M``, in which no factor may be taken for its transpose."""
+    c, s = np.cos(np.radians(40.0)), np.sin(np.radians(40.0))
+    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.3, 0.0, 1.0]])
+    rough = np.random.default_rng(1).standard_normal  # the axes and the turns are known differently well
+    recordings = [
+        replace(r, gyroscope=r.gyroscope @ turned.T + 0.1 * rough((r.samples, 3)) * [1.0, 0.0, 0.0])
+        for r in record(Session(1, wander=0.0))
+        if r.role == "gyroscope" and r.gyroscope is not None
+    ]
+    recordings[2] = recordings[2].select(slice(recordings[2].samples // 2))
+    settings = SETTINGS | {"uncertainty": {"monte_carlo": 4000}}
+    budget = fit_joint("gyroscope", recordings, [], None, settings).budget
+    assert budget is not None
+    stated, drawn = (np.array(b["standard_uncertainty"])[3:] for b in (budget, budget["monte_carlo"]))
+    assert np.abs(np.log(stated / drawn)).max() < 0.08  # a standard deviation of 4000 is known to 1 %
+    assert stated.max() > 1.3 * stated.min()
+
+
 def test_the_stage_passes_on_what_was_there_where_no_effect_is_asked_for() -> None:
     before = SensorCalibration("accelerometer", bias=np.ones(3))
     assert fit_effects("accelerometer", [], before, {"effects": {"accelerometer": []}}) is before

@@ -94,6 +94,20 @@ def test_the_score_of_every_set_is_its_evidence_by_the_definition(sizes: dict[st
     assert search.best() == frozenset(sizes)
 
 
+@pytest.mark.parametrize("sizes", [{}, {"a": 0.1}, {"a": 0.3, "c": 0.05}], ids=["nothing", "weak", "two"])
+def test_the_probabilities_of_all_sets_are_those_of_their_evidence_and_sum_to_one(sizes: dict[str, float]) -> None:
+    dense = Dense(3, sizes)
+    found = answers([Search(dense.problem())], lambda _: 0, NAMES)
+    stated = dict(found.sets)
+    each = {names: dense.averaged(names) for names in stated}
+    total = logsumexp(list(each.values()))
+    assert sum(stated.values()) == pytest.approx(1.0, abs=1e-9)
+    for names, value in each.items():
+        assert stated[names] == pytest.approx(np.exp(value - total), abs=0.03), names
+    for name in NAMES:
+        assert found.probability(name) == pytest.approx(sum(p for names, p in stated.items() if name in names))
+
+
 def test_residuals_below_the_known_noise_are_no_evidence_of_less_noise() -> None:
     dense = Dense(3, {"a": 0.0, "b": 0.0, "c": 0.0})
     problem = dense.problem()

@@ -135,6 +135,18 @@ def test_what_a_wrong_table_does_to_a_fit_is_what_its_budget_says(
     assert stated.max() > 1e-6
 
 
+def test_a_wrong_azimuth_changes_a_gyroscope_on_a_table_with_a_place_as_the_budget_says() -> None:
+    stages, u, place = STAGES["reference"]["gyroscope"], 0.1, {"latitude_deg": 40.0, "azimuth_deg": 25.0}
+    recordings = recordings_of("gyroscope")
+    found = run_stages("gyroscope", stages, recordings, settings(**place, azimuth_accuracy_deg=u))
+    lines = {line["source"]: line["contribution"] for line in found.budget["contributions"]}
+    turned = run_stages("gyroscope", stages, recordings, settings(**place | {"azimuth_deg": 25.0 + u}))
+    stated = np.array(lines["Earth's rotation"])
+    assert np.abs(values(turned) - values(found)) == pytest.approx(stated, rel=5e-3, abs=5e-3 * stated.max())
+    # 0.1 deg of the 15.04 deg/h times cos 40 deg that point along level x or y
+    assert 0.1 < stated[:3].max() / (np.radians(u) * 15.041 / 3600.0 * np.cos(np.radians(40.0))) <= 1.0
+
+
 @pytest.mark.parametrize("method", ["reference", "staged", "cholesky"])
 def test_a_wrong_clock_changes_a_gyroscope_whose_table_logs_the_angle_alone_as_the_budget_says(method: str) -> None:
     stages, ppm = STAGES[method]["gyroscope"], 1000.0

@@ -58,6 +58,10 @@ OWN = {
             "unit": "1",
         },
         "q": {"formula": "band(alphax, -500, 500) * (temperature - 25) + step(fz) * abs(u) ** 0.5", "unit": "1"},
+        "r": {
+            "formula": "step(fx - fx) + 2 * band(fy - fy, 0, 1) + 4 * band(1 + 0 * fz, 0, 1)",
+            "unit": "1",
+        },  # at ends
         "v": {"formula": ["sin(radians(wz))", "-cos(fy) / (1 + fx ** 2)", "sign(wx) * log(2 + abs(fy))"], "unit": "1"},
     },
 }

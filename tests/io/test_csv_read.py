@@ -30,6 +30,15 @@ def read_back(folder: Path, ingest: dict[str, Any], name: str = "accel_x") -> Re
     return read_recordings(procedure(name), ingest, SENSOR, folder)[0]
 
 
+def test_rows_that_are_counted_keep_the_rate_to_the_last(tmp_path: Path, canonical: dict[str, Any]) -> None:
+    """An interval of 9.765625 us is no whole number of ns: rounded, it would lose 38 ppm."""
+    canonical["csv"]["columns"]["time"] = None
+    canonical["csv"]["rate_hz"] = 102_400.0
+    write_canonical_csv(tmp_path / "accel_x.csv", make_recording(5000))
+    read = read_back(tmp_path, canonical)
+    assert read.time_ns.tolist() == [round(i * 10**9 / 102_400) for i in range(5000)]
+
+
 def test_canonical_csv_comes_back_bit_for_bit(tmp_path: Path, canonical: dict[str, Any]) -> None:
     written = make_recording()
     write_canonical_csv(tmp_path / "accel_x.csv", written)

@@ -77,6 +77,13 @@ def test_a_summary_that_counts_other_messages_is_refused(change: int, *, of_chan
         read_messages(stream.getvalue())
 
 
+def test_a_summary_with_a_wrong_checksum_is_refused(tmp_path: Path) -> None:
+    damaged = bytearray(log_of("zstd", tmp_path))
+    damaged[-12] ^= 1  # the last field of the footer, before eight magic bytes
+    with pytest.raises(IngestError, match="the checksum of the summary is wrong"):
+        read_messages(bytes(damaged))
+
+
 def test_cut_log_without_chunks_is_refused_even_on_request(tmp_path: Path) -> None:
     whole = log_of("unchunked, data checksum", tmp_path)
     with pytest.raises(IngestError, match="not every message lies in a chunk with a checksum") as caught:

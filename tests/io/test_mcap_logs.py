@@ -122,6 +122,17 @@ def test_file_of_the_official_encoder_is_read_in_house_units(tmp_path: Path) -> 
     assert {n.code for n in log.notes} == {"N-INTERPOLATED", "N-UNMATCHED", "N-IGNORED"}
 
 
+def test_a_temperature_is_that_of_the_time_of_its_own_stamps_and_held_at_the_ends(tmp_path: Path) -> None:
+    warmth = [
+        ("/temperature", TEMPERATURE, {"header": header(s), "temperature": value, "variance": 0.0})
+        for s, value in ((1, 20.0), (3, 22.0))
+    ]
+    write_ros2(tmp_path / "accel_x.mcap", *(("/imu", IMU, imu(s)) for s in range(5)), *warmth)
+    found = read(tmp_path).temperature
+    assert found is not None
+    np.testing.assert_allclose(found, [20.0, 20.0, 21.0, 22.0, 22.0])
+
+
 MINUS_ONE = [-1.0, *[0.0] * 8]
 IMUS = [("/a", IMU, imu(s)) for s in (1, 2)]
 ABSENT = {"angular_velocity_covariance": MINUS_ONE, "linear_acceleration_covariance": MINUS_ONE}

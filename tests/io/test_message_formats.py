@@ -115,6 +115,12 @@ def test_ulog_agrees_with_pyulog(tmp_path: Path) -> None:
     )
 
 
+def test_the_loggers_times_of_a_ulog_are_those_of_its_messages(tmp_path: Path) -> None:
+    path = write_ulog(tmp_path / "log.ulg", Truth())
+    stamps = ULog(str(path)).get_dataset("sensor_combined").data["timestamp"].astype(np.int64)
+    assert read(path, "px4_ulog", time_source="log_time").time_ns.tolist() == (1000 * stamps).tolist()
+
+
 def test_the_raw_messages_of_one_sensor_of_a_board(tmp_path: Path) -> None:
     """``sensor_accel`` and ``sensor_gyro`` of instance 1, as PX4 names their fields."""
     truth = Truth()

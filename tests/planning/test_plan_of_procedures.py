@@ -62,6 +62,8 @@ def test_the_other_direction_helps_most_where_turns_go_in_one(one_way: dict[str,
     assert lines[1] == f"  1. make every turn in the other direction too (--both-directions): {best.minutes:+.1f} min"
     assert "shows scale_factor_asymmetry, vibration_rectification of the gyroscope" in lines[2]
     assert len(lines) == 7
+    by_option = {gain.change.options: gain for gain in gains}
+    assert 0.5**0.5 - 0.01 < by_option["--dwell 2"].factor < 1.0  # sizes fall by the root of the time at most
     assert "--both-directions" in [change.options for change in changes(ONE_WAY)]
     assert "--both-directions" not in [change.options for change in changes(BOTH_WAYS)]
 

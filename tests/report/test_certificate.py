@@ -129,6 +129,14 @@ def test_each_result_carries_the_uncertainty_of_the_calibrations_budget(unit: Un
     assert "wobble is not stated" in page
 
 
+def test_the_errors_before_and_after_are_those_of_the_readings_and_of_the_last_step(unit: Unit) -> None:
+    for result in report_of(unit, STATED)["measurementResults"]:
+        first, *_, last = unit.validation[result["name"]]["steps"]
+        for key, expected in (("beforeAdjustment", first), ("afterAdjustment", last)):
+            assert result[key].items() <= expected.items()
+        assert result["afterAdjustment"]["rms_error"] < result["beforeAdjustment"]["rms_error"]
+
+
 def test_the_accuracy_of_gravity_is_asked_for(unit: Unit) -> None:
     report = report_of(unit, STATED, gravity_accuracy_g=None)
     assert [m["key"] for m in report["missing"]] == ["table.gravity_accuracy_g"]

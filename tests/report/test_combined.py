@@ -69,6 +69,13 @@ def test_the_joint_estimate_of_drawn_calibrations_is_inside_its_uncertainty(scat
     assert np.mean(np.square(found_r)) == pytest.approx(expected, rel=0.4 if scatter == 0.0 else 0.1)
 
 
+def test_more_calibrations_lower_the_noise_and_not_the_error_of_the_bench() -> None:
+    count = 16
+    found, _ = joint([document(f"U{k}", TRUTH) for k in range(count)])
+    variance = np.diag(found["S1"]["accelerometer"]["covariance"]["values"])
+    assert variance == pytest.approx(np.full(12, OWN_U**2 / count + BENCH_U**2), rel=1e-6)
+
+
 def test_small_and_exact_parameters_stand_beside_large_ones() -> None:
     """A clock rate in ppm has 1e14 times the variance of a bias; the matrix is stated without uncertainty."""
     documents = []

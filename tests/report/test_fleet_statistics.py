@@ -48,6 +48,12 @@ def test_a_unit_far_from_its_siblings_is_named_and_no_other() -> None:
     assert (told["drift"], told["lots"], told["repeatability"]) == ([], [], [])
 
 
+def test_the_farthest_unit_is_named_first_on_whichever_side_it_is() -> None:
+    values = np.random.default_rng(1).normal(3.0, 0.5, 400)
+    values[[17, 30, 50]] = 9.0, -6.0, 7.5
+    assert [f["name"] for f in fleet_statistics(*fleet(values))["far"]] == ["U30", "U17", "U50"]
+
+
 def test_units_of_another_model_are_no_siblings() -> None:
     rng = np.random.default_rng(2)
     one, two = fleet(rng.normal(0.0, 1.0, 30)), fleet(rng.normal(100.0, 1.0, 30), "stim300")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from pipeline.records import Noise, SensorCalibration
 from pipeline.validation.expected_error import LinearizedSamples, expected_rms_error
@@ -55,8 +56,12 @@ def interval(
     *,
     scale: float = 0.0,
     of_scale: float = np.inf,
+    correlated: float = 1.0,
 ) -> tuple[float, float]:
-    """Return the interval; ``bias, scale``: standard uncertainties, of ``freedom`` and ``of_scale``."""
+    """Return the interval; ``bias, scale``: standard uncertainties, of ``freedom`` and ``of_scale``.
+
+    ``correlated``: samples of the noise that count as one.
+    """
     covariance, J = np.zeros((12, 12)), np.zeros((SAMPLES, 3, 12))
     covariance[:3, :3] = bias**2 * np.eye(3)
     J[:, :, :3] = -np.eye(3)
@@ -67,8 +72,20 @@ def interval(
     smallest = min(freedom, of_scale)
     found = SensorCalibration("gyroscope", covariance=covariance, degrees_of_freedom=smallest, freedom=each)
     spread = [np.broadcast_to(v**2, (SAMPLES, 3)) for v in (noise.white, noise.wander)]
-    held_out = LinearizedSamples(INTERVAL * np.arange(SAMPLES), *spread, truth, J, SAMPLES)
+    held_out = LinearizedSamples(INTERVAL * np.arange(SAMPLES), *spread, truth, J, SAMPLES, correlated)
     return expected_rms_error(found, [held_out], noise, {})
+
+
+def test_the_interval_holds_99_percent_of_units_whose_noise_a_filter_has_correlated() -> None:
+    rng, truth, keep = np.random.default_rng(6), truth_of(1.0), 0.9
+    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((UNITS, SAMPLES + 100, 3))
+    error = WHITE * lfilter([1.0], [1.0, -keep], drive, axis=1)[:, 100:]
+    rms = np.sqrt(np.mean((np.linalg.norm(truth + error, axis=2) - 1.0) ** 2, axis=1))
+    noise = Noise(np.full(3, WHITE), np.zeros(3), TAU, "static", length=1e9)
+    low, high = interval(truth, noise, 0.0, correlated=(1.0 + keep**2) / (1.0 - keep**2))  # sum of squared correlations
+    assert np.mean(rms > high) < 0.015
+    assert np.mean(rms < low) < 0.015
+    assert high < 1.35 * np.quantile(rms, 0.995)
 
 
 def test_what_is_less_known_widens_the_interval() -> None:

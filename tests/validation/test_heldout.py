@@ -398,6 +398,18 @@ def test_limits_become_pass_or_fail() -> None:
     assert validate(c, [recording], noise_of("accelerometer"), SETTINGS)["pass"] is None
 
 
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_the_limit_of_the_largest_error_concerns_both_signs(factor: float) -> None:
+    c = calibration("accelerometer")
+    recording = read(held_out(300), accelerometer=c)
+    assert recording.accelerometer is not None
+    recording.accelerometer[150] *= factor
+    limits = {"accelerometer": {"held_out_max_abs_error": 0.05}}
+    part = validate(c, [recording], noise_of("accelerometer"), {**SETTINGS, "limits": limits})
+    assert part["pass"] is False
+    assert part["limits"][0]["value"] == pytest.approx(0.1, rel=0.1)
+
+
 def test_an_unknown_limit_is_refused() -> None:
     c = calibration("accelerometer")
     settings = {**SETTINGS, "limits": {"accelerometer": {"beauty": 1.0}}}
