@@ -1,29 +1,30 @@
-"""Faults of single recordings: a static recording that moves or has other noise, axes that do not vary or are copies.
+"""Check single recordings: a static one that moves or has other noise, and axes that do not vary or are copies.
 
 A static recording determines the noise of all results, so it must be at rest. It is cut into blocks of a second, of
 16 samples at least. A block moves where
 
-    a sensor scatters in it by more than 4 times the usual scatter, and than exp(5 s) times its median, where s is the
-        standard deviation of the logarithm of the scatters by their quartiles: noise with a memory,
-    its mean is farther from the recording's median than the slow changes of a bias can be at rest, or
-    the table's log turns by 0.02 deg/s or more
+    a sensor scatters in it by more than 4 times the usual scatter and more than exp(5 s) times the median scatter,
+        where s is the standard deviation of the logarithm of the scatters by their quartiles (correlated noise),
+    its mean differs from the recording's median by more than a bias can change slowly at rest, or
+    the table turns by 0.02 deg/s or more
 
-The usual scatter is the first quartile of the blocks', and no more than twice that of the table's rests in the unit's
-other recordings, or four times the sensor file's white noise where there are none. Slow changes by the sensor file's
-limits: six standard deviations of ``bias_wander``, ``bias_drift`` over the recording, ``bias_temperature`` times the
-range of the temperature, ``warm_up``; and 6 times the usual scatter, as if all noise of a block had a memory.
+The usual scatter is the first quartile of the blocks. Its limit is twice the scatter of the table's rests in the unit's
+other recordings or twice the sensor file's white noise, whichever is larger; without rests, four times that white
+noise. The slow change of a bias is at most the sum of six standard deviations of ``bias_wander``, ``bias_drift`` over
+the recording, ``bias_temperature`` times the range of the temperature, ``warm_up`` (limits of the sensor file), and 6
+times the usual scatter, as for fully correlated noise.
 
-A static recording is held against the rests of the unit's other recordings, which are those of the table's log, or the
-quietest tenth of a recording by hand. It gets the note ``N-REFERENCE`` where
+A static recording is compared with the rests of the unit's other recordings, by the table's log, or with the quietest
+tenth of a recording by hand. It gets the note ``N-REFERENCE`` where
 
     its scatter is more than twice theirs on an axis,
     its white noise, by successive differences, is less than half of theirs on all axes, or
-    its gyroscope's mean is outside the range of the table's rests by more than 6 standard deviations of a rest's mean,
-        Earth's rate and the sensor file's limits of a bias that changes: the slow changes above, ``g_sensitivity`` and
-        ``g_squared_sensitivity``, as the unit may lie in another attitude.
+    its gyroscope's mean is outside the range of the table's rests by more than the sum of 6 standard deviations of a
+        rest's mean, Earth's rate, the slow change above and, as the unit may lie in another attitude,
+        ``g_sensitivity`` and ``g_squared_sensitivity``
 
-Its noise and bias are then not those of the others: it may be of another unit. White noise grows with the square root
-of the sampling rate, which is allowed for.
+It may then be a recording of another unit. White noise grows with the square root of the sampling rate: the limits
+include the ratio of the rates.
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ if TYPE_CHECKING:
 
 
 BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
-FEWEST_OF_REST, RESTS = 8, 3  # samples of a rest, and rests of a recording, by which the usual scatter is told
+FEWEST_OF_REST, RESTS = 8, 3  # samples of a rest, and rests of a recording, that determine the usual scatter
 LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer than 1 of 10^9 blocks
-QUARTER_SIZE, UNUSUAL, WIDEST = 0.6745, 5.0, 0.4  # quartile of a normal distribution; its standard deviations
-OF_RESTS, OF_SHEET = 2.0, 4.0  # a bench that runs is louder than a unit on a desk; data sheets state typical noise
+QUARTER_SIZE, UNUSUAL, WIDEST = 0.6745, 5.0, 0.4  # quartile of a normal distribution; factor and limit of s
+OF_RESTS, OF_SHEET = 2.0, 4.0  # a running bench adds noise to that on a desk; data sheets state typical noise
 STEPPED_DEG = 0.1  # between two samples of a rest: five times what RATE_AT_REST_DPS turns in a second
 SIGNIFICANT = 6.0  # standard deviations, as in pipeline.signal.rests
-FEWEST_SAMPLES = 60  # as of pipeline.estimation.noise, which tells no noise by fewer
+FEWEST_SAMPLES = 60  # fewest that determine the noise in pipeline.estimation.noise
 SHORTEST_S = 10.0  # in which a wander of 100 s changes by a third of its size
 UNKNOWN_DEGC = 5.0  # change of temperature in some minutes of a room, where none is logged
 HALF_TURN_DEG = 180.0  # in which both axes across a level turn vary by 1 g at least
@@ -66,9 +67,9 @@ FEWEST = 32  # samples, of which an axis is copied or stays
 
 
 def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
-    """Return the recordings of a unit, of a static one only the part that rests, with the note ``N-MOVED``.
+    """Return the recordings of a unit; of a static one only the part at rest, with the note ``N-MOVED``.
 
-    ``settings`` holds the section ``sensor``. ``IngestError``: too little of a static recording rests.
+    ``settings``: section ``sensor``. ``IngestError``: too little of a static recording is at rest.
     """
     if all(r.role != "static" for r in recordings):
         return list(recordings)
@@ -85,7 +86,7 @@ def _doubted(
     rests_of: Mapping[str, Values],
     sensor_configs: Mapping[str, Any],
 ) -> Recording:
-    """Return a static recording, with the note ``N-REFERENCE`` where it contradicts the rests of the others."""
+    """Return a static recording, with the note ``N-REFERENCE`` if it contradicts the rests of the others."""
     others = [r for r in recordings if r.role != "static" and r.samples > 1]
     if recording.samples < FEWEST_SAMPLES or not others:
         return recording
@@ -99,9 +100,9 @@ def _doubted(
         if reading is None or not len(rests) or not len(blocks := _blocks(recording, reading)):
             continue
         step = _digit(reading)
-        own, usual = median(_moments(blocks)), median(rests)
-        louder = float(np.max(own[0] / np.maximum(usual[0], step)))
-        quieter = float(np.min(usual[1] / np.maximum(own[1], step)))
+        static, usual = median(_moments(blocks)), median(rests)
+        louder = float(np.max(static[0] / np.maximum(usual[0], step)))
+        quieter = float(np.min(usual[1] / np.maximum(static[1], step)))
         if louder > OF_RESTS * faster:
             details.append(
                 f"the {sensor} scatters {louder:.3g} times as much as in the rests of the other recordings; "
@@ -115,7 +116,7 @@ def _doubted(
         sensor_config = sensor_configs.get(sensor)
         if sensor == "gyroscope" and sensor_config:
             means = rests[:, 2]
-            away = float(np.max([means.min(axis=0) - own[2], own[2] - means.max(axis=0)]))
+            away = float(np.max([means.min(axis=0) - static[2], static[2] - means.max(axis=0)]))
             noise = SIGNIFICANT * float(usual[0].max()) / np.sqrt(FEWEST_OF_REST)
             most = noise + _bias_change([recording, *others], sensor_config)
             if away > most:
@@ -128,18 +129,17 @@ def _doubted(
 
 
 def _digit(reading: Values) -> Values:
-    """Return the smallest change of each axis between two samples, infinity where it stays: (3,) array."""
+    """Return the smallest change of each axis between two samples, infinity for a constant one: (3,) array."""
     step = np.abs(np.diff(reading, axis=0))
     return np.asarray(np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
 
 
 def _bias_change(recordings: Sequence[Recording], sensor_config: Mapping[str, Any]) -> float:
-    """Return by how much the gyroscope's reading at rest can change between recordings, deg/s."""
+    """Return the largest plausible change of the gyroscope's reading at rest between recordings, deg/s."""
     effects = sensor_config.get("effects") or {}
     attitude = 2.0 * float(effects.get("g_sensitivity") or 0.0) + float(effects.get("g_squared_sensitivity") or 0.0)
-    warmth = [r.temperature for r in recordings]
-    known = [t for t in warmth if t is not None]
-    change = float(np.ptp(np.concatenate(known))) if len(known) == len(warmth) else UNKNOWN_DEGC
+    known = [r.temperature for r in recordings if r.temperature is not None]
+    change = float(np.ptp(np.concatenate(known))) if len(known) == len(recordings) else UNKNOWN_DEGC
     duration = max(r.time[-1] for r in recordings) - min(r.time[0] for r in recordings)
     duration = max(float(duration), sum(float(r.time[-1] - r.time[0]) for r in recordings))
     return attitude + 2.0 * EARTH_RATE_DPS + _slow(sensor_config, change, duration)
@@ -153,6 +153,7 @@ def _blocks(recording: Recording, values: Values) -> Values:
 
 
 def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_configs: Mapping[str, Any]) -> Recording:
+    """Return the longest part of a static recording at rest, with a note if it is not all of it."""
     if recording.samples < 2 * FEWEST_OF_BLOCK:
         return recording
     count, size = _blocks(recording, recording.time).shape
@@ -168,9 +169,9 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_config
         if reading is None:
             continue
         blocks = _blocks(recording, reading)
-        found, what = _moving(recording, sensor, blocks, sensor_configs.get(sensor) or {}, rests_of[sensor])
-        why = why or (what if found.any() else "")
-        moving |= found
+        moves, what = _moving(recording, sensor, blocks, sensor_configs.get(sensor) or {}, rests_of[sensor])
+        why = why or (what if moves.any() else "")
+        moving |= moves
     if not moving.any():
         return recording
     parts = [(a * size, b * size if b < count else recording.samples) for a, b in runs(~moving)]
@@ -196,7 +197,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_config
 def _moving(
     recording: Recording, sensor: str, blocks: Values, sensor_config: Mapping[str, Any], rests: Values
 ) -> tuple[Mask, str]:
-    """Return which blocks a sensor moves in, and the largest sign of it in words."""
+    """Return in which blocks a sensor moves, and the strongest evidence of it in words."""
     unit = SENSOR_UNITS[sensor]
     means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
     usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
@@ -216,14 +217,12 @@ def _moving(
     moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)
     if np.any(loud > louder):
         return moving, f"the {sensor} scatters {loud.max():.3g} times as usual"
-    return (
-        moving,
-        f"the {sensor} changes by {away.max():.3g} {unit}, a resting one by {allowed.max():.3g} {unit} at most",
-    )
+    what = f"the {sensor} changes by {away.max():.3g} {unit}, a resting one by {allowed.max():.3g} {unit} at most"
+    return moving, what
 
 
 def _slow(sensor_config: Mapping[str, Any], change: float, duration: float) -> float:
-    """Return by how much a bias can change at rest, for a change of temperature (degC) and a duration (s)."""
+    """Return the largest plausible change of a bias at rest, for a change of temperature (degC) and a duration (s)."""
     effects = sensor_config.get("effects") or {}
     return (
         SIGNIFICANT * float(sensor_config.get("bias_wander") or 0.0)
@@ -234,8 +233,8 @@ def _slow(sensor_config: Mapping[str, Any], change: float, duration: float) -> f
 
 
 def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
-    """Return for each sensor ``_moments`` of the rests of the table's log: (k, 3, 3) array; k = 0 without any."""
-    found: dict[str, list[Values]] = {sensor: [np.zeros((0, 3, 3))] for sensor in SENSORS}
+    """Return ``_moments`` of the rests of the table's log for each sensor: (k, 3, 3) array; k = 0 without rests."""
+    moments: dict[str, list[Values]] = {sensor: [np.zeros((0, 3, 3))] for sensor in SENSORS}
     for recording in recordings:
         if recording.role == "static" or recording.axis is None:
             continue
@@ -247,12 +246,12 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
         for sensor in SENSORS:
             reading = recording.reading(sensor)
             if reading is not None:
-                found[sensor] += [_moments(reading[None, rest]) for rest in rests[:: len(rests) // RESTS + 1]]
-    return {sensor: np.concatenate(moments) for sensor, moments in found.items()}
+                moments[sensor] += [_moments(reading[None, rest]) for rest in rests[:: len(rests) // RESTS + 1]]
+    return {sensor: np.concatenate(parts) for sensor, parts in moments.items()}
 
 
 def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Values:
-    """Return ``_moments`` of the quietest tenth of each recording by hand, whose mean is not known (NaN)."""
+    """Return ``_moments`` of the quietest tenth of each recording by hand, with an unknown mean (NaN)."""
     found = [np.zeros((0, 3, 3))]
     for recording in recordings:
         reading = recording.reading(sensor) if recording.role == "rests" else None
@@ -266,27 +265,26 @@ def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Values:
 def _moments(blocks: Values) -> Values:
     """Return scatter, white noise and mean of (k, n, 3) blocks: (k, 3, 3) array.
 
-    The white noise is that of successive differences, to which slow changes add nothing (J. von Neumann, Annals of
-    Mathematical Statistics 12 (1941), 367-395).
+    The white noise by successive differences does not include slow changes (J. von Neumann, Annals of Mathematical
+    Statistics 12 (1941), 367-395).
     """
     white = np.sqrt(np.mean(np.diff(blocks, axis=1) ** 2, axis=1) / 2.0)
     return np.stack([blocks.std(axis=1, ddof=1), white, blocks.mean(axis=1)], axis=1)
 
 
 def check_axes(recordings: Sequence[Recording]) -> None:
-    """Refuse an axis that stays while the table turns, or that is a copy of another."""
+    """Refuse an axis that is constant while the table turns, or that is a copy of another."""
     for recording in recordings:
-        if recording.samples < FEWEST:
-            continue
-        _check_copies(recording)
-        if recording.axis is not None:
-            _check_spans(recording)
+        if recording.samples >= FEWEST:
+            _check_copies(recording)
+            if recording.axis is not None:
+                _check_spans(recording)
 
 
 def _check_copies(recording: Recording) -> None:
-    for sensor, one, two in itertools.product(SENSORS, range(3), range(3)):
+    for sensor, (one, two) in itertools.product(SENSORS, itertools.combinations(range(3), 2)):
         reading = recording.reading(sensor)
-        if reading is None or one >= two:
+        if reading is None:
             continue
         a, b = reading[:, one], reading[:, two]
         changing = a[1:] != a[:-1]
@@ -310,24 +308,21 @@ def _check_spans(recording: Recording) -> None:
         return
     if recording.gyroscope is not None:
         required, spans = _span(rate), [_span(w) for w in recording.gyroscope.T]
-        turned_other = max(spans) >= SPANNED * required and int(np.argmax(spans)) != axis  # the mounting's matter
+        turned_other = max(spans) >= SPANNED * required and int(np.argmax(spans)) != axis  # see check_mounting
         if required > LEAST_RATE_DPS and spans[axis] < SPANNED * required and not turned_other:
             raise _stuck(recording, TRIADS["gyroscope"][axis], spans[axis], required, "deg/s")
-    if recording.accelerometer is None or _turned(recording, rate) < HALF_TURN_DEG:
+    angle = recording.table_angle
+    if angle is None:
+        angle = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))
+    if recording.accelerometer is None or np.ptp(angle) < HALF_TURN_DEG:
         return
     spans = [_span(f) for f in recording.accelerometer.T]
     across = [(axis + 1) % 3, (axis + 2) % 3]
     if max(spans[i] for i in across) < LEVEL_G or spans[axis] > LEVEL_G:
-        return  # a turn about the vertical, or about another axis: the mounting's matter
+        return  # a turn about the vertical, or about another axis: see check_mounting
     for i in across:
         if spans[i] < SPANNED:
             raise _stuck(recording, TRIADS["accelerometer"][i], spans[i], 1.0, "g")
-
-
-def _turned(recording: Recording, rate: Values) -> float:
-    if recording.table_angle is not None:
-        return float(np.ptp(recording.table_angle))
-    return float(np.ptp(np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))))
 
 
 def _span(values: Values) -> float:

@@ -1,52 +1,69 @@
-"""Mounting of the unit in one turn: as stated in the configuration, and as found in the recording.
+"""Find the mounting of the unit in one turn, and whether both sensors are read in one right-handed frame.
+
+The logged table angle A becomes the angle of the convention of ``pipeline``:
 
     A' = s (A - zero) + face
 
 where
 
-A    : angle that the table logs
-s    : +1 where it counts right-handed about the body axis that the procedure names, else -1
-zero : what the table logs while the upward face points up
-face : 0, 90, 180 or 270 deg, the angle at which that face points up by the convention of ``pipeline``
-A'   : angle by the convention, with which everything after ingest works
+s    : +1 if A counts right-handed about the body axis that the procedure names, else -1
+zero : logged angle at which the upward face points up
+face : 0, 90, 180 or 270 deg, the angle of the convention at which that face points up
 
-The mounting is found before any calibration. In a turn about a level axis the accelerometer reads
+Gravity determines them before any calibration. In a turn about a level axis the accelerometer reads
 
-    f(A) = c + p cos A + q sin A,    p = K u,   q = K (u x a),   c = b + K (component of gravity along a) + d(r)
+    f(A) = c + p cos A + q sin A + d(r),    p = K u,   q = K (u x a),   c = b + K (component of gravity along a)
 
 where
 
-d : what goes with the rate r: lever arms (r^2), vibration (|r|), dependence on the rate (r), in a turn between rests;
-    subtracted by least squares with 1, r, |r| and r^2
 A : table angle, counted right-handed about body axis a
 u : body axis that points up at A = 0
 K : inverse of the calibration matrix, the unit matrix to a few percent; b: bias
+d : in a turn between rests, a combination of r (rate dependence), |r| (vibration) and r^2 (lever arms), with rate r
 
-so ``q x p`` points along the turn axis, and p and q give the upward face and the zero. An angle that counts the other
-way turns the sign of q. The gyroscope's gain against the table's rate r in the same rows,
+``q x p`` points along the turn axis, and p and q determine face and zero. If the angle counts left-handed, q changes
+its sign. The gain of the gyroscope against the table's rate points along the turn axis, too:
 
     k = sum((w - mean w) (r - mean r)) / sum((r - mean r)^2)
 
-points along the turn axis as well. Means are subtracted because a bias of some deg/s may exceed a slow table's rate;
-where the rate does not change, they stay, and only a rate beyond any bias tells something.
+The means are subtracted because a bias of some deg/s may exceed the rate of a slow table. At constant rate they are not
+subtracted, and only a rate above any bias is evidence.
+
+If the sensors read ``M_a f`` and ``M_g w`` (signed permutations of the true vectors), gravity turns about
+``n = det(M_a) M_a t`` in a turn about t, and the gyroscope's gain is ``k = M_g t``. So all turns have
+
+    n = D k,   D = det(M_a) M_a M_g^T,   det D = det M_g
+
+and D is the unit matrix where both sensors are read in one right-handed frame. On a table, the stated faces and turn
+axes give M_a:
+
+    M_a = signed permutation nearest to sum (p u^T + q (u x a)^T)
+
+By hand, the gyroscope's rates rotate gravity from rest to rest with the right D: ``du/dt = -(D w) x u``. There, a
+mirrored accelerometer cannot be detected, because the opposite of gravity rotates alike.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pipeline.errors import IngestError
+from pipeline.io.channel_table import axis_matrix
+from pipeline.io.gravity_rotation import FAILS_DEG, FEWEST_MOVES, MOST_SAMPLES, misfits_deg, moves_of
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.records import AXES
 from pipeline.signal.rests import still_samples
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Mask, Recording, Values
+    from pipeline.io.gravity_rotation import Move
+    from pipeline.records import Recording, Values
 
 FEWEST = 10  # samples, five times the unknowns of an angle
 ACROSS = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
@@ -59,11 +76,14 @@ CHANGING = 0.1  # standard deviation over largest rate, from which a rate change
 SLOWEST_DPS = 0.1  # standard deviation of a rate that can be followed
 LARGEST_BIAS_DPS = 20.0  # zero-rate output of consumer MEMS (MPU-6050 product specification)
 ALIKE = 0.9  # correlation of a gyroscope axis with the rate from which its gain is evidence
+# From the nearest axis: beyond cross-axis sensitivity and seats, below the 45 deg between two axes.
+CLEAR_DEG = 30.0
+FEWEST_MISSED, CLEARLY_FEWER = 2, 4  # moves that gravity does not follow: one may be a knock
 
 
 @dataclass(frozen=True)
 class Bench:
-    """How a recording's bench holds the unit, and how its table counts the angle."""
+    """Mounting of the unit in one turn, and how the table counts the angle."""
 
     axis: str  # body axis turned about
     up: str  # body axis, with its sign, that points up where the table logs ``zero_deg``
@@ -72,33 +92,30 @@ class Bench:
 
     @property
     def vertical(self) -> bool:
-        """Whether the turn axis points up or down, so that gravity stays as it is in the body."""
+        """Whether the turn axis is vertical: gravity is then constant in the body."""
         return self.up[1] == self.axis
 
     @property
     def conventional(self) -> bool:
-        """Whether the logged angle is the convention's."""
+        """Whether the logged angle is that of the convention."""
         return self.sense == 1 and self.zero_deg == 0.0 and self.up == usual_up(self.axis)
 
     @property
     def offset(self) -> float:
-        """What is added to ``sense * A`` for the convention's angle, deg."""
+        """Convention's angle minus ``sense * A``, deg."""
         a, up = AXES.index(self.axis), signed_axis(self.up)
         face = 0.0 if self.vertical else float(np.degrees(np.arctan2(up @ ACROSS[a], up @ UP_AT_ZERO[a])))
         return face - self.sense * self.zero_deg
 
 
 def stated_bench(entry: Mapping[str, Any], table: Mapping[str, Any], axis: str) -> Bench:
-    """Return what a recording's entry in the procedure says of its bench; sense and zero are the table's else."""
-    own = {k: table.get(k) if entry.get(k) is None else entry[k] for k in ("sense", "zero_deg")}
-    return Bench(axis, entry.get("up") or usual_up(axis), int(own["sense"] or 1), float(own["zero_deg"] or 0.0))
+    """Return the mounting that a recording's entry in the procedure states; the table states sense and zero else."""
+    stated = {k: table.get(k) if entry.get(k) is None else entry[k] for k in ("sense", "zero_deg")}
+    return Bench(axis, entry.get("up") or usual_up(axis), int(stated["sense"] or 1), float(stated["zero_deg"] or 0.0))
 
 
 def found_bench(fit: TurnFit, axis: str) -> Bench | None:
-    """Return what gravity says of a turn about a known, level axis; None where it says nothing.
-
-    The sense is that of q x p along the axis, the zero what turns p and q onto the nearest face with least squares.
-    """
+    """Return the mounting by gravity in a turn about a known level axis; None where gravity does not determine it."""
     if fit.gravity is None or fit.turn_axis is None:
         return None
     a = AXES.index(axis)
@@ -113,29 +130,29 @@ def angle_ahead(axis: int, p: Values, q: Values) -> float:
 
 
 def bench_of(axis: str, sense: int, at_zero: float) -> Bench:
-    """Return the bench with the nearest face and the smallest zero; ``at_zero``: the convention's angle at angle 0."""
+    """Return the mounting with the smallest zero; ``at_zero``: the convention's angle at logged angle 0, deg."""
     a, face = AXES.index(axis), 90.0 * round(at_zero / 90.0)
     up = nearest_axis(np.cos(np.radians(face)) * UP_AT_ZERO[a] + np.sin(np.radians(face)) * ACROSS[a])
     return Bench(axis, up, sense, sense * (face - at_zero))
 
 
-def off_at_rest(recording: Recording, bench: Bench) -> float | None:
-    """Return by how much gravity is ahead of the stated bench while the table rests, deg; None where it never does.
+def off_at_rest(recording: Recording, bench: Bench) -> float:
+    """Return by how much gravity at rest is ahead of the stated mounting, deg; 0 where the table never rests.
 
-    A bias of 0.1 g makes it 6 deg where all rests are at one angle.
+    Where all rests are at one angle, a bias of 0.1 g changes it by 6 deg.
     """
     angle, force = recording.table_angle, recording.accelerometer
     if angle is None or force is None:
-        return None
+        return 0.0
     still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.valid
     if np.sum(still) < FEWEST:
-        return None
+        return 0.0
     A = np.radians(bench.sense * angle[still] + bench.offset)
     return angle_ahead(AXES.index(bench.axis), np.cos(A) @ force[still], np.sin(A) @ force[still])
 
 
 def by_convention(fit: TurnFit, bench: Bench) -> Gravity | None:
-    """Return c, p and q of a turn against the convention's angle; None where gravity does not tell."""
+    """Return c, p and q against the convention's angle; None where gravity does not turn or was not fitted."""
     if fit.gravity is None or bench.vertical or fit.vertical is not None:
         return None
     c, s = np.cos(np.radians(bench.offset)), np.sin(np.radians(bench.offset))
@@ -150,24 +167,27 @@ def usual_up(axis: str) -> str:
 
 def signed_axis(name: str) -> Values:
     """Return the unit vector of ``+x``, ``-z`` ..: (3,) array."""
-    vector = np.zeros(3)
-    vector[AXES.index(name[1])] = 1.0 if name[0] == "+" else -1.0
-    return vector
+    return np.asarray(np.eye(3)[AXES.index(name[1])] * (1.0 if name[0] == "+" else -1.0))
 
 
 def nearest_axis(direction: Values) -> str:
-    """Return the signed axis that a direction is nearest to."""
+    """Return the signed axis nearest to a direction."""
     largest = int(np.argmax(np.abs(direction)))
     return f"{'+' if direction[largest] > 0.0 else '-'}{AXES[largest]}"
 
 
 def off_axis_deg(direction: Values) -> float:
-    """Return the angle between a direction and the signed axis that it is nearest to, deg."""
+    """Return the angle between a direction and the nearest signed axis, deg."""
     return float(np.degrees(np.arccos(np.clip(np.max(np.abs(direction)) / np.linalg.norm(direction), -1.0, 1.0))))
 
 
+def unit(vector: Values) -> Values:
+    """Return a vector of length 1."""
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))
+
+
 class Gravity(NamedTuple):
-    """c, p and q above: (3,) arrays, g."""
+    """The fitted c, p and q: (3,) arrays, g."""
 
     constant: Values
     cosine: Values
@@ -176,13 +196,13 @@ class Gravity(NamedTuple):
 
 @dataclass(frozen=True)
 class TurnFit:
-    """Evidence of one recording."""
+    """What gravity and gyroscope show of the mounting in one turn."""
 
-    gravity: Gravity | None  # None where the angle does not cover enough
-    gain: Values | None  # (3,), k above; None where the rate does not tell
-    mean_rate: float  # deg/s, of the angle over the samples; with a time offset it is a part of the zero
-    arc: float  # deg
-    unknown: str = ""  # why gravity tells nothing
+    gravity: Gravity | None  # None where the angle covers too little
+    gain: Values | None  # k, (3,) array; None where no axis follows the rate
+    mean_rate: float = 0.0  # deg/s, of the angle over the samples; times a time offset it adds to the zero
+    arc: float = 0.0  # deg
+    unknown: str = ""  # why gravity determines nothing
 
     @cached_property
     def turn_axis(self) -> Values | None:
@@ -193,55 +213,52 @@ class TurnFit:
 
     @cached_property
     def vertical(self) -> Values | None:
-        """Direction of gravity's reaction where the turn leaves it as it is (a vertical axis): (3,) array, or None."""
+        """Direction of the specific force in a turn about a vertical axis, which does not change it: (3,), or None."""
         if self.gravity is None:
             return None
-        staying, cosine, sine = self.gravity
+        constant, cosine, sine = self.gravity
         turning = float(np.hypot(np.linalg.norm(cosine), np.linalg.norm(sine)))
-        return unit(staying) if turning < 0.25 * float(np.linalg.norm(staying)) else None
+        return unit(constant) if turning < 0.25 * float(np.linalg.norm(constant)) else None
 
 
 def fit_turn(recording: Recording) -> TurnFit:
-    """Return what the rows of a turn recording, with the table's angle, its rate, or both, tell of its mounting."""
+    """Return c, p, q and k of a turn whose log has the table's angle, its rate, or both."""
     angle, rate = recording.table_angle, recording.table_rate
     slope = None if angle is None or recording.samples < 2 else np.gradient(angle, recording.time)
     used = slope if rate is None else rate
     gain = _gain(recording, used)
     if gain is not None and rate is not None and slope is not None and float(rate @ slope) < 0.0:
-        gain = -gain  # the rate counts against the angle: compared with gravity here, and refused as a reference
+        gain = -gain  # the rate counts against the angle: here the angle counts; the check of the reference refuses it
     if angle is None or recording.accelerometer is None:
         missing = "angle of the table" if angle is None else "accelerometer"
-        return TurnFit(None, gain, 0.0, 0.0, f"the log holds no {missing}")
+        return TurnFit(None, gain, unknown=f"the log holds no {missing}")
     keep = recording.valid
     A, reading = np.radians(angle[keep]), recording.accelerometer[keep]
     arc = float(np.ptp(angle)) if len(angle) else 0.0
     mean_rate = 0.0 if slope is None else float(np.mean(slope))
-    other = _of_rate(used, keep)
-    # Normal equations of both, those of the rate eliminated.
-    columns = np.column_stack([other, np.cos(A), np.sin(A), reading])
-    products, m = columns.T @ columns, other.shape[1]
+    terms = [np.ones_like(A)]
+    if used is not None and np.any(used[keep]):
+        r = used[keep] / np.max(np.abs(used))
+        terms += [r, np.abs(r), r * r]
+    # Normal equations of all columns; the constant and the terms of the rate are eliminated.
+    columns, m = np.column_stack([*terms, np.cos(A), np.sin(A), reading]), len(terms)
+    products = columns.T @ columns
     inverse = np.linalg.pinv(products[:m, :m], rcond=SMALLEST_SHARE, hermitian=True)
-    left = products[m:, m:] - products[m:, :m] @ inverse @ products[:m, m:]
-    normal = left[:2, :2]
+    reduced = products[m:, m:] - products[m:, :m] @ inverse @ products[:m, m:]
+    normal = reduced[:2, :2]
     if len(A) < FEWEST or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
         return TurnFit(None, gain, mean_rate, arc, f"the table angle covers {arc:.3g} deg only")
-    found = np.linalg.solve(normal, left[:2, 2:])
-    residual = np.diag(left[2:, 2:] - left[2:, :2] @ found) / len(A)
-    scatter = float(np.sqrt(np.max(residual.clip(0.0)) * np.max(np.diag(np.linalg.inv(normal)))))
+    p_and_q = np.linalg.solve(normal, reduced[:2, 2:])
+    variance = np.diag(reduced[2:, 2:] - reduced[2:, :2] @ p_and_q) / len(A)
+    scatter = float(np.sqrt(np.max(variance.clip(0.0)) * np.max(np.diag(np.linalg.inv(normal)))))
     if scatter > LARGEST_UNCERTAINTY:
         return TurnFit(None, gain, mean_rate, arc, "the accelerometer does not follow the table angle")
-    constant = np.mean(reading, axis=0) - np.mean(columns[:, m : m + 2], axis=0) @ found
-    return TurnFit(Gravity(constant, found[0], found[1]), gain, mean_rate, arc)
-
-
-def _of_rate(rate: Values | None, keep: Mask) -> Values:
-    """Return 1, r, |r| and r^2, with the largest |r| as unit: (n, at most 4) array."""
-    r = np.zeros(int(keep.sum())) if rate is None else rate[keep] / (np.max(np.abs(rate), initial=0.0) or 1.0)
-    return np.column_stack([np.ones_like(r), r, np.abs(r), r * r][: 4 if np.any(r) else 1])
+    constant = np.mean(reading, axis=0) - np.mean(columns[:, m : m + 2], axis=0) @ p_and_q
+    return TurnFit(Gravity(constant, *p_and_q), gain, mean_rate, arc)
 
 
 def _gain(recording: Recording, rate: Values | None) -> Values | None:
-    """Return k above where a gyroscope axis follows the rate."""
+    """Return k where a gyroscope axis follows the rate."""
     if recording.gyroscope is None or rate is None:
         return None
     keep = recording.valid
@@ -253,11 +270,124 @@ def _gain(recording: Recording, rate: Values | None) -> Values | None:
     if power <= len(rate) * (SLOWEST_DPS if changing else LARGEST_BIAS_DPS) ** 2:
         return None
     gain = rate @ gyro / power
-    other = int(np.argmax(np.abs(gain)))
-    alike = abs(gain[other]) * np.sqrt(power / max(float(gyro[:, other] @ gyro[:, other]), 1e-30))
+    largest = int(np.argmax(np.abs(gain)))
+    alike = abs(gain[largest]) * np.sqrt(power / max(float(gyro[:, largest] @ gyro[:, largest]), 1e-30))
     return np.asarray(gain) if alike >= ALIKE else None
 
 
-def unit(vector: Values) -> Values:
-    """Return a vector of length 1."""
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))
+def check_frames(
+    turns: Sequence[tuple[Recording, TurnFit]], accelerometer: Values | None, maps: Mapping[str, Sequence[str]]
+) -> None:
+    """Refuse turns in which gravity and the gyroscope turn about different axes; ``accelerometer`` is M_a."""
+    axes: list[tuple[Recording, str, str]] = []  # n and k
+    for recording, fit in turns:
+        n, k = fit.turn_axis, fit.gain
+        if n is not None and k is not None and max(off_axis_deg(n), off_axis_deg(k)) < CLEAR_DEG:
+            axes.append((recording, nearest_axis(n), nearest_axis(k)))
+    wrong = [entry for entry in axes if entry[1] != entry[2]]
+    if not wrong:
+        return
+    recording, gravity, gyro = wrong[0]
+    names = ", ".join(r.name for r, _, _ in wrong)
+    agreeing = ", ".join(r.name for r, n, k in axes if n == k)
+    # Pairs k = +x, n; D where the unit was turned about all three axes, and no two recordings disagree.
+    pairs = {(k[1], n if k[0] == "+" else n.translate(str.maketrans("+-", "-+"))) for _, n, k in axes}
+    columns = [signed_axis(n) for _, n in sorted(pairs)]
+    D = np.column_stack(columns) if [k for k, _ in sorted(pairs)] == list(AXES) else np.zeros((3, 3))
+    raise IngestError(
+        f"accelerometer and gyroscope contradict each other in {names}"
+        + (f" (not in {agreeing})" if agreeing else "")
+        + f": in {recording.name} gravity turns as in a turn about body {gravity}, and the gyroscope reads a turn "
+        f"about {gyro}; both belong in one right-handed frame",
+        recording.source.get("file"),
+        code="mirrored_axes",
+        hint=_cure(D if abs(np.linalg.det(D)) > 0.5 else None, accelerometer, maps),
+    )
+
+
+def check_frames_by_hand(recording: Recording, maps: Mapping[str, Sequence[str]]) -> None:
+    """Refuse rests and moves by hand in which the gyroscope's rates rotate gravity only with other axes."""
+    if recording.accelerometer is None or recording.gyroscope is None:
+        return
+    part = slice(0, MOST_SAMPLES)
+    moves = moves_of(recording.accelerometer[part], recording.gyroscope[part], recording.time[part])
+    contradiction = other_axes(moves)
+    if contradiction is None:
+        return
+    text, D = contradiction
+    raise IngestError(
+        f"accelerometer and gyroscope contradict each other: {text}; both belong in one right-handed frame",
+        recording.source.get("file"),
+        code="mirrored_axes",
+        hint=_cure(D, None, maps),
+    )
+
+
+def other_axes(moves: Sequence[Move]) -> tuple[str, Values | None] | None:
+    """Return the evidence that only other axes rotate gravity rightly, and D if one alone does; None without it."""
+
+    def missed(D: Values) -> int:
+        return int(np.sum(misfits_deg([replace(m, turns=m.turns @ D.T) for m in moves], [1.0]) > FAILS_DEG))
+
+    as_read = missed(np.eye(3)) if len(moves) >= FEWEST_MOVES else 0
+    if as_read < FEWEST_MISSED:
+        return None
+    permutations = signed_permutations()
+    counts = [missed(D) for D in permutations]
+    fewest = min(counts)
+    if fewest > as_read / CLEARLY_FEWER:
+        return None
+    text = (
+        f"in {as_read} of {len(moves)} moves between rests gravity turns by more than {FAILS_DEG:g} deg otherwise than "
+        f"the angular rates say, and with other axes of the gyroscope in {fewest}"
+    )
+    return text, permutations[counts.index(fewest)] if counts.count(fewest) == 1 else None
+
+
+def signed_permutations() -> list[Values]:
+    """Return the 48 maps of axes onto signed axes: (3, 3) arrays."""
+    return [
+        axis_matrix([s + a for s, a in zip(signs, order, strict=True)])
+        for order in itertools.permutations(AXES)
+        for signs in itertools.product("+-", repeat=3)
+    ]
+
+
+def nearest_permutation(total: Values) -> Values | None:
+    """Return the signed permutation near to a matrix of the order of 1, or None."""
+    scale = np.linalg.norm(total, axis=0)
+    if np.min(scale) < 0.25:
+        return None
+    return next((found for found in signed_permutations() if np.max(np.abs(total / scale - found)) <= 0.5), None)
+
+
+def as_map(matrix: Values) -> str:
+    """Return a signed permutation in the form of the setting ``axis_map``."""
+    return f"[{','.join(nearest_axis(column) for column in np.asarray(matrix).T)}]"
+
+
+def _cure(D: Values | None, accelerometer: Values | None, maps: Mapping[str, Sequence[str]]) -> str:
+    """Return which sensor is mirrored or turned, as far as it is known, and the setting that corrects it."""
+    if D is None:
+        return "set sensor.accelerometer.axis_map or sensor.gyroscope.axis_map after the data sheet (docs/mounting.md)"
+    now = {sensor: axis_matrix(entries) for sensor, entries in maps.items()}
+    mirrored = np.linalg.det(D) < 0.0
+    right = {"accelerometer": now["accelerometer"], "gyroscope": D @ now["gyroscope"]}
+    if accelerometer is None:
+        which = "the gyroscope is mirrored" if mirrored else "one sensor is read in other axes"
+        right = right if mirrored else right | {"accelerometer": D.T @ now["accelerometer"]}
+    elif np.linalg.det(accelerometer) > 0.0:
+        which = "the gyroscope is mirrored" if mirrored else "the gyroscope is read in other axes"
+    elif mirrored:
+        which = "both sensors are mirrored"
+        right = {s: M.T @ now[s] for s, M in (("accelerometer", accelerometer), ("gyroscope", -D.T @ accelerometer))}
+    else:
+        which = "the accelerometer is mirrored"
+        right = {"accelerometer": -D.T @ now["accelerometer"], "gyroscope": now["gyroscope"]}
+    changed = {s: M for s, M in right.items() if not np.array_equal(M, now[s])}
+    settings = [f"sensor.{s}.axis_map={as_map(M)}" for s, M in changed.items()]
+    if len(changed) == 2 and np.array_equal(right["accelerometer"], right["gyroscope"]):
+        settings = [f"sensor.axis_map={as_map(right['gyroscope'])}"]
+    if accelerometer is None:
+        return f"{which}: the data sheet shows which axes are right, and gravity agrees with {' or '.join(settings)}"
+    return f"by the faces that are stated {which}: set {' and '.join(settings)}"

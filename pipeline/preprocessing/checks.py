@@ -1,15 +1,15 @@
-"""Checks that need all recordings of a unit: its rests, its reference, its mounting, and whether they share samples.
+"""Check all recordings of a unit together: its rests, its reference, its mounting, and whether they share samples.
 
-Shared samples mean that held-out motion is not held out. The rows of all recordings are compared by the numbers of
-their sensor channels, rounded to ten digits so that another unit of the file does not hide them, and again at the
-coarser decimals of a rounded copy. A row counts where it occurs once in its own recording: rests of a coarse sensor
-repeat rows. Two recordings share samples where at least 20 such rows follow each other in both, each within 8 rows of
-the one before; by chance that is as improbable as
+Two recordings that share samples are refused, because motion that is in both is not held out. Their rows are compared
+by the readings of the sensors, rounded to ten digits so that a conversion of units in one file makes no difference, and
+again rounded to the decimals of the coarser one. Only a row that occurs once in its recording counts: the rests of a
+coarse sensor repeat rows. Two recordings share samples where at least 20 such rows follow each other in both, each
+within 8 rows of the one before. By chance the probability is
 
     (8 c / n)^19,   c : rows that occur in both,   n : rows of the longer recording
 
-for which 10^-6 is the limit, as for stuck readings (``pipeline.io.quality_flags``). So whole copies are found, shifted
-in rows or time, cut, or with rows left out.
+and its limit is 10^-6, as for stuck readings (``pipeline.io.quality_flags``). This detects whole copies, copies shifted
+in rows or time, cut copies, and copies with rows left out.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 FEWEST, APART = 20, 8  # rows, see above
 DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
 SAME_GRAVITY_G = 1e-4  # gravity changes by as much over 0.3 km of height
-OF_DECIMALS = 200  # samples by which the decimals are told: a finer reading ends in a zero in a tenth of them
+OF_DECIMALS = 200  # samples that determine the decimals: a finer reading ends in a zero in a tenth of them
 MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
 
 
 def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
-    """Return the recordings of a unit, their turns by the convention, with notes on what was found.
+    """Return the recordings of a unit, their turns by the convention, with notes on faults and corrections.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     InputError
         If the recordings contradict each other, or the table's log contradicts itself or gravity.
     """
-    check_shared_rows(recordings)
+    _check_shared_rows(recordings)
     check_axes(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
     checked = refined(check_motion(check_mounting(turns, settings), delays, settings))
@@ -66,57 +66,53 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
 
 
 def _placed(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recording]:
-    """Add notes on what latitude and azimuth mean: gravity that was left at 1 g, and where the turn axes point."""
+    """Note the gravity at the latitude if ``gravity_g`` is left at 1, and the azimuths of the turn axes."""
     latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
     if latitude is None:
         return recordings
-    gravity = normal_gravity_g(float(latitude))
-    wrong = table.get("gravity_g") == 1.0 and abs(gravity - 1.0) >= SAME_GRAVITY_G
-    detail = (
-        f"table.gravity_g is 1, its default; at latitude {latitude:g} deg gravity is {gravity:.5f} g at sea level, and "
-        f"0.000315 g less for each km of height. Scale and bias of the accelerometer are then in units of local "
-        f"gravity, {abs(gravity - 1.0):.3%} off standard g: set table.gravity_g={gravity:.5f} for standard g"
-    )
-    k = next((k for k, r in enumerate(recordings) if r.accelerometer is not None), None)
-    notes = [(k, Note("N-GRAVITY", 1, 0, 0, detail))] if wrong and k is not None else []
-    if table.get("azimuth_of") == "turn_axis" and azimuth is not None:
-        turns = [(k, r) for k, r in enumerate(recordings) if r.axis and not r.up and r.role != "validation"]
+    gravity, notes = normal_gravity_g(float(latitude)), []
+    measured = [k for k, r in enumerate(recordings) if r.accelerometer is not None]
+    if measured and table.get("gravity_g") == 1.0 and abs(gravity - 1.0) >= SAME_GRAVITY_G:
+        detail = (
+            f"table.gravity_g is 1, its default; at latitude {latitude:g} deg gravity is {gravity:.5f} g at sea level, "
+            "and 0.000315 g less for each km of height. Scale and bias of the accelerometer are then in units of local "
+            f"gravity, {abs(gravity - 1.0):.3%} off standard g: set table.gravity_g={gravity:.5f} for standard g"
+        )
+        notes.append((measured[0], Note("N-GRAVITY", 1, 0, 0, detail)))
+    turns = [(k, r) for k, r in enumerate(recordings) if r.axis and not r.up and r.role != "validation"]
+    if turns and table.get("azimuth_of") == "turn_axis" and azimuth is not None:
         ends = [f"body {r.axis} to {(azimuth + 90.0 * (1 - r.sense)) % 360.0:g} deg in {r.name}" for _, r in turns]
         detail = (
             f"Earth's rotation is in the model: by table.azimuth_deg and the sense of the encoder the shaft points "
             f"with {', '.join(ends)}, clockwise from north; if it does not, correct table.azimuth_deg by 180 deg"
         )
-        notes += [(turns[0][0], Note("N-AZIMUTH", len(turns), 0, 0, detail))] if turns else []
+        notes.append((turns[0][0], Note("N-AZIMUTH", len(turns), 0, 0, detail)))
     for k, note in notes:
         recordings[k] = replace(recordings[k], notes=(*recordings[k].notes, note))
     return recordings
 
 
-def check_shared_rows(recordings: Sequence[Recording]) -> None:
-    """Refuse two recordings that hold the same samples, naming both and the rows."""
+def _check_shared_rows(recordings: Sequence[Recording]) -> None:
+    """Refuse two recordings with the same samples."""
     decimals = [_decimals(r) for r in recordings]
-    pairs = {tuple(min(a, b) for a, b in zip(x, y, strict=True)) for x, y in itertools.combinations(decimals, 2)}
-    for coarse in sorted(pairs, reverse=True):
-        _check_at(recordings, coarse)
+    for coarser in sorted({tuple(map(min, x, y)) for x, y in itertools.combinations(decimals, 2)}, reverse=True):
+        _check_at(recordings, coarser)
 
 
 def _decimals(recording: Recording) -> tuple[int, ...]:
     """Return the decimals of each sensor's readings, by its first samples; ``DIGITS`` for an absent sensor."""
-    out = []
+    decimals = []
     for sensor in SENSORS:
         reading = recording.reading(sensor)
-        part = np.zeros((0, 3)) if reading is None else reading[:OF_DECIMALS]
-        part = part[np.isfinite(part).all(axis=1)]
-        exact = (d for d in range(1, DIGITS) if len(part) and np.all(np.abs(part - np.round(part, d)) < 10.0**-DIGITS))
-        out.append(next(exact, DIGITS))
-    return tuple(out)
+        part = np.zeros(0) if reading is None else reading[:OF_DECIMALS][np.isfinite(reading[:OF_DECIMALS]).all(axis=1)]
+        exact = (d for d in range(1, DIGITS) if part.size and np.all(np.abs(part - np.round(part, d)) < 10.0**-DIGITS))
+        decimals.append(next(exact, DIGITS))
+    return tuple(decimals)
 
 
 def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:
-    """Refuse two recordings that hold the same samples, rounded to the decimals of each sensor."""
+    """Refuse two recordings with the same samples, rounded to the decimals of each sensor."""
     keys = [_keys(r, decimals) for r in recordings]
-    if not any(len(k) for k in keys):
-        return
     value = np.concatenate(keys)
     owner = np.repeat(np.arange(len(keys)), [len(k) for k in keys])
     row = np.concatenate([np.arange(len(k)) for k in keys])
@@ -126,29 +122,26 @@ def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:
     if np.count_nonzero(same) < FEWEST - 1:
         return
     within = same & (owner[1:] == owner[:-1])
-    single = ~(np.append(within, False) | np.append(False, within))
+    single = ~(np.append(within, False) | np.append(False, within))  # rows that occur once in their recording
     value, owner, row = value[single], owner[single], row[single]
-    for step in range(1, len(keys)):  # a row may be in several recordings: each pair lies at most so far apart
+    for step in range(1, len(keys)):  # a row may be in several recordings: a pair of it is up to n - 1 places apart
         twin = np.flatnonzero(value[step:] == value[:-step])
         if twin.size < FEWEST:
             break
-        for pair in np.unique(owner[twin] * len(keys) + owner[twin + step]):
-            chosen = twin[owner[twin] * len(keys) + owner[twin + step] == pair]
+        pairs = owner[twin] * len(keys) + owner[twin + step]
+        for pair in np.unique(pairs):
+            chosen = twin[pairs == pair]
             one, two = divmod(int(pair), len(keys))
             _check_pair(recordings[one], recordings[two], row[chosen], row[chosen + step])
 
 
 def _keys(recording: Recording, decimals: Sequence[int]) -> NDArray[np.uint64]:
-    """Return a number for each row's readings; rows with equal readings have equal numbers."""
+    """Return a hash of each row's readings: (n,) array; empty without readings."""
     pairs = zip(SENSORS, decimals, strict=True)
-    found = [np.round(r, d) for s, d in pairs if (r := recording.reading(s)) is not None]
-    if not found:
-        return np.zeros(0, np.uint64)
-    values = np.ascontiguousarray(np.concatenate(found, axis=1) + 0.0)  # no negative zero
-    bits = values.view(np.uint64)
-    key = np.zeros(len(bits), np.uint64)
-    for column in range(bits.shape[1]):
-        key = (key ^ bits[:, column]) * MIX
+    columns = [c for s, d in pairs if (r := recording.reading(s)) is not None for c in np.round(r, d).T]
+    key = np.zeros(recording.samples if columns else 0, np.uint64)
+    for column in columns:
+        key = (key ^ (column + 0.0).view(np.uint64)) * MIX  # + 0.0: no negative zero
         key ^= key >> np.uint64(29)
     return key
 
@@ -171,11 +164,11 @@ def _check_pair(one: Recording, two: Recording, first: Index, second: Index) -> 
     a, b = int(edges[2 * best]), int(edges[2 * best + 1])
     late, early = (two, one) if two.role == "validation" or one.role != "validation" else (one, two)
     spans = {one.name: (first[a], first[b]), two.name: (second[a], second[b])}
-    own, other = (place(r, int(spans[r.name][0]), int(spans[r.name][1])) for r in (late, early))
+    rows, copied = (place(r, int(spans[r.name][0]), int(spans[r.name][1])) for r in (late, early))
     held_out = "; held-out motion would not be held out" if late.role == "validation" else ""
     raise refusal(
         late,
         "shared_rows",
-        f"{own} are those of recording {early.name}, {other} ({common} rows are the same){held_out}",
+        f"{rows} are those of recording {early.name}, {copied} ({common} rows are the same){held_out}",
         "record each by itself, or remove the copy",
     )

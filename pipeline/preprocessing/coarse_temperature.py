@@ -1,8 +1,8 @@
-"""The temperature between the steps of a coarse thermometer, from all recordings of a unit.
+"""Estimate the temperature between the steps of a coarse thermometer, from all recordings of a unit.
 
-A thermometer that reads in steps h is wrong by up to h / 2, for as long as the temperature stays between two steps. An
-error of a regressor that lasts cannot be smoothed away: a warm-up, which needs no thermometer, would then explain a
-bias that follows the temperature better than the temperature does. But the time of each step is known, so that
+A thermometer that reads in steps h has an error of up to h / 2 as long as the temperature stays between two steps.
+Smoothing cannot remove so long an error of a regressor: a warm-up, which needs no thermometer, would then explain a
+bias that follows the temperature better than the temperature does. But the time of each step is known, and
 
     q_i = h round((T(t_i) + s e_i) / h),    T(t) = c exp(-t / theta) + m(t),    m'' white noise of density lambda
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from pipeline.records import Recording, Values
 
 CELL_S = 10.0  # between the nodes of T, a line between them: of 5 degC with theta = 300 s it misses 1e-3 degC
-QUARTERS = 4  # of a cell, in which equal readings are one
+QUARTERS = 4  # parts of a cell; equal readings in a part become one
 MOST_NODES = 4000  # 11 h; a longer log is left as it is
-ONE_STEP = 0.99  # share of the changes that are of one step: more noise than that smooths itself
+ONE_STEP = 0.99  # least share of the changes that are of one step: larger noise dithers the steps, and averages out
 NOISES = (0.02, 0.04, 0.07, 0.12, 0.2)  # s over h
 DENSITIES = tuple(10.0 ** np.arange(-12.0, -3.0))  # lambda, degC^2 / s^3: 0.03 to 30 degC in an hour
 SETTLING_S = (None, *np.geomspace(50.0, 1600.0, 21))  # theta: of packages on boards to that of housings
@@ -38,15 +38,15 @@ ROUNDING = 1e-12  # relative: some thousand roundings of a double
 
 
 def refined(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return recordings with the temperature between the steps of a coarse thermometer, noted; others as they are."""
-    own = [r for r in recordings if r.temperature is not None and np.isfinite(r.temperature).all()]
-    step = _step(own)
-    if step == 0.0 or len(own) < len(recordings) or not all(r.clock_shared for r in own):
+    """Return the recordings of a unit; with a coarse thermometer, with the estimated temperature and a note."""
+    known = [r for r in recordings if r.temperature is not None and np.isfinite(r.temperature).all()]
+    step = _step(known)
+    if step == 0.0 or len(known) < len(recordings) or not all(r.clock_shared for r in known):
         return list(recordings)
-    first = min(float(r.time[0]) for r in own)
-    if max(float(r.time[-1]) for r in own) - first > MOST_NODES * CELL_S:
+    first = min(float(r.time[0]) for r in known)
+    if max(float(r.time[-1]) for r in known) - first > MOST_NODES * CELL_S:
         return list(recordings)
-    time, reading = (np.concatenate([getattr(r, name) for r in own]) for name in ("time", "temperature"))
+    time, reading = (np.concatenate([getattr(r, name) for r in known]) for name in ("time", "temperature"))
     curve = _Curve(time - first, reading, step).best()
     nodes = first + CELL_S * np.arange(len(curve))
     detail = f"the thermometer reads in steps of {step:.3g} degC; between them the temperature is estimated"
@@ -59,7 +59,7 @@ def refined(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def _step(recordings: Sequence[Recording]) -> float:
-    """Return the step of a thermometer whose noise is below it, degC; 0 for others and where it does not change."""
+    """Return the step of a thermometer with a smaller noise, degC; 0 for others and for a constant temperature."""
     changes = [np.abs(np.diff(np.asarray(r.temperature))) for r in recordings]
     each = np.concatenate([np.zeros(1), *changes])
     moved = each[each > 0.0]
@@ -70,7 +70,7 @@ def _step(recordings: Sequence[Recording]) -> float:
 
 
 class _Curve:
-    """T through its nodes, m and c, of readings of which equal ones in a quarter of a cell are one."""
+    """The curve T through nodes, fitted to readings; equal readings in a quarter of a cell are one with a count."""
 
     def __init__(self, time: Values, reading: Values, step: float) -> None:
         place, self.mean, self.step = time / CELL_S, float(reading.mean()), step
@@ -78,13 +78,13 @@ class _Curve:
         _, inverse, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
         place, value = (np.bincount(inverse.ravel(), v) / count for v in (place, reading - self.mean))
         self.value, self.count, self.k = value, count.astype(float), place.astype(int)
-        self.shares = 1.0 - place + self.k, place - self.k  # of the nodes k and k + 1
+        self.shares = 1.0 - place + self.k, place - self.k  # weights of the nodes k and k + 1
         self.nodes = int(self.k.max()) + 2
         self.last: tuple[Values, float] = np.interp(np.arange(self.nodes), self.k, value), 0.0
         self.known: dict[tuple[float, float, float | None], tuple[float, Values]] = {}
 
     def best(self) -> Values:
-        """Return T at the nodes under the most probable noise, density and time of settling, one after the other."""
+        """Return T at the nodes with the most probable noise, density and time of settling, by cyclic search."""
         noise, density, settling, before = NOISES[2], DENSITIES[4], SETTLING_S[12], None
         while (noise, density, settling) != before:
             before = noise, density, settling
@@ -100,7 +100,7 @@ class _Curve:
         return self.known[key][0]
 
     def _posterior(self, noise: float, density: float, settling: float | None) -> tuple[float, Values]:
-        """Return the log evidence, up to a constant, and T above the mean, by Newton's method from the last one on."""
+        """Return the log evidence up to a constant, and T minus the mean, by Newton's method from the last result."""
         from scipy.linalg import cholesky_banded, solveh_banded  # noqa: PLC0415  (0.1 s that only this log pays)
 
         n, stiff, least = self.nodes, 1.0 / (density * CELL_S**3), AMPLITUDE_DEGC**-2
@@ -126,8 +126,8 @@ class _Curve:
             bent = stiff * np.diff(m, 2)
             slope = self._back(first) - least * m - np.convolve(bent, [1.0, -2.0, 1.0])
             solved = solveh_banded(band, np.stack([slope, cross], axis=1), lower=True)
-            own = float(second @ at_decay**2 + least - cross @ solved[:, 1])
-            to_c = float(first @ at_decay - least * c - cross @ solved[:, 0]) / own
+            of_c = float(second @ at_decay**2 + least - cross @ solved[:, 1])  # the Schur complement
+            to_c = float(first @ at_decay - least * c - cross @ solved[:, 0]) / of_c
             to_m: Values = solved[:, 0] - to_c * solved[:, 1]
             share = 1.0
             if gained < SETTLED:
@@ -139,14 +139,14 @@ class _Curve:
                 m, c, (value, first, second) = m + share * to_m, c + share * to_c, new
         self.last = m, c
         logarithms = [2.0 * float(np.sum(np.log(cholesky_banded(b, lower=True)[0]))) for b in (band, prior)]
-        return value - 0.5 * (logarithms[0] - logarithms[1] + float(np.log(own / least))), m + c * decay
+        return value - 0.5 * (logarithms[0] - logarithms[1] + float(np.log(of_c / least))), m + c * decay
 
     def _at(self, nodes: Values) -> Values:
-        """Return a curve through the nodes at the readings."""
+        """Return the values of a curve through the nodes at the readings."""
         return np.asarray(self.shares[0] * nodes[self.k] + self.shares[1] * nodes[self.k + 1])
 
     def _back(self, values: Values) -> Values:
-        """Return the sums of values at the readings over the nodes, by their shares."""
+        """Return the transpose of ``_at``: the weighted sums of values at the readings, by node."""
         left, right = (share * values for share in self.shares)
         return np.asarray(np.bincount(self.k, left, self.nodes) + np.bincount(self.k + 1, right, self.nodes))
 

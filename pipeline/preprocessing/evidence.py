@@ -1,8 +1,8 @@
-"""What the channels of a recording say of its rotation, in one form, so that they can be compared.
+"""The rotation of a recording by each of its channels, in one form, so that they can be compared.
 
-A table's angle or attitude gives the mean rate over the interval between two samples, exactly. A logged rate and a
-gyroscope give the rate at the samples. Scales are compared by the weighted median of ratios, with weights that are cut
-off: some spikes do not move it.
+A table's angle or attitude gives the exact mean rate over the interval between two samples. A logged rate and a
+gyroscope give the rate at the samples. Scales are compared by the weighted median of ratios. Its weights are cut off,
+so that a few spikes do not change it.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 
 
 EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
-OPPOSITE = 0.8  # correlation, from which two channels differ in sign alone
-SIGN_BLOCK = 8  # intervals, over which short moves show their angle in both
-SAMPLED = 0.05  # relative: of an angle that is summed up from the rate in moves of some samples (1.6 % in 3 deg)
+OPPOSITE = 0.8  # correlation from which two channels differ in sign alone
+SIGN_BLOCK = 8  # intervals over which both channels show the angle of a short move
+SAMPLED = 0.05  # relative error of an angle summed up from the rate in moves of some samples (1.6 % in 3 deg)
 LEAST_TURN_DEG = 60.0  # for gravity to determine an angle: biases of 0.1 g distort its phase by 6 deg
-LEAST_SWING_G = 0.5  # radius of gravity's circle, from which the axis is level
+LEAST_SWING_G = 0.5  # radius of gravity's circle from which the axis is level
 FASTEST_DEG = 90.0  # in one interval, beyond which the phase may lose a turn
-LEAST_RATE_DPS = 1.0  # 90 % of the moving samples turn at least so fast where a rate tells the gyroscope's scale
+LEAST_RATE_DPS = 1.0  # change of a rate from which it determines the gyroscope's scale
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far channels may be apart where an effect of the catalogue explains it, and how the files name channels."""
+    """How much an effect of the catalogue may make channels differ, and the names of channels in the files."""
 
     late_s: float  # time_offset and low_pass_lag
     clock: float  # relative
@@ -43,12 +43,12 @@ class Limits:
     angle_deg: float
     angle_stated_deg: float
     gain: float  # relative, of a gyroscope by its sensor file
-    offset_dps: float  # what gravity adds to the gyroscope's reading
+    offset_dps: float  # of the gyroscope, by gravity
     columns: Mapping[str, Any]  # ingest.csv.columns
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Limits:
-        """Return what the sections ``sensor``, ``table`` and ``ingest`` state; what they do not state is 0."""
+        """Return the limits by the sections ``sensor``, ``table`` and ``ingest``; those that are not stated are 0."""
         sensor, table = settings.get("sensor") or {}, settings.get("table") or {}
         effects = [(sensor.get(s) or {}).get("effects") or {} for s in SENSORS]
         gyroscope = sensor.get("gyroscope") or {}
@@ -72,25 +72,24 @@ class Limits:
         )
 
     def column(self, recording: Recording, channel: str) -> str:
-        """Return how the recording's file names a channel."""
+        """Return the name of a channel in the recording's file."""
         if not str(recording.source.get("file", "")).endswith(".csv"):
             return channel
         ends = {"gyroscope": ("gyro_x", "gyro_z"), "table_attitude": ("table_qw", "table_qz")}.get(channel, (channel,))
-        entries = {c: self.columns.get(c) for c in ends}
-        names = {c: e.get("column") if isinstance(e, dict) else None for c, e in entries.items()}
-        return " .. ".join(c if name is None else str(name) for c, name in names.items())
+        entries = [(c, self.columns.get(c)) for c in ends]
+        return " .. ".join(str(e.get("column", c) or c) if isinstance(e, dict) else c for c, e in entries)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A rotation as a channel of the table (``table_rate``, ``table_angle``, ``table_attitude``) or a sensor tells it.
+    """The rotation by a channel of the table (``table_rate``, ``table_angle``, ``table_attitude``) or a sensor.
 
     Attributes
     ----------
     low, high : (m,) array, deg/s
-        The rate at the samples (m = n) or over the intervals between them (m = n - 1); infinite where it is not known.
+        The rate at the samples (m = n) or over the intervals between them (m = n - 1); infinite where it is unknown.
     turned : (n - 1,) array, deg
-        Angle turned in each interval; 0 where it is not known.
+        Angle turned in each interval; 0 where it is unknown.
     noise : float, deg/s
     """
 
@@ -102,12 +101,12 @@ class Channel:
 
     @property
     def of_intervals(self) -> bool:
-        """Whether it gives means over intervals."""
+        """Whether the rates are means over intervals."""
         return len(self.low) == len(self.turned)
 
 
 def quantiles(values: Values, *shares: float) -> Values:
-    """Return values below which these shares of all lie, without interpolation: numpy's takes ten times as long."""
+    """Return quantiles without interpolation, in a tenth of the time of ``numpy.quantile``."""
     places = [round(share * (len(values) - 1)) for share in shares]
     return np.asarray(np.partition(values, places, axis=0)[places])
 
@@ -118,9 +117,9 @@ def gaps(recording: Recording) -> Mask:
 
 
 def of_table(recording: Recording) -> list[Channel]:
-    """Return what the table's log says: its rate, and the angle of a turn or the attitude of held-out motion.
+    """Return the rotation by the table's log: its rate, and the angle of a turn or the attitude of held-out motion.
 
-    Of held-out motion it is the size of the rate.
+    In held-out motion the rate is a magnitude.
     """
     channels, turns = [], recording.axis is not None
     rate, angle, attitude = recording.table_rate, recording.table_angle, recording.table_attitude
@@ -149,7 +148,7 @@ def _of_turned(name: str, recording: Recording, turned: Values) -> Channel:
 
 
 def of_rate(recording: Recording, name: str, rate: Values, known: Mask | None = None) -> Channel:
-    """Return what rates at the samples say; those that are not known allow anything."""
+    """Return the rotation by rates at the samples; an unknown rate contradicts nothing."""
     dt = np.diff(recording.time)
     turned = np.where(gaps(recording), 0.0, 0.5 * (rate[1:] + rate[:-1]) * dt)
     low = high = rate
@@ -166,7 +165,7 @@ def opposite(channels: Sequence[Channel]) -> bool:
 
 
 def _alike(one: Values, two: Values) -> float:
-    """Return the correlation of two angles turned, by blocks; 0 where one does not turn."""
+    """Return the correlation of two angles turned in blocks; 0 if one does not turn."""
     starts = np.arange(0, len(one), SIGN_BLOCK)
     a, b = np.add.reduceat(one, starts), np.add.reduceat(two, starts)
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
@@ -174,11 +173,11 @@ def _alike(one: Values, two: Values) -> float:
 
 
 def gravity_turned(recording: Recording) -> Values | None:
-    """Return the angle by which gravity turned about the turn axis in each interval, deg; None where it does not."""
+    """Return the angle by which gravity turned about the turn axis in each interval, deg; None if it does not turn."""
     if "gravity_turned" not in recording.cache:
         recording.cache["gravity_turned"] = _gravity_turned(recording)
-    found: Values | None = recording.cache["gravity_turned"]
-    return found
+    turned: Values | None = recording.cache["gravity_turned"]
+    return turned
 
 
 def _gravity_turned(recording: Recording) -> Values | None:
@@ -199,10 +198,11 @@ def _gravity_turned(recording: Recording) -> Values | None:
 
 
 def of_gravity(recording: Recording, turned: Values, channels: Sequence[Channel]) -> Channel:
-    """Return what gravity says, with the sign of the gyroscope, or of that channel that it is most like."""
-    found = [(_alike(turned, c.turned), c.name == "gyroscope") for c in channels]
-    sure = [f for f in found if f[1] and abs(f[0]) > OPPOSITE] or found
-    sign = -1.0 if max(sure, key=lambda f: abs(f[0]))[0] < 0.0 else 1.0
+    """Return the rotation by gravity, with the sign of the gyroscope or, without it, of the most similar channel."""
+    alike = {c.name: _alike(turned, c.turned) for c in channels}
+    if abs(alike.get("gyroscope", 0.0)) > OPPOSITE:
+        alike = {"gyroscope": alike["gyroscope"]}
+    sign = -1.0 if max(alike.values(), key=abs) < 0.0 else 1.0
     noise = float(noise_of_steps(np.abs(np.diff(turned)))) / recording.interval
     return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
 
@@ -223,19 +223,9 @@ def ratio_quartiles(one: Values, other: Values, cut: int, least: float) -> Value
 
 
 def largest_but(size: Values, cut: int) -> float:
-    """Return the value that (1 / cut) of all reach."""
+    """Return the value that a share ``1 / cut`` of all values reaches."""
     place = max(len(size) // cut, 1)
     return float(np.partition(size, -place)[-place])
-
-
-def slopes_of(y: Values, rate: Values) -> list[tuple[float, float] | None]:
-    """Return K and b of ``y = K rate + b`` for each axis of a gyroscope; None where the rate hardly changes."""
-    dr = rate - median(rate)
-    if largest_but(np.abs(dr), 100) < LEAST_RATE_DPS:
-        return [None] * 3
-    gain = ratio_quartiles(y - median(y), dr, 100, 0.1)[1]
-    bias = median(y - gain * rate[:, None])
-    return [(K, b) if K != 0.0 else None for K, b in zip(gain.tolist(), bias.tolist(), strict=True)]
 
 
 def axis_index(recording: Recording) -> int:
@@ -244,7 +234,7 @@ def axis_index(recording: Recording) -> int:
 
 
 def place(recording: Recording, first: int, last: int) -> str:
-    """Say where samples are: their numbers and times; rows of the file where none were left out."""
+    """Return numbers and times of samples in words; they are rows of the file if ingest left out none."""
     what = "row" if recording.samples == recording.source.get("rows") else "sample"
     t = recording.time
     if first == last:
@@ -253,5 +243,5 @@ def place(recording: Recording, first: int, last: int) -> str:
 
 
 def refusal(recording: Recording, code: str, message: str, hint: str) -> IngestError:
-    """Return the error that names a recording's file."""
+    """Return the error that refuses a recording."""
     return IngestError(f"recording {recording.name}: {message}", recording.source.get("file"), code=code, hint=hint)

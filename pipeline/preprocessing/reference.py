@@ -1,12 +1,12 @@
-"""Whether the reference contradicts itself or the sensor: table angle, rate, attitude, gravity, gyroscope and time.
+"""Check that table angle, rate, attitude, gravity, gyroscope and time do not contradict each other.
 
-First the scales (``pipeline.preprocessing.reference_scale``), then delays, then single samples and stretches
-(``pipeline.preprocessing.reference_rows``). The gyroscope's gain and bias for this are those of the unit's turns,
-where they agree. What no effect of the catalogue explains within its configured limit is refused; what exceeds noise
-and the table's stated accuracy but not these limits gets the note ``N-REFERENCE``.
+Scales are checked first (``pipeline.preprocessing.reference_scale``), then delays, then single samples and stretches
+(``pipeline.preprocessing.reference_rows``). Gain and bias of the gyroscope for these checks come from the unit's turns,
+where they agree. A difference that no effect of the catalogue explains within its configured limit is refused. One
+within these limits that exceeds noise and the table's stated accuracy gets the note ``N-REFERENCE``.
 
 The delay d between the sensor and the table's log minimises the variance S(d) of the difference of two rates, both
-averaged over steps of at least a twentieth of a second; where equal steps of a table give several such minima, the
+averaged over steps of at least a twentieth of a second. If equal steps of a table give several such minima, the
 smallest |d| is taken. The recording determines d to the interval in which
 
     n log(S(d) / S_min) <= 5 sqrt(4 d_max)
@@ -15,8 +15,8 @@ where n is the number of steps and d_max the largest delay tried, in steps: a wi
 2 d_max differences at each end, whose sum of squares has the standard deviation ``sqrt(4 d_max)`` in units of S_min.
 A turn at one rate determines no delay: its interval covers every delay tried.
 
-The effects ``time_offset`` and ``low_pass_lag`` allow a delay, and of the sensor ``clock_rate`` what its clock gains
-after power-on. All recordings of a unit have one offset and one clock. A recording is refused only where its whole
+The effects ``time_offset`` and ``low_pass_lag`` allow a delay; for the sensor, ``clock_rate`` allows the drift of its
+clock since power-on. All recordings of a unit have one offset and one clock. A recording is refused only if its whole
 interval contradicts this.
 """
 
@@ -28,16 +28,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.preprocessing.evidence import (
+    LEAST_RATE_DPS,
     Limits,
     axis_index,
     gravity_turned,
+    largest_but,
     of_gravity,
     of_rate,
     of_table,
     opposite,
     quantiles,
+    ratio_quartiles,
     refusal,
-    slopes_of,
     spin,
 )
 from pipeline.preprocessing.reference_rows import Comparison
@@ -58,41 +60,39 @@ if TYPE_CHECKING:
 
 
 FEWEST = 32  # samples, two short stretches
-HALF = (
-    0.5  # of the usual gain, which the axis turned about shows at least; of an interval, between its end and its mean
-)
-SAME = 0.1  # relative: gains of two turns that are of one gyroscope
+HALF = 0.5  # of the usual gain, which the axis turned about reaches; of an interval, between its end and its mean
+SAME = 0.1  # relative difference between gains of one gyroscope in two turns
 FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
 FINEST_S = 0.05  # step in which delays are tried; a parabola finds what lies between
 CLOCKS = 4001  # rates of the clock that are tried: 5 us in 1 s where it may be off by 1 %
 RESTING = 0.01  # of the fastest rate of a turn, below which the table rests
 QUARTER = 0.25  # of an interval, within which a delay between samples is known
-BETTER = 0.5  # share of its power that a signal has to keep where it is no other's
+BETTER = 0.5  # share of the power of the difference of two signals below which they are alike
 NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
-SURE = 5.0  # standard deviations of what the ends of the window add
+SURE = 5.0  # standard deviations of the sum of squares that the ends of the window add
 ALIGN = "align the table's log with the sensor's rows, or give it a time column of its own (ingest=table_log)"
 
 
 @dataclass(frozen=True)
 class Delay:
-    """Delay of the sensor against the table's log, s, and the interval that the recording allows; positive: late."""
+    """Delay of the sensor against the table's log, s, positive if late, and the interval that the recording allows."""
 
     best: float
     low: float
     high: float
 
     def nearest(self, value: float) -> float:
-        """Return the delay of the interval that is nearest to a value, s."""
+        """Return the delay in the interval nearest to a value, s."""
         return min(max(value, self.low), self.high)
 
 
 def check_turns(
     recordings: Sequence[Recording], settings: Mapping[str, Any]
 ) -> tuple[list[Recording], dict[str, Delay]]:
-    """Return the recordings of a unit with notes on the reference of their turns, and how late the sensor is in each.
+    """Return the recordings of a unit with notes on the reference of their turns, and the delay of the sensor in each.
 
-    Signs and directions do not count: this goes before the mounting, which wrong units would hide. ``IngestError``:
-    channels of a turn contradict each other beyond what an effect of the catalogue explains.
+    Signs and directions are not compared: this check precedes that of the mounting, which wrong units would mislead.
+    ``IngestError``: channels of a turn contradict each other by more than an effect of the catalogue explains.
     """
     limits, turns = Limits.of(settings), _turns(recordings)
     for recording in turns:
@@ -113,8 +113,8 @@ def check_motion(
 ) -> list[Recording]:
     """Return the recordings of a unit with notes on the reference of held-out motion.
 
-    The turns are as they are mounted, with their ``delays``. ``IngestError``: channels of held-out motion contradict
-    each other, or a recording is late otherwise than all others.
+    ``recordings``: with their turns by the convention; ``delays``: of the sensor in them. ``IngestError``: channels of
+    held-out motion contradict each other, or the delay of a recording contradicts those of the others.
     """
     limits, gyroscope = Limits.of(settings), _Gyroscope(_turns(recordings))
     logged = [r for r in recordings if r.samples >= FEWEST and r.role != "static"]
@@ -123,7 +123,7 @@ def check_motion(
         _check_attitude_of_turn(turn, limits)
     found = {r.name: _check_motion(r, gyroscope, limits) for r in moved}
     late = {**delays, **{name: delay for name, (_, delay) in found.items() if delay is not None}}
-    check_delays([(r, late[r.name]) for r in recordings if r.name in late], limits)
+    _check_delays([(r, late[r.name]) for r in recordings if r.name in late], limits)
     return _with_notes(recordings, found)
 
 
@@ -135,19 +135,18 @@ def _with_notes(
 
 
 class _Gyroscope:
-    """Gain matrix and bias of a gyroscope, roughly, by the turns of a unit."""
+    """Rough gain matrix and bias of a gyroscope, by the turns of a unit."""
 
     def __init__(self, turns: Sequence[Recording]) -> None:
-        self.slopes: dict[str, list[tuple[float, float] | None]] = {}  # of each turn: gain and bias of each axis
+        self.slopes: dict[str, Values] = {}  # of each turn: (2, 3), gain and bias of each axis; zeros if unknown
         found: list[tuple[int, float, Values, Values]] = []  # axis turned about, usual fastest rate, gain and bias
         for recording in turns:
             rate = recording.logged_rate
             if rate is None or recording.gyroscope is None:
                 continue
-            slopes = self.slopes[recording.name] = slopes_of(recording.gyroscope, rate)
-            if None not in slopes:
-                gain, bias = np.array(slopes, np.float64).T
-                turned = int(np.argmax(np.abs(gain)))  # the stated axis may be another: a matter of the mounting
+            gain, bias = self.slopes[recording.name] = _slopes(recording.gyroscope, rate)
+            if np.all(gain):
+                turned = int(np.argmax(np.abs(gain)))  # not the stated axis: the mounting is checked later
                 found.append((turned, float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
         gains = [abs(gain[axis]) for axis, _, gain, _ in found]
         self.usual = float(np.median(gains)) if len(gains) > 2 else 1.0
@@ -159,38 +158,45 @@ class _Gyroscope:
         self.bias = np.median([bias for *_, bias in found], axis=0) if found else None
 
     def along(self, recording: Recording, axis: int) -> Values | None:
-        """Return the rate about a turn axis: (n,) array, deg/s; its bias is that of this recording."""
+        """Return the rate about a turn axis with the bias of this recording: (n,) array, deg/s."""
         rate, slopes = recording.logged_rate, self.slopes.get(recording.name)
         if recording.gyroscope is None or rate is None or slopes is None:
             return None
-        reading, slope = recording.gyroscope[:, axis], slopes[axis]
-        gains = [0.0 if s is None else abs(s[0]) / self.usual for s in slopes]
-        if slope is not None and abs(gains[axis] - 1.0) <= SAME:
-            return np.asarray((reading - slope[1]) / slope[0])
+        reading, gains = recording.gyroscope[:, axis], np.abs(slopes[0]) / self.usual
+        if abs(gains[axis] - 1.0) <= SAME:
+            return np.asarray((reading - slopes[1, axis]) / slopes[0, axis])
         if max(gains) > HALF > gains[axis]:
-            return None  # another axis turns: a matter of the mounting
+            return None  # another axis turns: the check of the mounting decides
         gain = self.matrix[axis, axis]
         bias = np.median(reading - gain * rate) if self.bias is None else self.bias[axis]
         return np.asarray((reading - float(bias)) / gain)
 
     def vector(self, recording: Recording) -> Values | None:
-        """Return the angular rate: (n, 3) array, deg/s; None where no turn tells the bias."""
+        """Return the angular rate: (n, 3) array, deg/s; None if no turn determines the bias."""
         if recording.gyroscope is None or self.bias is None:
             return None
         return np.asarray(np.linalg.solve(self.matrix, (recording.gyroscope - self.bias).T).T)
+
+
+def _slopes(reading: Values, rate: Values) -> Values:
+    """Return gain and bias of each axis of a gyroscope against a rate: (2, 3) array; zeros if the rate is constant."""
+    change = rate - median(rate)
+    if largest_but(np.abs(change), 100) < LEAST_RATE_DPS:
+        return np.zeros((2, 3))
+    gain = ratio_quartiles(reading - median(reading), change, 100, 0.1)[1]
+    return np.stack([gain, median(reading - gain * rate[:, None])])
 
 
 def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> tuple[list[Note], Delay | None]:
     channels, axis = of_table(recording), axis_index(recording)
     if opposite(channels):
         rate, angle = (limits.column(recording, name) for name in ("table_rate", "table_angle"))
+        problem = f"{rate} and the change of {angle} have opposite signs"
         hint = f"negate the column of one, or leave {rate} out (ingest.csv.columns.table_rate=null)"
-        raise refusal(
-            recording, "reference_contradiction", f"{rate} and the change of {angle} have opposite signs", hint
-        )
-    seen = gyroscope.along(recording, axis)
-    if seen is not None:
-        channels.append(of_rate(recording, "gyroscope", seen, recording.valid))
+        raise refusal(recording, "reference_contradiction", problem, hint)
+    measured = gyroscope.along(recording, axis)
+    if measured is not None:
+        channels.append(of_rate(recording, "gyroscope", measured, recording.valid))
     phase = gravity_turned(recording)
     if phase is not None and recording.table_angle is not None:
         channels.append(of_gravity(recording, phase, channels))
@@ -215,12 +221,12 @@ def _check_motion(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -
 
 
 def _compare(recording: Recording, channels: Sequence[Channel], limits: Limits) -> tuple[list[Note], Delay | None]:
-    """Compare each channel of the table's log with all others."""
+    """Compare each channel of the table's log with all others; return notes, and the delay of the sensor."""
     if len([c for c in channels if c.name != "gravity"]) < 2:
         return [], None
-    delay = delay_of(recording, channels, limits)
+    delay = _delay_of(recording, channels, limits)
     late = abs(delay.nearest(0.0)) if delay else 0.0
-    if late > limits.late_s:  # a clock that runs off: what it adds is about the same all through the recording
+    if late > limits.late_s:  # a clock that drifts: it adds nearly the same delay throughout the recording
         limits = replace(limits, late_s=late + limits.late_s)
     notes = []
     for gross, note in filter(None, map(Comparison(recording, channels, limits).find, channels)):
@@ -232,7 +238,7 @@ def _compare(recording: Recording, channels: Sequence[Channel], limits: Limits) 
 
 
 def _check_attitude_of_turn(recording: Recording, limits: Limits) -> None:
-    """Compare a turn of which the table logs the attitude alone with the gyroscope, less its readings at rest."""
+    """Compare the attitude of a turn without angle and rate with the gyroscope, whose bias is its median at rest."""
     if recording.table_attitude is None or recording.gyroscope is None:
         return
     speed = np.linalg.norm(spin(recording.table_attitude), axis=1) / np.diff(recording.time)
@@ -247,9 +253,9 @@ def _check_directions(
     recording: Recording, attitude: Values, vector: Values, limits: Limits, where: Mask | slice = slice(None)
 ) -> None:
     """Refuse an attitude whose rotation has another direction in the body than the gyroscope's."""
-    turned = (spin(attitude) / np.diff(recording.time)[:, None])[where]
-    seen = 0.5 * (vector[1:] + vector[:-1])[where]
-    off, size = np.linalg.norm(turned - seen, axis=1), np.linalg.norm(seen, axis=1)
+    logged = (spin(attitude) / np.diff(recording.time)[:, None])[where]
+    measured = 0.5 * (vector[1:] + vector[:-1])[where]
+    off, size = np.linalg.norm(logged - measured, axis=1), np.linalg.norm(measured, axis=1)
     change = np.linalg.norm(np.diff(vector, axis=0), axis=1)[where] / recording.interval
     allowed = (limits.gain + limits.rate) * size + limits.late_s * change + limits.offset_dps
     usual_off, usual_size = float(np.median(off)), float(np.median(size))
@@ -263,7 +269,7 @@ def _check_directions(
         )
 
 
-def delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits) -> Delay | None:
+def _delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits) -> Delay | None:
     """Return the delay of the sensor against the table's log; refuse a delay that no effect explains."""
     first, *others = (c for c in channels if c.name != "gravity")
     found = None
@@ -295,20 +301,20 @@ def delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits) 
 
 
 def _variances(fixed: Values, moved: Values) -> Values:
-    """Return the variance of the difference to (n,) values of each n successive ones of (m,): (m - n + 1,) array."""
+    """Return the variance of the difference between (n,) values and each n successive ones of (m,): (m - n + 1,)."""
     n, one, two = len(fixed), fixed - fixed.mean(), moved - moved.mean()
     total, squares = (np.append(0.0, np.cumsum(v)) for v in (two, two * two))
     power = one @ one
-    apart = power + squares[n:] - squares[:-n] - 2.0 * np.correlate(two, one, "valid")
+    difference = power + squares[n:] - squares[:-n] - 2.0 * np.correlate(two, one, "valid")
     rounding = np.finfo(float).eps * power
-    return np.asarray(np.maximum(apart - (total[n:] - total[:-n]) ** 2 / n, rounding) / n)
+    return np.asarray(np.maximum(difference - (total[n:] - total[:-n]) ** 2 / n, rounding) / n)
 
 
-def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> None:
-    """Refuse a recording whose delay is not that of the one offset and the one clock that a unit's recordings share.
+def _check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> None:
+    """Refuse a recording whose delay contradicts the one offset and the one clock of a unit's recordings.
 
-    Some tau and e with ``|tau| <= time_offset + low_pass_lag`` and ``|e| <= clock_rate`` have to lie, as ``tau + e t``,
-    in the interval of every recording at some time t of it. If not, the recording is refused whose removal allows it.
+    For some tau and e with ``|tau| <= time_offset + low_pass_lag`` and ``|e| <= clock_rate``, ``tau + e t`` has to be
+    in the interval of every recording at some time t of it. If not, the recording whose removal allows it is refused.
     """
     if len(found) < 2 or not all(r.clock_shared for r, _ in found):
         return
@@ -334,9 +340,9 @@ def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> No
 def _of_one_clock(intervals: Values, limits: Limits) -> bool:
     """Return whether one offset and one clock explain (r, 4) first and last times, least and largest delays, s."""
     start, end, low, high = intervals.T
-    run_off = np.linspace(-limits.clock, limits.clock, CLOCKS)[:, None, None] * np.stack([start, end])
-    least = np.maximum((low - run_off.max(axis=1)).max(axis=1), -limits.late_s)
-    most = np.minimum((high - run_off.min(axis=1)).min(axis=1), limits.late_s)
+    drift = np.linspace(-limits.clock, limits.clock, CLOCKS)[:, None, None] * np.stack([start, end])
+    least = np.maximum((low - drift.max(axis=1)).max(axis=1), -limits.late_s)
+    most = np.minimum((high - drift.min(axis=1)).min(axis=1), limits.late_s)
     return bool(np.any(least <= most))
 
 
@@ -353,9 +359,9 @@ def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[floa
 
 
 def _interval(squares: Values, room: float, steps: int) -> tuple[float, float, float] | None:
-    """Return the place of the minimum, and of the first and the last delay that the steps do not exclude.
+    """Return the index of the minimum, and of the first and the last delay that the steps do not exclude.
 
-    None where they exclude neither the first nor the last of all delays tried.
+    None if they exclude neither the first nor the last of all delays tried.
     """
     best = _nearest_minimum(squares, room)
     least = max(float(squares.min()), float(np.finfo(float).tiny))
@@ -366,16 +372,16 @@ def _interval(squares: Values, room: float, steps: int) -> tuple[float, float, f
 
 
 def _nearest_minimum(squares: Values, room: float) -> float:
-    """Return the place, nearest to the middle, of a minimum that is not much above the least: equal steps repeat.
+    """Return the index, nearest to the middle, of a minimum at most ``room`` above the least: equal steps repeat.
 
-    Between the samples a minimum lies where the parabola through the least square and its neighbours is least.
+    A minimum between samples is that of the parabola through the least sample and its neighbours.
     """
     a, b, c = squares[:-2], squares[1:-1], squares[2:]
     lowest = (b <= a) & (b <= c) & (a + c > 2.0 * b)
-    at = 0.5 * (a - c) / np.where(lowest, a - 2.0 * b + c, np.inf)
-    value = np.where(lowest, np.maximum(b - 0.25 * (a - c) * at, 0.0), np.inf)
+    shift = 0.5 * (a - c) / np.where(lowest, a - 2.0 * b + c, np.inf)
+    value = np.where(lowest, np.maximum(b - 0.25 * (a - c) * shift, 0.0), np.inf)
     if not np.isfinite(value).any():
         return float(np.argmin(squares))
-    places = np.flatnonzero(value <= value.min() + room)
-    nearest = int(places[np.argmin(np.abs(places + 1 - len(squares) // 2))])
-    return nearest + 1 + float(at[nearest])
+    minima = np.flatnonzero(value <= value.min() + room)
+    nearest = int(minima[np.argmin(np.abs(minima + 1 - len(squares) // 2))])
+    return nearest + 1 + float(shift[nearest])

@@ -1,18 +1,19 @@
-"""Samples and stretches in which one channel of a table's log contradicts all others.
+"""Find samples and stretches in which one channel of a table's log contradicts all others.
 
-One value c of a channel (at a sample, or over an interval) is contradicted by another channel w where
+A channel w contradicts a value c of another one (at a sample, or over an interval) where
 
     c > w_max + m b + d   or   c < w_min - m b - d
 
-where w_min and w_max are both the mean of the two nearest values of another channel of the table (m = 3), or of a
-sensor the extremes within the largest plausible delay (m = 1), and b is the largest second difference of w there: a
-short move may reach its rate between the samples that w shows. Stretches, of 16 samples and of a twelfth of the
-recording, are contradicted where
+where b is the largest second difference of w near c: a short move may reach its rate between two samples of w. If w is
+a channel of the table, w_min and w_max are both the mean of its two nearest values, and m = 3. If w is a sensor, they
+are its extremes within the largest plausible delay, and m = 1. Stretches of 16 samples and of a twelfth of the
+recording contradict each other where
 
     |sum (c - w) dt| > d_s + T range(w) + 3 sqrt(sum (dc dt / 2)^2 + sum (dw dt / 2)^2)
 
-with T the largest delay, and the last term what a rate that bends between its samples leaves of a sum. d and d_s are
-what noise and the limits of the catalogue's effects allow. What exceeds noise and the stated accuracy only is a doubt.
+with the largest delay T. The last term is the error of a sum over a rate that changes between its samples. Noise and
+the limits of the catalogue's effects allow d and d_s. A difference that exceeds only noise and the stated accuracy is
+a doubt.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ if TYPE_CHECKING:
 
 
 BY_NOISE = 10.0  # standard deviations, as of disturbances (pipeline.io.disturbances)
-BENDS = 3.0  # of a move as long as one interval, whose second difference shows a quarter of its rate
+BENDS = 3.0  # times the second difference: in a move as long as one interval, it is a quarter of the rate
 SHORT, LONG = 16, 12  # samples of a short stretch; long ones in a recording
-MANY = 20  # samples, more than a spike or a jump concerns
+MANY = 20  # samples, more than a spike or a jump changes
 RESOLVED_DEG = 1e-3  # of a logged angle: the tenth of a common encoder's 0.01 deg
-CURVED = 0.02  # relative: what nonlinearities leave of a gyroscope's gain that is fitted to the same turn
+CURVED = 0.02  # relative error by nonlinearities of a gyroscope's gain that is fitted to the same turn
 OF_SENSOR = ("gyroscope", "gravity")
 PHASE = 0.2  # relative error of gravity's phase over some degrees: twice 0.1 g of bias
 
@@ -48,11 +49,11 @@ class Comparison:
         self.recording, self.channels, self.limits = recording, channels, limits
         self.dt = np.diff(recording.time)
         self.interval = float(median(self.dt))
-        self.known = np.ones(len(self.dt), bool)  # intervals that every channel knows
+        self.known = np.ones(len(self.dt), bool)  # intervals in which every channel is known
         for channel in channels:
             finite = np.isfinite(channel.low)
             self.known &= finite if channel.of_intervals else finite[1:] & finite[:-1]
-        # size and starts, and the sums of each channel
+        # Size, starts, and the sums of each channel.
         self.stretches: list[tuple[int, Index, dict[str, tuple[Values, Values, Values, Values]]]] = []
         n = len(self.dt)
         for size in sorted({SHORT, max(n // LONG, SHORT)}):
@@ -60,23 +61,23 @@ class Comparison:
             self.stretches.append((size, starts, {c.name: self._sums(c, starts) for c in channels}))
 
     def find(self, claim: Channel) -> tuple[bool, Note] | None:
-        """Return where a channel contradicts all others, and whether no effect of the catalogue explains it."""
+        """Return whether no effect of the catalogue explains a contradiction, and the note on it; None without one."""
         others = [c for c in self.channels if c is not claim and (c.name != "gravity" or claim.name == "table_angle")]
         if not others or claim.name in OF_SENSOR:
             return None
         alone = all(w.name in OF_SENSOR for w in others)
         gross, doubt = zip(*(self._rows(claim, w, alone=alone) for w in others), strict=True)
-        if (note := self._worst_row(claim, others, gross)) or (note := self._worst_stretch(claim, others)):
+        if note := self._worst_row(claim, others, gross) or self._worst_stretch(claim, others):
             return True, note
         note = self._worst_row(claim, others, doubt)
         return (False, note) if note else None
 
     def _rows(self, claim: Channel, other: Channel, *, alone: bool) -> tuple[Values, Values]:
-        """Return by how much each value is beyond what another channel allows, grossly and by noise: (m,) arrays."""
+        """Return the excess of each value over what another channel allows: by effects, by accuracy: (m,) arrays."""
         limits, of_sensor = self.limits, other.name in OF_SENSOR
         reach = max(int(np.ceil(limits.late_s / self.interval)), 1) if of_sensor else 1
         low, high, bend = _near(other, claim, reach)
-        if other.name == "gravity":  # a move between two samples of the angle may be shared by two of the sensor
+        if other.name == "gravity":  # a move between two samples of the angle may be split between two of the sensor
             low, high, bend = np.minimum(2.0 * low, 0.0), np.maximum(2.0 * high, 0.0), np.zeros_like(bend)
         size = np.maximum(np.abs(low), np.abs(high))
         size[np.isinf(size)] = np.nan
@@ -121,43 +122,43 @@ class Comparison:
             length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
             excess, sums = [], []
             for other in others:
-                seen, seen_total, seen_bends, swing = known[other.name]
-                most = np.maximum(total, seen_total)
-                allowed = limits.rate * most + BENDS * np.sqrt(bends + seen_bends) + RESOLVED_DEG
+                shown, shown_total, shown_bends, swing = known[other.name]
+                most = np.maximum(total, shown_total)
+                allowed = limits.rate * most + BENDS * np.sqrt(bends + shown_bends) + RESOLVED_DEG
                 if claim.of_intervals or other.of_intervals:
                     allowed += limits.angle_deg
                 if other.name in OF_SENSOR:
                     share = PHASE if other.name == "gravity" else limits.gain
                     noise = BY_NOISE * other.noise * self.interval * (1.0 if other.of_intervals else np.sqrt(size))
                     allowed += share * most + limits.late_s * swing + limits.offset_dps * length + noise
-                excess.append(np.abs(turned - seen) - allowed)
-                sums.append(seen)
+                excess.append(np.abs(turned - shown) - allowed)
+                sums.append(shown)
             off = np.min(excess, axis=0)
             rows = np.flatnonzero(off > 0.0)
             if rows.size:
                 worst = int(np.argmax(off))
-                seen = sums[int(np.argmin([e[worst] for e in excess]))]
+                shown = sums[int(np.argmin([e[worst] for e in excess]))]
                 first, last = int(starts[rows[0]]), min(int(starts[rows[-1]]) + size, n)
                 part = getattr(self.recording, claim.name)[first : last + 1]
                 name, names = self._names(claim, others)
                 message = (
                     f"{name}{' stays the same and' if np.all(part == part[0]) else ''} contradicts {names} in "
                     f"{place(self.recording, first, last)}: it turns by {turned[worst]:.4g} deg and they by "
-                    f"{seen[worst]:.4g} deg in one of {rows.size} such stretches"
+                    f"{shown[worst]:.4g} deg in one of {rows.size} such stretches"
                 )
                 return self._note(message, rows.size, first, last)
         return None
 
     def _sums(self, channel: Channel, starts: Index) -> tuple[Values, Values, Values, Values]:
-        """Return the angle turned, its total, the square of what bends leave and the range of the rate, by stretch."""
+        """Return for each stretch: angle, sum of its magnitudes, squared error by bends, and range of the rate."""
         turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
         rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
         if not channel.of_intervals:
             steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
             bend = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
         swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
-        turns, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
-        return turns, total, bends, swing
+        angle, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
+        return angle, total, bends, swing
 
     def _names(self, claim: Channel, others: list[Channel]) -> tuple[str, str]:
         name, *names = (self.limits.column(self.recording, c.name) for c in (claim, *others))
@@ -171,11 +172,7 @@ class Comparison:
 def _near(other: Channel, claim: Channel, reach: int) -> tuple[Values, Values, Values]:
     """Return smallest and largest value, and largest second difference, of a channel near each value of another."""
     m, n = len(other.low), len(claim.low)
-    before, after = reach, reach
-    if m < n:  # of intervals, about a sample: those on either side
-        after -= 1
-    elif m > n:  # samples about an interval: those at its ends
-        after += 1
+    before, after = reach, reach + m - n  # n - 1 intervals next to n samples, or the reverse
     bend = np.zeros(m)
     with np.errstate(invalid="ignore"):
         bend[1:-1] = np.abs(other.low[2:] - 2.0 * other.low[1:-1] + other.low[:-2])

@@ -1,28 +1,28 @@
-"""Whether table angle, table rate, gyroscope, gravity and time agree in scale: wrong units.
+"""Check that table angle, table rate, gyroscope, gravity and time agree in scale, to find wrong units.
 
 In a turn about a level axis gravity turns in the body by the table's angle, whatever the units of the log:
 
     phi = atan2(f_w - c_w, f_v - c_v)
 
-with v, w the axes across the turn axis and c the middle of each axis's readings. For blocks of a recording the turned
-angles by gravity (phi), by the table's angle, and by the sums of table rate and gyroscope over the time are compared by
-the weighted median of their ratios. Gravity tells which of two that differ is wrong:
+with v, w the axes across the turn axis and c the middle of each axis's readings. Each block of a recording gives the
+angles turned by gravity (phi) and by the table's angle, and the sums of table rate and gyroscope over the time. The
+weighted medians of their ratios are compared. Gravity determines which of two that differ is wrong:
 
     angle right, rate and gyroscope wrong alike by 1000 : the time
     angle right, rate and gyroscope wrong alike otherwise : both rates
-    angle right, rate wrong alone : the rate
+    angle right, only the rate wrong : the rate
     rate right, angle wrong : the angle
 
-A gyroscope that is wrong alone is a matter of its scale factor. Biases of the accelerometer distort phi twice a turn at
-most, by some degrees.
+If only the gyroscope differs, its scale factor explains it. Biases of the accelerometer distort phi by some degrees, at
+most twice a turn.
 
 An encoder with a wrong number of counts a turn, or a gear of another ratio, gives angle and rate the same small error
-``s - 1``. No unit does that, and the gyroscope agrees with it; gravity does not:
+``s - 1``. No wrong unit does that, and the gyroscope agrees with it. Gravity does not:
 
     f_k = c_k + A_k cos(s a) + B_k sin(s a) + r_k
 
-with table angle a, both axes k across the turn axis, one s for both, and in r what else depends on the motion:
-harmonics up to the third, what a delay (rate times the first harmonic) and a lever arm add, drifts of bias and scale.
+with table angle a, both axes k across the turn axis, and one s for both. The other dependences on the motion are in r:
+harmonics up to the third, a delay (rate times the first harmonic), a lever arm, drifts of bias and scale.
 """
 
 from __future__ import annotations
@@ -74,21 +74,21 @@ TIMES = ((1e3, "ms declared as s"), (1e6, "us declared as s"), (1e9, "ns declare
 OTHER_AXIS = 0.5  # the axis that turns reads more than twice as much as one that leans by up to 26 deg
 LEAST_TOTAL_DEG = 1.0  # over a recording, for a ratio
 SPREAD = 0.2  # relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale
-EVEN = 1e-2  # relative change of a rate that is constant
+EVEN = 1e-2  # relative change of a constant rate
 FEWEST = 10  # intervals at constant rate
 MOSTLY_EVEN = 0.7  # of the angle that is turned
-WHOLE_TURN_DEG = 330.0  # of gravity's phase, from which its harmonics are told apart from its slope
-ALIKE_SAMPLES = 64.0  # neighbours whose residuals go together, by which the variance of the slope is enlarged
+WHOLE_TURN_DEG = 330.0  # of gravity's phase, from which its harmonics are distinguished from its slope
+ALIKE_SAMPLES = 64.0  # neighbours with correlated residuals, by which the variance of the slope is enlarged
 SIGNIFICANT = 6.0  # standard uncertainties, as in pipeline.signal.rests
 QUARTZ = 2e-4  # relative: two quartz clocks of +-100 ppm each
-GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz, what lever arms leave of its phase
-SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, what nonlinearities of an accelerometer leave of gravity's direction
+GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz, errors of its phase by lever arms
+SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, error of gravity's direction by an accelerometer's nonlinearities
 FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, ROUNDS = 200, 24, 4  # samples; blocks of a sandwich estimate; Gauss-Newton steps
 ALIKE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
 
 
 class _Ratio(NamedTuple):
-    """How many times as far one channel turns as another: weighted median over blocks, and whether all blocks agree."""
+    """Angle by one channel over that by another: weighted median over blocks, and whether the blocks agree."""
 
     value: float
     even: bool
@@ -101,18 +101,19 @@ class _Ratio(NamedTuple):
 
     @property
     def of_time(self) -> bool:
-        """Whether a wrong unit of the time makes it."""
+        """Whether a wrong unit of the time explains it."""
         return self.even and bool(_unit(self.value, TIMES))
 
 
 def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
     """Refuse a turn in which angle, rate, gyroscope, gravity and time contradict each other in scale.
 
-    A turn about another axis than the stated one is left to the check of the mounting.
+    A turn about another axis than the stated one is not compared: the check of the mounting follows.
     """
-    if _about_another_axis(recording):
+    turned = _turned(recording)
+    if turned is None:
         return
-    angle, rate, gyro, gravity = _turned(recording)
+    angle, rate, gyro, gravity = turned
     true_angle, true_rate = _ratio(angle, gravity), _ratio(rate, gravity)
     ratio, by_gyro = _ratio(rate, angle), _ratio(rate, gyro)
     gyro_agrees = by_gyro is not None and by_gyro.agrees(GRAVITY_TOLERANCE)
@@ -136,25 +137,24 @@ def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
             raise _wrong_time(recording, limits, factor, "the gyroscope's readings sum up to")
 
 
-def _about_another_axis(recording: Recording) -> bool:
-    gyro = recording.gyroscope
-    if gyro is None or recording.axis is None or not recording.valid.any():
-        return False
-    spread = np.std(gyro[recording.valid], axis=0)
-    return bool(spread["xyz".index(recording.axis)] < OTHER_AXIS * spread.max())
+def _turned(recording: Recording) -> tuple[Values | None, ...] | None:
+    """Return the angle turned in each block by angle, rate, gyroscope and gravity: (96,) arrays, deg.
 
-
-def _turned(recording: Recording) -> tuple[Values | None, ...]:
-    """Return the angle turned in each block of a turn by angle, rate, gyroscope and gravity: (96,) arrays, deg."""
+    None for a turn about another axis than the stated one.
+    """
+    axis, gyro = axis_index(recording), None
+    if recording.gyroscope is not None and recording.valid.any():
+        spread = np.std(recording.gyroscope[recording.valid], axis=0)
+        if spread[axis] < OTHER_AXIS * spread.max():
+            return None
     found = {c.name: c.turned for c in of_table(recording)}
-    gyro = None
     if recording.gyroscope is not None:
-        reading = still = recording.gyroscope[:, axis_index(recording)]
+        reading = still = recording.gyroscope[:, axis]
         if recording.table_rate is not None:
             still = reading[np.abs(recording.table_rate) <= np.min(np.abs(recording.table_rate))]
         gyro = of_rate(recording, "gyroscope", reading - np.median(still), recording.valid).turned
-    every = (found.get("table_angle"), found.get("table_rate"), gyro, gravity_turned(recording))
-    return tuple(map(_in_blocks, every))
+    channels = (found.get("table_angle"), found.get("table_rate"), gyro, gravity_turned(recording))
+    return tuple(map(_in_blocks, channels))
 
 
 def check_scale_of_motion(recording: Recording, size: Values | None, limits: Limits) -> None:
@@ -183,7 +183,7 @@ def check_scale_of_motion(recording: Recording, size: Values | None, limits: Lim
 
 
 def doubt_of_angle(recording: Recording, limits: Limits) -> str | None:
-    """Return a sentence where a turn's angle is not exactly as large as gravity's: an encoder's counts, a gear."""
+    """Return the doubt that a turn's angle differs from gravity's by a factor: an encoder's counts, a gear."""
     found = _gear(recording)
     if found is None:
         return None
@@ -200,9 +200,9 @@ def doubt_of_angle(recording: Recording, limits: Limits) -> str | None:
 
 
 def _gear(recording: Recording) -> tuple[float, float] | None:
-    """Return how many times as far the angle turns as gravity, and its standard uncertainty."""
+    """Return the ratio of the table's angle to gravity's, and its standard uncertainty; None if it is unknown."""
     angle, rate, force = recording.table_angle, recording.logged_rate, recording.accelerometer
-    if recording.role != "gyroscope":  # in a turn of minutes, a bias that follows the temperature looks the same
+    if recording.role != "gyroscope":  # in a turn of minutes, a bias that follows the temperature has the same signal
         return None
     if angle is None or rate is None or force is None or gravity_turned(recording) is None:
         return None
@@ -232,7 +232,7 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
 
 
 def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
-    """Return a sentence where a turn's rate is not exactly that of its angle, or of gravity."""
+    """Return the doubt that a turn's rate differs from that of its angle, or of gravity, by a factor."""
     found = rate_against_angle(recording)
     if found is None:
         return None
@@ -249,10 +249,10 @@ def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
 
 
 def rate_against_angle(recording: Recording) -> tuple[float, float, int] | None:
-    """Return how many times as large as the change of its angle a turn's rate is, its uncertainty, and the samples.
+    """Return the ratio of a turn's rate to the change of its angle, its standard uncertainty, and the samples.
 
-    At constant rate the angle's increment is the rate times the interval, exactly. Without an angle the sum of the rate
-    is regressed on gravity's phase and its first two harmonics, in which biases and cross-axis sensitivity distort it.
+    At constant rate the angle's increment is exactly the rate times the interval. Without an angle the sum of the rate
+    is regressed on gravity's phase and its first two harmonics, by which biases and cross-axis sensitivity distort it.
     """
     rate = recording.table_rate
     if rate is None:
@@ -260,7 +260,7 @@ def rate_against_angle(recording: Recording) -> tuple[float, float, int] | None:
     dt = np.diff(recording.time)
     even = np.abs(np.diff(rate)) <= EVEN * np.abs(rate[1:])
     even &= (np.abs(rate[1:]) > LEAST_TOTAL_DEG) & ~gaps(recording)
-    even[1:-1] &= even[2:] & even[:-2]  # two samples on either side of a short move's peak are alike by chance
+    even[1:-1] &= even[2:] & even[:-2]  # two samples on either side of a short move's peak are equal by chance
     even[[0, -1]] = False
     samples = int(even.sum())
     if samples < FEWEST:
@@ -284,13 +284,12 @@ def _against_phase(recording: Recording, steps: Values, even: Mask) -> tuple[flo
     a = np.radians(phase)
     A = np.column_stack([phase, np.ones_like(a), np.cos(a), np.sin(a), np.cos(2.0 * a), np.sin(2.0 * a)])
     x = np.linalg.lstsq(A, summed, rcond=None)[0]
-    left = summed - A @ x
-    spread = float(np.sqrt(np.mean(left**2) / np.sum((phase - phase.mean()) ** 2) * ALIKE_SAMPLES))
-    return abs(float(x[0])), spread
+    variance = np.mean((summed - A @ x) ** 2) / np.sum((phase - phase.mean()) ** 2)
+    return abs(float(x[0])), float(np.sqrt(variance * ALIKE_SAMPLES))
 
 
 def check_intervals(recordings: Sequence[Recording], limits: Limits) -> None:
-    """Refuse a recording whose interval is a thousand or a million times that of the unit's others."""
+    """Refuse a recording whose interval differs from that of the unit's others as by a wrong unit of the time."""
     if len(recordings) < 3:
         return
     middle = float(np.median([r.interval for r in recordings]))
@@ -314,7 +313,7 @@ def _in_blocks(turned: Values | None) -> Values | None:
 
 
 def _ratio(one: Values | None, other: Values | None) -> _Ratio | None:
-    """Return the ratio of two channels over the blocks in which the other turned; None where it did not."""
+    """Return the ratio of two channels over the blocks in which the other turned; None if it did not turn."""
     if one is None or other is None:
         return None
     size = np.abs(other)
@@ -325,20 +324,21 @@ def _ratio(one: Values | None, other: Values | None) -> _Ratio | None:
 
 
 def _unit(value: float, units: Units) -> str:
-    """Return which wrong unit makes a factor; empty for none."""
+    """Return the wrong unit that explains a factor, in words; empty for none."""
     return next((what for factor, what in units if abs(value / factor - 1.0) <= ALIKE), "")
 
 
 def _wrong_angle(recording: Recording, limits: Limits, factor: float, against: str) -> IngestError:
-    name, what = limits.column(recording, "table_angle"), _unit(factor, ANGLE_UNITS)
-    whole = place(recording, 0, recording.samples - 1)
-    what = what or f"is {factor:.4g} times what it should be"
-    message = f"{name} {what}: over {whole} it turns {factor:.4g} times as far as {against} says"
+    what = _unit(factor, ANGLE_UNITS) or f"is {factor:.4g} times what it should be"
+    message = (
+        f"{limits.column(recording, 'table_angle')} {what}: over {place(recording, 0, recording.samples - 1)} it turns "
+        f"{factor:.4g} times as far as {against} says"
+    )
     return refusal(recording, "reference_scale", message, "correct ingest.csv.columns.table_angle.unit")
 
 
 def _wrong_rate(recording: Recording, limits: Limits, ratio: _Ratio, against: str, *, gyro_agrees: bool) -> IngestError:
-    """Refuse the table's rate, or the time or both rates where the gyroscope agrees with it."""
+    """Return the refusal of the table's rate, or of the time or both rates if the gyroscope agrees with it."""
     if gyro_agrees and ratio.of_time:
         return _wrong_time(recording, limits, ratio, "the table's rate sums up to")
     name, keys = limits.column(recording, "table_rate"), "ingest.csv.columns.table_rate.unit"

@@ -1,4 +1,4 @@
-"""Whether one common mounting explains all turns of a unit.
+"""Check whether one common mounting explains all turns of a unit.
 
 Each turn for the accelerometer gives three vectors (``pipeline.preprocessing.bench``), by the convention
 
@@ -10,14 +10,15 @@ K, b     : inverse of the calibration matrix, and bias
 S_k      : rotation of the unit in its seat in turn k, small; the rotation that all turns share is a part of K
 u_k, a_k : upward face at angle 0 and turn axis
 
-Three turns are 27 numbers against 9 of K, 3 of b and 6 of the seats. A zero of the angle is a seat about the turn axis.
-Table tilt, and turn axes that are not at right angles, look like seats in p and q and lift the turn axes as well: where
-they explain the 27 numbers within their limits, and level seats do not, the diagnosis of the unit names them.
+Three turns give 27 numbers for 9 of K, 3 of b and 6 of the seats. A zero of the angle is a seat about the turn axis.
+Table tilt, and turn axes that are not at right angles, have the same signal as seats in p and q, and change the
+elevation of the turn axes as well. If they explain the 27 numbers within their limits, and level seats do not, the
+diagnosis of the unit names them.
 
 A turn for the gyroscope gives the direction of its turn axis in the frame of the accelerometer, ``K^T (q x p)``,
-whatever its zero and its time offset; the gyroscope alone could not tell it from a misalignment of its own.
+whatever its zero and its time offset. The gyroscope alone cannot distinguish it from its misalignment.
 
-Turns that do not fit together get the note ``N-SEATS``.
+Turns that no common mounting explains get the note ``N-SEATS``.
 """
 
 from __future__ import annotations
@@ -39,15 +40,15 @@ if TYPE_CHECKING:
     from pipeline.preprocessing.mounting import Turn
     from pipeline.records import Values
 
-# Seats smaller than this are left to the diagnosis: hidden table effects of the blind study (tilt 0.26 deg, leans 0.13
-# deg) reach 0.2 deg.
+# Smaller seats are left to the diagnosis: hidden table effects of the blind study (tilt 0.26 deg, leans 0.13 deg) reach
+# 0.2 deg.
 SMALLEST_DEG = 0.3
 TIMES_STATED = 3.0  # standard uncertainties of the table's orthogonality and angle
-NOISE_PQ_G = 5e-4  # what wander, drift and nonlinearity leave in p and q in the blind study: 0.03 deg
+NOISE_PQ_G = 5e-4  # by wander, drift and nonlinearity in p and q in the blind study: 0.03 deg
 NOISE_C_G = 4e-3  # likewise in c: half of a K2 of 6e-3 1/g (twice 0.3 %), or 8 degC at 5e-4 g/degC
 CLEARLY, OF_TWO_MORE = 1.0, 4.0  # chi-square by which leans have to be better than seats: 1 sigma; 2 sigma with tilt
 FITS = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
-GAUGE = 1e-6  # weight that makes the seats those of the smallest sum of squares
+GAUGE = 1e-6  # weight with which the seats have the smallest sum of squares
 QUARTERS = np.array([0.0, 90.0, 180.0, 270.0])
 TABLE = ("table_tilt", "table_axis_nonorthogonality")
 # Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
@@ -56,7 +57,7 @@ LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 
 
 @dataclass(frozen=True)
 class _Conventional:
-    """A turn by the convention of its bench."""
+    """A turn by the convention of its mounting."""
 
     turn: Turn
     bench: Bench
@@ -79,11 +80,11 @@ class _Conventional:
 
 @dataclass(frozen=True)
 class _Seats:
-    """How the unit sits in the turns for the accelerometer."""
+    """Seats of the unit in the turns for the accelerometer."""
 
-    K: Values  # with the common seat that is left where zeros explain the rest, else with the mean of the seats
+    K: Values  # includes the common seat if zeros explain the differences, else the mean of the seats
     seats: Values  # (n, 3), deg, rotation in each turn against the mean of all
-    zeros: Values | None  # (n,), deg, of each turn, where one common seat and the zeros explain the turns
+    zeros: Values | None  # (n,), deg, of each turn, if one common seat and the zeros explain the turns
 
 
 def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
@@ -93,32 +94,25 @@ def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
     gauge = GAUGE * np.eye(9 + seats.size)[9:]
     for _ in range(4):
         R = turn_by_vector(np.radians(seats))
-        design, left = np.zeros((n, 2, 3, 9 + seats.size)), np.zeros((n, 2, 3))
+        design, residual = np.zeros((n, 2, 3, 9 + seats.size)), np.zeros((n, 2, 3))
         for k, turn in enumerate(turns):
             for row, ideal in enumerate(turn.ideal):
                 d = R[k].T @ ideal
-                for i in range(3):
-                    design[k, row, i, 3 * i : 3 * i + 3] = d
+                design[k, row, :, :9] = np.kron(np.eye(3), d)
                 design[k, row, :, 9 + 3 * k : 12 + 3 * k] = np.radians(K @ skew(d))
-                left[k, row] = turn.gravity[1 + row] - K @ d
-        rows, off = design.reshape(6 * n, -1), np.append(left, -GAUGE * seats)
-        step = np.linalg.lstsq(np.vstack([rows, gauge]), off, rcond=None)[0]
+                residual[k, row] = turn.gravity[1 + row] - K @ d
+        rows = np.vstack([design.reshape(6 * n, -1), gauge])
+        step = np.linalg.lstsq(rows, np.append(residual, -GAUGE * seats), rcond=None)[0]
         K, seats = K + step[:9].reshape(3, 3), seats + step[9:].reshape(-1, 3)
-    common, zeros = _zeros(turns, seats)
-    return _Seats(K @ turn_by_vector(np.radians(common)).T, seats - seats.mean(axis=0), zeros)
-
-
-def _zeros(turns: Sequence[_Conventional], seats: Values) -> tuple[Values, Values | None]:
-    """Return a common seat and the zeros that explain the other seats, or their mean and None where none do."""
-    design = np.zeros((seats.size, 3 + len(turns)))
-    for k, turn in enumerate(turns):
-        design[3 * k : 3 * k + 3, :3] = np.eye(3)
-        design[3 * k + turn.axis, 3 + k] = 1.0
+    # A common seat, and a zero of each turn that is a seat about its axis.
+    about = np.zeros((n, 3, n))
+    about[range(n), [turn.axis for turn in turns], range(n)] = 1.0
+    design = np.column_stack([np.tile(np.eye(3), (n, 1)), about.reshape(3 * n, n)])
     found = np.linalg.lstsq(design, seats.ravel(), rcond=None)[0]
-    left = seats.ravel() - design @ found
-    if np.max(np.abs(left)) < SMALLEST_DEG / 3.0:
-        return np.asarray(found[:3], np.float64), np.asarray(-found[3:], np.float64)
-    return np.asarray(seats.mean(axis=0), np.float64), None
+    common, zeros = seats.mean(axis=0), None
+    if np.max(np.abs(seats.ravel() - design @ found)) < SMALLEST_DEG / 3.0:
+        common, zeros = found[:3], np.asarray(-found[3:])
+    return _Seats(K @ turn_by_vector(np.radians(common)).T, seats - seats.mean(axis=0), zeros)
 
 
 def _table_explains(turns: Sequence[_Conventional], K: Values, limits: Sequence[float]) -> bool:
@@ -145,8 +139,7 @@ def _fit(turns: Sequence[_Conventional], K: Values, columns: Values, limits: Seq
     """
     design = np.zeros((*columns.shape[:3], 12 + columns.shape[3]))
     for k, turn in enumerate(turns):
-        for i in range(3):
-            design[k, 1:, i, 3 * i : 3 * i + 3] = turn.ideal
+        design[k, 1:, :, :9] = [np.kron(np.eye(3), ideal) for ideal in turn.ideal]
     design[:, 0, :, 9:12] = np.eye(3)
     design[..., 12:] = K @ columns
     weight = 1.0 / np.array([[NOISE_C_G], [NOISE_PQ_G], [NOISE_PQ_G]])
@@ -175,25 +168,14 @@ def _offset_columns(turn: _Conventional) -> Values:
     return np.asarray(np.radians(mean_rate) * np.stack([np.zeros(3), across, -up])[..., None])
 
 
-def _axis_off_deg(turn: _Conventional, K: Values, others: Sequence[_Conventional]) -> Values:
-    """Return the rotation of a turn axis against the body axis, or that of another turn about it: (3,) array, deg.
-
-    The smaller of the two: where the axes of the table lean, the gyroscope's lean with the accelerometer's.
-    """
-    near = [np.eye(3)[turn.axis], *(o.normal(K) for o in others if o.axis == turn.axis)]
-    off = [np.degrees(np.cross(turn.normal(K), axis)) for axis in near]
-    return min(off, key=lambda v: float(np.linalg.norm(v)))
-
-
-def _letters(vector: Values) -> str:
-    return ", ".join(f"{v:+.2f} deg about {a}" for a, v in zip(AXES, vector, strict=True))
-
-
 def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> dict[str, Note]:
-    """Return the doubt about each recording of a unit, by name.
+    """Return the note on each recording that the common mounting does not explain, by name.
 
-    The turns of one setup are compared; all together where no setup holds turns about all three axes.
+    The turns of one setup are compared, or all together if no setup has turns about all three axes. With
+    ``table.seat_deg`` each turn has a separate mounting, which the fit estimates.
     """
+    if table.get("seat_deg") is not None:
+        return {}
     orthogonality, angle = (float(table.get(k) or 0.0) for k in ("orthogonality_deg", "angle_accuracy_deg"))
     allowed = max(SMALLEST_DEG, TIMES_STATED * float(np.hypot(orthogonality, angle)))
     effects = (sensor.get("accelerometer") or {}).get("effects") or {}
@@ -203,54 +185,60 @@ def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[
         _conventional([(t, t.stated) for t in turns if t.recording.setup == setup])
         for setup in dict.fromkeys(t.recording.setup for t in turns)
     ]
-    complete = [(own, slow) for own, slow in setups if {c.axis for c in slow} == set(range(3))]
-    for own, slow in complete or [_conventional([(t, t.stated) for t in turns])]:
+    complete = [(every, slow) for every, slow in setups if {c.axis for c in slow} == set(range(3))]
+    for every, slow in complete or [_conventional([(t, t.stated) for t in turns])]:
         in_doubt = any(note.code == "N-REFERENCE" for c in slow for note in c.turn.recording.notes)
         if in_doubt or {c.axis for c in slow} != set(range(3)):
-            continue  # an angle that is in doubt already tells nothing of seats
+            continue  # an angle in doubt is no evidence of seats
         found = _find_seats(slow)
         doubt = np.max(np.abs(found.seats)) > allowed and not _table_explains(slow, found.K, limits)
         if doubt:
             details |= dict.fromkeys((c.turn.name for c in slow), _seats_in_words(slow, found, allowed))
-        for fast in own:
-            off = _axis_off_deg(fast, found.K, [] if doubt else slow)
+        for fast in every:
+            # Against the body axis, or the axis of another turn about it, whichever is nearer: if the table's axes
+            # lean, the turns for the gyroscope lean with those for the accelerometer.
+            alike = [] if doubt else [slower.normal(found.K) for slower in slow if slower.axis == fast.axis]
+            rotations = [np.degrees(np.cross(fast.normal(found.K), a)) for a in (np.eye(3)[fast.axis], *alike)]
+            off = min(rotations, key=lambda v: float(np.linalg.norm(v)))
             if fast.turn.recording.role == "gyroscope" and np.max(np.abs(off)) > allowed:
                 details[fast.turn.name] = (
                     f"the unit does not sit in {fast.turn.name} as in the turns for the accelerometer, by more than "
-                    f"{allowed:.2g} deg: by gravity it is rotated by {_letters(off)}, and the gyroscope's matrix is "
+                    f"{allowed:.2g} deg: by gravity it is rotated by {_in_words(off)}, and the gyroscope's matrix is "
                     "off by as much; set table.seat_deg=1 to estimate it (docs/mounting.md)"
                 )
     return {t.name: Note("N-SEATS", t.recording.samples, 0, 0, details[t.name]) for t in turns if t.name in details}
 
 
 def refined_zeros(turns: Sequence[Turn]) -> dict[str, float]:
-    """Return the zero of each turn, deg, by all turns at once; nothing where one seat does not explain them.
+    """Return the zero of each turn, deg, by all turns together; empty where one seat does not explain them.
 
-    The zero of one turn by itself is uncertain by the misalignment of the axes.
+    The zero by one turn alone is uncertain by the misalignment of the axes.
     """
-    own, slow = _conventional([(t, t.found) for t in turns])
-    if {c.axis for c in slow} != set(range(3)):
-        return {}
-    found = _find_seats(slow)
-    if found.zeros is None:
+    every, slow = _conventional([(t, t.found) for t in turns])
+    found = _find_seats(slow) if {c.axis for c in slow} == set(range(3)) else None
+    if found is None or found.zeros is None:
         return {}
     zeros = {}
-    for c in own:
+    for c in every:
         p, q = np.linalg.solve(found.K, np.column_stack(c.gravity[1:])).T
         zeros[c.turn.name] = c.bench.zero_deg - c.bench.sense * angle_ahead(c.axis, p, q)
     return zeros
 
 
 def _conventional(turns: list[tuple[Turn, Bench | None]]) -> tuple[list[_Conventional], list[_Conventional]]:
-    """Return the turns of which gravity tells, and those of them for the accelerometer."""
+    """Return the turns in which gravity turns, and those of them for the accelerometer."""
     known = [(t, bench, by_convention(t.fit, bench)) for t, bench in turns if bench is not None]
-    own = [_Conventional(t, bench, gravity) for t, bench, gravity in known if gravity is not None]
-    return own, [c for c in own if c.turn.recording.role == "accelerometer"]
+    every = [_Conventional(t, bench, gravity) for t, bench, gravity in known if gravity is not None]
+    return every, [c for c in every if c.turn.recording.role == "accelerometer"]
+
+
+def _in_words(rotation: Values) -> str:
+    return ", ".join(f"{v:+.2f} deg about {a}" for a, v in zip(AXES, rotation, strict=True))
 
 
 def _seats_in_words(slow: Sequence[_Conventional], found: _Seats, allowed: float) -> str:
     if found.zeros is None:
-        seats = "; ".join(f"{c.turn.name} {_letters(s)}" for c, s in zip(slow, found.seats, strict=True))
+        seats = "; ".join(f"{c.turn.name} {_in_words(s)}" for c, s in zip(slow, found.seats, strict=True))
         return (
             f"the unit does not sit alike in the turns, by more than {allowed:.2g} deg; its rotation against the mean "
             f"of the turns: {seats}; set table.seat_deg=1 to estimate them, or mount it once for all turns "

@@ -22,7 +22,7 @@ from pipeline.io.message_layout import short_name
 from pipeline.io.message_logs import open_reader
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
 from pipeline.io.units import DEGREES, TRIADS
-from pipeline.preprocessing.frames import other_axes
+from pipeline.preprocessing.bench import other_axes
 from pipeline.profile_detection.columns import FEWEST_ROWS, MOST_ROWS, Log, find_columns
 from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
