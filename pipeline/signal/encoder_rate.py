@@ -124,9 +124,10 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
     lengths = np.diff(np.append(starts, n))
     lasts = time[starts + lengths - 1] - time[starts] > (step / RATE_AT_REST_DPS or EDGE * interval)
     moving = ~np.repeat(lasts, lengths)
-    apart = np.flatnonzero(np.diff(time) > GAP * float(np.median(np.diff(time)))) + 1  # each begins behind a gap
+    apart = (np.flatnonzero(np.diff(time) > GAP * interval) + 1).tolist()  # first samples after a gap
+    ends = [[first, *(i for i in apart if first < i < last), last] for first, last in runs(moving)]
     vague = np.zeros(n, bool)
-    for first, last in _split(runs(moving), apart.tolist()):
+    for first, last in itertools.chain.from_iterable(map(itertools.pairwise, ends)):
         before, after = first in apart, last in apart
         around = slice(first if before else max(first - EDGE, 0), last if after else min(last + EDGE, n))
         vague[first : first + EDGE * before] = vague[max(last - EDGE * after, first) : last] = before or after
@@ -137,24 +138,13 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
         size = error if step else (_errors(time[around], angle[around])[1] or error)
         found, spread = _stretch(time[around], angle[around], size)
         slope = np.gradient(found, time[around])
-        start, stop = _longest_steady(slope)
+        usual = float(np.median(slope))
+        steady = runs(np.abs(slope - usual) < STEADY * abs(usual))
+        start, stop = max(steady, key=lambda run: run[1] - run[0], default=(0, 0))
         if stop - start >= MOSTLY * len(slope):
             spread = max(spread, _stretch(time[around][start:stop], angle[around][start:stop], size)[1])
         smooth[span], noise[span], rate[span] = found[part], spread, slope[part]
     return EncoderRate(smooth, rate, noise, vague)
-
-
-def _longest_steady(rate: Values) -> tuple[int, int]:
-    """Return start and stop of the longest run in which the rate is near its median."""
-    usual = float(np.median(rate))
-    spans = runs(np.abs(rate - usual) < STEADY * abs(usual))
-    return max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
-
-
-def _split(spans: list[tuple[int, int]], at: list[int]) -> list[tuple[int, int]]:
-    """Cut spans of indices at the indices ``at``."""
-    ends = [sorted({first, last, *(i for i in at if first < i < last)}) for first, last in spans]
-    return [pair for cut in ends for pair in itertools.pairwise(cut)]
 
 
 def _stretch(time: Values, angle: Values, error: float) -> tuple[Values, float]:

@@ -95,7 +95,7 @@ def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
         notes=recording.notes + (() if name == "rc_low_pass" else _timing_notes(recording)),
         filter={
             **settings,
-            "delay_s": 0.0 if zero_phase else _delay(name, settings, sections, interval),
+            "delay_s": 0.0 if zero_phase or name == "high_pass" else _group_delay(settings, sections, interval),
             "noise_gain": _noise_gain(sections, zero_phase=zero_phase),
         },
     )
@@ -174,15 +174,15 @@ def _rc_filtered(time: Values, time_constant: float, zero_phase: bool, reading: 
     return _rc_low_pass(-time[::-1], forward[::-1], time_constant)[::-1] if zero_phase else forward
 
 
-def _group_delay(sections: Values, omega: float) -> float:
-    """Return the group delay, samples, of second-order sections b0 b1 b2 a0 a1 a2 at omega, rad a sample."""
-    n = np.arange(3)
+def _group_delay(settings: dict[str, Any], sections: Values, interval: float) -> float:
+    """Return the group delay, s, of second-order sections b0 b1 b2 a0 a1 a2: at 0 Hz, or in the middle of a band."""
+    n, omega = np.arange(3), 0.0  # rad a sample
+    if settings["name"] == "band_pass":  # the middle of the band as the bilinear transform maps it
+        edges = np.tan(np.pi * interval * np.array([settings["low_hz"], settings["high_hz"]]))
+        omega = 2.0 * float(np.arctan(np.sqrt(np.prod(edges))))
     turn = np.exp(-1j * omega * n)
-
-    def delay(c: Values) -> Values:
-        return np.real((c @ (n * turn)) / (c @ turn))
-
-    return float(np.sum(delay(sections[:, :3]) - delay(sections[:, 3:])))
+    numerator, denominator = ((c @ (n * turn)) / (c @ turn) for c in (sections[:, :3], sections[:, 3:]))
+    return float(np.sum(np.real(numerator - denominator))) * interval
 
 
 def _noise_gain(sections: Values, *, zero_phase: bool) -> float:
@@ -278,16 +278,6 @@ def _timing_notes(recording: Recording) -> tuple[Note, ...]:
         detail = f"{recording.name}: {count} intervals are off the median by over 10 %; the filter takes them as even"
         notes.append(Note("N-FILTER-JITTER", count, 0, 0, detail))
     return tuple(notes)
-
-
-def _delay(name: str, settings: dict[str, Any], sections: Values, interval: float) -> float:
-    if name == "high_pass":
-        return 0.0
-    omega = 0.0
-    if name == "band_pass":  # the middle of the band as the bilinear transform maps it
-        edges = np.tan(np.pi * interval * np.array([settings["low_hz"], settings["high_hz"]]))
-        omega = 2.0 * float(np.arctan(np.sqrt(np.prod(edges))))
-    return _group_delay(sections, omega) * interval
 
 
 BLOCK = 256  # cells at once: their kernels stay in the processor's cache

@@ -191,7 +191,8 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     pieces: Spans = []
     for i, (start, stop) in enumerate(stretches):
         turns = np.any(off[i] > limit[i], axis=1) | (of_parts[i][1] > loud[i])
-        quiet = ~_widened(turns, size // 2, stop - start)
+        # Without the samples within half a window of the middle of a window in which the unit turns.
+        quiet = np.convolve(turns, np.ones(2 * (size // 2) + 1))[: stop - start] < 0.5
         turned = np.vstack([np.zeros(3), np.cumsum((parts[i] - reference[i]) * interval, axis=0)])
         found = _rests(quiet, turned, shortest)
         if not (found or resting[i]):
@@ -213,8 +214,7 @@ def windows(values: Values, size: int) -> tuple[Values, Values]:
     """Return the mean of each window of ``size`` rows, (m, k), and its variance summed over the columns, (m,)."""
     middle = median(values)
     centred = values - middle
-    sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(centred, axis=0)])
-    squares = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(centred**2, axis=0)])
+    sums, squares = (np.pad(np.cumsum(v, axis=0), ((1, 0), (0, 0))) for v in (centred, centred**2))
     total, power = sums[size:] - sums[:-size], squares[size:] - squares[:-size]
     variance = np.maximum((power - total**2 / size).sum(axis=1), 0.0) / (size - 1)
     return total / size + middle, variance
@@ -239,20 +239,13 @@ def _references(medians: Values, ends: Values) -> tuple[Values, Mask]:
     return out, resting
 
 
-def _widened(turns: Mask, half: int, samples: int) -> Mask:
-    """Return which samples lie within half a window of the middle of a window in which the unit turns."""
-    near = np.zeros(samples, bool)
-    for start in np.flatnonzero(turns):
-        near[start : start + 2 * half + 1] = True
-    return near
-
-
 def _rests(quiet: Mask, turned: Values, shortest: int) -> Spans:
     """Return the quiet runs; of runs between which the unit did not turn, only the longest."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(np.int8)))
-    found = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= shortest]
     out: Spans = []
-    for a, b in found:
+    for a, b in edges.reshape(-1, 2).tolist():
+        if b - a < shortest:
+            continue
         if out and np.linalg.norm(turned[a] - turned[out[-1][1]]) < SAME_DEG:
             if b - a > out[-1][1] - out[-1][0]:
                 out[-1] = (a, b)

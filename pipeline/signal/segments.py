@@ -27,6 +27,7 @@ where
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -94,23 +95,24 @@ def cut(
     ``InputError`` if no segment is found, or a window contains no samples.
     """
     segments = _find_segments(recording) if windows is None else [_segment_of_window(recording, w) for w in windows]
+    how = "found" if found or windows is None else "given by a window"
     out: list[Recording] = []
-    count: dict[str, int] = {}
-    for segment in segments:
-        name = SHORT_NAMES[segment.role] + (f"_{segment.axis}" if segment.axis else "")
-        count[name] = count.get(name, 0) + 1
-        part = recording.select(slice(segment.start, segment.stop))
+    count: Counter[str] = Counter()
+    for start, stop, role, axis, what in segments:
+        name = SHORT_NAMES[role] + (f"_{axis}" if axis else "")
+        count[name] += 1
+        first, last = float(recording.time[start]), float(recording.time[stop - 1])
+        since = first - recording.time[0], last - recording.time[0]
+        detail = f"{what}, from {since[0]:.2f} to {since[1]:.2f} s of {recording.name}: {how}"
+        part = recording.select(slice(start, stop))
         out.append(
             replace(
                 part,
                 name=name if count[name] == 1 else f"{name}_{count[name]}",
-                role=segment.role,
-                axis=segment.axis,
-                table_rate=part.table_rate if segment.axis is not None else _size_of_rate(part),
-                notes=(
-                    *(recording.notes if not out else ()),
-                    _note(recording, segment, found=found or windows is None),
-                ),
+                role=role,
+                axis=axis,
+                table_rate=part.table_rate if axis is not None else _size_of_rate(part),
+                notes=(*(() if out else recording.notes), Note("N-SEGMENT", stop - start, 0, 0, detail, first, last)),
             )
         )
     return out
@@ -125,14 +127,6 @@ def _size_of_rate(part: Recording) -> Values | None:
     if logged is not None and np.mean(np.abs(turned - logged)) < AGREES * np.mean(turned) + RATE_AT_REST_DPS:
         return logged
     return turned
-
-
-def _note(recording: Recording, segment: Segment, *, found: bool) -> Note:
-    first = recording.time[0]
-    start, end = float(recording.time[segment.start]), float(recording.time[segment.stop - 1])
-    how = "found" if found else "given by a window"
-    detail = f"{segment.what}, from {start - first:.2f} to {end - first:.2f} s of {recording.name}: {how}"
-    return Note("N-SEGMENT", segment.stop - segment.start, 0, 0, detail, start, end)
 
 
 def _segment_of_window(recording: Recording, window: Mapping[str, Any]) -> Segment:
@@ -150,7 +144,9 @@ def _segment_of_window(recording: Recording, window: Mapping[str, Any]) -> Segme
 
 def _find_segments(recording: Recording) -> list[Segment]:
     """Find the turns, rests and free motion of one long recording, in order of time."""
-    rate, gyro = _rate_of_table(recording), recording.gyroscope
+    rate, gyro = recording.logged_rate, recording.gyroscope
+    if rate is None and recording.table_attitude is not None:
+        rate = rate_of_attitude(recording.time, recording.table_attitude)
     if rate is None or gyro is None:
         raise InputError(
             "the recording is to be cut into its turns, and it holds no gyroscope or no log of the table; give windows "
@@ -167,13 +163,6 @@ def _find_segments(recording: Recording) -> list[Segment]:
             recording.source.get("file"),
         )
     return sorted(segments, key=lambda s: (s.start, s.role))
-
-
-def _rate_of_table(recording: Recording) -> Values | None:
-    """Return the rate of the table, or its magnitude where only an attitude is logged: (n,) array, deg/s."""
-    if recording.logged_rate is not None or recording.table_attitude is None:
-        return recording.logged_rate
-    return rate_of_attitude(recording.time, recording.table_attitude)
 
 
 class _Session:
@@ -203,15 +192,11 @@ class _Session:
         axis = int(np.argmax(energy))
         rate = np.abs(self.rate[start:stop])
         angle = float(np.sum(rate * step[start:stop]))
-        alone = energy[axis] > ONE_AXIS * energy.sum() and self._encoder_agrees(start, stop, angle)
+        alone, logged = energy[axis] > ONE_AXIS * energy.sum(), self.recording.table_angle
+        if logged is not None:  # if its change is not the integrated rate, it is the angle of another gimbal
+            passed = float(np.sum(np.abs(np.diff(logged[max(start - 1, 0) : stop + 1]))))
+            alone &= abs(passed - angle) < ENCODER_AGREES_DEG + ENCODER_AGREES * angle
         return Move(start, stop, axis if alone else None, angle, float(rate.max()))
-
-    def _encoder_agrees(self, start: int, stop: int, angle: float) -> bool:
-        """Return whether the logged angle changes by the integrated rate; else it is the angle of another gimbal."""
-        if self.recording.table_angle is None:
-            return True
-        passed = float(np.sum(np.abs(np.diff(self.recording.table_angle[max(start - 1, 0) : stop + 1]))))
-        return abs(passed - angle) < ENCODER_AGREES_DEG + ENCODER_AGREES * angle
 
     def _groups(self) -> list[list[Move]]:
         """Group successive moves of one kind; a new mounting of the sensor begins a new group."""
