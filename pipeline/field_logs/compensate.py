@@ -3,8 +3,14 @@
 The modules ``pipeline.field_logs.text_output`` and ``mcap_log`` read and write the blocks of each format. The largest
 block determines the memory; logs of other programs, and files that the profile joins, are read into memory.
 
-If the user states an interval with a rest, the log is read twice, first to estimate the gyroscope's bias from that rest
-(``pipeline.field_logs.bias_of_rest``).
+If the user states an interval with a rest (``apply --rest``), the log is read twice, first to estimate the gyroscope's
+bias b from that rest:
+
+    b' = b + K m,    K = matrix^-1
+
+where m is the mean rate, calibrated with b, of the longest rest in the interval. Rests are found as in recordings by
+hand (``pipeline.signal.rests``). b' is the bias at the power-on of the log. It includes Earth's rotation, at most
+0.0042 deg/s.
 """
 
 from __future__ import annotations
@@ -14,18 +20,20 @@ import re
 import shutil
 import sys
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError
-from pipeline.field_logs.bias_of_rest import Stretch, with_bias_changed
 from pipeline.field_logs.log_checks import LogChecks
 from pipeline.io.channel_table import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
 from pipeline.io.files import MESSAGE_FORMATS, not_regular
 from pipeline.io.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
 from pipeline.model.compensation import SMOOTHING_S
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, Recording
+from pipeline.signal.rests import find_rests
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,6 +49,7 @@ if TYPE_CHECKING:
 BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take about 10 MB
 DESCRIPTOR = re.compile(r"-|/dev/stdout|(?:/dev/fd|/proc/self/fd)/(\d+)")  # files that are already open
 KINDS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
+PARTS, K95 = 10, 2.262  # of a rest; Student's t for 95 %, two-sided, with 9 degrees of freedom
 
 
 USED = ("time", "temperature", *ACCELEROMETER, *GYROSCOPE)
@@ -76,6 +85,52 @@ class LogProfile:
     def to_body(self, sensor: str, readings: Values) -> Values:
         """Return (n, 3) readings of a sensor in body axes."""
         return in_body_axes(self.axis_maps.get(sensor, STRAIGHT), readings)
+
+
+@dataclass
+class Stretch:
+    """The calibrated readings in an interval of a log, s from its first sample, collected block by block."""
+
+    first: float
+    last: float
+    begin: float | None = None  # time of the first sample of the log, s
+    blocks: list[tuple[Values, Values, Values]] = field(  # s from the first sample, specific force, rate
+        default_factory=lambda: [(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))]
+    )
+
+    def add(self, readings: Mapping[str, Values], time: Values | None, file: str) -> None:
+        """Add a block: (n, 3) calibrated readings of each sensor, (n,) times in s."""
+        if time is None or not {"accelerometer", "gyroscope"} <= set(readings):
+            message = "--rest needs the time and the readings of both sensors; the log lacks some of these"
+            raise InputError(f"{message}: leave out --rest", file)
+        if self.begin is None:
+            self.begin = float(time[0])
+        since = time - self.begin
+        inside = (since >= self.first) & (since <= self.last)
+        if inside.any():
+            self.blocks.append((since[inside], readings["accelerometer"][inside], readings["gyroscope"][inside]))
+
+    def mean_rate(self, file: str) -> tuple[Values, str]:
+        """Return the mean rate of the longest rest, deg/s, (3,) array, and a note that states it."""
+        since, force, rate = (np.concatenate(column) for column in zip(*self.blocks, strict=True))
+        log = Recording("log", "rests", None, np.round(since * 1e9).astype(np.int64), force, rate)
+        rests = [r for r in find_rests(log) if r.accepted]
+        if not rests:
+            message = f"no rest of 1 s or more from {self.first:g} to {self.last:g} s of the log"
+            raise InputError(
+                f"{message}; --rest states an interval with a rest, in s from the first sample of the log", file
+            )
+        longest = max(rests, key=lambda r: r.stop - r.start)
+        still = rate[longest.start : longest.stop]
+        mean = still.mean(axis=0)
+        parts = np.array([part.mean(axis=0) for part in np.array_split(still, PARTS)])
+        error = parts.std(axis=0, ddof=1) / np.sqrt(PARTS)  # of the mean, also for noise correlated within a part
+        words = ", ".join(f"{m:.4f} +- {K95 * e:.4f}" for m, e in zip(mean, error, strict=True))
+        start, stop = since[[longest.start, longest.stop - 1]]
+        return mean, (
+            f"mean rate of the rest from {start:.1f} to {stop:.1f} s of the log, subtracted from all rates: {words} "
+            f"deg/s (x, y, z; +- is the 95 % interval from the scatter of {PARTS} parts of the rest)"
+        )
 
 
 @dataclass
@@ -128,12 +183,14 @@ def compensate_log(
 
     notes = []
     if rest is not None:
-        if compensation.gyroscope is None:
+        gyroscope = compensation.gyroscope
+        if gyroscope is None:
             raise ConfigurationError("the calibration holds no gyroscope: leave out --rest", str(source))
         stretch = Stretch(*rest)
         write(LogStream(compensation, smoothed, progress, stretch), Path(os.devnull))
         rate, note = stretch.mean_rate(str(source))
-        compensation, notes = with_bias_changed(compensation, rate), [note]
+        gyroscope = replace(gyroscope, bias=gyroscope.bias + np.linalg.solve(gyroscope.matrix, rate))
+        compensation, notes = replace(compensation, gyroscope=gyroscope), [note]
     result = write(LogStream(compensation, smoothed, progress), target)
     result.notes = notes + result.notes
     return result
