@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.estimation.stages import fit_stage
-from pipeline.report.lot import calibration_with_prior, estimates, priors_of
+from pipeline.report.combined import calibration_with_prior, estimates, priors_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 

@@ -10,7 +10,7 @@ from pipeline.errors import DamagedFileError
 from pipeline.exports import exports
 from pipeline.pack import DOCUMENTS, STAGE_OF, Pack, as_bytes, new_pack
 from pipeline.records import SENSORS, SensorCalibration
-from pipeline.report.lot import Estimate, Prior, calibration_with_prior, priors_of, with_card
+from pipeline.report.combined import Estimate, Prior, calibration_with_prior, priors_of, with_card
 from pipeline.stages.batch import record_output
 from pipeline.stages.summary import failed_files
 from pipeline.stages.unit_files import recordings_of, require_noises

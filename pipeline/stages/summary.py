@@ -30,7 +30,7 @@ def summary_unit(job: Job, unit: str, settings: JSON) -> Files:
 
         found["figures"] = unit_figures(*documents)
     if settings["lot_prior"]:
-        from pipeline.report.lot import estimates  # noqa: PLC0415  (only where a lot is the prior)
+        from pipeline.report.combined import estimates  # noqa: PLC0415  (only where a lot is the prior)
 
         found["estimates"] = [e._asdict() for e in estimates(settings["row"], calibration, diagnosis)]
     return {f"{unit}.json": found}

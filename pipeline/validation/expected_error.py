@@ -125,17 +125,6 @@ def _changed(calibration: SensorCalibration, number: int, name: str, step: float
     return replace(calibration, effects=tuple(effects))
 
 
-@dataclass(frozen=True)
-class _Uncertain:
-    """Random quantities in addition to the white noise."""
-
-    covariance: Values  # (p + 1, p + 1), of the parameters and of the scale of the table's rate
-    noise: Noise
-    coarse: Values  # (3,), variance of rounding that the white noise does not contain
-    drift: Values  # (3,), variance of a drift in addition to the wander
-    drift_time: float  # s
-
-
 def expected_rms_error(
     calibration: SensorCalibration,
     held_out: Sequence[LinearizedSamples],
@@ -154,18 +143,14 @@ def expected_rms_error(
     wanders = [s.details["bias_wander"] for s in calibration.stages if "bias_wander" in s.details]
     residual_wander = np.array(wanders[-1]) if wanders else None  # of the residuals of the fit: (3,)
     time = float(sensor_file.get("wander_time_s") or DEFAULT_TIME_S)
-    uncertain = _Uncertain(
-        _covariance(calibration, settings.get("table") or {}),
-        noise,
-        np.where(noise.white < DITHERED * step, step**2 / 12.0, 0.0),
-        _drift(residual_wander, noise, float(sensor_file.get("bias_wander") or 0.0), time),
-        time,
-    )
-    form = _form(calibration.matrix, held_out, uncertain)
+    drift = _drift(residual_wander, noise, float(sensor_file.get("bias_wander") or 0.0), time)
+    coarse = np.where(noise.white < DITHERED * step, step**2 / 12.0, 0.0)  # rounding that is not in the white noise
+    covariance, freedom = _of_parameters(calibration, settings.get("table") or {})
+    form = _form(calibration.matrix, held_out, covariance, noise, coarse=coarse, drift=drift, drift_time=time)
     if form.cumulants(np.ones((4, 1)))[0, 0] <= 0.0:
         return 0.0, 0.0
     observed_s = noise.length + (fitted_s if residual_wander is not None else 0.0)
-    nu = form.freedom(_freedom(calibration))
+    nu = form.freedom(freedom)
     factors = [_factors(nu, noise, observed_s, upper=upper) for upper in (False, True)]
     low, high = (_quantile(form, *f, p) for f, p in zip(factors, (TAIL, 1.0 - TAIL), strict=True))
     return float(np.sqrt(low)), float(np.sqrt(high))
@@ -184,34 +169,27 @@ def _drift(residual_wander: Values | None, noise: Noise, size: float, time: floa
     return np.asarray(np.maximum(size**2 - slow, 0.0) + np.maximum(fitted - noise.wander**2, 0.0))
 
 
-def _covariance(calibration: SensorCalibration, table: Mapping[str, Any]) -> Values:
-    """Return the covariance of the parameters, without lack of fit, and of the scale of the table's rate."""
+def _of_parameters(calibration: SensorCalibration, table: Mapping[str, Any]) -> tuple[Values, Values]:
+    """Return covariance and degrees of freedom of the parameters and of the scale of the table's rate.
+
+    The covariance is without lack of fit. Errors that calibration and reference share are left out. Their size is
+    exact, so that the degrees of freedom of the remaining variance follow by Welch and Satterthwaite.
+    """
     size = len(calibration.parameter_names())
     lines = (calibration.budget or {}).get("contributions", ())
-    out = np.zeros((size + 1, size + 1))
+    out, nu = np.zeros((size + 1, size + 1)), np.full(size + 1, np.inf)
     if calibration.covariance is not None:
         covariance = covariance_beside_reference(calibration)
-        total = np.diag(covariance)
+        total, remaining = np.diag(calibration.covariance), np.diag(covariance)
         lack = np.sum([np.square(line["parts"][LACK_OF_FIT]) for line in lines if LACK_OF_FIT in line["parts"]], axis=0)
-        share = np.sqrt(np.clip(1.0 - lack / np.where(total > 0.0, total, 1.0), 0.0, 1.0)) * np.ones(size)
-        out[:size, :size] = covariance * share[:, None] * share
+        scale = np.sqrt(np.clip(1.0 - lack / np.where(remaining > 0.0, remaining, 1.0), 0.0, 1.0)) * np.ones(size)
+        out[:size, :size] = covariance * scale[:, None] * scale
+        share = np.clip(remaining / np.where(total > 0.0, total, 1.0), 0.0, 1.0)
+        with np.errstate(invalid="ignore"):  # of a parameter without variance
+            nu[:size] = np.where(share > 0.0, np.maximum(calibration.effective_freedom() * share**2, 1.0), np.inf)
     if calibration.sensor == "gyroscope" and not any(line["source"] == "table rate" for line in lines):
         out[size, size] = float(table.get("rate_accuracy") or 0.0) ** 2
-    return out
-
-
-def _freedom(calibration: SensorCalibration) -> Values:
-    """Return the degrees of freedom of ``_covariance``, by Welch and Satterthwaite: (p + 1,) array.
-
-    The variance that calibration and reference share is left out; its size is exact.
-    """
-    if calibration.covariance is None:
-        return np.full(len(calibration.parameter_names()) + 1, np.inf)
-    total, of_calibration = np.diag(calibration.covariance), np.diag(covariance_beside_reference(calibration))
-    share = np.clip(of_calibration / np.where(total > 0.0, total, 1.0), 0.0, 1.0)
-    with np.errstate(invalid="ignore"):  # of a parameter without variance
-        nu = np.where(share > 0.0, calibration.effective_freedom() * share**2, np.inf)
-    return np.append(np.maximum(nu, 1.0), np.inf)
+    return out, nu
 
 
 @dataclass(frozen=True)
@@ -244,8 +222,18 @@ class _QuadraticForm:
         return np.stack([one + white + within, 2.0 * squares, 8.0 * cubes])
 
 
-def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertain) -> _QuadraticForm:
-    noise, q = uncertain.noise, len(uncertain.covariance)
+def _form(
+    M: Values,
+    held_out: Sequence[LinearizedSamples],
+    covariance: Values,
+    noise: Noise,
+    *,
+    coarse: Values,
+    drift: Values,
+    drift_time: float,
+) -> _QuadraticForm:
+    """Return the form of the mean squared error; ``coarse, drift``: (3,) variances in addition to noise and wander."""
+    q = len(covariance)
     total = sum(each.number for each in held_out)
     white, within, size = np.zeros(2), np.zeros(2), q
     of_parameters, of_blocks = np.zeros((q, q)), []
@@ -258,15 +246,15 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
         start = each.time[first]
         length = np.maximum(np.diff(start, append=each.time[-1] + interval), 1e-6)
         B = block_covariance(start, length, noise.correlation_time)
-        W = _weights(M, each, uncertain)
+        W = _weights(M, each, covariance[:-1, :-1], drift + coarse)
         J = np.concatenate([each.derivative, -each.truth[:, :, None]], axis=2)
         WJ, MWM = W @ J, M.T @ W @ M
         of_parameters += share / n * np.tensordot(J, WJ, ([0, 1], [0, 1]))
         of_wander = np.add.reduceat(MWM, first, axis=0) * share / n
         across = np.swapaxes(np.add.reduceat(WJ, first, axis=0), 1, 2) @ M * share / n
-        of_blocks.append((of_wander, across, B, block_covariance(start, length, uncertain.drift_time)))
+        of_blocks.append((of_wander, across, B, block_covariance(start, length, drift_time)))
         size += 3 * count
-        Q = MWM * (each.white_variance + uncertain.coarse)[:, None, :]
+        Q = MWM * (each.white_variance + coarse)[:, None, :]
         white = white + _traces_of(Q) * [share, share**2 * each.correlated_samples / each.number]
         within_block = np.clip(each.wander_variance - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
         correlated = np.clip(noise.correlation_time / interval, 1.0, n / count) / n
@@ -278,11 +266,11 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
             block = slice(at, at + 3)
             A[block, block], A[:q, block], A[block, :q] = form, mixed, mixed.T
             at = block.stop
-    Q[0, :, :q], at = A[:, :q] @ uncertain.covariance, q
+    Q[0, :, :q], at = A[:, :q] @ covariance, q
     for of_wander, _, B, slow in of_blocks:  # the blocks of a recording have the covariance in time, on each axis
         blocks = slice(at, at + 3 * len(of_wander))
         of_axes = A[:, blocks].reshape(size, -1, 3).swapaxes(1, 2)
-        for k, in_time, of_axis in ((1, B, noise.wander**2), (2, slow, uncertain.drift)):
+        for k, in_time, of_axis in ((1, B, noise.wander**2), (2, slow, drift)):
             Q[k, :, blocks] = ((of_axes @ in_time).swapaxes(1, 2) * of_axis).reshape(size, -1)
         at = blocks.stop
     transposed = np.swapaxes(Q, 1, 2).reshape(3, -1)
@@ -294,7 +282,7 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
         for l, trace in enumerate(transposed @ (Q[i, :, filled] @ Q[j, filled]).ravel()):
             for order in permutations((i, j, l)):
                 third_order[order] = trace
-    by_parameter = np.diag(of_parameters) * np.diag(uncertain.covariance)
+    by_parameter = np.diag(of_parameters) * np.diag(covariance)
     return _QuadraticForm(by_parameter, white, within, 1.0 / determined, first_order, second_order, third_order)
 
 
@@ -303,10 +291,9 @@ def _traces_of(Q: Values) -> Values:
     return np.array([np.trace(Q, axis1=1, axis2=2).mean(), np.sum(Q * np.swapaxes(Q, 1, 2), axis=(1, 2)).mean()])
 
 
-def _weights(M: Values, each: LinearizedSamples, uncertain: _Uncertain) -> Values:
-    """Return W of each sample: (n, 3, 3) array."""
-    J, C = each.derivative, uncertain.covariance[:-1, :-1]
-    noise = each.white_variance + each.wander_variance + uncertain.drift + uncertain.coarse
+def _weights(M: Values, each: LinearizedSamples, C: Values, slow: Values) -> Values:
+    """Return W of each sample, (n, 3, 3); ``C``: covariance of the parameters, ``slow``: (3,), further variance."""
+    J, noise = each.derivative, each.white_variance + each.wander_variance + slow
     of_parameters = np.einsum("nip,pq,njq->ij", J, C, J, optimize=True) / len(J)
     mean = np.einsum("ij,j,kj->ik", M, noise.mean(axis=0), M) + of_parameters
     size = np.linalg.norm(each.truth, axis=1)
