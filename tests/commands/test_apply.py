@@ -156,8 +156,14 @@ def test_other_columns_are_kept_to_the_letter(calibration: Path, log: Path, tmp_
     assert out.read_text(encoding="utf-8").count('"a, ""b"""') == 5
 
 
-@pytest.mark.parametrize("block_bytes", [150, 1000, 20_000])
-def test_small_blocks_give_what_one_block_gives(calibration: Path, log: Path, tmp_path: Path, block_bytes: int) -> None:
+@pytest.mark.parametrize(("block_bytes", "since"), [(150, 0.0), (1000, 0.0), (20_000, 0.0), (1000, 1_700_000_000.0)])
+def test_small_blocks_give_what_one_block_gives(
+    calibration: Path, log: Path, tmp_path: Path, block_bytes: int, since: float
+) -> None:
+    """``since``: of the first sample, s; since 1970, time counts from it."""
+    head, *rows = log.read_text(encoding="utf-8").splitlines()
+    cells = [row.partition(",") for row in rows]
+    log.write_text("\n".join([head, *(f"{since + float(t):.2f},{others}" for t, _, others in cells)]), encoding="utf-8")
     compensation = load(calibration)
     whole, cut = tmp_path / "whole.csv", tmp_path / "cut.csv"
     result = compensate_log(compensation, log, whole)
@@ -165,6 +171,7 @@ def test_small_blocks_give_what_one_block_gives(calibration: Path, log: Path, tm
     seen = []
     compensate_log(compensation, log, cut, block_bytes=block_bytes, progress=lambda rows, _: seen.append(rows))
     assert len(seen) > 500 * 60 // block_bytes / 2
+    assert cut.read_bytes() == whole.read_bytes()
 
 
 def test_cells_that_are_empty_stay_empty(calibration: Path, log: Path, tmp_path: Path) -> None:

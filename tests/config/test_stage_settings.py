@@ -41,6 +41,16 @@ def of(batch: str, *stages: str) -> set[str]:
     ("unit", "override", "expected"),
     [
         ("A1", "limits.gyroscope.bias=20", of(REFERENCE, "validate", "calibration", "report")),
+        ("A1", "diagnosis.depth=full", of(REFERENCE, "diagnose", "calibration", "report")),
+        ("B1", "ingest.checks.missing_time=0.3", of(STAGED, "ingest", "calibration", "report")),
+        ("B1", "procedure.mounting_tolerance_deg=9", of(STAGED, "ingest", "calibration", "report")),
+        (
+            "A1",
+            "uncertainty.monte_carlo=2000",
+            of(REFERENCE, "calibration", "report")
+            | {f"{REFERENCE}/fit/{s}/reference_least_squares" for s in ("accelerometer", "gyroscope")}
+            | {f"{REFERENCE}/fit/gyroscope/effects"},
+        ),
         (
             "B1",
             "filter.zero_phase=true",

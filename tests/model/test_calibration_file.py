@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
+from pipeline.io.quality_flags import CLIPPED
 from pipeline.model.calibration_file import implausible, sentences
-from pipeline.records import FittedEffect, SensorCalibration
-from pipeline.stages.calibration import judged
+from pipeline.records import FittedEffect, Recording, SensorCalibration
+from pipeline.stages.calibration import calibrated_range, judged
 
 CONFIGS = Path(__file__).parents[2] / "configs/sensor"
 
@@ -102,3 +103,16 @@ def test_the_user_can_accept_them() -> None:
     assert [e["ratio"] for e in plain["implausible"]] == pytest.approx([1.0 / 0.03] * 3)
     assert meant["implausible"] == []
     assert meant["implausible_accepted"] == plain["implausible"]
+
+
+def test_the_calibrated_range_is_that_of_the_sound_samples_of_the_fits() -> None:
+    def recording(role: str, force: float, rate: float, warmth: float) -> Recording:
+        ramp = np.linspace(0.1, 1.0, 10)
+        flags = np.where(np.arange(10) == 9, CLIPPED, 0).astype(np.uint16)  # the largest is clipped
+        vectors = (size * np.outer(ramp, [0.6, 0.0, -0.8]) for size in (force, rate))
+        return Recording(role, role, None, np.arange(10) * 10**8, *vectors, temperature=warmth * ramp, flags=flags)
+
+    fitted = [recording("accelerometer", 1.0, 700.0, 30.0), recording("gyroscope", 3.0, 200.0, 40.0)]
+    others = [recording("validation", 4.0, 900.0, 60.0), recording("static", 5.0, 800.0, 1.0)]
+    found = calibrated_range([*fitted, *others])
+    assert found == {"specific_force_g": 0.9, "angular_rate_dps": 180.0, "temperature_degc": [3.0, 40.0]}

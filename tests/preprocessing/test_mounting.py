@@ -151,6 +151,23 @@ def test_a_unit_turned_as_a_whole_is_told_the_axis_map_that_may_be_right() -> No
     assert any("or sensor.axis_map=[-y,+x,+z]" in n.detail for r in found for n in r.notes)
 
 
+@pytest.mark.parametrize("turned", [[[0, -1, 0], [1, 0, 0], [0, 0, 1]], [[0, 0, 1], [1, 0, 0], [0, 1, 0]]])
+def test_held_out_attitudes_are_turned_to_the_axes_of_a_unit_that_is_turned_as_a_whole(turned: Any) -> None:
+    turns = [_mapped(r, turned) for r in recordings_of({})]
+    time = np.arange(400) * INTERVAL_S
+    angles = np.column_stack([80.0 * np.sin(0.4 * time), 60.0 * np.sin(0.3 * time + 1.0), 90.0 * np.sin(0.21 * time)])
+    attitude = Rotation.from_euler("xyz", angles, degrees=True)  # of the axes as stated
+    force = attitude.inv().apply([0.0, 0.0, 1.0]) @ np.array(turned, float).T
+    held_out = Recording(
+        "validation", "validation", None, (time * 1e9).astype(np.int64), force,
+        table_attitude=attitude.as_quat(scalar_first=True),
+    )  # fmt: skip
+    *_, found = check_mounting([*turns, held_out], settings_of(turns))
+    assert found.table_attitude is not None
+    up = Rotation.from_quat(found.table_attitude, scalar_first=True).inv().apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(up, force, atol=1e-9)
+
+
 @pytest.mark.parametrize("sense", [1, -1])
 def test_a_unit_turned_over_is_used_and_a_negated_accelerometer_is_refused(sense: int) -> None:
     turns = [r for r in recordings_of({a: Setup(a, sense=sense) for a in "xyz"}) if r.role == "accelerometer"]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.pack import Pack, new_pack
+from pipeline.results_folder import repetitions
 from pipeline.stages import batch
 
 if TYPE_CHECKING:
@@ -28,12 +29,13 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201
     monkeypatch.setattr("pipeline.stages.diagnose.diagnose_unit", diagnose)
     monkeypatch.setattr(batch, "hold_as_job", lambda _: None)
 
-    def run_job(files: dict[str, dict[str, str]] = HERE, code: str = "a", **effects: int) -> list[str]:
+    def run_job(files: dict[str, dict[str, str]] = HERE, code: str = "a", again: int = 0, **effects: int) -> list[str]:
         output = tmp_path / "results" / "batches" / "b" / "diagnose.zip"
         output.unlink(missing_ok=True)  # as Snakemake does
         (tmp_path / "results" / "configs").mkdir(parents=True, exist_ok=True)
         config = tmp_path / "results" / "configs" / "diagnose.json"
-        config.write_text(json.dumps({"units": {u: {"effects": effects.get(u, 0)} for u in ("U1", "U10")}}))
+        units = {u: {"effects": effects.get(u, 0)} for u in ("U1", "U10")}
+        config.write_text(json.dumps({"units": units} | ({"again": again} if again else {})))
         argv = ["--config", str(config), "--output", str(output), "--code", code]
         for stage, changed in files.items():
             with new_pack(tmp_path / f"{stage}.zip") as add:
@@ -61,3 +63,17 @@ def test_only_units_whose_inputs_have_changed_are_computed(run, tmp_path: Path) 
     assert run(code="b", U10=1) == ["U1", "U10"]
     batch.forget_last_outputs(tmp_path / "results")
     assert run(code="b", U10=1) == ["U1", "U10"]
+
+
+def test_an_edited_output_is_computed_again_once(run, tmp_path: Path) -> None:  # noqa: ANN001
+    """The output of the last run is a link to the same file, and was edited with it."""
+    results, output = tmp_path / "results", "batches/b/diagnose.zip"
+    assert run() == ["U1", "U10"]
+    assert repetitions(results, output) == (0, [])
+    with new_pack(results / output) as add:
+        add({f"{u}.json": b'{"found": 0, "edited": true}' for u in ("U1", "U10")})
+    again, edited = repetitions(results, output)
+    assert (again, edited) == (1, [str(results / output)])
+    assert run(again=again) == ["U1", "U10"]
+    assert repetitions(results, output) == (1, [])
+    assert run(again=again) == []
