@@ -100,7 +100,15 @@ def evidence(printed: Path, results: Results, rows: pd.DataFrame) -> JSON:
             {"device": name, "ours": results.errors(f"{d}-gyro-20dps-printed", "gyroscope")[0], "printed": motion[d]}
             for d, name in DEVICES.items()
         ],
-        "misalignment": [_misalignment(parameters, results, device) for device in DEVICES],
+        "misalignment": [
+            {
+                "device": DEVICES[str(device)],
+                "of_bias": float(np.prod(np.sqrt(1.0 - of_device[BIAS].median() ** 2))),
+                "ours": results.parameter(f"{device}-stop-1s-printed", "accelerometer", "misalignment", "M_P_x"),
+                "printed": sorted({f"{m:.3f}" for m in of_device["M_x"]}),
+            }
+            for device, of_device in parameters[parameters["rate_table"] == "acutronic"].groupby("device", sort=False)
+        ],
         "bias_of_mark2": {
             "printed": mark2["b_y_g"],
             "errors": [
@@ -139,17 +147,6 @@ def _forward_matrix(rows: pd.DataFrame) -> list[JSON]:
         inverted, presented = (float(np.abs(m - other).max()) for m in (np.linalg.inv(staged), staged))
         found.append({"device": DEVICES[str(device)], "inverted": inverted, "presented": presented})
     return found
-
-
-def _misalignment(parameters: pd.DataFrame, results: Results, device: str) -> JSON:
-    """Return M of a device: from the printed biases alone, from our staged method as printed, and the printed M."""
-    device_rows = parameters[(parameters["device"] == device) & (parameters["rate_table"] == "acutronic")]
-    return {
-        "device": DEVICES[device],
-        "of_bias": float(np.prod(np.sqrt(1.0 - device_rows[BIAS].median() ** 2))),
-        "ours": results.parameter(f"{device}-stop-1s-printed", "accelerometer", "misalignment", "M_P_x"),
-        "printed": sorted({f"{m:.3f}" for m in device_rows["M_x"]}),
-    }
 
 
 def agreements(printed: Path, results: Results) -> pd.DataFrame:

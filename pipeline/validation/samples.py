@@ -33,7 +33,7 @@ from pipeline.estimation.gauss_markov import variance_of_average
 from pipeline.estimation.observations import filtered_motion
 from pipeline.estimation.rest_means import held_out_rests, rest_means, split_rests
 from pipeline.model.effects.base import truth
-from pipeline.model.effects.timing import shifted
+from pipeline.model.effects.equations import shifted
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.model.measurement import linear_truth
 from pipeline.signal.encoder_rate import FEWEST, EncoderRate, rate_by_angle

@@ -10,7 +10,7 @@
 A ``formula`` is one of three forms: a text (the same formula for each axis, with coefficients A_x, A_y, A_z), a mapping
 of x, y and z (a formula and a coefficient for each axis), or a list of three (a vector with one coefficient). A star in
 the name of a term stands for the axis (``G_*x``: G_xx, G_yx, G_zx). ``docs/effects_of_your_own.md`` lists all keys. A
-built-in effect that no formula can express states its class (``python: timing.TimeOffset``) and its ``parameters``.
+built-in effect that no formula can express states its class (``python: equations.TimeOffset``) and its ``parameters``.
 """
 
 from __future__ import annotations
