@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 State = TypeVar("State")
-HALVINGS = 30  # of a step: what is left then is rounding
+HALVINGS = 30  # of a step; a smaller one is rounding
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
-PART_OF_NULL_SPACE = 1e-3  # of a unit vector of it, from which on a parameter is named as not determined
-COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, with a factor for sums over many residuals
+PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
+COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, times a factor for sums over many residuals
 STEP_AT_MINIMUM = 1e-10  # relative; well below any uncertainty, well above rounding
 ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
 
@@ -45,7 +45,7 @@ class ScaledColumns:
     singular: Values
     Vt: Values
     scale: Values
-    tolerance: float  # of the largest singular value, below which a combination counts as not determined
+    tolerance: float  # share of the largest singular value, below which a combination is not determined
 
     @classmethod
     def of(cls, A: Values, tolerance: float = RANK_TOLERANCE) -> ScaledColumns:
@@ -92,7 +92,7 @@ class ScaledColumns:
         return [name for name, part in zip(names, parts, strict=True) if part > share]
 
     def require_full_rank(self, names: Sequence[str]) -> None:
-        """Raise ``NotObservableError`` with the names of the parameters that the data do not determine."""
+        """Raise ``NotObservableError``, with the names of the parameters, if the data do not determine some."""
         if self.rank < len(self.scale):
             raise NotObservableError(
                 f"the data determine {self.rank} of {len(self.scale)} parameters; not determined, or only in "
@@ -102,7 +102,7 @@ class ScaledColumns:
 
 
 def gauss_newton(  # noqa: PLR0917  (what an iteration is)
-    at: Callable[[State], tuple[Values, Values]],
+    residual_at: Callable[[State], tuple[Values, Values]],
     start: State,
     moved: Callable[[State, Values], tuple[State, Values]],
     small: Callable[[Values, ScaledColumns], bool] | None,
@@ -111,12 +111,12 @@ def gauss_newton(  # noqa: PLR0917  (what an iteration is)
 ) -> tuple[State, tuple[Values, Values], int]:
     """Minimise ``|r|`` by Gauss-Newton steps, each halved while it does not lower ``|r|``.
 
-    ``at``: state to its residuals (n,) and their derivative (n, p). ``moved``: state and step (p,) to the new state,
-    and the step taken. ``small``: whether a step, with the factors of the derivative, is the last; by default a step of
-    the size of rounding. ``tolerance``: as of ``ScaledColumns``. Returns the final state, its residuals and derivative,
-    and the number of steps. Raises ``NotObservableError`` if the start is not finite.
+    ``residual_at``: state to its residuals (n,) and their derivative (n, p). ``moved``: state and step (p,) to the new
+    state, and the step taken. ``small``: whether a step, with the factors of the derivative, is the last; by default a
+    step of the size of rounding. ``tolerance``: see ``ScaledColumns``. Returns the final state, its residuals and
+    derivative, and the number of steps. Raises ``NotObservableError`` if the start is not finite.
     """
-    state, (r, J), size = start, at(start), np.inf
+    state, (r, J), size = start, residual_at(start), np.inf
     if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
         raise NotObservableError(
             "residuals or their derivatives are not finite at the start: give a start nearer the solution, or "
@@ -127,8 +127,8 @@ def gauss_newton(  # noqa: PLR0917  (what an iteration is)
         step, before = -factors.solve(r), r @ r
         for halving in range(HALVINGS):
             new, taken = moved(state, step * 0.5**halving)
-            r_new, J_new = at(new)
-            # Near the minimum the sum of squares is flat to rounding while the step still has digits.
+            r_new, J_new = residual_at(new)
+            # Near the minimum the sum of squares is flat to rounding while the step is still larger than rounding.
             if r_new @ r_new < before * (1.0 + (ROUNDING if halving == 0 else 0.0)) and np.all(np.isfinite(J_new)):
                 break
         else:

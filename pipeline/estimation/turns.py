@@ -9,14 +9,14 @@ where
     z    : reading where the axis is level, g
     phi  : angle at which the axis points up, deg
     a, c : half sum and half difference of the two sides, g: the largest reading is ``z + a + c``, the smallest
-           ``z - a + c``; c is zero where a sensor has one scale factor for both sides
+           ``z - a + c``; c is zero if a sensor has one scale factor for both sides
 
 and in the channel along the turn axis ``y = z + h cos(A - phi)`` with a small h, the misalignment. For a given phi the
 other parameters are linear. phi is the phase of the first harmonic of the linear fit, found in a few rounds because
 |cos| has even harmonics only. So all samples of a turn determine its extremes, not only the few at its flat peaks.
 
-A filter shifts phi by rate x delay and reduces a, but only while the table turns: the readings of a rest at either end
-are not changed, and one sinusoid does not describe both.
+A filter shifts phi by rate x delay and reduces a, but only while the table turns: it does not change the readings of a
+rest at either end, so that one sinusoid does not describe both.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to 
 DISTINCT_DIRECTION_G = 0.01  # attitudes 0.6 deg apart differ
 ROUNDS = 12  # of the phase
 SAME_PHASE = 1e-12  # rad
-SLOWEST_SHARE = 0.02  # of the largest rate, below which a turn is not called one
+SLOWEST_SHARE = 0.02  # of the largest rate, below which the table is not taken as turning
 CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
 EDGE_S = 0.15  # left out at either end of a steady turn, where the table still accelerates
 LONGEST_TAIL = 0.4  # of a steady turn
@@ -78,7 +78,7 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
     own = [r for r in recordings if r.role == sensor and r.reading(sensor) is not None]
     parts = []
     for recording in own:
-        without = recording if recording.cache else replace(recording, temperature=None)  # no fit here asks for it
+        without = recording if recording.cache else replace(recording, temperature=None)  # these fits do not use it
         motion = table_motion(without, table)
         if motion is not None:
             parts.append(Part(recording, motion, recording.valid))
@@ -111,8 +111,8 @@ def settled(part: Part) -> Mask:
 def steady_turns(part: Part, memory: float) -> Mask:
     """Return the samples in the steady parts of a turn about one axis, without the settling of a filter.
 
-    Of a turn that is shorter than the settling time ``memory``, s, the middle is used: the filter's error there is a
-    small share of the rate.
+    ``memory``: the settling time, s. Of a shorter turn the middle is used: the filter's error there is a small share of
+    the rate.
     """
     motion = part.motion
     if motion.axis is None or motion.rate is None:
@@ -132,8 +132,8 @@ def steady_turns(part: Part, memory: float) -> Mask:
 def filtered_alike(part: Part) -> Mask:
     """Return the samples of ``settled`` that a filter changes equally.
 
-    Without a filter, and for rests, these are all. In a continuous turn with a filter they are the samples in which the
-    table turns steadily and the filter has settled.
+    Without a filter, and for rests, these are all samples. In a continuous turn with a filter they are the samples in
+    which the table turns steadily and the filter has settled.
     """
     keep, applied = settled(part), part.recording.filter
     if applied["name"] == "none" or part.motion.rate is None or stop_and_go(part.motion):
@@ -193,33 +193,26 @@ def _factors(columns: Values, where: str) -> ScaledColumns:
 def blocks_of_samples(parts: Sequence[tuple[Recording, Mask]]) -> Blocks:
     """Divide the used samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
 
-    ``parts``: each recording and which of its samples are used.
+    Recordings of one session, one after the other, share a clock. ``parts``: each recording and which of its samples
+    are used.
     """
     used = [int(keep.sum()) for _, keep in parts]
     size = max(1, -(-sum(used) // BLOCKS))
-    first, start, length, clock, row = [], [], [], [], 0
-    known: dict[str, tuple[int, float]] = {}
+    rows = []
+    sessions: dict[str, tuple[int, float]] = {}  # clock and end of the last recording of each session
     for number, ((recording, keep), samples) in enumerate(zip(parts, used, strict=True), start=1):
         if samples == 0:
             continue
-        time = recording.time[keep]
-        begin = np.arange(0, samples, size)
-        first.append(begin + row)
-        start.append(time[begin])
-        length.append(time[np.minimum(begin + size, samples) - 1] - time[begin] + recording.interval)
-        clock.append(np.full(len(begin), 0 if recording.clock_shared else _clock(recording, number, known)))
-        row += samples
-    firsts = np.concatenate(first)
-    weight = np.diff(np.append(firsts, row)).astype(float)
-    return Blocks(firsts, weight, np.concatenate(start), np.concatenate(length), np.concatenate(clock))
-
-
-def _clock(recording: Recording, number: int, known: dict[str, tuple[int, float]]) -> int:
-    """Return the clock of a recording: its own, or that of an earlier recording of the session, from ``known``."""
-    before, end = known.get(recording.setup, (number, np.inf))
-    clock = before if recording.setup and recording.time[0] > end else number
-    known[recording.setup] = clock, float(recording.time[-1])
-    return clock
+        before, end = sessions.get(recording.setup, (number, np.inf))
+        clock = before if recording.setup and recording.time[0] > end else number
+        sessions[recording.setup] = clock, float(recording.time[-1])
+        time, first = recording.time[keep], np.arange(0, samples, size)
+        length = time[np.minimum(first + size, samples) - 1] - time[first] + recording.interval
+        weight = np.diff(np.append(first, samples)).astype(float)
+        rows.append((weight, time[first], length, np.full(len(first), 0 if recording.clock_shared else clock)))
+    weights, start, length, clocks = (np.concatenate(column) for column in zip(*rows, strict=True))
+    firsts = np.cumsum(np.append(0, weights[:-1])).astype(np.intp)
+    return Blocks(firsts, weights, start, length, clocks)
 
 
 @dataclass(frozen=True)
@@ -232,11 +225,9 @@ class Rows:
     total: int  # samples of the recording
 
     def settled(self, reading: Values) -> Rows:
-        """Split groups that scatter too much into single samples.
+        """Split groups whose readings, (n, 3), scatter too much into single samples.
 
         They are at rest by the table's log; with an error of the sensor's clock, the sensor still moves at their edges.
-
-        ``reading``: (n, 3), g or deg/s.
         """
         size = self.count.astype(int)
         if np.all(size < 2):
@@ -249,12 +240,10 @@ class Rows:
         scatter = np.add.reduceat(deviation, self.first, axis=0)
         freedom = np.maximum(self.count - 1.0, 0.0)
         most = freedom + SCATTERED * np.sqrt(2.0 * freedom) + SCATTERED**2 / 2.0
-        apart = np.any((scatter > most[:, None] * white) & (white > 0), axis=1) & (size > 1)
-        if not apart.any():
-            return self
-        new = np.repeat(apart, size)
-        new[self.first] = True
-        first = np.flatnonzero(new)
+        moving = np.any((scatter > most[:, None] * white) & (white > 0), axis=1) & (size > 1)
+        starts = np.repeat(moving, size)
+        starts[self.first] = True
+        first = np.flatnonzero(starts)
         return replace(self, first=first, count=np.diff(np.append(first, len(kept))).astype(float))
 
     def means(self, values: Values) -> Values:
@@ -297,8 +286,8 @@ class Rows:
 def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> Rows:
     """Select the samples of a fit, and group the samples of each rest.
 
-    ``valid``: (n,), samples with valid readings. ``together``: whether the samples of a rest are equivalent; after a
-    filter they are not.
+    ``valid``: (n,), samples with valid readings. ``together``: whether the samples of a rest are equivalent, which they
+    are not after a filter.
     """
     moving = np.linalg.norm(motion.angular_rate, axis=1) > RATE_AT_REST_DPS
     if motion.rate is not None:
@@ -311,16 +300,15 @@ def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> Rows:
     rest = np.concatenate([[0], np.cumsum(~alike)])
     begin = time[np.concatenate([[True], ~alike])]
     piece = np.floor((time - begin[rest]) / MEAN_S + 1e-9)
-    new = np.concatenate([[True], ~alike | (np.diff(piece) != 0)])
-    first = np.flatnonzero(new)
+    first = np.flatnonzero(np.concatenate([[True], ~alike | (np.diff(piece) != 0)]))
     return Rows(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(valid))
 
 
 def reference_valid(motion: Motion) -> Mask:
     """Return at which samples the log describes the motion of the table: (n,) array of bool.
 
-    Both intervals next to a sample of a turn must be explained. With an attitude log, the rate at the sample and at its
-    neighbours must agree with the cubic through the four nearest samples, to 0.05 deg/s and 0.1 %.
+    In a turn, the log must describe both intervals next to a sample. With an attitude log, the rate at the sample and
+    at its neighbours must agree with the cubic through the four nearest samples, to 0.05 deg/s and 0.1 %.
     """
     if motion.reference_valid is not None:
         return motion.reference_valid
@@ -335,5 +323,4 @@ def reference_valid(motion: Motion) -> Mask:
             guess += weight[:, None] * rate[j : len(time) - 4 + j]
         bend[2:-2] = np.abs(guess - rate[2:-2]).max(axis=1)
     bends = bend > np.maximum(BEND_DPS, BEND_SHARE * np.abs(rate).max(axis=1))
-    near = np.convolve(bends, np.ones(3), "same") > 0.5
-    return np.logical_not(near)
+    return np.asarray(np.convolve(bends, np.ones(3), "same") < 0.5)

@@ -14,8 +14,8 @@ orthogonality and misalignment averaged, and ``bias`` is the reading that is cor
 
 The result is a function of the coefficients of the sinusoids fitted to the turns. Its covariance follows from theirs by
 the derivative of all stages up to this one (JCGM 100:2008, 5.2.2), by differences. As printed (``as_printed``, with the
-thesis's errata, to reproduce a table) the extremes are single samples, order statistics of the noise: the covariance is
-then that of synthetic turns, the fitted sinusoids with new noise of the size that the residuals have.
+thesis's errata, to reproduce a table) the extremes are single samples, order statistics of the noise: the covariance
+then follows from synthetic turns, which are the fitted sinusoids with simulated noise as large as the residuals.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.gauss_markov import Prior
 
-    Quantities = dict[str, tuple[float, str]]
+    Quantities = dict[str, tuple[float, str]]  # value and unit of each parameter
+    Outcome = tuple[list[dict[str, Any]], Quantities]  # steps of the correction by a stage, and its parameters
 
 REPLICATES = 60  # synthetic turns: their covariance is known to a tenth
 SEED = 20190508  # any number
@@ -67,27 +68,15 @@ STEP = 1e-7  # g, of the differences: truncation and rounding are then both abou
 ASYMMETRY = "scale_factor_asymmetry"
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The result of one stage."""
-
-    steps: list[dict[str, Any]]  # its steps of the correction, see ``pipeline.estimation.stages``
-    values: Quantities  # value and unit of each of its parameters
-    # each (3,); its factors in the contract's form
-    positive: Values = field(default_factory=lambda: np.ones(3))
-    negative: Values = field(default_factory=lambda: np.ones(3))
-    subtracted: Values = field(default_factory=lambda: np.zeros(3))  # (3,), g; its offset
-
-
 def _per_axis(name: str, values: Values, unit: str) -> Quantities:
     return {f"{name}_{axis}": (float(value), unit) for axis, value in zip(AXES, values, strict=True)}
 
 
-def _angles(names: tuple[str, ...], sides: Mapping[str, Values]) -> Quantities:
+def _angles(sides: Mapping[str, Values]) -> Quantities:
     return {
         f"{name}_{side}": (float(angle), "deg")
         for side, degrees in sides.items()
-        for name, angle in zip(names, degrees, strict=True)
+        for name, angle in zip(GREEK, degrees, strict=True)
     }
 
 
@@ -118,9 +107,8 @@ def orthogonality(extremes: Extremes) -> Outcome:
     positive, negative = factors(extremes.excess_high), factors(extremes.excess_low)
     switch_at = np.zeros(3) if extremes.as_printed else extremes.a_zero
     values = _per_axis("O_P", positive, "1") | _per_axis("O_N", negative, "1")
-    values |= _angles(GREEK, {"P": extremes.excess_high, "N": extremes.excess_low})
-    mean = (positive + negative) / 2.0
-    return Outcome([two_sided(positive, negative, switch_at)], values, mean, mean)
+    values |= _angles({"P": extremes.excess_high, "N": extremes.excess_low})
+    return [two_sided(positive, negative, switch_at)], values
 
 
 def misalignment(extremes: Extremes) -> Outcome:
@@ -152,16 +140,15 @@ def misalignment(extremes: Extremes) -> Outcome:
         sides = dict.fromkeys("PN", angles((extremes.a_max - extremes.a_min) / 2.0))
     positive, negative = (float(np.prod(np.cos(sides[side]))) * np.ones(3) for side in "PN")
     values = _per_axis("M_P", positive, "1") | _per_axis("M_N", negative, "1")
-    values |= _angles(GREEK, {side: np.degrees(angle) for side, angle in sides.items()})
-    mean = (positive + negative) / 2.0
+    values |= _angles({side: np.degrees(angle) for side, angle in sides.items()})
     switch_at = np.zeros(3) if extremes.as_printed else extremes.a_zero
-    return Outcome([two_sided(positive, negative, switch_at)], values, mean, mean)
+    return [two_sided(positive, negative, switch_at)], values
 
 
 def bias(extremes: Extremes) -> Outcome:
     """Return the bias (3.38-3.39): ``a_bi = a_mis - b``, b = a_zero, the mean reading of each axis where level."""
     b = extremes.a_zero
-    return Outcome([{"subtract": b.tolist()}], _per_axis("b", b, "g"), subtracted=b)
+    return [{"subtract": b.tolist()}], _per_axis("b", b, "g")
 
 
 def scale_factor(extremes: Extremes) -> Outcome:
@@ -179,8 +166,7 @@ def scale_factor(extremes: Extremes) -> Outcome:
     else:
         positive, negative = G / (a_max - a_zero), G / np.abs(a_min - a_zero)
         steps = [two_sided(positive, negative, a_zero)]
-    values = _per_axis("S_P", positive, "1") | _per_axis("S_N", negative, "1")
-    return Outcome(steps, values, positive, negative, a_zero if extremes.as_printed else np.zeros(3))
+    return steps, _per_axis("S_P", positive, "1") | _per_axis("S_N", negative, "1")
 
 
 STAGES = {f.__name__: f for f in (orthogonality, misalignment, bias, scale_factor)}
@@ -216,11 +202,20 @@ class Corrected:
         """Half the difference of both sides: (3,) array."""
         return (1.0 / self.positive - 1.0 / self.negative) / 2.0
 
+    def after(self, step: Mapping[str, Any], *, averaged: bool) -> Corrected:
+        """Return the correction after a further step; ``averaged``: the factors of both sides are averaged."""
+        steps = [*self.steps, dict(step)]
+        if "subtract" in step:
+            return replace(self, steps=steps, bias=self.bias + np.array(step["subtract"]) * self.k)
+        positive, negative = (np.array(step["two_sided"][side]) for side in ("positive", "negative"))
+        if averaged:
+            positive = negative = (positive + negative) / 2.0
+        return replace(self, steps=steps, positive=self.positive * positive, negative=self.negative * negative)
+
     def vector(self) -> Values:
         """Return bias, matrix, c and the last stage's parameters in one vector."""
-        return np.concatenate(
-            [self.bias, np.diag(1.0 / self.k).ravel(), self.c, [value for value, _ in self.values.values()]]
-        )
+        parameters = [value for value, _ in self.values.values()]
+        return np.concatenate([self.bias, np.diag(1.0 / self.k).ravel(), self.c, parameters])
 
 
 def follow(extremes: Extremes, names: Sequence[str], start: Corrected | None = None) -> Corrected:
@@ -232,13 +227,11 @@ def follow(extremes: Extremes, names: Sequence[str], start: Corrected | None = N
     for step in found.steps:
         extremes = extremes.corrected(step)
     for name in names:
-        own = STAGES[name](extremes)
-        for step in own.steps:
+        steps, values = STAGES[name](extremes)
+        for step in steps:
             extremes = extremes.corrected(step)
-        positive, negative = found.positive * own.positive, found.negative * own.negative
-        found = Corrected(
-            found.steps + own.steps, found.bias + own.subtracted * found.k, positive, negative, own.values
-        )
+            found = found.after(step, averaged=name != "scale_factor")
+        found = replace(found, values=values)
     return found
 
 
@@ -255,17 +248,17 @@ def fit(
     prior = prior_of("accelerometer", recordings, settings)
     theta = np.concatenate([s.coefficients for channel in range(3) for s in (turn[channel] for turn in sinusoids)])
 
-    def chain(values: Values) -> Corrected:
-        return follow(extremes_of_sinusoids(by_turn(sinusoids, values), gravity_g), [*before, name])
+    def chain(values: Values) -> Values:
+        return follow(extremes_of_sinusoids(by_turn(sinusoids, values), gravity_g), [*before, name]).vector()
 
     by_sinusoids = extremes_of_sinusoids(by_turn(sinusoids, theta), gravity_g)
     extremes = extremes_of_samples(turns, gravity_g) if as_printed else by_sinusoids
     found = follow(extremes, [name], Corrected.of(previous))
-    map_ = _linear_map(sinusoids, theta, chain)
     noise = _noise(turns, prior, settings["table"])
     if as_printed:
         scatter = _resampled(turns, sinusoids, noise, gravity_g, [*before, name])
     else:
+        map_ = _linear_map(sinusoids, theta, chain)
         scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, np.concatenate([turn.reading for turn in turns]))
     result = staged_result(
@@ -294,7 +287,7 @@ def fit(
     reference = Reference("accelerometer", motions, np.diag(found.k), settings["table"])
 
     def results(errors: Values) -> Values:
-        return np.array([chain(theta + e).vector()[kept] for e in errors])
+        return np.array([chain(theta + e)[kept] for e in errors])
 
     return budgeted(calibration, reference, map_.results(kept), noise, [scatter.of(kept)], settings, results)
 
@@ -314,12 +307,10 @@ def _noise(turns: Sequence[Turn], prior: Prior, table: Mapping[str, Any]) -> Res
     return noise_on_table(reference, reading - X @ beta, X, blocks, prior)
 
 
-def _linear_map(
-    sinusoids: Sequence[Sequence[Sinusoid]], theta: Values, chain: Callable[[Values], Corrected]
-) -> LinearMap:
+def _linear_map(sinusoids: Sequence[Sequence[Sinusoid]], theta: Values, chain: Callable[[Values], Values]) -> LinearMap:
     """Return the map from readings to ``Corrected.vector``, by the derivative of all stages so far."""
-    here = chain(theta).vector()
-    columns = np.stack([(chain(theta + STEP * e).vector() - here) / STEP for e in np.eye(len(theta))], axis=1)
+    here = chain(theta)
+    columns = np.stack([(chain(theta + STEP * e) - here) / STEP for e in np.eye(len(theta))], axis=1)
     x, y, z = (np.asarray(scipy.linalg.block_diag(*(turn[c].weights for turn in sinusoids))) for c in range(3))
     J_x, J_y, J_z = np.split(columns, np.cumsum([len(x), len(y)]), axis=1)
     return LinearMap((x, y, z), (J_x, J_y, J_z))
@@ -332,7 +323,7 @@ def _resampled(
     gravity_g: float,
     names: Sequence[str],
 ) -> Contribution:
-    """Return the scatter of the stages' parameters over synthetic turns."""
+    """Return the contribution of the noise to the parameters of stages, from their scatter over synthetic turns."""
     pairs = list(zip(turns, sinusoids, strict=True))
     means = [turn.reading - np.column_stack([s.residuals for s in fits]) for turn, fits in pairs]
     cuts = np.cumsum([len(turn.angle) for turn in turns])[:-1]

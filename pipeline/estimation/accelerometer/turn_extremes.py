@@ -38,16 +38,15 @@ class Extremes:
     # each (3, 2), deg; table angle where the first and the second axis of the turn about x, y, z read most and least
     angle_high: Values
     angle_low: Values
-    # each (3, 2), g; largest and smallest readings of each axis, one from each of the two turns in which it goes up and
-    # down
+    # each (3, 2), g; largest and smallest readings of each axis, from the two turns in which it goes up and down
     high: Values
     low: Values
     level: Values  # (3, m), g; readings of each axis where it is level
-    # (3,), g; what each axis reads while the table turns about it: by default the amplitude of its swing, as printed
+    # (3,), g; reading of each axis while the table turns about it: by default the amplitude of its swing, as printed
     # its mean
     height: Values
     gravity_g: float
-    as_printed: bool  # whether they are single samples, and the equations those that are printed
+    as_printed: bool  # whether they are single samples, for the equations as printed
 
     @property
     def a_max(self) -> Values:
@@ -66,7 +65,7 @@ class Extremes:
 
     @property
     def excess_high(self) -> Values:
-        """alpha_P, beta_P, gamma_P: by how much the upper extremes of a turn are not 90 deg apart."""
+        """alpha_P, beta_P, gamma_P: angle between the upper extremes of a turn, minus 90 deg."""
         return wrap(self.angle_high[:, 0] - self.angle_high[:, 1] - 90.0)
 
     @property
@@ -95,15 +94,12 @@ class Turn:
 
     angle: Values  # (n,), deg
     reading: Values  # (n, 3), g
-    used: list[tuple[Recording, Mask]]  # where they come from, in order
-    motions: list[Motion]  # by the table, at these samples
+    used: list[tuple[Recording, Mask]]  # the recordings, in order, and which of their samples
+    motions: list[Motion]  # of the table, at these samples
 
 
 def turns_of(parts: Sequence[Part], *, as_printed: bool) -> list[Turn]:
-    """Return the turns about x, y and z.
-
-    Raises ``NotObservableError`` if there is none about one of the axes.
-    """
+    """Return the turns about x, y and z; raise ``NotObservableError`` if there is none about one of the axes."""
     turns = []
     for axis in range(3):
         used = [(part, samples_of(part, as_printed=as_printed)) for part in parts if part.motion.axis == axis]
@@ -141,13 +137,9 @@ def sinusoids_of(turns: Sequence[Turn]) -> list[list[Sinusoid]]:
 
 
 def extremes_of_sinusoids(coefficients: Sequence[Sequence[Values]], gravity_g: float) -> Extremes:
-    """Return the extremes of fitted sinusoids.
-
-    ``coefficients``: ``Sinusoid.coefficients``.
-    """
-    angle = np.empty((3, 2))
-    high, low, level = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 3))
-    height = np.empty(3)
+    """Return the extremes of fitted sinusoids; ``coefficients``: of each turn, by channel (``Sinusoid``)."""
+    angle, high, low = np.empty((3, 3, 2))
+    level, height = np.empty((3, 3)), np.empty(3)
     for axis in range(3):
         zero, cosine, sine = coefficients[axis][axis]
         level[axis, 2], height[axis] = zero, np.hypot(cosine, sine)
@@ -163,11 +155,10 @@ def extremes_of_sinusoids(coefficients: Sequence[Sequence[Values]], gravity_g: f
 def extremes_of_samples(turns: Sequence[Turn], gravity_g: float) -> Extremes:
     """Return the extremes as the largest and smallest samples of the turns, the readings of each pose from one sample.
 
-    An axis is level in two poses of either turn in which it goes up and down and in all four of its own turn.
+    An axis is level in two poses of each turn in which it goes up and down, and in all four poses of the turn about it.
     """
-    angle_high, angle_low = np.empty((3, 2)), np.empty((3, 2))
-    high, low, level = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 8))
-    height = np.empty(3)
+    angle_high, angle_low, high, low = np.empty((4, 3, 2))
+    level, height = np.empty((3, 8)), np.empty(3)
     for axis, turn in enumerate(turns):
         pair = list(OTHERS[axis])
         top, bottom = np.argmax(turn.reading[:, pair], axis=0), np.argmin(turn.reading[:, pair], axis=0)
@@ -186,13 +177,13 @@ def by_turn(sinusoids: Sequence[Sequence[Sinusoid]], values: Values) -> list[lis
     """Return coefficients ``[turn][channel]`` from a vector in which the channels follow each other."""
     sizes = [len(turn[channel].coefficients) for channel in range(3) for turn in sinusoids]
     pieces = np.split(values, np.cumsum(sizes)[:-1])
-    return [[pieces[channel * len(sinusoids) + turn] for channel in range(3)] for turn in range(len(sinusoids))]
+    return [pieces[turn :: len(sinusoids)] for turn in range(len(sinusoids))]
 
 
 def certificate_of(sinusoids: Sequence[Sequence[Sinusoid]]) -> dict[str, Any]:
-    """Return the certificate of the worst of the sinusoids' fits."""
-    every = [s for turn in sinusoids for s in turn]
-    parts = [certificate(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in every]
-    worst = {key: max(part[key] for part in parts) for key in ("cosine", "condition")}
+    """Return the certificate of the sinusoids' fits: the largest cosine and condition of all."""
+    fits = [s for turn in sinusoids for s in turn]
+    parts = [certificate(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in fits]
+    cosine, condition = (max(part[key] for part in parts) for key in ("cosine", "condition"))
     count = sum(part["parameters"] for part in parts)
-    return certified(worst["cosine"], worst["condition"], count, count)
+    return certified(cosine, condition, count, count)

@@ -15,16 +15,16 @@ and
 
     A = Y U^T (U U^T)^-1,   S T = chol(A A^T),   M = (S T)^-1 A
 
-Several turns about an axis, at several rates and in both directions, make A a least-squares estimate. The calibration
-matrix is ``A^-1``. As printed it is A: in Sudsanguan 2019, tables 5.25 and 5.26, the forward matrix is applied as if it
-were the correction.
+With several turns about an axis, at several rates and in both directions, A is a least-squares estimate. The
+calibration matrix is ``A^-1``. As printed it is A: in Sudsanguan 2019, tables 5.25 and 5.26, the forward matrix is
+applied as if it were the correction.
 
 Y is linear in the readings. So ``pipeline.estimation.engine`` gives the covariance of A under white noise and bias
 wander, and the derivatives with respect to A give the covariance of S, T, M and ``A^-1``. The integrals
 
     Y = integral (y - b) dt,   U = integral u dt
 
-are by the trapezoidal rule on the time stamps, so that noise and a delay between reading and reference have little
+are by the trapezoidal rule on the timestamps, so that noise and a delay between reading and reference have little
 effect. A turn is the time in which the table's rate is above a threshold, in one direction, plus the time in which the
 output of a filter still changes.
 """
@@ -32,7 +32,7 @@ output of a filter still changes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -58,11 +58,10 @@ STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-
 MOTION_SHARE = 0.01  # of the largest rate, above which the table turns
 SLOWEST_DPS = 0.02  # five times Earth's rotation, which a log may contain
 DELAYS_TO_SETTLE = 5.0  # after which an RC filter holds less than 1 % of a change of rate
-SMALLEST_ANGLE_DEG = 1.0  # a shorter move says little of a matrix
+SMALLEST_ANGLE_DEG = 1.0  # a smaller turn hardly determines the matrix
 
 
-@dataclass(frozen=True)
-class _Factors:
+class Factors(NamedTuple):
     """S, T and M of a forward matrix ``A = S T M``: (3,), (3, 3) and (3, 3) arrays."""
 
     S: Values
@@ -91,23 +90,28 @@ def fit(
     residuals = turns.reading - previous.bias - turns.rate @ A.T
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
     prior = prior_of("gyroscope", recordings, settings)
-    fit, given = _linear_map(turns, A, previous, as_printed=as_printed)
+    fit, of_bias = _linear_map(turns, A, previous, as_printed=as_printed)
     reference = Reference("gyroscope", turns.motions, A, settings["table"])
     noise = noise_on_table(reference, residuals, design, blocks_of_samples(turns.parts), prior)
     scatter = noise_contribution(noise, fit, prior)
     matrix = _matrix(A, as_printed=as_printed)
+    # The rms error of the integrated angles: rows are turn axes, columns are sensor axes.
+    squares, about = (Y @ matrix.T - U) ** 2, np.argmax(np.abs(U), axis=1)
+    angle_errors = [
+        np.sqrt(squares[about == i].mean(axis=0)).tolist() if np.any(about == i) else 3 * [None] for i in range(3)
+    ]
     after = (turns.reading - previous.bias) @ matrix.T
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(turns.rate, axis=1)
     result = StageResult(
         name=NAME,
-        parameters=stage_parameters(_values(factors), (scatter.covariance + given)[12:, 12:]),
+        parameters=stage_parameters(_values(factors), (scatter.covariance + of_bias)[12:, 12:]),
         residual_rms=float(np.sqrt(np.mean(error**2))),
         correction={"steps": [{"subtract": previous.bias.tolist()}, {"matrix": matrix.tolist()}]},
         details={
             "turns": len(U),
             "turns_left_out": turns.left_out,
             "samples_used": len(turns.reading),
-            "angle_error_rms_deg": _angle_errors(Y, U, matrix),
+            "angle_error_rms_deg": angle_errors,
             "orthonormality_error": float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
             "determinant_of_M": float(np.linalg.det(factors.M)),
             "condition": float(np.linalg.cond(U / np.linalg.norm(U, axis=0))),
@@ -123,9 +127,9 @@ def fit(
     )
     kept = slice(0, 12)
     lines = [scatter.of(kept)]
-    if np.any(given):
+    if np.any(of_bias):
         before = np.inf if previous.freedom is None else float(previous.freedom[:3].min())
-        lines.append(replace(scatter_contribution(given[kept, kept], before), source="bias of the stage before"))
+        lines.append(replace(scatter_contribution(of_bias[kept, kept], before), source="bias of the stage before"))
     theta = np.column_stack([previous.bias, A])
 
     def results(errors: Values) -> Values:
@@ -135,11 +139,11 @@ def fit(
     return budgeted(found, reference, fit.results(kept), noise, lines, settings, results)
 
 
-def factorise(A: Values) -> _Factors:
+def factorise(A: Values) -> Factors:
     """Return S (positive), T (unit lower triangular) and M (orthonormal) with ``A = S T M``."""
     L = np.linalg.cholesky(A @ A.T)
     S = np.diag(L).copy()
-    return _Factors(S, L / S[:, None], np.linalg.solve(L, A))
+    return Factors(S, L / S[:, None], np.linalg.solve(L, A))
 
 
 def _matrix(A: Values, *, as_printed: bool) -> Values:
@@ -147,9 +151,10 @@ def _matrix(A: Values, *, as_printed: bool) -> Values:
 
 
 def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_printed: bool) -> tuple[LinearMap, Values]:
-    """Return the map from readings to bias, matrix, S, T and M (12 + 15), and their covariance from a given bias.
+    """Return the map from readings to bias, matrix, S, T and M (12 + 15), and their covariance by the bias before.
 
-    Without a rest in the turns' recordings the bias is from another recording, with a separate covariance.
+    Without a rest in the turns' recordings the bias is from another recording, and its covariance adds to the other;
+    else that covariance is zero.
     """
     inverse = ScaledColumns.of(turns.integral(turns.rate)).weights()
     inside = turns.turn >= 0
@@ -159,7 +164,7 @@ def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_prin
     lever = np.array([1.0, *(-weights[1:].sum(axis=1))])
     if from_rests:
         weights += lever[:, None] * np.where(turns.rest, 1.0 / turns.rest.sum(), 0.0)
-    theta, given = np.column_stack([previous.bias, A]).ravel(), np.zeros((27, 27))
+    theta, of_bias = np.column_stack([previous.bias, A]).ravel(), np.zeros((27, 27))
 
     def results(values: Values) -> Values:
         channels = values.reshape(3, 4)
@@ -169,25 +174,16 @@ def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_prin
     x, y, z = np.split(derivative(results, theta, np.full(12, STEP)), 3, axis=1)
     if not from_rests and previous.covariance is not None:
         for channel, J in enumerate((x, y, z)):
-            given += previous.covariance[channel, channel] * np.outer(J @ lever, J @ lever)
-    return LinearMap((weights, weights, weights), (x, y, z)), given
+            of_bias += previous.covariance[channel, channel] * np.outer(J @ lever, J @ lever)
+    return LinearMap((weights, weights, weights), (x, y, z)), of_bias
 
 
-def _values(factors: _Factors) -> dict[str, tuple[float, str]]:
+def _values(factors: Factors) -> dict[str, tuple[float, str]]:
     """Return S, the elements of T below its diagonal, and M, with their units."""
     below = list(zip(*np.tril_indices(3, -1), strict=True))
     values = {f"S_{axis}": (float(s), "1") for axis, s in zip(AXES, factors.S, strict=True)}
     values |= {f"T_{AXES[i]}{AXES[j]}": (float(factors.T[i, j]), "1") for i, j in below}
     return values | {f"M_{AXES[i]}{AXES[j]}": (float(factors.M[i, j]), "1") for i in range(3) for j in range(3)}
-
-
-def _angle_errors(Y: Values, U: Values, matrix: Values) -> list[list[float | None]]:
-    """Return the rms error of the integrated angles, deg: rows are turn axes, columns are sensor axes."""
-    error, about = Y @ matrix.T - U, np.argmax(np.abs(U), axis=1)
-    return [
-        [float(np.sqrt(np.mean(error[about == i, j] ** 2))) if np.any(about == i) else None for j in range(3)]
-        for i in range(3)
-    ]
 
 
 @dataclass(frozen=True)
@@ -197,11 +193,11 @@ class Turns:
     reading: Values  # (n, 3), deg/s
     rate: Values  # (n, 3), deg/s; by the table, Earth's rotation included where it is known
     rest: Mask  # (n,)
-    weight: Values  # (n,), s; of each sample in the integral of its turn; 0 at rest
+    weight: Values  # (n,), s; of each sample in the integral over its turn; 0 at rest
     turn: Index  # (n,); turn of each sample, -1 at rest
     parts: tuple[tuple[Recording, Mask], ...]
     left_out: int  # turns with clipped or stuck readings
-    motions: tuple[Motion, ...]  # by the table, at these samples
+    motions: tuple[Motion, ...]  # of the table, at these samples
 
     def integral(self, values: Values) -> Values:
         """Return the integral of (n, 3) values over each turn: (t, 3) array, deg."""

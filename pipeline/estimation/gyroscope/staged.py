@@ -42,27 +42,22 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.gauss_markov import Blocks
 
+    # step of the correction by a stage, and value and unit of each of its parameters
+    Outcome = tuple[dict[str, Any], dict[str, tuple[float, str]]]
+
 STEP = 1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
-FORGOTTEN = 1e-5  # of a change of rate, that a filter's output may still hold where a rest or a steady turn begins
+FORGOTTEN = 1e-5  # share of a change of rate in a filter's output, below which the filter has settled
 DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The result of one stage: its step of the correction, and value and unit of each of its parameters."""
-
-    step: dict[str, Any]
-    values: dict[str, tuple[float, str]]
 
 
 def bias(response: Response) -> Outcome:
     """Return the bias (3.47-3.48): ``g_bi = g_r - b``, b the mean of the readings at rest.
 
-    The rests are those of the recordings made for the gyroscope, by the table's log, as in the thesis; the static
-    recording, perhaps far away in time and temperature, stands in only where these hold no rest.
+    The rests are those of the recordings made for the gyroscope, by the table's log, as in the thesis. The static
+    recording may be far away in time and temperature: it is used only where these hold no rest.
     """
     values = {f"b_{axis}": (float(b), "deg/s") for axis, b in zip(AXES, response.rest, strict=True)}
-    return Outcome({"subtract": response.rest.tolist()}, values)
+    return {"subtract": response.rest.tolist()}, values
 
 
 def orthogonality_and_misalignment(response: Response) -> Outcome:
@@ -80,7 +75,7 @@ def orthogonality_and_misalignment(response: Response) -> Outcome:
     S = rate @ response.slope
     M = np.linalg.solve(S.T, rate).T if response.as_printed else np.linalg.solve(S, rate)
     values = {f"M_{i + 1}{j + 1}": (float(M[i, j]), "1") for i in range(3) for j in range(3)}
-    return Outcome({"matrix": M.T.tolist()}, values)
+    return {"matrix": M.T.tolist()}, values
 
 
 def scale_factor(response: Response) -> Outcome:
@@ -95,7 +90,7 @@ def scale_factor(response: Response) -> Outcome:
     g_max = g_min + response.rate * np.diag(response.slope)
     scale = response.rate / g_max - g_min if response.as_printed else response.rate / (g_max - g_min)
     values = {f"S_{axis}": (float(s), "1") for axis, s in zip(AXES, scale, strict=True)}
-    return Outcome({"matrix": np.diag(scale).tolist()}, values)
+    return {"matrix": np.diag(scale).tolist()}, values
 
 
 STAGES = {f.__name__: f for f in (bias, orthogonality_and_misalignment, scale_factor)}
@@ -109,7 +104,7 @@ class Corrected:
     values: dict[str, tuple[float, str]] = field(default_factory=dict)
 
     def contract(self) -> tuple[Values, Values]:
-        """Return bias and matrix of ``matrix @ (reading - bias)``, which all steps together are."""
+        """Return bias and matrix of ``matrix @ (reading - bias)``, the composition of all steps."""
         offset: Values = np.zeros(3)
         matrix: Values = np.eye(3)
         for step in self.steps:
@@ -131,12 +126,12 @@ def follow(response: Response, names: Sequence[str], start: Sequence[Mapping[str
     ``start``: the correction by the stages before the first of ``names``.
     """
     found = Corrected([dict(step) for step in start])
-    for step in start:
+    for step in found.steps:
         response = response.corrected(step)
     for name in names:
-        own = STAGES[name](response)
-        response = response.corrected(own.step)
-        found = Corrected([*found.steps, own.step], own.values)
+        step, values = STAGES[name](response)
+        response = response.corrected(step)
+        found = Corrected([*found.steps, step], values)
     return found
 
 
@@ -145,7 +140,7 @@ def fit(
 ) -> SensorCalibration:
     """Run one stage of the staged method (``pipeline.estimation.stages``).
 
-    Role ``gyroscope``, on a table; for want of a rest in these recordings, role ``static`` too.
+    Role ``gyroscope``, on a table; also role ``static`` if these recordings hold no rest.
     """
     before = stages_before("gyroscope", previous, STAGES)
     as_printed = bool(settings["method"].get("as_printed", False))
@@ -156,17 +151,14 @@ def fit(
     design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])
     residuals = samples.reading - theta[0] - samples.rate @ theta[1:]
 
-    def response(values: Values) -> Response:
-        b, slope = values.reshape(3, 4)[:, 0], values.reshape(3, 4)[:, 1:].T
-        return Response(b, slope, samples.speed, as_printed)
-
     def chain(values: Values) -> Values:
-        return follow(response(values), [*before, name]).vector()
+        b, *slope = values.reshape(3, 4).T
+        return follow(Response(b, np.array(slope), samples.speed, as_printed), [*before, name]).vector()
 
-    at = theta.T.ravel()
+    here = theta.T.ravel()
     correction = (previous.stages[-1].correction or {}) if previous and previous.stages else {}
-    found = follow(response(at), [name], correction.get("steps", []))
-    x, y, z = np.split(derivative(chain, at, np.full(12, STEP)), 3, axis=1)
+    found = follow(Response(theta[0], theta[1:], samples.speed, as_printed), [name], correction.get("steps", []))
+    x, y, z = np.split(derivative(chain, here, np.full(12, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
     reference = Reference("gyroscope", samples.motions, theta[1:].T, settings["table"])
     noise = noise_on_table(reference, residuals, design, samples.blocks, prior)
@@ -191,12 +183,12 @@ def fit(
         stages=(*(previous.stages if previous else ()), result),
         convergence=certified(0.0, condition, columns, columns) | {"closed_form": True},
     )
-    kept, K = slice(0, 12), np.asarray(np.linalg.solve(matrix, np.eye(3)))
+    kept = slice(0, 12)
 
     def results(errors: Values) -> Values:
-        return np.array([chain(at + e)[kept] for e in errors])
+        return np.array([chain(here + e)[kept] for e in errors])
 
-    reference = replace(reference, K=K)
+    reference = replace(reference, K=np.asarray(np.linalg.solve(matrix, np.eye(3))))
     return budgeted(calibration, reference, map_.results(kept), noise, [scatter.of(kept)], settings, results)
 
 
@@ -231,11 +223,10 @@ class Samples:
     """The used samples, stacked."""
 
     reading: Values  # (n, 3), deg/s; less Earth's rotation where it is known
-    # (n, 3), deg/s; signed rate of the table about its turn axis, in that axis's column; 0 at rest
-    rate: Values
+    rate: Values  # (n, 3), deg/s; signed rate of the table about its turn axis, in the column of the axis; 0 at rest
     blocks: Blocks
     total: int  # samples of the recordings
-    motions: tuple[Motion, ...]  # by the table, at these samples; at rest in a static recording
+    motions: tuple[Motion, ...]  # of the table, at these samples; at rest in a static recording
 
     @property
     def speed(self) -> Values:
@@ -277,7 +268,7 @@ def _memory(recording: Recording) -> float:
     if applied["name"] == "none":
         return 0.0
     try:
-        from pipeline.signal.filters import filter_autocovariance  # noqa: PLC0415  (only filtered recordings pay for it)
+        from pipeline.signal.filters import filter_autocovariance  # noqa: PLC0415  (needed for filtered recordings only)
 
         covariance = np.abs(filter_autocovariance(recording))
     except (ConfigurationError, KeyError):
@@ -286,7 +277,7 @@ def _memory(recording: Recording) -> float:
 
 
 def _without_tails(part: Part, memory: float) -> Mask:
-    """Return the samples of the rests in which a filter has settled after a turn, and before the next turn."""
+    """Return the samples at rest in which a filter has settled after a turn, and before the next turn."""
     still, time = part.motion.still.copy(), part.motion.time
     before = memory if part.recording.filter.get("zero_phase") else 0.0
     for start, stop in runs(part.motion.still) if memory > 0 else []:
@@ -310,6 +301,6 @@ def weights_of(rate: Values, *, as_printed: bool) -> Values:
     for axis in range(3):
         by = np.sign(rate[:, axis]) if as_printed else rate[:, axis]
         if np.any(by):
-            own = by / (by @ rate[:, axis])
-            weights[axis + 1] = own - own.sum() * weights[0]
+            slope = by / (by @ rate[:, axis])
+            weights[axis + 1] = slope - slope.sum() * weights[0]
     return weights
