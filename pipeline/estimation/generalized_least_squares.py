@@ -5,7 +5,7 @@
 
 where
 
-    u  : truth by the table, at the time t' after effects of timing
+    u  : truth by the table, at the time t' that follows from the effects of timing
     J  : derivative of the model with respect to beta; r: readings minus the model
     C  : white noise plus a Gauss-Markov bias, ``pipeline.estimation.gauss_markov``
 
@@ -68,7 +68,7 @@ LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 
 class Fit(Start):
     """The best fit of base and effects to the readings."""
 
-    # (12 + p, 12 + p); of bias, K (row by row) and the effects' parameters, as the noise settings of the fit weight it
+    # (12 + p, 12 + p); of bias, K (row by row) and the effects' parameters, averaged over the noise settings of the fit
     covariance: Values
     log_likelihood: float  # under the best noise setting, up to a constant of the readings
     setting: Setting  # that noise setting
@@ -77,7 +77,7 @@ class Fit(Start):
     rounds: int
     converged: bool
     condition: float  # of the scaled products of columns
-    cosine: float  # largest between what is left of the readings and a column, both whitened
+    cosine: float  # largest between the residual and a column, both whitened
     rank: int  # parameters, or combinations of them, that the readings determine
 
 
@@ -96,9 +96,8 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         taken = np.concatenate([solved.step[:BASE], taken])
         K = state.K + taken[3:BASE].reshape(3, 3)
         state = replace(state, bias=state.bias + taken[:3], K=K, terms=tuple(moved))
-        small = np.maximum(
-            SMALL_STEP * np.sqrt(np.diag(solved.best_covariance)), np.where(np.arange(len(taken)) < BASE, 1e-12, 0.0)
-        )
+        small = SMALL_STEP * np.sqrt(np.diag(solved.best_covariance))
+        small[:BASE] = np.maximum(small[:BASE], 1e-12)
         converged = linear or bool(np.all(np.abs(taken) <= small))
         if not linear:
             solved = _solve(design_at(observations, state), observations, settings)
@@ -119,19 +118,19 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         rounds=rounds,
         converged=converged,
         condition=solved.condition,
-        cosine=solved.left if linear else solved.cosine,
+        cosine=solved.cosine_after if linear else solved.cosine,
         rank=solved.rank,
     )
 
 
 def _with_all_columns(start: Start, terms: Sequence[Term]) -> Start:
-    """Return a base with terms that have the columns of all their parameters."""
+    """Return a base with terms whose parameters all have a column."""
     full = (replace(term, values=np.array(term.values, float), full=True) for term in terms)
     return Start(start.bias, start.K, start.scale, tuple(full))
 
 
 def design_at(observations: Observations, at: Start, beside: Sequence[Term] | None = None) -> Design:
-    """Return the design of a model at given parameters, or of additional terms ``beside``; and the residual."""
+    """Return the design, with the residual, of a model at given parameters, or of terms ``beside`` it."""
     residual, base = _residual(observations, at)
     terms, project = (at.terms, False) if beside is None else (beside, True)
     return Design(observations, terms, at.K, np.maximum(at.scale, 1e-300), target=residual, base=base, project=project)
@@ -167,8 +166,9 @@ class _Solved:
     log_likelihood: float
     setting: Setting
     condition: float
+    # largest between a whitened column and the whitened residual, before the step and after a linear step
     cosine: float
-    left: float
+    cosine_after: float
     rank: int
     # each (g,); of every setting: log det C + log det(X^T C^-1 X), and the weighted sum of squared residuals
     logarithms: Values
@@ -196,19 +196,18 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     best = int(np.argmax(scores))
     weight = np.exp(scores - scores[best])
     norm = unit[best] * np.sqrt(max(float(products[best, -1, -1]), 1e-300))
-    left = rhs[best] - gram[best] @ steps[best]
     return _Solved(
-        steps[best] / size,
-        Posterior(weight / weight.sum(), covariances, spare),
-        covariances[best],
-        float(scores[best]),
-        settings[best],
-        float(np.sqrt(values[best, -1] / max(values[best, 0], 1e-300))),
-        float(np.max(np.abs(rhs[best]) / norm)),
-        float(np.max(np.abs(left) / norm)),
-        int(kept[best].sum()),
-        logarithms + determinants,
-        rss,
+        step=steps[best] / size,
+        posterior=Posterior(weight / weight.sum(), covariances, spare),
+        best_covariance=covariances[best],
+        log_likelihood=float(scores[best]),
+        setting=settings[best],
+        condition=float(np.sqrt(values[best, -1] / max(values[best, 0], 1e-300))),
+        cosine=float(np.max(np.abs(rhs[best]) / norm)),
+        cosine_after=float(np.max(np.abs(rhs[best] - gram[best] @ steps[best]) / norm)),
+        rank=int(kept[best].sum()),
+        logarithms=logarithms + determinants,
+        squares=rss,
     )
 
 
@@ -237,16 +236,15 @@ def fit_best(
 ) -> Fit:
     """Fit from the combination of starts with the largest likelihood after one linear step.
 
-    Effects of timing are first fitted with the base alone: far from their values, where a linear step is inaccurate,
-    other effects would absorb their signal.
+    Effects of timing are first fitted with the base alone: far from their values a linear step is inaccurate, and other
+    effects would absorb their signal.
     """
-    chosen = combinations[0]
-    if len(combinations) > 1:
-        scores = []
-        for terms in combinations:
-            design = design_at(observations, _with_all_columns(start, terms))
-            scores.append(_solve(design, observations, settings).log_likelihood)
-        chosen = combinations[int(np.argmax(scores))]
+
+    def likelihood(terms: Sequence[Term]) -> float:
+        design = design_at(observations, _with_all_columns(start, terms))
+        return _solve(design, observations, settings).log_likelihood
+
+    chosen = combinations[0] if len(combinations) == 1 else max(combinations, key=likelihood)
     timing = [term for term in chosen if term.effect.moves and not np.any(term.values)]
     if timing and len(timing) < len(chosen):
         start = fit_terms(observations, timing, start, settings)
@@ -262,22 +260,17 @@ def require_observable(observations: Observations, fit: Fit) -> None:
     free = np.ones(len(names), bool)  # a prior determines the others
     for at, term in zip(design.slices, fit.terms, strict=True):
         free[at] = term.prior is None or np.linalg.matrix_rank(term.prior.precision) < len(term.values)
-    names = [name for name, own in zip(names, free, strict=True) if own]
+    names = [name for name, kept in zip(names, free, strict=True) if kept]
     size = design.sizes()[:-1][free]
     products = design.products([WHITE])[0][0, :-1, :-1][np.ix_(free, free)]
-    products = products / np.outer(*[np.where(size > 0, size, 1.0)] * 2)
-    values, vectors = np.linalg.eigh(products)
+    values, vectors = np.linalg.eigh(products / np.outer(*[np.where(size > 0, size, 1.0)] * 2))
+    undetermined = vectors[:, values < LEAST_EIGENVALUE].T
     weak = [name for name, s in zip(names, size, strict=True) if s == 0]
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value < LEAST_EIGENVALUE:
-            weak += [
-                name for name, share in zip(names, np.abs(vector), strict=True) if share > 0.2 and name not in weak
-            ]
+    weak += [name for vector in undetermined for name, share in zip(names, np.abs(vector), strict=True) if share > 0.2]
+    weak = list(dict.fromkeys(weak))
     if weak:
-        involved = {name.split(".")[0] for name in weak if "." in name}
-        advice = "; ".join(
-            f"{t.effect.name} needs {t.effect.excitation}" for t in fit.terms if t.effect.name in involved
-        )
+        involved = [t.effect for t in fit.terms if any(name.startswith(f"{t.effect.name}.") for name in weak)]
+        advice = "; ".join(f"{effect.name} needs {effect.excitation}" for effect in involved)
         raise NotObservableError(
             f"the recordings of the {observations.sensor} do not determine {', '.join(weak)}: "
             f"{advice or 'record turns about all three axes'}; or take the effect out of effects.{observations.sensor}"
@@ -338,7 +331,9 @@ def calibration_of(
         rows = BASE + np.flatnonzero(held)
         change[rows] = covariance[rows] = covariance[:, rows] = 0.0
         of_terms = np.split(held, np.cumsum([len(term.values) for term in fit.terms])[:-1])
-        terms = [replace(t, values=np.where(own, 0.0, t.values)) for t, own in zip(fit.terms, of_terms, strict=True)]
+        terms = [
+            replace(t, values=np.where(fixed, 0.0, t.values)) for t, fixed in zip(fit.terms, of_terms, strict=True)
+        ]
         fit = replace(fit, terms=tuple(terms))
         effects, parameters = effect_parameters(sensor, fit.terms, covariance)
     details: dict[str, Any] = {
@@ -378,8 +373,8 @@ def calibration_of(
     lines = [noise_contribution(errors, whole, prior)]
     for name, prior_part in design.prior_covariances(fit.setting).items():
         remark = HELD if name == TILT and not observations.levelling_deg else ""
-        own, never = change @ prior_part @ change.T, np.full(len(change), np.inf)
-        lines.append(Contribution(name.replace("_", " "), "B", NORMAL, own, never, remark=remark))
+        part, freedom = change @ prior_part @ change.T, np.full(len(change), np.inf)
+        lines.append(Contribution(name.replace("_", " "), "B", NORMAL, part, freedom, remark=remark))
     return budgeted(found, reference, whole, errors, lines, settings, results, names)
 
 
@@ -388,8 +383,8 @@ def fit_in_mean_frame(fit: Fit) -> tuple[Fit, Values]:
     found = next((each for each in placed(fit.terms).values() if isinstance(each[0].effect, Mounting)), None)
     if found is None:
         return fit, np.eye(len(fit.covariance))
-    mounting, own = found
+    mounting, place = found
     K, theta = in_mean_frame(fit.K, mounting.values)
-    change = errors_in_mean_frame(K, theta, own, len(fit.covariance))
+    change = errors_in_mean_frame(K, theta, place, len(fit.covariance))
     terms = tuple(replace(term, values=theta) if term is mounting else term for term in fit.terms)
     return replace(fit, K=K, terms=terms, covariance=change @ fit.covariance @ change.T), change

@@ -1,6 +1,6 @@
 """Fit bias and full 3x3 matrix of a sensor by least squares against the table's motion.
 
-In the measurement direction, with regressors that have no noise,
+In the measurement direction, with regressors without noise,
 
     y = b + K u + noise,   matrix = K^-1
 
@@ -13,7 +13,7 @@ where
 
 each channel is a linear problem with the same columns (1, u_x, u_y, u_z). A filtered reading is compared with
 ``b + K F u``, F the same filter. This is exact for any linear filter; a shift of u by the filter's delay would ignore
-its attenuation and be wrong in every ramp. If the filter cannot be reproduced, the shift ``u(t - delay)`` is used.
+its attenuation and be wrong in every ramp. Only if the filter cannot be reproduced, the shift ``u(t - delay)`` is used.
 
 With stop-and-go turns the accelerometer is fitted to the settled rests, otherwise to all samples. The gyroscope is
 fitted to all samples; if the table's rate is only the derivative of its logged angle, the ramps are not used.
@@ -61,7 +61,7 @@ ADVICE = {
 def fit(
     sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Fit bias and matrix of a sensor against the table's motion (``pipeline.estimation.stages``); its own role."""
+    """Fit bias and matrix of a sensor against the table's motion (``pipeline.estimation.stages``); role: the sensor."""
     parts = [_select(sensor, part) for part in parts_of(recordings, sensor, settings["table"], NAME)]
     y = np.concatenate([part.reading(sensor) for part in parts])
     u = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
@@ -74,7 +74,12 @@ def fit(
     prior = prior_of(sensor, recordings, settings)
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
-    fit = _linear_map(factors.weights(), matrix)
+    J = np.zeros((3, 12, 4))
+    for channel in range(3):
+        J[channel, channel, 0] = 1.0
+        J[channel, 3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
+    weights = factors.weights()
+    fit = LinearMap((weights, weights, weights), (J[0], J[1], J[2]))
     motions = [part.motion.select(part.keep) for part in parts]
     reference = Reference(sensor, motions, K, settings["table"])
     noise = noise_on_table(reference, residuals, X, blocks, prior)
@@ -104,9 +109,9 @@ def fit(
     def results(errors: Values) -> Values:
         return with_matrix(of_channels(beta.T.ravel() + errors))
 
-    own = bench_effects(sensor, settings, recordings)
-    if own and not stated_priors(settings["table"]):  # else by the stage ``effects``
-        return fit_joint(sensor, recordings, own, noise_of(sensor, recordings, settings), settings, found)
+    bench = bench_effects(sensor, settings, recordings)
+    if bench and not stated_priors(settings["table"]):  # else the stage ``effects`` fits them
+        return fit_joint(sensor, recordings, bench, noise_of(sensor, recordings, settings), settings, found)
     return budgeted(found, reference, fit, noise, contributions, settings, results)
 
 
@@ -139,7 +144,7 @@ def _reference(sensor: str, part: Part) -> Values:
 
 
 def _require_observable(sensor: str, X: Values) -> float:
-    """Return the condition of the columns, all in units of the largest motion."""
+    """Return the condition of the columns, in units of the largest motion; raise if one is not determined."""
     size = float(np.max(np.linalg.norm(X[:, 1:], axis=1), initial=0.0))
     if size == 0.0:
         raise NotObservableError(f"{sensor}: the table never moved in these recordings; {ADVICE[sensor]}")
@@ -156,12 +161,3 @@ def _require_observable(sensor: str, X: Values) -> float:
             f"{' independently of each other' if len(lost) > 1 else ''}: {ADVICE[sensor]}"
         )
     return float(singular[0] / singular[-1])
-
-
-def _linear_map(weights: Values, matrix: Values) -> LinearMap:
-    """Return the map from readings to bias and matrix: ``dM = -M dK M``."""
-    J = np.zeros((3, 12, 4))
-    for channel in range(3):
-        J[channel, channel, 0] = 1.0
-        J[channel, 3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
-    return LinearMap((weights, weights, weights), (J[0], J[1], J[2]))

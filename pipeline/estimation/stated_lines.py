@@ -1,16 +1,16 @@
-"""What the budget of a fit holds beside its method: temperature, repeatability, and a time that was counted.
+"""Add the lines of a budget that do not depend on the method of the fit: temperature, repeatability, counted time.
 
     temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
     repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
-    time base     : dM = M e of a gyroscope whose rows were counted at the sensor's stated rate (note N-SYNTHTIME), or
-                    on a table whose rate is 1 + e times the change of its angle over the log's time
+    time base     : dM = M e of a gyroscope whose time is a count of rows at the sensor's stated rate (note
+                    N-SYNTHTIME), or on a table whose rate is 1 + e times the change of its angle over the log's time
 
 where a is the standard uncertainty of the thermometer, R the range of temperatures recorded, c the sensor file's limits
 of the change per degC (or the fitted effect: then without the root, and R is 0), r standard deviations from one
-switching-on to the next, and e the sensor file's limit of ``clock_rate`` or what the table's log shows, of rectangular
-distribution: the log does not show which of rate, angle and time is wrong. They are added after the last stage of a
-fit, with ``up_to`` of each source that is not included and whose error has a known limit: relative for the elements of
-the matrix, in the sensor's unit for the bias.
+switching-on to the next, and e the sensor file's limit of ``clock_rate`` or the difference in the table's log, of
+rectangular distribution: the log does not show which of rate, angle and time is wrong. They are added after the last
+stage of a fit. A source that is not included, and whose error has a known limit, has ``up_to``: relative for the
+elements of the matrix, in the sensor's unit for the bias.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ IN_LOCAL_GRAVITY = (
 def with_stated(
     calibration: SensorCalibration, recordings: Sequence[Recording], settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Return a calibration whose budget holds temperature, repeatability and a counted time, as far as they are known.
+    """Add temperature, repeatability and a counted time to a calibration's budget, as far as they are known.
 
     ``recordings``: of the fit; their temperature and notes are used. ``settings``: sections ``sensor``, ``table``.
     """
@@ -62,21 +62,22 @@ def with_stated(
     lines += _counted_time(calibration, recordings, limits.get("clock_rate"))
     lines += _rate_off_angle(calibration, recordings, settings.get("table") or {})
     known = {line.source.partition(" (")[0] for line in lines} | set(missing)
-    kept = [entry for entry in budget["not_included"] if entry["source"] not in known]
-    left = [_bounded(entry, settings.get("table") or {}, limits.get("clock_rate")) for entry in kept]
-    left += [{"source": source, "reason": reason} for source, reason in missing.items()]
+    entries = [entry for entry in budget["not_included"] if entry["source"] not in known]
+    not_included = [_bounded(entry, settings.get("table") or {}, limits.get("clock_rate")) for entry in entries]
+    not_included += [{"source": source, "reason": reason} for source, reason in missing.items()]
     covariance = before + np.sum([line.covariance for line in lines], axis=0) if lines else before
     old = np.array([np.inf if v is None else v for v in budget["effective_degrees_of_freedom"]])
     share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(before)), where=np.diag(before) > 0.0)
     freedom = np.where(np.diag(before) > 0.0, old * share**2, np.inf)
     contributions = [*budget["contributions"], *(line.to_json() for line in lines)]
-    return with_uncertainty(calibration, covariance, freedom, {**budget, "contributions": contributions}, left)
+    budget = {**budget, "contributions": contributions}
+    return with_uncertainty(calibration, covariance, freedom, budget, not_included)
 
 
 def _counted_time(
     calibration: SensorCalibration, recordings: Sequence[Recording], limit_ppm: float | None
 ) -> list[Contribution]:
-    """Return the line of a time base that is not stated, where rows were counted at the rate of the sensor's clock."""
+    """Return the line of an unstated time base, where times are a count of rows at the rate of the sensor's clock."""
     unstated = any(map(_clock_unstated, (calibration.budget or {})["not_included"]))
     own = (r for r in recordings if r.role in (calibration.sensor, "rests"))
     if not limit_ppm or not unstated or not any(note.code == "N-SYNTHTIME" for r in own for note in r.notes):
@@ -106,7 +107,7 @@ def _clock_unstated(entry: Mapping[str, Any]) -> bool:
 
 
 def _bounded(entry: Mapping[str, Any], table: Mapping[str, Any], limit_ppm: float | None) -> dict[str, Any]:
-    """Return a source that is not included, with ``up_to`` where it is known how large its error can be."""
+    """Return a source that is not included, with ``up_to`` where the size of its error has a known limit."""
     if entry["source"] == GRAVITY and float(table.get("gravity_g") or 1.0) == 1.0:
         return {"source": GRAVITY, "reason": IN_LOCAL_GRAVITY, "up_to": {"matrix": GRAVITY_ON_EARTH}}
     if _clock_unstated(entry) and limit_ppm:
@@ -131,6 +132,7 @@ def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]
 def _repeatability(
     calibration: SensorCalibration, sensor_config: Mapping[str, Any]
 ) -> tuple[list[Contribution], dict[str, str]]:
+    """Return the contributions of the repeatability, and the reason if it is not stated."""
     lines, lacking = [], []
     for name, unit, effect in _effects_on(calibration):
         u = sensor_config.get(f"repeatability_{name}")
@@ -145,7 +147,7 @@ def _repeatability(
 def _temperature(
     calibration: SensorCalibration, accuracy: float, recordings: Sequence[Recording], limits: Mapping[str, float]
 ) -> list[Contribution] | str:
-    """Return what the temperature contributes to bias and scale factor, or why that is not known."""
+    """Return the contributions of the temperature to bias and scale factor, or why they are not known."""
     own = [r for r in recordings if r.role in (calibration.sensor, "rests") and r.temperature is not None]
     if not own:
         return "the recordings hold no temperature"

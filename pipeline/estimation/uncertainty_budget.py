@@ -3,14 +3,13 @@
     U = sum over sources of U_s,    nu_eff = u^4 / sum_s (u_s^4 / nu_s),    expanded uncertainty = k(nu_eff) u
 
 The noise of the readings is of type A, from the residuals (``pipeline.estimation.engine``), including slow errors and
-lack of fit. Its parts are stated separately: white noise, the bias instability that is expected by the static recording
-or the sensor file, and lack of fit beyond both. All other contributions are of type B, with infinite degrees of
-freedom:
+lack of fit. Its parts are stated separately: white noise, the bias instability by the static recording or the sensor
+file, and lack of fit beyond both. All other contributions are of type B, with infinite degrees of freedom:
 
     limits        : misalignments that rests do not determine (``limit_contribution``)
     bench         : the table's stated accuracies (``pipeline.estimation.table_errors``), local gravity
     quantisation  : where white noise does not make the rounding errors of the samples independent
-    others        : temperature, repeatability, a time that was counted (``pipeline.estimation.stated_lines``)
+    others        : temperature, repeatability, a time from a count of rows (``pipeline.estimation.stated_lines``)
 
 Sources without a stated accuracy are listed as not included.
 """
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
 
-BY_CHANCE = 0.1  # of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
+BY_CHANCE = 0.1  # share of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not tell it: calibrate the unit again after switching it off"
@@ -98,8 +97,8 @@ def scatter_contribution(
 def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
     """Return the contribution of rounding to whole counts, or why it has no separate line.
 
-    With white noise of half a count and more, the rounding errors of the samples are independent, of variance 1/12
-    count^2, and part of the noise that the residuals show. With less, each block of samples has one error.
+    With white noise of half a count or more, the rounding errors of the samples are independent, of variance 1/12
+    count^2, and part of the noise of the residuals. With less, all samples of a block have the same error.
     """
     if not counts_per_unit:
         return "the sensor's counts_per_unit is not configured"
@@ -113,7 +112,7 @@ def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float |
 
 
 def gravity_line(calibration: SensorCalibration, table: Mapping[str, Any]) -> tuple[list[Contribution], dict[str, str]]:
-    """Return the contribution of local gravity to a matrix that is scaled by it, ``dM = M dG / G``, or why not."""
+    """Return the contribution of local gravity, which scales the matrix, ``dM = M dG / G``, or why there is none."""
     u = table.get("gravity_accuracy_g")
     if not u:
         return [], {GRAVITY: "table.gravity_accuracy_g is not stated"} if u is None else {}
@@ -134,7 +133,7 @@ def clock_contribution(
 def limit_contribution(
     gain: Values, names: Sequence[str], curvature: Values, covariance: Values, place: Values
 ) -> tuple[Contribution, Values]:
-    """Return the contribution of misalignments that are limited by the sensor file, and the first-order covariance.
+    """Return the contribution of misalignments by the sensor file's limits, and its first-order covariance.
 
     A limit is so wide that the square of a misalignment is significant, for example in six positions, where the
     readings depend on it only to second order. With the curvature H_i of equation i and the covariance C of a fit,
@@ -145,11 +144,11 @@ def limit_contribution(
     the pseudo-observations of the ``names``. ``curvature``: (n, p, p), of the same equations. ``covariance``: (p, p),
     C. ``place``: (12, p).
     """
-    own = gain[:, gain.shape[1] - len(names) :]
+    of_limits = gain[:, gain.shape[1] - len(names) :]
     HC = curvature @ covariance
     mean = 0.5 * np.trace(HC, axis1=1, axis2=2)
     bent = 0.5 * np.einsum("iab,jba->ij", HC, HC) + np.outer(mean, mean)
-    first = place @ own @ own.T @ place.T
+    first = place @ of_limits @ of_limits.T @ place.T
     total = first + place @ gain @ bent @ gain.T @ place.T
     return Contribution(LIMIT, "B", NORMAL, total, np.full(len(total), np.inf), remark=", ".join(names)), first
 
@@ -170,16 +169,16 @@ def combined(
             np.array([c.degrees_of_freedom for c in contributions]),
         )
     unit = SENSOR_UNITS[calibration.sensor]
-    own = [str(p.get("unit", "")) for effect in calibration.effects for p in effect.parameters.values()]
+    of_effects = [str(p.get("unit", "")) for effect in calibration.effects for p in effect.parameters.values()]
     head = {
         "parameters": calibration.parameter_names(),
-        "units": [unit] * 3 + ["1"] * 9 + own,
+        "units": [unit] * 3 + ["1"] * 9 + of_effects,
         "contributions": [c.to_json() for c in contributions],
     }
     reasons = {**not_included, "repeatability": f"{NOT_STATED}, and compare"}
     lines = {c.source for c in contributions}
-    left = [{"source": source, "reason": reason} for source, reason in reasons.items() if source not in lines]
-    return with_uncertainty(calibration, covariance, freedom, head, left)
+    missing = [{"source": source, "reason": reason} for source, reason in reasons.items() if source not in lines]
+    return with_uncertainty(calibration, covariance, freedom, head, missing)
 
 
 def budgeted(  # noqa: PLR0917  (what a fit on a table is)
@@ -197,18 +196,19 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     ``contributions``: first that of the noise; the others act on the parameters directly. ``settings``: sections
     ``sensor``, for the size of a count, and ``uncertainty``. ``results``: function of (t, q) errors of the fit's linear
     map, channel after channel, to (t, p) parameters. ``estimated``: effects of the fit; an error that one of them
-    estimates is not an input any more.
+    estimates is no input.
     """
     sensor = calibration.sensor
     counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
     found, absent = table_errors(reference, fit, estimated)
     if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
         absent["levelling"] = ACROSS
-    lines, missing = list(contributions), {"temperature": TEMPERATURE}
-    if noise.row_weight is None:
-        rounded = _quantisation(noise, fit, counts, SENSOR_UNITS[sensor])
-    else:
-        rounded = f"contained in the {NOISE}"
+
+    def rounding(fit: LinearMap) -> Contribution | str:
+        of_samples = noise.row_weight is None
+        return _quantisation(noise, fit, counts, SENSOR_UNITS[sensor]) if of_samples else f"contained in the {NOISE}"
+
+    lines, missing, rounded = list(contributions), {"temperature": TEMPERATURE}, rounding(fit)
     if isinstance(rounded, str):
         missing[QUANTISATION] = rounded
     else:
@@ -219,8 +219,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
         return complete
     first = fit.first()
     stated, _ = table_errors(reference, first, estimated)
-    again = None if isinstance(rounded, str) else _quantisation(noise, first, counts, SENSOR_UNITS[sensor])
-    covariances = [c.covariance for c in (*stated, again) if isinstance(c, Contribution)]
+    covariances = [c.covariance for c in (*stated, rounding(first)) if isinstance(c, Contribution)]
     draw = through(noise.posterior(first), covariances, results)
     return beside_trials(complete, draw, trials, contributions[1:])
 
@@ -228,7 +227,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
 def covariance_beside_reference(calibration: SensorCalibration) -> Values:
     """Return the covariance without errors that calibration and held-out reference share: local gravity, time base.
 
-    Both scale the whole matrix, ``dM = M e``, and the reference equally, so that no held-out error shows them.
+    Both scale the matrix, ``dM = M e``, and the reference equally, so that held-out errors do not contain them.
     """
     size = len(calibration.parameter_names())
     out = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance.copy()
@@ -248,21 +247,21 @@ def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Val
     size = len(calibration.parameter_names())
     C = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance
     lines = (calibration.budget or {}).get("contributions", [])
-    of_bench = [np.square(c["contribution"]) for c in lines if c["type"] == "B" and c["source"] != LIMIT]
-    stated = np.sum(of_bench or [np.zeros(size)], axis=0)
+    of_bench = np.zeros(size)
     for line in lines:
-        part_of, whole = np.square(line["parts"].get(shared, 0.0)), np.square(line["contribution"])
-        stated = stated + np.where(part_of > BY_CHANCE * whole, part_of, 0.0)
-    share = np.clip(stated / np.maximum(np.diag(C), 1e-300), 0.0, 1.0)
+        part, whole = np.square(line["parts"].get(shared, 0.0)), np.square(line["contribution"])
+        of_bench += np.where(part > BY_CHANCE * whole, part, 0.0)
+        of_bench += whole * (line["type"] == "B" and line["source"] != LIMIT)
+    share = np.clip(of_bench / np.maximum(np.diag(C), 1e-300), 0.0, 1.0)
     return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
 
 
 def stage_parameters(values: Mapping[str, tuple[float, str]], covariance: Values) -> dict[str, dict[str, Any]]:
     """Return the parameters of a stage as published."""
-    own = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None)).tolist()
     return {
-        name: {"value": value, "unit": unit, "standard_uncertainty": float(u)}
-        for (name, (value, unit)), u in zip(values.items(), own, strict=True)
+        name: {"value": value, "unit": unit, "standard_uncertainty": uncertainty}
+        for (name, (value, unit)), uncertainty in zip(values.items(), u, strict=True)
     }
 
 
@@ -276,7 +275,7 @@ def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Value
 def effect_parameters(
     sensor: str, terms: Sequence[Term], covariance: Values
 ) -> tuple[tuple[FittedEffect, ...], dict[str, dict[str, Any]]]:
-    """Return the fitted effects, and their parameters as a stage states them; they follow bias and matrix."""
+    """Return the fitted effects, and their parameters as published with a stage; they follow bias and matrix."""
     u = iter(np.sqrt(np.clip(np.diag(covariance)[BASE:], 0.0, None)).tolist())
     effects, parameters = [], {}
     for term in terms:
@@ -295,7 +294,7 @@ def with_uncertainty(
     budget: Mapping[str, Any],
     not_included: Sequence[Mapping[str, Any]],
 ) -> SensorCalibration:
-    """Return a calibration with a new covariance, and the values that follow from it in its effects and budget."""
+    """Return a calibration with a new covariance, and with effects and budget that follow from it."""
     u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     factors = coverage_factor(freedom)
     known = freedom[u > 0.0]
