@@ -4,8 +4,8 @@
     theta_i = x_i - G (x_i - m),    G = A_i (A_i + V)^-1,    cov = (1 - G) A_i (1 - G)^T + G V G^T + cov(b)
 
 x_i is the published estimate of unit i, A_i its covariance by the noise of the unit. b is the error of the table, which
-the units of a lot share: both m and x_i contain it, so that no G reduces it, and cov(b) is added. If b is not shared,
-the spread of the estimates contains it, and the result is wider than necessary (docs/uncertainty.md).
+is the same for the units of a lot: both m and x_i contain it, so that no G reduces it, and cov(b) is added. If b is not
+shared, the spread of the estimates contains it, and the result is wider than necessary (docs/uncertainty.md).
 
 m and V (diagonal) are mean and variance of the prediction of a unit from the other units of the lot, its siblings. mu
 and tau have flat densities (Gelman, Bayesian Analysis 1 (2006) 515); mu is integrated in closed form, tau on a grid.
@@ -24,8 +24,8 @@ from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.records import MEDIAN_SIZE, Index, Mask, Values
 
 FEWEST = 8  # siblings; docs/fleet.md has the errors and intervals in lots of 12 units
-LEVEL = 0.05  # the largest share of a lot that loses the prior by chance, which is no harm (measured: docs/fleet.md)
-FAR_LEVEL = 0.001  # below it a unit is no sibling of others; 0.05 would leave out 4 % of a lot and narrow its spread
+LEVEL = 0.05  # largest share of a lot without the prior by chance, which does no harm (measured: docs/fleet.md)
+FAR_LEVEL = 0.001  # below it a unit is no sibling of others; 0.05 would exclude 4 % of a lot and narrow its spread
 GRID = np.geomspace(0.01, 10.0, 64)  # of tau, over the spread of the estimates; steps of 12 %
 OMEGA = 0.5  # standard deviation of log tau within a kind: axes differ by a factor of 1.6 (assumption)
 ALIKE = np.exp(-0.5 * (np.log(GRID[:, None] / GRID) / OMEGA) ** 2)
@@ -94,10 +94,10 @@ def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tup
         predicted = _predicted(x, np.diagonal(own, axis1=1, axis2=2), siblings, itself, kind)
         z, probability = _tested(x, own, freedom, predicted)
         found = LotPrior(predicted, siblings.sum() - (itself >= 0), z, probability)
-        again = able & (probability >= FAR_LEVEL)
-        if np.array_equal(again, siblings) or again.sum() <= FEWEST:
+        remaining = able & (probability >= FAR_LEVEL)
+        if np.array_equal(remaining, siblings) or remaining.sum() <= FEWEST:
             break
-        siblings = again
+        siblings = remaining
     return found
 
 
@@ -108,18 +108,18 @@ def _predicted(x: Values, v: Values, siblings: Mask, itself: Index, kind: Index)
         columns = np.flatnonzero(kind == each)
         y = x[:, columns] - np.median(x[siblings][:, columns], axis=0)
         tau2 = (max(float(np.std(y[siblings])), 1e-300) * GRID) ** 2
-        at = [_given_tau(y[:, [k]], v[:, [j]], siblings, itself, tau2) for k, j in enumerate(columns)]
-        of_kind = [np.log(likelihood @ ALIKE.T) for *_, likelihood in at]
+        given = [_given_tau(y[:, [k]], v[:, [j]], siblings, itself, tau2) for k, j in enumerate(columns)]
+        of_kind = [np.log(likelihood @ ALIKE.T) for *_, likelihood in given]
         for k, j in enumerate(columns):
             others = np.sum([m for i, m in enumerate(of_kind) if i != k], axis=0) + np.log(GRID)
-            tau = _normalized(others) @ ALIKE * at[k][2]
+            means, variances, likelihood = given[k]
+            tau = _normalized(others) @ ALIKE * likelihood
             tau /= tau.sum(axis=1, keepdims=True)
-            middle, each_variance, _ = at[k]
-            m = np.sum(tau * middle, axis=1, keepdims=True)
-            off = (middle - m) ** 2
-            variance = np.sum(tau * (each_variance + off), axis=1)
-            fourth = np.sum(tau * (3.0 * each_variance**2 + 6.0 * each_variance * off + off**2), axis=1)
-            found.mean[:, j] = m[:, 0] + np.median(x[siblings, j])
+            mean = np.sum(tau * means, axis=1, keepdims=True)
+            off = (means - mean) ** 2
+            variance = np.sum(tau * (variances + off), axis=1)
+            fourth = np.sum(tau * (3.0 * variances**2 + 6.0 * variances * off + off**2), axis=1)
+            found.mean[:, j] = mean[:, 0] + np.median(x[siblings, j])
             found.variance[:, j] = variance
             found.freedom[:, j] = 4.0 + 6.0 / np.maximum(fourth / variance**2 - 3.0, 1e-6)
     return found
@@ -143,7 +143,8 @@ def _normalized(log: Values) -> Values:
 def _tested(x: Values, own: Values, own_freedom: Values, predicted: Prediction) -> tuple[Values, Values]:
     """Return the deviations of each unit, and their probability: the smaller p of two tests, times two.
 
-    The largest deviation by Student's t, times the number of parameters; all together by Hotelling's form of F.
+    The tests are of the largest deviation by Student's t, times the number of parameters, and of all deviations by
+    Hotelling's form of F.
     """
     mean, variance, freedom = predicted
     v, size = np.diagonal(own, axis1=1, axis2=2), x.shape[1]

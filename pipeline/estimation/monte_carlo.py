@@ -4,9 +4,8 @@
 
 where
 
-    z       : the linear functions of the readings that a fit first computes (coefficients of a sinusoid, response to
-    the
-              rate, lengths of gravity at the rests, directions of moves); to draw them instead of readings is exact
+    z       : linear functions of the readings that a fit computes first (coefficients of a sinusoid, response to the
+              rate, lengths of gravity at the rests, directions of moves); to draw these instead of readings is exact
     f       : all further computation, without linearisation
     e_noise : normal under each hypothesis of the noise; the hypotheses are drawn by their weight
     e_s     : normal; also the sum of many rounding errors is normal
@@ -18,8 +17,8 @@ trials, else two, because the ends of a Monte Carlo interval scatter by 2.7 u / 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -43,29 +42,28 @@ NEWTONS = 6  # each squares the relative error of a step; one by a wide prior st
 RANK = 3e-7  # of the largest singular value of unit columns, the root of 1e-13: the rounding of their products
 
 
-@dataclass(frozen=True)
-class Distribution:
-    """The results of a Monte Carlo run."""
+class Distribution(NamedTuple):
+    """The results of a Monte Carlo run: estimate and standard uncertainty, (n,), and coverage intervals, (n, 2).
 
-    # each (n,)
+    The intervals have as much probability below as above (7.7).
+    """
+
     estimate: Values
     standard_uncertainty: Values
-    symmetric: Values  # (n, 2); coverage intervals with as much outside on either side (7.7)
+    symmetric: Values
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """The interval by the law of propagation against the one by Monte Carlo."""
+class Comparison(NamedTuple):
+    """The interval by the law of propagation against the one by Monte Carlo: (n,) arrays.
 
-    tolerance: Values  # (n,); delta
-    # each (n,); by how much the lower and the upper ends differ
+    ``low``, ``high``: difference of the lower and of the upper ends. ``borne_out``: whether both are within delta, the
+    ``tolerance``.
+    """
+
+    tolerance: Values
     low: Values
     high: Values
-
-    @property
-    def borne_out(self) -> Mask:
-        """Whether both ends agree within the tolerance: (n,) array of bool."""
-        return np.asarray((self.low <= self.tolerance) & (self.high <= self.tolerance))
+    borne_out: Mask
 
 
 def distribution_of(results: ArrayLike, probability: float = 0.95) -> Distribution:
@@ -91,11 +89,9 @@ def compare(
 ) -> Comparison:
     """Compare ``y +- U`` by the law of propagation with the interval of a Monte Carlo run of the same probability."""
     y, U = np.atleast_1d(np.asarray(estimate, float)), np.atleast_1d(np.asarray(expanded_uncertainty, float))
-    return Comparison(
-        numerical_tolerance(np.minimum(found.standard_uncertainty, U), digits),
-        np.abs(y - U - found.symmetric[:, 0]),
-        np.abs(y + U - found.symmetric[:, 1]),
-    )
+    tolerance = numerical_tolerance(np.minimum(found.standard_uncertainty, U), digits)
+    low, high = np.abs(y - U - found.symmetric[:, 0]), np.abs(y + U - found.symmetric[:, 1])
+    return Comparison(tolerance, low, high, (low <= tolerance) & (high <= tolerance))
 
 
 def trials_of(settings: Mapping[str, Any]) -> int:
@@ -104,7 +100,11 @@ def trials_of(settings: Mapping[str, Any]) -> int:
 
 
 def through(posterior: Posterior, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
-    """Return a function that draws parameters: errors by noise and (q, q) stated covariances, (t, q), to (t, p)."""
+    """Return a function that draws parameters.
+
+    ``posterior``: of the noise of q linear functions of the readings. ``stated``: (q, q), covariances by stated
+    accuracies. ``results``: errors (t, q) to parameters (t, p).
+    """
 
     def draw(rng: np.random.Generator, count: int) -> Values:
         errors = posterior.draw(rng, count)
@@ -129,22 +129,16 @@ def beside_trials(
         for source in direct:
             values = values + draw_normal(rng, source.covariance, len(values))
         drawn.append(values)
-    budget = dict(calibration.budget or {})
-    budget[KEY] = _compared(calibration, np.concatenate(drawn))
-    return replace(calibration, budget=budget)
-
-
-def _compared(calibration: SensorCalibration, drawn: Values) -> dict[str, Any]:
     effects = [value for effect in calibration.effects for value in effect.values]
     estimate = np.concatenate([calibration.bias, calibration.matrix.ravel(), effects])
-    expanded = np.array((calibration.budget or {})["expanded_uncertainty"])
-    digits = 2 if len(drawn) >= TWO_DIGITS else 1
-    found = distribution_of(drawn)
+    budget = dict(calibration.budget or {})
+    expanded, digits = np.array(budget["expanded_uncertainty"]), 2 if trials >= TWO_DIGITS else 1
+    found = distribution_of(np.concatenate(drawn))
     against = compare(estimate, expanded, found, digits=digits)
     known = expanded > 0.0
     validated = against.borne_out | ~known
-    return {
-        "trials": len(drawn),
+    budget[KEY] = {
+        "trials": trials,
         "reason": None,
         "seed": SEED,
         "digits": digits,
@@ -160,16 +154,17 @@ def _compared(calibration: SensorCalibration, drawn: Values) -> dict[str, Any]:
         "validated": validated.tolist(),
         "all_validated": bool(validated.all()),
     }
+    return replace(calibration, budget=budget)
 
 
 def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Callable[[Values], Values]:
-    """Return the step of a least-squares fit by errors of its equations, to second order of the model.
+    """Return the step of a least-squares fit as a function of the equations' errors, to second order of the model.
 
         g(d) = J^T W (X d + d^T H d / 2 - e) = 0,   J = X + H d
 
     ``columns``: (n, p), X. ``curvature``: (n, p, p), H, symmetric in its last two. ``inverse``: (n, n), W, the weights
-    of the fit. The function takes (t, n) errors e to (t, p) steps d, by Gauss-Newton steps with the J of each draw:
-    where a prior is wide, H d is as large as X.
+    of the fit. The function takes (t, n) errors e and returns (t, p) steps d, by Gauss-Newton with the J of each draw:
+    if a prior is wide, H d is as large as X.
     """
     w, V = np.linalg.eigh(inverse)
     root = (V * np.sqrt(np.maximum(w, 0.0))).T
