@@ -36,8 +36,8 @@ from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import noise_of, prior_of
-from pipeline.estimation.table_errors import Reference, noise_on_table
-from pipeline.estimation.turns import Part, blocks_of_samples, parts_of, settled
+from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.turns import Part, noise_of_fit, parts_of, settled
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import truth
@@ -70,7 +70,6 @@ def fit(
     factors = ScaledColumns.of(X)
     beta = factors.solve(y)
     residuals = y - X @ beta
-    blocks = blocks_of_samples([(part.recording, part.keep) for part in parts])
     prior = prior_of(sensor, recordings, settings)
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
@@ -80,9 +79,8 @@ def fit(
         J[channel, 3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
     weights = factors.weights()
     fit = LinearMap((weights, weights, weights), (J[0], J[1], J[2]))
-    motions = [part.motion.select(part.keep) for part in parts]
-    reference = Reference(sensor, motions, K, settings["table"])
-    noise = noise_on_table(reference, residuals, X, blocks, prior)
+    reference = Reference(sensor, [part.used_motion for part in parts], K, settings["table"])
+    noise = noise_of_fit(parts, reference, residuals, X, prior)
     contributions = [noise_contribution(noise, fit, prior)]
     result = StageResult(
         name=NAME,

@@ -30,12 +30,15 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.least_squares import ScaledColumns
+from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.model.kinematics import table_motion
 from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from pipeline.estimation.engine import ResidualNoise
+    from pipeline.estimation.gauss_markov import Prior
     from pipeline.records import Index, Mask, Motion, Recording, Values
 
 
@@ -57,11 +60,16 @@ BEND_DPS, BEND_SHARE = 0.05, 1e-3  # see ``reference_valid``
 
 @dataclass(frozen=True)
 class Part:
-    """The samples of one recording that a fit uses."""
+    """The samples of one recording that a fit uses, and the motion of the table."""
 
     recording: Recording
     motion: Motion
     keep: Mask  # (n,)
+
+    @property
+    def used_motion(self) -> Motion:
+        """The motion at the samples that are used."""
+        return self.motion.select(self.keep)
 
     def reading(self, sensor: str) -> Values:
         """Return the readings that are used: (k, 3) array."""
@@ -190,23 +198,43 @@ def _factors(columns: Values, where: str) -> ScaledColumns:
     )
 
 
-def blocks_of_samples(parts: Sequence[tuple[Recording, Mask]]) -> Blocks:
-    """Divide the used samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
+def noise_of_fit(
+    parts: Sequence[Part], reference: Reference, residuals: Values, design: Values, prior: Prior
+) -> ResidualNoise:
+    """Return the noise of a fit to the stacked samples of parts, from its residuals."""
+    return noise_on_table(reference, residuals, design, blocks_of_samples(parts), prior)
 
-    Recordings of one session, one after the other, share a clock. ``parts``: each recording and which of its samples
-    are used.
+
+def noise_of_turns(
+    parts: Sequence[Part], prior: Prior, table: Mapping[str, Any], *, two_sided: bool = False
+) -> ResidualNoise:
+    """Return the noise of an accelerometer on a table, from the residuals of ``y = b + K u``, or ``+ C |u|`` too."""
+    motions = [part.used_motion for part in parts]
+    u = np.concatenate([motion.specific_force for motion in motions])
+    reading = np.concatenate([part.reading("accelerometer") for part in parts])
+    X = np.column_stack([np.ones(len(u)), u, np.abs(u)] if two_sided else [np.ones(len(u)), u])
+    beta = ScaledColumns.of(X).solve(reading)
+    reference = Reference("accelerometer", motions, beta[1:4].T, table)
+    return noise_of_fit(parts, reference, reading - X @ beta, X, prior)
+
+
+def blocks_of_samples(parts: Sequence[Part]) -> Blocks:
+    """Divide the used samples of parts, stacked in their order, into about ``BLOCKS`` blocks of equal size.
+
+    Recordings of one session, one after the other, share a clock.
     """
-    used = [int(keep.sum()) for _, keep in parts]
+    used = [int(part.keep.sum()) for part in parts]
     size = max(1, -(-sum(used) // BLOCKS))
     rows = []
     sessions: dict[str, tuple[int, float]] = {}  # clock and end of the last recording of each session
-    for number, ((recording, keep), samples) in enumerate(zip(parts, used, strict=True), start=1):
+    for number, (part, samples) in enumerate(zip(parts, used, strict=True), start=1):
         if samples == 0:
             continue
+        recording = part.recording
         before, end = sessions.get(recording.setup, (number, np.inf))
         clock = before if recording.setup and recording.time[0] > end else number
         sessions[recording.setup] = clock, float(recording.time[-1])
-        time, first = recording.time[keep], np.arange(0, samples, size)
+        time, first = recording.time[part.keep], np.arange(0, samples, size)
         length = time[np.minimum(first + size, samples) - 1] - time[first] + recording.interval
         weight = np.diff(np.append(first, samples)).astype(float)
         rows.append((weight, time[first], length, np.full(len(first), 0 if recording.clock_shared else clock)))

@@ -174,7 +174,7 @@ class Drawn:
             late = replace(part, recording=replace(part.recording, filter=filtered.filter))
             used = samples_of(late, as_printed=as_printed)
             reading = np.asarray(filtered.accelerometer)[used[kept]]
-            turns.append(Turn(np.asarray(part.motion.angle)[kept & used], reading, [], []))
+            turns.append(Turn(np.asarray(part.motion.angle)[kept & used], reading, []))
         fitted = [[s.coefficients for s in fits] for fits in ([] if as_printed else sinusoids_of(turns))]
         extremes = extremes_of_samples(turns, 1.0) if as_printed else extremes_of_sinusoids(fitted, 1.0)
         found: dict[str, float] = {}

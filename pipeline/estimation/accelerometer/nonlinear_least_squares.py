@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.engine import LinearMap, ResidualNoise
+from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE, Prior
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.monte_carlo import KEY, beside_trials, quadratic_results, through, trials_of
@@ -42,8 +42,7 @@ from pipeline.estimation.multi_position.result import (
 )
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
-from pipeline.estimation.table_errors import Reference, noise_on_table
-from pipeline.estimation.turns import blocks_of_samples
+from pipeline.estimation.turns import Part, noise_of_turns
 from pipeline.estimation.uncertainty_budget import (
     combined,
     gravity_line,
@@ -311,13 +310,15 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     count, of_limits = rows.rests.count, solved.model.known_by_limit
     parts = []
     for i in dict.fromkeys(rows.rests.recording.tolist()):
-        keep = np.zeros(rows.recordings[i].samples, bool)
+        recording, motion = rows.recordings[i], table_motion(rows.recordings[i], settings["table"])
+        assert motion is not None  # noqa: S101
+        keep = np.zeros(recording.samples, bool)
         for start, stop in rows.rests.span[rows.rests.recording == i]:
             keep[start:stop] = True
-        parts.append((rows.recordings[i], keep & sound_samples(rows.recordings[i], "accelerometer")))
+        parts.append(Part(recording, motion, keep & sound_samples(recording, "accelerometer")))
     truth = (rows.rests.reading - solved.fit.state.bias) @ solved.fit.state.matrix.T
     along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ solved.fit.state.matrix
-    noise, row = _table_noise(parts, prior, settings["table"]), np.repeat(np.arange(len(count)), count)
+    noise, row = noise_of_turns(parts, prior, settings["table"]), np.repeat(np.arange(len(count)), count)
 
     def map_of(weights: Values, derivative: Values) -> LinearMap:
         x, y, z = ((weights / count)[:, row] * along[row, c] for c in range(3))
@@ -348,21 +349,6 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         return np.asarray(estimate + steps(errors) @ PLACED.T)
 
     return beside_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines[1:])
-
-
-def _table_noise(parts: Sequence[tuple[Recording, Mask]], prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
-    """Return the noise on a table from the residuals of ``y = b + K u``."""
-    motions = []
-    for recording, keep in parts:
-        motion = table_motion(recording, table)
-        assert motion is not None  # noqa: S101
-        motions.append(motion.select(keep))
-    u = np.concatenate([motion.specific_force for motion in motions])
-    X = np.column_stack([np.ones(len(u)), u])
-    reading = np.concatenate([np.asarray(recording.accelerometer)[keep] for recording, keep in parts])
-    beta = ScaledColumns.of(X).solve(reading)
-    reference = Reference("accelerometer", motions, beta[1:].T, table)
-    return noise_on_table(reference, reading - X @ beta, X, blocks_of_samples(parts), prior)
 
 
 def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]]:

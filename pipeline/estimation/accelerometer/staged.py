@@ -38,11 +38,10 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     turns_of,
 )
 from pipeline.estimation.engine import LinearMap, ResidualNoise
-from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before, two_sided
-from pipeline.estimation.table_errors import Reference, noise_on_table
-from pipeline.estimation.turns import Sinusoid, blocks_of_samples, parts_of
+from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.turns import Sinusoid, noise_of_turns, parts_of
 from pipeline.estimation.uncertainty_budget import (
     budgeted,
     combined,
@@ -55,8 +54,6 @@ from pipeline.records import AXES, Contribution, FittedEffect, Recording, Sensor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.estimation.gauss_markov import Prior
 
     Quantities = dict[str, tuple[float, str]]  # value and unit of each parameter
     Outcome = tuple[list[dict[str, Any]], Quantities]  # steps of the correction by a stage, and its parameters
@@ -254,7 +251,8 @@ def fit(
     by_sinusoids = extremes_of_sinusoids(by_turn(sinusoids, theta), gravity_g)
     extremes = extremes_of_samples(turns, gravity_g) if as_printed else by_sinusoids
     found = follow(extremes, [name], Corrected.of(previous))
-    noise = _noise(turns, prior, settings["table"])
+    # A separate sinusoid for each turn and channel would absorb the changes of the bias from turn to turn.
+    noise = noise_of_turns([part for turn in turns for part in turn.parts], prior, settings["table"], two_sided=True)
     if as_printed:
         scatter = _resampled(turns, sinusoids, noise, gravity_g, [*before, name])
     else:
@@ -266,7 +264,7 @@ def fit(
         found.steps,
         stage_parameters(found.values, scatter.covariance[15:, 15:]),
         np.linalg.norm(after, axis=1) - gravity_g,
-        (len(after), sum(recording.samples for turn in turns for recording, _ in turn.used)),
+        (len(after), sum(part.recording.samples for turn in turns for part in turn.parts)),
         noise,
         scatter.degrees_of_freedom,
     )
@@ -283,28 +281,13 @@ def fit(
     kept = slice(0, 15 if last else 12)
     if as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
-    motions = [motion for turn in turns for motion in turn.motions]
+    motions = [part.used_motion for turn in turns for part in turn.parts]
     reference = Reference("accelerometer", motions, np.diag(found.k), settings["table"])
 
     def results(errors: Values) -> Values:
         return np.array([chain(theta + e)[kept] for e in errors])
 
     return budgeted(calibration, reference, map_.results(kept), noise, [scatter.of(kept)], settings, results)
-
-
-def _noise(turns: Sequence[Turn], prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
-    """Return the noise from the residuals of ``y = b + K u + C |u|`` of all turns together.
-
-    A separate sinusoid for each turn and channel would absorb the changes of the bias from turn to turn.
-    """
-    motions = [motion for turn in turns for motion in turn.motions]
-    u = np.concatenate([motion.specific_force for motion in motions])
-    reading = np.concatenate([turn.reading for turn in turns])
-    X = np.column_stack([np.ones(len(u)), u, np.abs(u)])
-    blocks = blocks_of_samples([used for turn in turns for used in turn.used])
-    beta = ScaledColumns.of(X).solve(reading)
-    reference = Reference("accelerometer", motions, beta[1:4].T, table)
-    return noise_on_table(reference, reading - X @ beta, X, blocks, prior)
 
 
 def _linear_map(sinusoids: Sequence[Sequence[Sinusoid]], theta: Values, chain: Callable[[Values], Values]) -> LinearMap:

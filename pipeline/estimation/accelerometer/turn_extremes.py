@@ -22,7 +22,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.least_squares import certificate, certified
 from pipeline.estimation.stages import apply_step
 from pipeline.estimation.turns import Part, Sinusoid, filtered_alike, fit_sinusoid, wrap
-from pipeline.records import AXES, Mask, Motion, Recording, Values
+from pipeline.records import AXES, Mask, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -94,24 +94,23 @@ class Turn:
 
     angle: Values  # (n,), deg
     reading: Values  # (n, 3), g
-    used: list[tuple[Recording, Mask]]  # the recordings, in order, and which of their samples
-    motions: list[Motion]  # of the table, at these samples
+    parts: list[Part]
 
 
 def turns_of(parts: Sequence[Part], *, as_printed: bool) -> list[Turn]:
     """Return the turns about x, y and z; raise ``NotObservableError`` if there is none about one of the axes."""
     turns = []
     for axis in range(3):
-        used = [(part, samples_of(part, as_printed=as_printed)) for part in parts if part.motion.axis == axis]
-        if not any(np.any(keep) for _, keep in used):
+        used = [
+            replace(part, keep=samples_of(part, as_printed=as_printed)) for part in parts if part.motion.axis == axis
+        ]
+        if not any(np.any(part.keep) for part in used):
             raise NotObservableError(
                 f"no usable sample of a turn about body axis {AXES[axis]}: the staged method needs a turn about each "
                 "of x, y and z; record it, or choose reference_least_squares"
             )
-        angle = np.concatenate([np.asarray(part.motion.angle)[keep] for part, keep in used])
-        reading = np.concatenate([np.asarray(part.recording.accelerometer)[keep] for part, keep in used])
-        motions = [part.motion.select(keep) for part, keep in used]
-        turns.append(Turn(angle, reading, [(part.recording, keep) for part, keep in used], motions))
+        angle = np.concatenate([np.asarray(part.motion.angle)[part.keep] for part in used])
+        turns.append(Turn(angle, np.concatenate([part.reading("accelerometer") for part in used]), used))
     return turns
 
 

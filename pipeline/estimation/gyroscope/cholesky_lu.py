@@ -43,10 +43,10 @@ from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import of_channels
-from pipeline.estimation.table_errors import Reference, noise_on_table
-from pipeline.estimation.turns import Part, blocks_of_samples, parts_of
+from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.turns import Part, noise_of_fit, parts_of
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
-from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import AXES, Index, Mask, Recording, SensorCalibration, StageResult, Values
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def fit(
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
     prior = prior_of("gyroscope", recordings, settings)
     fit, of_bias = _linear_map(turns, A, previous, as_printed=as_printed)
-    reference = Reference("gyroscope", turns.motions, A, settings["table"])
-    noise = noise_on_table(reference, residuals, design, blocks_of_samples(turns.parts), prior)
+    reference = Reference("gyroscope", [part.used_motion for part in turns.parts], A, settings["table"])
+    noise = noise_of_fit(turns.parts, reference, residuals, design, prior)
     scatter = noise_contribution(noise, fit, prior)
     matrix = _matrix(A, as_printed=as_printed)
     # The rms error of the integrated angles: rows are turn axes, columns are sensor axes.
@@ -195,9 +195,8 @@ class Turns:
     rest: Mask  # (n,)
     weight: Values  # (n,), s; of each sample in the integral over its turn; 0 at rest
     turn: Index  # (n,); turn of each sample, -1 at rest
-    parts: tuple[tuple[Recording, Mask], ...]
+    parts: list[Part]
     left_out: int  # turns with clipped or stuck readings
-    motions: tuple[Motion, ...]  # of the table, at these samples
 
     def integral(self, values: Values) -> Values:
         """Return the integral of (n, 3) values over each turn: (t, 3) array, deg."""
@@ -209,7 +208,7 @@ class Turns:
 
 def turns_of(parts: Sequence[Part]) -> Turns:
     """Stack the samples at rest and in turns of recordings."""
-    columns, chosen, motions, found, left_out = [], [], [], 0, 0
+    columns, chosen, found, left_out = [], [], 0, 0
     for part in parts:
         weight, turn = np.zeros(part.recording.samples), np.full(part.recording.samples, -1, np.intp)
         for start, stop in _moves(part):
@@ -223,10 +222,9 @@ def turns_of(parts: Sequence[Part]) -> Turns:
         keep = rest | (turn >= 0)
         each = np.asarray(part.recording.gyroscope), part.motion.angular_rate, rest, weight, turn
         columns.append([values[keep] for values in each])
-        chosen.append((part.recording, keep))
-        motions.append(part.motion.select(keep))
-    reading, rate, rest, weight, turn = (np.concatenate(own) for own in zip(*columns, strict=True))
-    return Turns(reading, rate, rest, weight, turn, tuple(chosen), left_out, tuple(motions))
+        chosen.append(replace(part, keep=keep))
+    reading, rate, rest, weight, turn = (np.concatenate(column) for column in zip(*columns, strict=True))
+    return Turns(reading, rate, rest, weight, turn, chosen, left_out)
 
 
 def _moves(part: Part) -> list[tuple[int, int]]:

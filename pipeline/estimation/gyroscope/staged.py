@@ -31,16 +31,14 @@ from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before
-from pipeline.estimation.table_errors import Reference, noise_on_table
-from pipeline.estimation.turns import Part, blocks_of_samples, parts_of, steady_turns
+from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.turns import Part, noise_of_fit, parts_of, steady_turns
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
-from pipeline.records import AXES, Mask, Motion, Recording, SensorCalibration, Values, motion_at_rest
+from pipeline.records import AXES, Mask, Recording, SensorCalibration, Values, motion_at_rest
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from pipeline.estimation.gauss_markov import Blocks
 
     # step of the correction by a stage, and value and unit of each of its parameters
     Outcome = tuple[dict[str, Any], dict[str, tuple[float, str]]]
@@ -160,8 +158,9 @@ def fit(
     found = follow(Response(theta[0], theta[1:], samples.speed, as_printed), [name], correction.get("steps", []))
     x, y, z = np.split(derivative(chain, here, np.full(12, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
-    reference = Reference("gyroscope", samples.motions, theta[1:].T, settings["table"])
-    noise = noise_on_table(reference, residuals, design, samples.blocks, prior)
+    motions = [part.used_motion for part in samples.parts]
+    reference = Reference("gyroscope", motions, theta[1:].T, settings["table"])
+    noise = noise_of_fit(samples.parts, reference, residuals, design, prior)
     scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
@@ -170,7 +169,7 @@ def fit(
         found.steps,
         stage_parameters(found.values, scatter.covariance[12:, 12:]),
         error,
-        (len(after), samples.total),
+        (len(after), sum(part.recording.samples for part in samples.parts)),
         noise,
         scatter.degrees_of_freedom,
     )
@@ -224,9 +223,7 @@ class Samples:
 
     reading: Values  # (n, 3), deg/s; less Earth's rotation where it is known
     rate: Values  # (n, 3), deg/s; signed rate of the table about its turn axis, in the column of the axis; 0 at rest
-    blocks: Blocks
-    total: int  # samples of the recordings
-    motions: tuple[Motion, ...]  # of the table, at these samples; at rest in a static recording
+    parts: list[Part]
 
     @property
     def speed(self) -> Values:
@@ -237,29 +234,24 @@ class Samples:
 
 def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Samples:
     """Return the samples at rest and in steady turns; without a rest, also the samples of a static recording."""
-    chosen, readings, rates, motions = [], [], [], []
+    chosen, readings, rates = [], [], []
     for part in parts:
         memory = _memory(part.recording)
         steady, still = steady_turns(part, memory), _without_tails(part, memory)
         rate = np.zeros((part.recording.samples, 3))
         if part.motion.axis is not None:
             rate[steady, part.motion.axis] = np.asarray(part.motion.rate)[steady]
-        keep = (still | steady) & part.keep
-        earth = part.motion.angular_rate[keep] - rate[keep]
-        readings.append(np.asarray(part.recording.gyroscope)[keep] - earth)
-        rates.append(rate[keep])
-        chosen.append((part.recording, keep))
-        motions.append(part.motion.select(keep))
+        chosen.append(replace(part, keep=(still | steady) & part.keep))
+        rates.append(rate[chosen[-1].keep])
+        earth = chosen[-1].used_motion.angular_rate - rates[-1]
+        readings.append(chosen[-1].reading("gyroscope") - earth)
     if all(np.any(rate, axis=1).all() for rate in rates):
         for recording in recordings:
             if recording.role == "static" and recording.gyroscope is not None:
-                keep = recording.valid
-                readings.append(recording.gyroscope[keep])
-                rates.append(np.zeros((int(keep.sum()), 3)))
-                chosen.append((recording, keep))
-                motions.append(motion_at_rest(recording.time[keep]))
-    total = sum(recording.samples for recording, _ in chosen)
-    return Samples(np.concatenate(readings), np.concatenate(rates), blocks_of_samples(chosen), total, tuple(motions))
+                chosen.append(Part(recording, motion_at_rest(recording.time), recording.valid))
+                readings.append(chosen[-1].reading("gyroscope"))
+                rates.append(np.zeros_like(readings[-1]))
+    return Samples(np.concatenate(readings), np.concatenate(rates), chosen)
 
 
 def _memory(recording: Recording) -> float:
