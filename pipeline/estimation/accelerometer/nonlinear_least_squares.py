@@ -37,6 +37,7 @@ from pipeline.estimation.multi_position.result import (
     after_stage,
     curvature,
     fit_faces,
+    limits_contribution,
     require_faces,
     with_stage,
 )
@@ -46,7 +47,6 @@ from pipeline.estimation.turns import Part, noise_of_turns
 from pipeline.estimation.uncertainty_budget import (
     combined,
     gravity_line,
-    limit_contribution,
     noise_contribution,
     stage_parameters,
 )
@@ -82,13 +82,12 @@ OF_LENGTH = {
 
 @dataclass(frozen=True)
 class _Solved:
-    """A fit of m rows and then k pseudo-observations; ``columns`` and ``residual`` are over the ``deviation``."""
+    """A fit of m rows and then k pseudo-observations."""
 
     model: AccelerometerModel
     fit: Fit
-    columns: Values  # (m + k, 9)
-    residual: Values  # (m + k,)
-    deviation: Values  # (m + k,), g; standard deviation
+    columns: Values  # (m + k, 9); over the standard deviation of each
+    share: Values  # (m + k,); white noise over that standard deviation
 
     @property
     def rows(self) -> slice:
@@ -98,7 +97,12 @@ class _Solved:
     @property
     def error(self) -> Values:
         """|u| minus its target: (m,) array, g."""
-        return -(self.residual * self.deviation)[self.rows]
+        return -(self.fit.residual * self.fit.error)[self.rows]
+
+    @property
+    def residual(self) -> Values:
+        """Residuals over the standard deviation of each: (m + k,) array."""
+        return self.fit.residual * self.share
 
     @property
     def spare(self) -> int:
@@ -110,11 +114,6 @@ class _Solved:
         """Standard uncertainties by the scatter of the rows: (9,) array."""
         scale = max(1.0, float(np.sum(self.residual**2)) / max(self.spare, 1))
         return np.asarray(np.sqrt(scale * np.diag(np.linalg.pinv(self.columns.T @ self.columns, hermitian=True))))
-
-    @property
-    def values(self) -> Values:
-        """The nine values."""
-        return np.asarray(np.concatenate([self.fit.state.bias, self.fit.state.matrix.ravel()])[PLACE], np.float64)
 
     @property
     def between(self) -> float:
@@ -167,7 +166,7 @@ def _fit_triangular(
     covariance = PLACED @ found.covariance @ PLACED.T
     freedom = float(found.degrees_of_freedom.min())
     details, parameters = _details(rows, solved, freedom), _parameters(solved, covariance)
-    gain = (ScaledColumns.of(solved.columns).weights() * (found.error / solved.deviation))[:, solved.rows]
+    gain = (ScaledColumns.of(solved.columns).weights() * solved.share)[:, solved.rows]
     return after_stage(
         before,
         NAME,
@@ -248,9 +247,8 @@ def _fitted(rows: Orientations, gravity_g: float, prior: Prior, by_limit: Mask, 
     noises = [replace(noise, known=True) for noise in noises]  # by the scatter within the rests
     found = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
     equations = model.equations(found.state)
-    deviation = np.sqrt(np.diag(equations.covariance(found.noise)) if rows.by_hand else equations.variance(found.noise))
-    scaled = equations.base / deviation[:, None], equations.residual / deviation
-    return _Solved(model, found, *scaled, deviation * equations.error)
+    variance = np.diag(equations.covariance(found.noise)) if rows.by_hand else equations.variance(found.noise)
+    return _Solved(model, found, equations.base / np.sqrt(variance)[:, None], 1.0 / np.sqrt(variance))
 
 
 def _start(y: Values, gravity_g: float, *, tilted: bool) -> Values:
@@ -307,8 +305,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
     in the readings of each channel c with the weights ``J^+ (n^T L)_c``.
     """
-    count, of_limits = rows.rests.count, solved.model.known_by_limit
-    parts = []
+    count, parts = rows.rests.count, []
     for i in dict.fromkeys(rows.rests.recording.tolist()):
         recording, motion = rows.recordings[i], table_motion(rows.recordings[i], settings["table"])
         assert motion is not None  # noqa: S101
@@ -324,12 +321,9 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         x, y, z = ((weights / count)[:, row] * along[row, c] for c in range(3))
         return LinearMap((x, y, z), (derivative, derivative, derivative))
 
-    weights, share = ScaledColumns.of(solved.columns).weights(), solved.fit.error / solved.deviation
-    scatter = noise_contribution(noise, map_of((weights / solved.deviation)[:, solved.rows], PLACED), prior)
-    lines = [scatter]
-    if of_limits:
-        bent = curvature(solved.model, solved.fit) * share[:, None, None]
-        lines.append(limit_contribution(weights, list(of_limits), bent, solved.fit.covariance, PLACED)[0])
+    weights, share, white = ScaledColumns.of(solved.columns).weights(), solved.share, solved.fit.error
+    scatter = noise_contribution(noise, map_of((weights * share / white)[:, solved.rows], PLACED), prior)
+    lines = [scatter, *limits_contribution(solved.model, solved.fit)[0]]
     details = _details(rows, solved, float(scatter.degrees_of_freedom.min()))
     parameters = _parameters(solved, np.sum([line.covariance for line in lines], axis=0))
     calibration = with_stage(before, NAME, details, solved.model, solved.fit, correction, parameters)
@@ -345,7 +339,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     estimate, every = np.concatenate([calibration.bias, calibration.matrix.ravel()]), np.eye(len(count))
 
     def results(drawn: Values) -> Values:
-        errors = np.pad(drawn / solved.fit.error[solved.rows], ((0, 0), (0, len(of_limits))))
+        errors = np.pad(drawn / white[solved.rows], ((0, 0), (0, len(white) - len(count))))
         return np.asarray(estimate + steps(errors) @ PLACED.T)
 
     return beside_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines[1:])
@@ -353,7 +347,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
 
 def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]]:
     """Return b, S and T with their uncertainties; ``L_ij = T_ij S_j``."""
-    values = solved.values
+    values = np.concatenate([solved.fit.state.bias, solved.fit.state.matrix.ravel()])[PLACE]
     S, J = np.diag(solved.fit.state.matrix)[COLUMNS], np.eye(9)
     for k, (i, j) in enumerate(ELEMENTS):
         if i != j:

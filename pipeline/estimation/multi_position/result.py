@@ -178,7 +178,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     parameters = parameters or of_effects
     parameters = parameters or base_parameters(sensor, found.state.bias, found.state.matrix, covariance)
     calibration = replace(with_stage(before, name, details, model, found, correction, parameters), effects=effects)
-    limit, of_limit = _limit_contribution(model, found, place)
+    limit, of_limit = limits_contribution(model, found)
     variance, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
     if white is not None:
         white = np.minimum(white, variance)
@@ -204,8 +204,9 @@ def _places(model: Model, found: Fit) -> Values:
     return np.asarray(scipy.linalg.block_diag(base, np.eye(len(found.covariance) - base.shape[1])))
 
 
-def _limit_contribution(model: Model, found: Fit, place: Values) -> tuple[list[Contribution], Values]:
+def limits_contribution(model: Model, found: Fit) -> tuple[list[Contribution], Values]:
     """Return the line of the misalignments known by the sensor file's limit, if any, and its first-order covariance."""
+    place = _places(model, found)
     if not model.known_by_limit:
         return [], np.zeros((len(place), len(place)))
     equations = model.equations(found.state)
