@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.model import Block, State, effect_readings, motion_of
-from pipeline.estimation.multi_position.moves import sound_span, spans_between, trapezoids
+from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
 from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, Values
 from pipeline.signal.segments import ACROSS, multiples
@@ -209,16 +209,10 @@ def turns_of(
         return None, moves
     axes, counts = np.array(multiple).T
     stated, number = counts * float(turns["angle_deg"]), len(chosen)
-    shape = (number, max(span.stop - span.start for _, span in chosen))
-    reading, force = np.zeros((*shape, 3)), np.zeros((*shape, 3))
-    times, temperature, weight = np.zeros(shape), np.full(shape, np.nan), np.zeros(shape)
-    for k, (recording, span) in enumerate(chosen):
-        at = np.minimum(np.arange(shape[1]) + span.start, span.stop - 1)
-        reading[k], times[k] = np.asarray(recording.gyroscope)[at], recording.time[at]
-        force[k] = (np.asarray(recording.accelerometer)[at] - accelerometer.bias) @ accelerometer.matrix.T
-        if recording.temperature is not None:
-            temperature[k] = recording.temperature[at]
-        weight[k] = trapezoids(times[k])
+    pairs = [(r, at) for (r, _), at in zip(chosen, padded([span for _, span in chosen]), strict=True)]
+    force = [(np.asarray(r.accelerometer)[at] - accelerometer.bias) @ accelerometer.matrix.T for r, at in pairs]
+    warmth = [np.full(len(at), np.nan) if r.temperature is None else r.temperature[at] for r, at in pairs]
+    times = np.array([r.time[at] for r, at in pairs])
     rows = [np.outer(turn, np.eye(3)[axis]) for turn, axis in zip(np.eye(number), axes, strict=True)]
     value, error = stated.tolist(), number * [float(turns["accuracy_deg"])]
     for axis in np.unique(axes):
@@ -227,9 +221,19 @@ def turns_of(
         rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != axis]
         value += [0.0, 0.0]
         error += 2 * [float(turns["axis_accuracy_deg"])]
-    samples = reading, force, times, temperature, weight
-    names = tuple(r.name for r, _ in chosen)
-    return Turns(names, axes, stated, *samples, np.array(rows), np.array(value), np.array(error)), moves
+    return Turns(
+        name=tuple(r.name for r, _ in chosen),
+        axis=axes,
+        stated=stated,
+        reading=np.array([np.asarray(r.gyroscope)[at] for r, at in pairs]),
+        force=np.array(force),
+        time=times,
+        temperature=np.array(warmth),
+        weight=trapezoids(times),
+        rows=np.array(rows),
+        value=np.array(value),
+        error=np.array(error),
+    ), moves
 
 
 def require_turns(

@@ -121,17 +121,16 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
         return None
     before, after = np.array([[i, j] for i, j, _ in found]).T
     spans = [span for *_, span in found]
-    shape = (len(spans), max(span.stop - span.start for span in spans))
-    reading, time, weight = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+    at = padded(spans)
+    reading, time = np.zeros((*at.shape, 3)), np.zeros(at.shape)
     for index in np.unique(rests.recording[after]):
         rows, recording = np.flatnonzero(rests.recording[after] == index), recordings[index]
         values = np.asarray(recording.gyroscope)
         clocks = clocks_of(recording.time, values, [spans[row] for row in rows], rests.white)
+        reading[rows] = values[at[rows]]
         for row, clock in zip(rows.tolist(), clocks, strict=True):
-            n = len(clock)
-            reading[row, :n], reading[row, n:] = values[spans[row]], values[spans[row].stop - 1]
-            time[row, :n], time[row, n:] = clock, clock[-1]
-            weight[row, :n] = trapezoids(clock)
+            time[row] = clock[at[row] - spans[row].start]
+    weight = trapezoids(time)
     excess, doubt = _bends(reading, weight, BENT * float(np.linalg.norm(rests.white)))
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
     warm = rests.temperature[before][:, None]
@@ -146,9 +145,15 @@ def clipped_moves(recordings: Sequence[Recording], rests: Rests) -> str:
     return f", and {lost} of the {len(valid)} moves hold clipped or stuck readings" if lost else ""
 
 
+def padded(spans: Sequence[slice]) -> Index:
+    """Return the samples of k spans, each padded with its last sample to the longest: (k, s) array."""
+    start, stop = np.array([[span.start, span.stop] for span in spans], np.intp).T[:, :, None]
+    return np.asarray(np.minimum(start + np.arange(np.max(stop - start)), stop - 1))
+
+
 def trapezoids(time: Values) -> Values:
-    """Return the weights of samples in an integral by the trapezoidal rule: (n,) array, s."""
-    return np.asarray(0.5 * (np.diff(time, prepend=time[0]) + np.diff(time, append=time[-1])))
+    """Return the weights of samples in integrals by the trapezoidal rule along the last axis, s."""
+    return np.asarray(0.5 * (np.diff(time, prepend=time[..., :1]) + np.diff(time, append=time[..., -1:])))
 
 
 def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Values]:
