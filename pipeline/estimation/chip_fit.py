@@ -259,7 +259,7 @@ def _joined(pairs: Sequence[tuple[Signals, Signals]]) -> tuple[Signals, Signals]
 def _fitted(sensors: Sequence[str], a: Signals, b: Signals) -> tuple[Values, Signals, list[Fit]]:
     """Return the rotation at which the fits are linear, which signals are clear of noise, and the fits.
 
-    The start is the rotation that brings vectors of a nearest to those of b (Wahba's problem, by Markley's SVD).
+    The start is the rotation that maps the vectors of a best onto the vectors of b (Wahba's problem, Markley's SVD).
     """
     U, _, Vt = np.linalg.svd(np.sum([m / np.linalg.norm(m) for m in (b[s].T @ a[s] for s in sensors)], axis=0))
     R = np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)

@@ -258,8 +258,8 @@ def require_observable(observations: Observations, fit: Fit) -> None:
     design = design_at(observations, fit)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
     free = np.ones(len(names), bool)  # a prior determines the others
-    for at, term in zip(design.slices, fit.terms, strict=True):
-        free[at] = term.prior is None or np.linalg.matrix_rank(term.prior.precision) < len(term.values)
+    for place, term in zip(design.slices, fit.terms, strict=True):
+        free[place] = term.prior is None or np.linalg.matrix_rank(term.prior.precision) < len(term.values)
     names = [name for name, kept in zip(names, free, strict=True) if kept]
     size = design.sizes()[:-1][free]
     products = design.products([WHITE])[0][0, :-1, :-1][np.ix_(free, free)]

@@ -140,17 +140,17 @@ def _normalized(log: Values) -> Values:
     return np.asarray(np.exp(log - np.max(log, axis=-1, keepdims=True)))
 
 
-def _tested(x: Values, own: Values, own_freedom: Values, predicted: Prediction) -> tuple[Values, Values]:
+def _tested(x: Values, own: Values, freedom: Values, predicted: Prediction) -> tuple[Values, Values]:
     """Return the deviations of each unit, and their probability: the smaller p of two tests, times two.
 
     The tests are of the largest deviation by Student's t, times the number of parameters, and of all deviations by
     Hotelling's form of F.
     """
-    mean, variance, freedom = predicted
+    mean, variance, predicted_freedom = predicted
     v, size = np.diagonal(own, axis1=1, axis2=2), x.shape[1]
     u = np.sqrt(v + variance)
     parts = np.sqrt(np.stack([v, variance])).reshape(2, -1)
-    nu = effective_degrees_of_freedom(parts, np.stack([own_freedom, freedom]).reshape(2, -1)).reshape(x.shape)
+    nu = effective_degrees_of_freedom(parts, np.stack([freedom, predicted_freedom]).reshape(2, -1)).reshape(x.shape)
     z = (x - mean) / u
     one = size * 2.0 * scipy.special.stdtr(np.minimum(nu, 1e9), -np.abs(z)).min(axis=1)
     correlation = (own + variance[:, :, None] * np.eye(size)) / (u[:, :, None] * u[:, None, :])

@@ -79,8 +79,8 @@ def _counted_time(
 ) -> list[Contribution]:
     """Return the line of an unstated time base, where times are a count of rows at the rate of the sensor's clock."""
     unstated = any(map(_clock_unstated, (calibration.budget or {})["not_included"]))
-    own = (r for r in recordings if r.role in (calibration.sensor, "rests"))
-    if not limit_ppm or not unstated or not any(note.code == "N-SYNTHTIME" for r in own for note in r.notes):
+    used = (r for r in recordings if r.role in (calibration.sensor, "rests"))
+    if not limit_ppm or not unstated or not any(note.code == "N-SYNTHTIME" for r in used for note in r.notes):
         return []
     remark = f"rows counted at the stated rate, by the sensor file's limit of clock_rate, {limit_ppm:g} ppm"
     return [clock_contribution(calibration, limit_ppm / np.sqrt(3.0), RECTANGULAR, remark)]
@@ -148,10 +148,10 @@ def _temperature(
     calibration: SensorCalibration, accuracy: float, recordings: Sequence[Recording], limits: Mapping[str, float]
 ) -> list[Contribution] | str:
     """Return the contributions of the temperature to bias and scale factor, or why they are not known."""
-    own = [r for r in recordings if r.role in (calibration.sensor, "rests") and r.temperature is not None]
-    if not own:
+    used = [r for r in recordings if r.role in (calibration.sensor, "rests") and r.temperature is not None]
+    if not used:
         return "the recordings hold no temperature"
-    spread = float(np.ptp(np.concatenate([temperature_of(r) for r in own]))) / np.sqrt(12.0)
+    spread = float(np.ptp(np.concatenate([temperature_of(r) for r in used]))) / np.sqrt(12.0)
     lines = []
     for name, unit, effect in _effects_on(calibration):
         fitted = next((e for e in calibration.effects if e.name in FITTED[name]), None)

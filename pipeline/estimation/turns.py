@@ -48,7 +48,7 @@ ROUNDS = 12  # of the phase
 SAME_PHASE = 1e-12  # rad
 SLOWEST_SHARE = 0.02  # of the largest rate, below which the table is not taken as turning
 CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
-EDGE_S = 0.15  # left out at either end of a steady turn, where the table still accelerates
+EDGE_S = 0.15  # excluded at either end of a steady turn, where the table still accelerates
 LONGEST_TAIL = 0.4  # of a steady turn
 DELAYS_TO_FOLLOW = 5.0  # after which an RC filter holds less than 1 % of a change of rate
 WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
@@ -83,15 +83,15 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
 
     ``method``: name of the method, for the message. Raises ``CannotCalibrateError`` if there is none.
     """
-    own = [r for r in recordings if r.role == sensor and r.reading(sensor) is not None]
+    usable = [r for r in recordings if r.role == sensor and r.reading(sensor) is not None]
     parts = []
-    for recording in own:
+    for recording in usable:
         without = recording if recording.cache else replace(recording, temperature=None)  # these fits do not use it
         motion = table_motion(without, table)
         if motion is not None:
             parts.append(Part(recording, motion, recording.valid))
     if not parts:
-        lack = "none of them logs the table's angle" if own else f"no recording of role {sensor} holds its readings"
+        lack = "none of them logs the table's angle" if usable else f"no recording of role {sensor} holds its readings"
         raise CannotCalibrateError(
             f"{method} needs the table's motion for the {sensor}, and {lack}: record turns about x, y and z with "
             "table_angle_deg, or rests in many attitudes, which need no table (procedure=multi_position, "

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 BY_CHANCE = 0.1  # share of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
-NOT_STATED = "one calibration does not tell it: calibrate the unit again after switching it off"
+NOT_STATED = "one calibration does not show it: calibrate the unit again after switching it off"
 TEMPERATURE = "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is stated"
 ACROSS = (
     "table_tilt estimates the component across the shaft alone; the one about the shaft is the same as a common zero "
@@ -306,13 +306,10 @@ def with_uncertainty(
         "expanded_uncertainty": (factors * u).tolist(),
         "not_included": list(not_included),
     }
-    effects, at = [], 12
+    expanded, effects = iter((factors * u).tolist()[12:]), []
     for effect in calibration.effects:
-        renewed = {}
-        for name, parameter in effect.parameters.items():
-            renewed[name] = {**parameter, "expanded_uncertainty": float(factors[at] * u[at]) if u[at] else None}
-            at += 1
-        effects.append(replace(effect, parameters=renewed))
+        parameters = {n: {**p, "expanded_uncertainty": next(expanded) or None} for n, p in effect.parameters.items()}
+        effects.append(replace(effect, parameters=parameters))
     return replace(
         calibration,
         effects=tuple(effects),

@@ -287,9 +287,8 @@ def _outlier(rows: Orientations, solved: _Solved) -> dict[int, str]:
     off = float(solved.error[worst] / rest[worst])
     if t[worst] <= coverage_factor(spare, 1.0 - FALSE_ALARM / len(r)) or abs(off) < SMALLEST_OUTLIER_G:
         return {}
-    return {
-        worst: f"length of the specific force is {1e3 * off:.2f} mg off what the other rests say, t = {t[worst]:.0f}"
-    }
+    error = f"{1e3 * off:.2f} mg off the length by the other rests, t = {t[worst]:.0f}"
+    return {worst: f"length of the specific force is {error}"}
 
 
 def _on_table(  # noqa: PLR0917  (what a fit on a table is)

@@ -49,8 +49,8 @@ def fit(
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
     if not any(r.role == ROLE and r.accelerometer is not None for r in recordings):
         raise CannotCalibrateError(
-            "rests and moves need the accelerometer's readings beside the gyroscope's: gravity before and after each "
-            "move tells by how much the unit turned. A gyroscope alone needs a rate table"
+            "rests and moves need the readings of both sensors: gravity before and after each move shows by how much "
+            "the unit turned. A gyroscope alone needs a rate table"
         )
     noise, advice = noise_of("gyroscope", recordings, settings), ADVICE + advice_on_held_out(recordings, settings)
     model = model_of(recordings, None, noise, settings)

@@ -52,7 +52,7 @@ ROUNDS = 6  # of effects that depend on the rate
 SETTLED_DPS = 1e-7  # change of the rate that ends these rounds
 MOVED = "accelerometer_moved"
 MANY = 1e6  # degrees of freedom beyond which Student's t is normal to 1e-6
-DRAWS, TAIL = 4000, 0.005  # as of the 99 % interval of other held-out errors: 20 draws are beyond it
+DRAWS, TAIL = 4000, 0.005  # as in the 99 % interval of other held-out errors: 20 draws are beyond it
 
 
 class GyroscopeModel:
@@ -63,7 +63,7 @@ class GyroscopeModel:
     """
 
     sensor = "gyroscope"
-    known_by_limit: Mapping[str, float] = {}  # as of the accelerometer's model
+    known_by_limit: Mapping[str, float] = {}  # see the accelerometer's model
 
     def __init__(
         self,

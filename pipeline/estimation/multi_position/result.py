@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 STEP = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
 REMARK = {
-    "accelerometer": "white noise, bias wander and what the rests scatter beyond both, as the residuals tell them",
+    "accelerometer": "white noise, bias wander and further scatter of the rests, estimated from the residuals",
     "gyroscope": "white noise, bias wander, scatter of rests and moves, and the accelerometer's own calibration",
 }
 NOT_INCLUDED = {
@@ -105,8 +105,8 @@ def fit_effects_by_rests(
         found = fit_configured(model, before, names, hypotheses, limits)
     if len(found.residual) <= found.rank:
         raise NotObservableError(
-            f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} beside bias and matrix: "
-            f"record at least {found.rank + 10} rests in as many orientations"
+            f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} in addition to bias and "
+            f"matrix: record at least {found.rank + 10} rests in as many orientations"
         )
     require_observable(model, found, limits)
     return calibration_of(model, found, before, settings)
@@ -283,7 +283,7 @@ def fit_faces(
     accuracy = float(settings["procedure"]["faces"]["accuracy_deg"])
     details = {
         "departures": [
-            f"face {name} is {angle:.1f} deg off what the others say, {angle / accuracy:.1f} times "
+            f"face {name} is {angle:.1f} deg off the direction by the other faces, {angle / accuracy:.1f} times "
             "procedure.faces.accuracy_deg"
             for name, angle in off.items()
             if angle > DEPARTS * accuracy

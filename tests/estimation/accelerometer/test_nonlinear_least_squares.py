@@ -238,7 +238,7 @@ def test_a_rest_that_contradicts_the_others_is_left_out_with_its_reason() -> Non
     calibration = fit([recording], None, _settings())
     left_out = calibration.stages[-1].details["rests_left_out"]
     assert [round(rest["time_s"] / 6.5) for rest in left_out] == [10]
-    assert "mg off what the other rests say" in left_out[0]["reason"]
+    assert "mg off the length by the other rests" in left_out[0]["reason"]
     assert _vector(calibration) == pytest.approx(TRUTH, abs=5e-4)
 
 
