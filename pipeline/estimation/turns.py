@@ -1,23 +1,4 @@
-"""Select the samples of a table's turns for a fit, average them at rest, and fit the sinusoid of a channel in a turn.
-
-While the table turns about body axis i by the angle A, gravity G causes in a channel with its axis across
-
-    y = z + a cos(A - phi) + c |cos(A - phi)|
-
-where
-
-    z    : reading where the axis is level, g
-    phi  : angle at which the axis points up, deg
-    a, c : half sum and half difference of the two sides, g: the largest reading is ``z + a + c``, the smallest
-           ``z - a + c``; c is zero if a sensor has one scale factor for both sides
-
-and in the channel along the turn axis ``y = z + h cos(A - phi)`` with a small h, the misalignment. For a given phi the
-other parameters are linear. phi is the phase of the first harmonic of the linear fit, found in a few rounds because
-|cos| has even harmonics only. So all samples of a turn determine its extremes, not only the few at its flat peaks.
-
-A filter shifts phi by rate x delay and reduces a, but only while the table turns: it does not change the readings of a
-rest at either end, so that one sinusoid does not describe both.
-"""
+"""Select the samples of a table's turns for a fit, assess their noise, and average them at rest."""
 
 from __future__ import annotations
 
@@ -27,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation.gauss_markov import Blocks
+from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.gauss_markov import Blocks, Prior
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.model.kinematics import table_motion
@@ -38,20 +19,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
-    from pipeline.estimation.gauss_markov import Prior
     from pipeline.records import Index, Mask, Motion, Recording, Values
 
 
 BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
 DISTINCT_DIRECTION_G = 0.01  # attitudes 0.6 deg apart differ
-ROUNDS = 12  # of the phase
-SAME_PHASE = 1e-12  # rad
 SLOWEST_SHARE = 0.02  # of the largest rate, below which the table is not taken as turning
 CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
 EDGE_S = 0.15  # excluded at either end of a steady turn, where the table still accelerates
 LONGEST_TAIL = 0.4  # of a steady turn
 DELAYS_TO_FOLLOW = 5.0  # after which an RC filter holds less than 1 % of a change of rate
-WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
 MEAN_S = 1.0  # a mean hides no motion at rest, and keeps the readings' change with temperature
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
 SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
@@ -147,55 +124,6 @@ def filtered_alike(part: Part) -> Mask:
     if applied["name"] == "none" or part.motion.rate is None or stop_and_go(part.motion):
         return keep
     return keep & steady_turns(part, DELAYS_TO_FOLLOW * float(applied["delay_s"]))
-
-
-@dataclass(frozen=True)
-class Sinusoid:
-    """The sinusoid of one channel in one turn."""
-
-    # (3,) or (4,), g; z, then the cosine's and the sine's coefficient, then c where both sides were fitted
-    coefficients: Values
-    columns: Values  # (n, p)
-    weights: Values  # (p, n); ``coefficients = weights @ readings``
-    residuals: Values  # (n,), g
-    condition: float  # of the columns, scaled
-
-
-def fit_sinusoid(angle_deg: Values, reading: Values, *, sides: bool, where: str) -> Sinusoid:
-    """Fit a sinusoid of the table angle.
-
-    ``angle_deg``: (n,), deg. ``reading``: (n,), g. ``sides``: whether the two sides may differ. ``where``: channel and
-    turn, for the message. Raises ``NotObservableError`` if the angles do not determine it.
-    """
-    angle = np.radians(angle_deg)
-    columns = harmonic = np.column_stack([np.ones_like(angle), np.cos(angle), np.sin(angle)])
-    factors = _factors(columns, where)
-    coefficients = factors.solve(reading)
-    for _ in range(ROUNDS if sides else 0):
-        phase = np.arctan2(coefficients[2], coefficients[1])
-        columns = np.column_stack([harmonic, np.abs(np.cos(angle - phase))])
-        factors = _factors(columns, where)
-        coefficients = factors.solve(reading)
-        if abs(np.arctan2(coefficients[2], coefficients[1]) - phase) < SAME_PHASE:
-            break
-    return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients, factors.condition)
-
-
-def wrap(angle_deg: Values) -> Values:
-    """Return angles in [-180, 180) deg."""
-    return (angle_deg + 180.0) % 360.0 - 180.0
-
-
-def _factors(columns: Values, where: str) -> ScaledColumns:
-    n, p = columns.shape
-    if n >= p:
-        factors = ScaledColumns.of(columns)
-        if factors.singular[-1] > WEAKEST_DIRECTION:
-            return factors
-    raise NotObservableError(
-        f"{where} does not show a sinusoid: {n} samples over too few angles; turn the table once around, stopping at "
-        "four angles or more, so that the axis points up and down and is level in between"
-    )
 
 
 def noise_of_fit(

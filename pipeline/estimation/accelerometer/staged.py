@@ -29,6 +29,7 @@ import scipy
 from pipeline.errors import NotObservableError
 from pipeline.estimation.accelerometer.turn_extremes import (
     Extremes,
+    Sinusoid,
     Turn,
     by_turn,
     certificate_of,
@@ -41,7 +42,7 @@ from pipeline.estimation.engine import LinearMap, ResidualNoise
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before, two_sided
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import Sinusoid, noise_of_turns, parts_of
+from pipeline.estimation.turns import noise_of_turns, parts_of
 from pipeline.estimation.uncertainty_budget import (
     budgeted,
     combined,

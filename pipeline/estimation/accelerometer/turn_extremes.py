@@ -6,9 +6,27 @@ readings, its readings where it is level, and its readings while the table turns
 
     a_max = mean of the largest, a_min = mean of the smallest, a_zero = mean of the level readings  (3.23-3.25)
 
-By default they are extremes of sinusoids fitted to the turns (``pipeline.estimation.turns``). Opposite extremes are
-then 180 deg apart, and all samples that a filter changes equally are used. ``as_printed`` uses the largest and the
-smallest of all samples and their angles, also samples in motion between two rests and at rest before or after a turn.
+By default they are extremes of sinusoids fitted to the turns. Opposite extremes are then 180 deg apart, and all samples
+that a filter changes equally are used. ``as_printed`` uses the largest and the smallest of all samples and their
+angles, also samples in motion between two rests and at rest before or after a turn.
+
+While the table turns about body axis i by the angle A, gravity causes in a channel with its axis across
+
+    y = z + a cos(A - phi) + c |cos(A - phi)|
+
+where
+
+    z    : reading where the axis is level, g
+    phi  : angle at which the axis points up, deg
+    a, c : half sum and half difference of the two sides, g: the largest reading is ``z + a + c``, the smallest
+           ``z - a + c``; c is zero if a sensor has one scale factor for both sides
+
+and in the channel along the turn axis ``y = z + h cos(A - phi)`` with a small h, the misalignment. For a given phi the
+other parameters are linear. phi is the phase of the first harmonic of the linear fit, found in a few rounds because
+|cos| has even harmonics only. So all samples of a turn determine its extremes, not only the few at its flat peaks.
+
+A filter shifts phi by rate x delay and reduces a, but only while the table turns: it does not change the readings of a
+rest at either end, so that one sinusoid does not describe both.
 """
 
 from __future__ import annotations
@@ -19,15 +37,18 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.least_squares import certificate, certified
+from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
 from pipeline.estimation.stages import apply_step
-from pipeline.estimation.turns import Part, Sinusoid, filtered_alike, fit_sinusoid, wrap
+from pipeline.estimation.turns import Part, filtered_alike
 from pipeline.records import AXES, Mask, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 
+ROUNDS = 12  # of the phase
+SAME_PHASE = 1e-12  # rad
+WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
 OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y, z
 
 
@@ -117,6 +138,55 @@ def turns_of(parts: Sequence[Part], *, as_printed: bool) -> list[Turn]:
 def samples_of(part: Part, *, as_printed: bool) -> Mask:
     """Return which samples of a part are used."""
     return part.keep if as_printed else filtered_alike(part)
+
+
+@dataclass(frozen=True)
+class Sinusoid:
+    """The sinusoid of one channel in one turn."""
+
+    # (3,) or (4,), g; z, then the cosine's and the sine's coefficient, then c where both sides were fitted
+    coefficients: Values
+    columns: Values  # (n, p)
+    weights: Values  # (p, n); ``coefficients = weights @ readings``
+    residuals: Values  # (n,), g
+    condition: float  # of the columns, scaled
+
+
+def fit_sinusoid(angle_deg: Values, reading: Values, *, sides: bool, where: str) -> Sinusoid:
+    """Fit a sinusoid of the table angle.
+
+    ``angle_deg``: (n,), deg. ``reading``: (n,), g. ``sides``: whether the two sides may differ. ``where``: channel and
+    turn, for the message. Raises ``NotObservableError`` if the angles do not determine it.
+    """
+    angle = np.radians(angle_deg)
+    columns = harmonic = np.column_stack([np.ones_like(angle), np.cos(angle), np.sin(angle)])
+    factors = _factors(columns, where)
+    coefficients = factors.solve(reading)
+    for _ in range(ROUNDS if sides else 0):
+        phase = np.arctan2(coefficients[2], coefficients[1])
+        columns = np.column_stack([harmonic, np.abs(np.cos(angle - phase))])
+        factors = _factors(columns, where)
+        coefficients = factors.solve(reading)
+        if abs(np.arctan2(coefficients[2], coefficients[1]) - phase) < SAME_PHASE:
+            break
+    return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients, factors.condition)
+
+
+def wrap(angle_deg: Values) -> Values:
+    """Return angles in [-180, 180) deg."""
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+def _factors(columns: Values, where: str) -> ScaledColumns:
+    n, p = columns.shape
+    if n >= p:
+        factors = ScaledColumns.of(columns)
+        if factors.singular[-1] > WEAKEST_DIRECTION:
+            return factors
+    raise NotObservableError(
+        f"{where} does not show a sinusoid: {n} samples over too few angles; turn the table once around, stopping at "
+        "four angles or more, so that the axis points up and down and is level in between"
+    )
 
 
 def sinusoids_of(turns: Sequence[Turn]) -> list[list[Sinusoid]]:
