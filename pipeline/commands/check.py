@@ -66,7 +66,7 @@ exit code: 0 if a run would use every file or unit, 2 if one is refused or its l
 
 
 class Refused(NamedTuple):
-    """What is refused of a log or, where ``reading`` is None, of a unit."""
+    """A refusal of a log or, if ``reading`` is None, of a unit."""
 
     code: str
     message: str
@@ -74,7 +74,7 @@ class Refused(NamedTuple):
     reading: Reading | None = None
 
 
-Told = tuple[str, list[Refused]]  # what is printed of a log or a unit, and what is refused
+Outcome = tuple[str, list[Refused]]  # the printed text on a log or a unit, and its refusals
 
 
 def main(argv: Sequence[str]) -> int:
@@ -135,10 +135,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Told]]]:
-    """Return what is to be checked, in words and as a function: units of campaigns, then logs alone."""
+def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
+    """Return the name and the function of each check: of units of campaigns, then of logs alone."""
     given = find_campaign(arguments.campaign) if arguments.campaign else None
-    own_profile = arguments.ingest is not None or arguments.sensor is not None
+    stated = arguments.ingest is not None or arguments.sensor is not None
     if arguments.range and arguments.sensor is None:
         raise ConfigurationError("--range is that of --sensor; a campaign states it in campaign.yaml")
     if not arguments.files and given is None:
@@ -148,7 +148,7 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Told]]]:
         places.setdefault(given or campaign_of(file), []).append(file)
     units, logs = [], []
     for directory, files in places.items():
-        if directory is None or own_profile:
+        if directory is None or stated:
             logs += _logs(files, directory, arguments)
             continue
         campaign = load_campaign({"campaign": str(directory)})
@@ -164,39 +164,40 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Told]]]:
 
 
 def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Namespace) -> list[Reading]:
-    """Return how logs are read by a profile and a sensor."""
+    """Return the logs, read by a profile and a sensor."""
     profile, sensor = arguments.ingest, arguments.sensor
     config = config_of_log(files[0], profile, sensor, campaign=campaign)
     if arguments.range:
         ranges = settings_of_ranges(config["sensor"], arguments.range)
         config = config_of_log(files[0], profile, sensor, ranges, campaign)
-    said = f"ingest={config['ingest']['name']}" + (f", sensor={sensor}" if sensor else "")
+    read_with = f"ingest={config['ingest']['name']}" + (f", sensor={sensor}" if sensor else "")
     ingest, sensor_config = config["ingest"], config["sensor"] if sensor else {}
-    return [Reading.alone(group, ingest, sensor_config, said) for group in grouped(files, ingest)]
+    return [Reading.alone(group, ingest, sensor_config, read_with) for group in grouped(files, ingest)]
 
 
 def _logs_of_campaign(files: Sequence[Path], campaign: Campaign, units: Sequence[str]) -> list[Reading]:
-    """Return how logs that are no recordings of a campaign are read by its settings."""
+    """Return logs that are no recordings of a campaign, read by its settings."""
     first, *others = (campaign.units[unit].config for unit in units)
     if any(first[section] != other[section] for other in others for section in ("ingest", "sensor")):
         message = "the units are read by different settings (ingest, sensor): choose one by --unit"
         raise ConfigurationError(message, str(campaign.directory / "units.csv"))
     ingest, sensor = first["ingest"], first["sensor"]
-    said = f"campaign {campaign.name}, as no recording of a unit: ingest={ingest['name']}, sensor={sensor['name']}"
-    return [Reading.alone(group, ingest, sensor, said) for group in grouped(files, ingest)]
+    names = f"ingest={ingest['name']}, sensor={sensor['name']}"
+    read_with = f"campaign {campaign.name}, as no recording of a unit: {names}"
+    return [Reading.alone(group, ingest, sensor, read_with) for group in grouped(files, ingest)]
 
 
-def _check_log(reading: Reading) -> Told:
+def _check_log(reading: Reading) -> Outcome:
     """Return content and notes of a log that is checked alone, or its refusal."""
     try:
         recording = reading.checked()
-        return _told_of(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), []
+        return _described(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), []
     except PipelineError as error:
         return _refusal_of(reading, error)
 
 
-def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
-    """Return what a run would make of a unit: content and notes of the recordings that are named, or a line of all."""
+def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
+    """Return the result of a run for a unit: content and notes of the named recordings, or a summary of all."""
     trial, missing = try_unit(campaign, unit, "fit" if names else "calibration"), ""
     if names and trial.failure and trial.failure["code"] == "missing_file":
         missing = (
@@ -204,22 +205,22 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
         )
         trial = try_unit(campaign, unit, "ingest", incomplete=True)
     read = _readings_of(campaign, unit)
-    told = []
+    texts = []
     refused: list[Refused] = []
     for name in names or (read if not trial.recordings else ()):
         try:
             lines = _facts_of_recording(read[name], campaign, trial)
-            told += [_told_of(read[name], lines)] if names else []
+            texts += [_described(read[name], lines)] if names else []
         except PipelineError as error:
             text, found = _refusal_of(read[name], error)
-            told.append(text)
+            texts.append(text)
             refused += found
     if trial.failure and (not refused or trial.failure["code"] == "missing_file"):
         place = trial.failure["file"] or f"unit {unit}"
         refused.append(Refused(trial.failure["code"], trial.failure["message"], place))
         file = [("file", trial.failure["file"])] if trial.failure["file"] else []
         lines = [*file, ("REFUSED", trial.failure["message"]), ("code", trial.failure["code"])]
-        told.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
+        texts.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
     elif not names and not refused:
         lines = [(sensor, f"null: {reason}") for sensor, reason in trial.not_calibrated.items()]
         lines += [(sensor, text) for sensor, text in trial.not_determined.items() if text]
@@ -228,21 +229,15 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
             for note in recording.notes:
                 place = f", line {note.first} to {note.last}" if note.code in LEFT_OUT and note.first else ""
                 noted.setdefault(note.code, {}).setdefault((place, note.detail), []).append(recording.name)
-        texts = [
+        notes = [
             f"{code} {name}{place}: {detail}" + f"; likewise {', '.join(others)}" * bool(others)
             for code, found in noted.items()
             for (place, detail), (name, *others) in found.items()
         ]
-        lines += [("notes" if i == 0 else "", text) for i, text in enumerate(texts)]
-        told.append(
-            "\n".join(
-                [
-                    f"unit {unit}: {counted(len(trial.recordings), 'recording')}, no refusal",
-                    *([as_text(lines)] if lines else []),
-                ]
-            )
-        )
-    return "\n\n".join([*told, *([missing] if missing else [])]), refused
+        lines += [("notes" if i == 0 else "", note) for i, note in enumerate(notes)]
+        head = f"unit {unit}: {counted(len(trial.recordings), 'recording')}, no refusal"
+        texts.append("\n".join([head, *([as_text(lines)] if lines else [])]))
+    return "\n\n".join([*texts, *([missing] if missing else [])]), refused
 
 
 def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
@@ -253,13 +248,13 @@ def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
     found = {}
     for name, files in recording_files(config["procedure"], config["ingest"], campaign.folder(unit)).items():
         procedure = {**config["procedure"], "recordings": {name: config["procedure"]["recordings"][name]}}
-        said = f"unit {unit} of campaign {campaign.name}, recording {name}: {used}"
-        found[name] = Reading(files, {"procedure": procedure, **sections}, said)
+        place = f"unit {unit} of campaign {campaign.name}, recording {name}"
+        found[name] = Reading(files, {"procedure": procedure, **sections}, f"{place}: {used}")
     return found
 
 
 def _facts_of_recording(reading: Reading, campaign: Campaign, trial: Trial) -> list[Line]:
-    """Return what a recording holds, as ingest leaves it; of one that ingest cuts, the parts as well."""
+    """Return the content of a recording after ingest, and the parts if ingest cuts it."""
     ((name, entry),) = reading.settings["procedure"]["recordings"].items()
     parts = [
         r
@@ -275,26 +270,26 @@ def _facts_of_recording(reading: Reading, campaign: Campaign, trial: Trial) -> l
     return _topics(reading) + lines + [("segments" if i == 0 else "", text) for i, text in enumerate(segments)]
 
 
-def _told_of(reading: Reading, lines: Sequence[Line]) -> str:
-    """Return how a log is read, and what it holds, as text."""
-    return f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}\n{as_text(lines)}"
+def _described(reading: Reading, lines: Sequence[Line]) -> str:
+    """Return the content of a log as text, with its profile and settings."""
+    return f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.read_with}\n{as_text(lines)}"
 
 
 def _topics(reading: Reading, *, fields: bool = False) -> list[Line]:
     return topic_lines(reading.files[0], fields=fields) if reading.has_topics else []
 
 
-def _refusal_of(reading: Reading, error: PipelineError) -> Told:
+def _refusal_of(reading: Reading, error: PipelineError) -> Outcome:
     unlike = "the file needs another profile, see below: " if error.code in UNKNOWN_LAYOUT else ""
     lines = [("REFUSED", f"{unlike}{_place(error.file, reading.files)}{error.message}"), ("code", error.code)]
     refused = Refused(error.code, error.message, error.file or str(reading.files[0]), reading)
-    text = _told_of(reading, [*lines, *_topics(reading, fields=error.code == "missing_topic")])
+    text = _described(reading, [*lines, *_topics(reading, fields=error.code == "missing_topic")])
     parts = getattr(error, "sessions", 0)
     return f"{text}\n\n{_recipe(reading, parts)}" if parts else text, [refused]
 
 
 def _recipe(reading: Reading, parts: int) -> str:
-    """Return what the user writes to use all parts of a log that was restarted."""
+    """Return the settings with which all parts of a log that was restarted are used."""
     ((name, entry),) = reading.settings["procedure"]["recordings"].items()
     if "file" not in entry:
         return "To use all parts, check the file where it lies in your campaign: check then prints the settings."
@@ -317,7 +312,7 @@ def _recipe(reading: Reading, parts: int) -> str:
 
 
 def _place(file: str | None, files: Sequence[Path]) -> str:
-    """Return where a refusal lies, without the name of the only file."""
+    """Return the place of a refusal, without the name of the only file."""
     if file is None or [file] == [str(f) for f in files]:
         return ""
     line = file.removeprefix(f"{files[0]}:") if len(files) == 1 else file
@@ -326,20 +321,17 @@ def _place(file: str | None, files: Sequence[Path]) -> str:
 
 def _layouts(reading: Reading, code: str) -> list[Log]:
     """Return the layout of each log that the profile does not describe; of a log of messages, that of one topic."""
-    if code not in UNKNOWN_LAYOUT:
-        return []
-    found = []
-    for file in reading.files:
+    layouts = []
+    for file in reading.files if code in UNKNOWN_LAYOUT else ():
         try:
-            found.append(topics_of(file)[0] if reading.has_topics else _text_layout(file))
+            if reading.has_topics:
+                layouts.append(topics_of(file)[0])
+                continue
+            with file.open("rb") as stream:
+                layouts.append(find_layout(stream.read(SEARCHED_BYTES), str(file)))
         except IngestError as none:
             print(f"{file}: {none.message}\n")
-    return found
-
-
-def _text_layout(file: Path) -> Log:
-    with file.open("rb") as stream:
-        return find_layout(stream.read(SEARCHED_BYTES), str(file))
+    return layouts
 
 
 def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save: Path | None) -> None:
@@ -370,7 +362,7 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
 
 
 def _next_step(proposal: Proposal, name: str, save: Path | None) -> str:
-    """Return how a proposed profile is saved, checked and used, and where files go that are joined."""
+    """Return how to save, check and use a proposed profile, and where to place files that are joined."""
     profile = save or Path("my_bench", "configs", "ingest", f"{name}.yaml")
     todo = "check it by" if save else f"save it in your campaign (--save {profile}), and check it by"
     lines = [

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from pipeline.records import Recording, Values
     from pipeline.signal.rests import Rest
 
-POLL_S = 1.0  # between two looks at a growing log: short against a rest
-STILL_RESTING_S = 1.0  # from a rest's end to that of the log, below which the rest may go on
+POLL_S = 1.0  # between two readings of a growing log: short against a rest
+STILL_RESTING_S = 1.0  # from the end of a rest to that of the log, below which the rest may continue
 FIRST = Turn(0, 2, 180.0)  # about x, while nothing of the gyroscope is known
 EPILOG = """\
 The next rest is the one that reduces the uncertainty of the accelerometer's calibration most. The goal is reached when
@@ -70,7 +70,7 @@ class Source:
 
     config: dict[str, Any]
     folder: Path | None  # of a campaign's unit
-    files: tuple[Path, ...]  # that were named
+    files: tuple[Path, ...]  # on the command line
 
     def entries(self) -> dict[str, tuple[dict[str, Any], list[Path]]]:
         """Return role and files of each recording that exists."""
@@ -184,7 +184,7 @@ def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _held_out(source: Source) -> list[str]:
-    """Return which rests are held out of the fit, and why; nothing where faces and turns are asked for."""
+    """Return which rests are held out of the fit, and why; empty for a procedure of given faces and turns."""
     procedure = source.config["procedure"]
     every = int(procedure.get("holdout_every") or 0)
     if procedure.get("faces"):
@@ -194,14 +194,12 @@ def _held_out(source: Source) -> list[str]:
         return ["no rest is held out of the fit: the recording for validation judges it"]
     if not every:
         return ["no rest is held out of the fit: procedure.holdout_every is 0"]
-    why = "there is no recording for validation"
-    return [
-        f"one of {every} rests is held out of the fit, to judge it: {why} (a run does so from holdout_from rests on)"
-    ]
+    held = f"one of {every} rests is held out of the fit, to judge it: there is no recording for validation"
+    return [f"{held} (a run does so from holdout_from rests on)"]
 
 
 class RestLine(NamedTuple):
-    """What is printed of a rest."""
+    """The printed line on a rest."""
 
     recording: str
     start: float  # s; with the recording it identifies the rest, since its number may change
@@ -211,12 +209,12 @@ class RestLine(NamedTuple):
     text: str
 
     def overlaps(self, other: RestLine) -> bool:
-        """Return whether both are the same rest: more of the log may shift its start and its end."""
+        """Return whether both are the same rest: its start and end may change while the log grows."""
         return self.recording == other.recording and self.start < other.stop and other.start < self.stop
 
 
 class Advice(NamedTuple):
-    """Return the messages on the recordings so far."""
+    """The messages on the recordings so far."""
 
     enough: bool
     rests: list[RestLine]
@@ -224,10 +222,10 @@ class Advice(NamedTuple):
 
 
 class Goals(NamedTuple):
-    """Largest expanded uncertainties that are enough."""
+    """Largest expanded uncertainties that are sufficient."""
 
     accelerometer: float  # g
-    gyroscope: float | None  # per cent of the matrix; None: not asked
+    gyroscope: float | None  # per cent of the matrix; None: no goal
 
 
 def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goals, dwell: float) -> Advice:
@@ -236,14 +234,15 @@ def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goal
         return Advice(done, [], words)
     progress = progress_of(recordings, config, dwell)
     rows = zip(progress.rests, progress.up, progress.held_out, strict=True)
-    lines = [
-        RestLine(r.name, *_span(r, rest), k, "held out" if held else "in the fit", f"{k:>4}  {text}")
-        for k, ((r, rest), up, held) in enumerate(rows, start=1)
-        for text in [_described(r, rest, up, held=held)]
-    ]
+    lines = []
+    for k, ((r, rest), up, held) in enumerate(rows, start=1):
+        start, stop = _span(r, rest)
+        text = f"{k:>4}  {r.name} {start:.1f} to {stop:.1f} s: {in_words(up)}{' (held out)' if held else ''}"
+        lines.append(RestLine(r.name, start, stop, k, "held out" if held else "in the fit", text))
     for r, rest in progress.left_out:
-        text = f"   -  {r.name} {_span(r, rest)[0]:.1f} s: left out: {rest.reason}"
-        lines.append(RestLine(r.name, *_span(r, rest), 0, "left out", text))
+        start, stop = _span(r, rest)
+        text = f"   -  {r.name} {start:.1f} s: left out: {rest.reason}"
+        lines.append(RestLine(r.name, start, stop, 0, "left out", text))
     done, words = _next(progress, goals.accelerometer, dwell)
     if goals.gyroscope is None:
         return Advice(done, lines, words)
@@ -280,11 +279,6 @@ def _span(recording: Recording, rest: Rest) -> tuple[float, float]:
     return float(recording.time[rest.start]), float(recording.time[rest.stop - 1])
 
 
-def _described(recording: Recording, rest: Rest, up: Any, *, held: bool) -> str:  # noqa: ANN401  (an array)
-    start, stop = _span(recording, rest)
-    return f"{recording.name} {start:.1f} to {stop:.1f} s: {in_words(up)}{' (held out)' if held else ''}"
-
-
 def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str]]:
     """Return whether the goal is reached, and the next rest in words."""
     held = sum(progress.held_out)
@@ -301,8 +295,8 @@ def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str
     lines.append(f"next: {in_words(proposal.up)}; rest it for {dwell:g} s")
     if progress.next_is_held_out:
         lines.append("      (held out of the fit, to judge it: an attitude far from all others)")
-    elif again := _again(progress, proposal.up):
-        lines.append(f"      ({again})")
+    elif repeated := _repeated_attitude(progress, proposal.up):
+        lines.append(f"      ({repeated})")
     if proposal.expected > goal:
         lines.append(
             f"expected: {1e3 * proposal.expected:.3g} mg after {MOST} more rests, so the goal is out of reach: rest "
@@ -313,13 +307,13 @@ def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str
     return False, lines
 
 
-def _again(progress: Progress, up: Values) -> str:
-    """Return why an attitude is proposed that was recorded before; empty where no rest is near it."""
-    there = progress.near(up)
-    if not there:
+def _repeated_attitude(progress: Progress, up: Values) -> str:
+    """Return why an attitude is proposed that was recorded before; empty if no rest is near it."""
+    near = progress.near(up)
+    if not near:
         return ""
-    of_fit = [i for i in there if not progress.held_out[i]]
-    i = (of_fit or there)[-1]
+    of_fit = [i for i in near if not progress.held_out[i]]
+    i = (of_fit or near)[-1]
     known = f"rest {i + 1} ({progress.rests[i][0].name} {_span(*progress.rests[i])[0]:.1f} s) is near this attitude"
     if of_fit:
         return f"{known}; of all attitudes another rest there still reduces the uncertainty most"
@@ -327,8 +321,8 @@ def _again(progress: Progress, up: Values) -> str:
 
 
 def _follow(source: Source, goals: Goals, dwell: float) -> None:
-    """Look at a growing log again and again, and tell what is new, until it is enough."""
-    told: list[RestLine] = []
+    """Read a growing log repeatedly and print what is new, until the goal is reached."""
+    printed: list[RestLine] = []
     advice: Advice | None = None
     last, waiting, state = "", "", "no rest was read"
     bell = "\a" if sys.stdout.isatty() else ""
@@ -347,27 +341,27 @@ def _follow(source: Source, goals: Goals, dwell: float) -> None:
             waiting = problem
             if advice is not None:
                 state = advice.words[0]
-                new = any(not any(rest.overlaps(t) for t in told) for rest in advice.rests)
+                new = any(not any(rest.overlaps(other) for other in printed) for rest in advice.rests)
                 if new or advice.enough or not last or (not advice.rests and advice.words[-1] != last):
-                    lines, told = _news(advice.rests, told)
+                    lines, printed = _news(advice.rests, printed)
                     print("\n".join([*lines, *advice.words]) + bell, flush=True)
                     last = advice.words[-1]
                     if advice.enough:
                         return
             time.sleep(POLL_S)
     except KeyboardInterrupt:
-        changes = _news(advice.rests, told)[0] if advice is not None else []
+        changes = _news(advice.rests, printed)[0] if advice is not None else []
         print("\n".join(["", *changes, f"ended before it was enough: {state}"]))
 
 
-def _news(rests: Sequence[RestLine], told: Sequence[RestLine]) -> tuple[list[str], list[RestLine]]:
-    """Return the lines on the rests that are new or of another use than was told, and what then is told.
+def _news(rests: Sequence[RestLine], printed: Sequence[RestLine]) -> tuple[list[str], list[RestLine]]:
+    """Return the lines on new rests and on those whose use changed, and the rests that are then printed.
 
-    More of the log may change the use of a rest: its rate is compared with that of its neighbours, the limit of a
-    quiet window is found from the whole log, and with a rest admitted or left out each later one has another number,
-    so that another one of three is held out. The changes are told together with the next new rest.
+    The use of a rest may change while the log grows: its rate is compared with that of its neighbours, and the limit of
+    a quiet window follows from the whole log. If a rest is admitted or left out, all later ones have other numbers, so
+    that other rests are held out. The changes are printed together with the next new rest.
     """
-    changed, numbers, new, known = [], [], [], list(told)
+    changed, numbers, new, known = [], [], [], list(printed)
     for rest in rests:
         before = next((t for t in known if rest.overlaps(t)), None)
         if before is None:
@@ -388,10 +382,10 @@ def _news(rests: Sequence[RestLine], told: Sequence[RestLine]) -> tuple[list[str
 
 
 def _without_last_rest(recording: Recording, dwell: float) -> Recording:
-    """Return a recording without the rest at its end, where that may go on and is still shorter than ``dwell``."""
+    """Return a recording without a rest at its end that may continue and is still shorter than ``dwell``."""
     rests = find_rests(recording) if recording.role == "rests" else []
     if not rests:
         return recording
     start, stop, end = recording.time[[rests[-1].start, rests[-1].stop - 1, -1]]
-    goes_on = end - stop < STILL_RESTING_S and stop - start < dwell - WINDOW_S
-    return recording.select(slice(0, max(rests[-1].start, 1))) if goes_on else recording
+    continues = end - stop < STILL_RESTING_S and stop - start < dwell - WINDOW_S
+    return recording.select(slice(0, max(rests[-1].start, 1))) if continues else recording

@@ -35,16 +35,16 @@ class Reading:
 
     files: list[Path]
     settings: dict[str, Any]
-    said: str
+    read_with: str  # profile, sensor and place in a campaign, in words
 
     @classmethod
     def alone(
-        cls, files: list[Path], ingest: dict[str, Any], sensor: dict[str, Any], said: str = "", role: str = "rests"
+        cls, files: list[Path], ingest: dict[str, Any], sensor: dict[str, Any], read_with: str = "", role: str = "rests"
     ) -> Reading:
         """Return the reading of files that belong to no campaign, without a table."""
         recordings = {files[0].stem: {"role": role, "axis": None}}
         settings = {"procedure": {"recordings": recordings}, "table": {}, "sensor": sensor, "ingest": ingest}
-        return cls(files, settings, said)
+        return cls(files, settings, read_with)
 
     @property
     def has_topics(self) -> bool:

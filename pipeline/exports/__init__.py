@@ -10,11 +10,18 @@ and how ``convert`` reads it), and the text of the file in Jinja2. The text has 
 
 and the functions of ``sensors.FUNCTIONS``. The name of the template without ``.j2`` is the name of the format and, by
 default, of its file. Formats are listed nowhere else.
+
+``calibration.h`` has the effects as C expressions (``plan_of``). It performs the operations of
+``pipeline.model.compensation`` for one sample, in the same order. Double precision without fused operations and without
+functions of the C library then gives the same last bit. Effects of only time and temperature (``steady``) are
+subtracted once. Effects of the motion (``moving``) are subtracted by a fixed-point iteration if they depend on the
+calibrated reading of the same sensor, also through the other sensor (``circular_sensors``).
 """
 
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import MISSING, dataclass, field, replace
 from dataclasses import fields as dataclass_fields
 from functools import cache, cached_property
@@ -25,13 +32,21 @@ import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from pipeline.errors import ConfigurationError
-from pipeline.exports.c_effects import plan_of
 from pipeline.exports.sensors import FACTORS, FUNCTIONS, ExportedSensor, before_use, noise_figures, plain
 from pipeline.model.checked import Check, WrongValueError, each, fields, one_of
-from pipeline.records import SENSORS, SensorCalibration
+from pipeline.model.compensation import OF_THE_PAST, SMOOTHING_S, Steps, circular
+from pipeline.model.effects import effect_of
+from pipeline.model.effects.base import REFERENCE_TEMPERATURE
+from pipeline.model.formula import c_number
+from pipeline.model.log_motion import SIGNALS
+from pipeline.model.measurement import sensor_effects
+from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 JSON = dict[str, Any]
 TEMPLATES = Path(__file__).parent / "templates"
+ROUNDS = 12  # of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal
+IN_C = set(SIGNALS) - {"specific_force_rate"}
+CALL = re.compile(r"(\w+)\(")  # of a function in C
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,25 +94,23 @@ def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
     return _environment().get_template(name).render(values)
 
 
-def _declared(template: Path, header: object) -> Format:
-    """Return the declaration of a template; raises ``ConfigurationError`` for a missing or unknown key, or a unit."""
+@cache
+def formats() -> dict[str, tuple[Format, Template]]:
+    """Return declaration and text of every format, by name, in alphabetical order.
+
+    Raises ``ConfigurationError`` for a missing or unknown key of a declaration, an unknown unit, or one file of two.
+    """
     keys = [key for key in dataclass_fields(Format) if key.name != "file"]
     required = [key.name for key in keys if key.default is MISSING and key.default_factory is MISSING]
     checks: dict[str, Check] = {key.name: lambda value: value for key in dataclass_fields(Format)}
-    try:
-        declared = fields(checks | {"units": each(one_of(*FACTORS))}, required)(header)
-    except WrongValueError as wrong:
-        raise ConfigurationError(f"{template}: {wrong}. docs/exports.md, Add a format, has an example") from None
-    return Format(**{"file": template.stem, **declared})
-
-
-@cache
-def formats() -> dict[str, tuple[Format, Template]]:
-    """Return declaration and text of every format, by name, in alphabetical order."""
+    check = fields(checks | {"units": each(one_of(*FACTORS))}, required)
     formats_by_name: dict[str, tuple[Format, Template]] = {}
     for template in sorted(TEMPLATES.glob("*.j2")):
         header, _, text = template.read_text(encoding="utf-8").partition("\n---\n")
-        declared = _declared(template, yaml.safe_load(header))
+        try:
+            declared = Format(**{"file": template.stem, **check(yaml.safe_load(header))})
+        except WrongValueError as wrong:
+            raise ConfigurationError(f"{template}: {wrong}. docs/exports.md, Add a format, has an example") from None
         same = [name for name, (other, _) in formats_by_name.items() if other.file == declared.file]
         if same:
             raise ConfigurationError(
@@ -221,3 +234,60 @@ def _yaml(content: Any) -> str:  # noqa: ANN401
 
 def _numbers(values: Any, form: str = "%.17g", separator: str = " ") -> str:  # noqa: ANN401
     return separator.join(form % value for value in values)
+
+
+@dataclass
+class SensorPlan:
+    """The effects of one sensor as assignments in C, and the omitted effects with the reason."""
+
+    bias: list[str]
+    matrix: list[list[str]]
+    steady: list[str] = field(default_factory=list)
+    moving: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+
+def plan_of(sensors: dict[str, ExportedSensor]) -> JSON:
+    """Return the contents of ``calibration.h``; the readings of a sensor without a calibration are unchanged."""
+    plans: dict[str, SensorPlan] = {}
+    steps: dict[str, Steps] = {}
+    with_time: set[str] = set()
+    for sensor in SENSORS:
+        calibration = sensors[sensor].calibration if sensor in sensors else SensorCalibration(sensor)
+        matrix = [[c_number(x) for x in row] for row in calibration.matrix.tolist()]
+        plan = plans[sensor] = SensorPlan([c_number(b) for b in calibration.bias.tolist()], matrix)
+        reasons = {fitted.name: _not_in_c(sensor, fitted) for fitted in sensor_effects(calibration)}
+        plan.left_out += [f"{name} ({reason})" for name, reason in reasons.items() if reason]
+        step = steps[sensor] = Steps.of(sensor, [e for e in sensor_effects(calibration) if not reasons[e.name]])
+        for effects, lines in ((step.steady, plan.steady), (step.moving, plan.moving)):
+            for fitted in effects:
+                needs_time = bool(step.fields[fitted.name] & ({"time"} | OF_THE_PAST))
+                condition = "if (!m->alone) " if needs_time else ""
+                with_time |= {fitted.name} if needs_time else set()
+                terms = effect_of(fitted).in_c(fitted.values) or ()
+                lines += [f"{condition}r[{i}] -= {term}; /* {fitted.name} */" for i, term in enumerate(terms)]
+    circular_sensors, used = circular(steps), set().union(*(step.used for step in steps.values()))
+    past = bool(used & OF_THE_PAST)
+    return {
+        "sensors": plans,
+        "circular_sensors": circular_sensors,
+        "past": past,
+        "temperature": "temperature" in used,
+        "with_time": sorted(with_time),
+        "rounds": ROUNDS if circular_sensors else 1,
+        "ends": ROUNDS if circular_sensors and past else 1,
+        "functions": {name for p in plans.values() for line in p.steady + p.moving for name in CALL.findall(line)},
+        "memory": SMOOTHING_S,
+        "reference": c_number(REFERENCE_TEMPERATURE),
+    }
+
+
+def _not_in_c(sensor: str, fitted: FittedEffect) -> str:
+    """Return the reason why the header omits an effect; empty if it contains the effect."""
+    if fitted.definition and "python" in fitted.definition:
+        return "it is in Python; python -m pipeline apply --python-effect subtracts it"
+    effect = effect_of(fitted)
+    if effect.in_c(fitted.values) is None:
+        return "its equation has no form in C; python -m pipeline apply subtracts it"
+    unknown = sorted(effect.fields(sensor, fitted.values) - IN_C)
+    return f"it needs {', '.join(unknown)}, which this header does not know" if unknown else ""
