@@ -374,9 +374,7 @@ def _news(rests: Sequence[RestLine], printed: Sequence[RestLine]) -> tuple[list[
         elif number:
             numbers.append(f"{before.number} ({rest.recording} {rest.start:.1f} s) is now {rest.number}")
     gone = [t for t in known if any(r.recording == t.recording and r.start >= t.stop for r in rests)]
-    changed += [
-        f"   -  {t.recording} {t.start:.1f} s: no rest of its own any more; before it was {t.use}" for t in gone
-    ]
+    changed += [f"   -  {t.recording} {t.start:.1f} s: no longer a separate rest; before it was {t.use}" for t in gone]
     renumbered = [f"      numbers: {', '.join(numbers)}"] if numbers else []
     return [*changed, *renumbered, *new], [*rests, *(t for t in known if t not in gone)]
 

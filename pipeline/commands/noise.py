@@ -17,7 +17,6 @@ from pipeline.report.noise_section import remarks, term_rows
 from pipeline.report.numbers import MINUS, aligned, number
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Sequence
 
 JSON = dict[str, Any]
@@ -35,7 +34,10 @@ examples:
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline noise LOG``."""
-    arguments = _parser().parse_args(argv)
+    parser = parser_of("noise", __doc__, EPILOG, ("--ingest", "--sensor"))
+    parser.add_argument("log", type=Path, metavar="LOG", help="a log of the unit at rest")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="file to write, in the format of its name")
+    arguments = parser.parse_args(argv)
     target: Path | None = arguments.output
     consumers = [name for name, (declared, _) in formats().items() if declared.noise and not declared.units]
     if target is not None and target.name not in consumers and target.suffix != ".json":
@@ -63,13 +65,6 @@ def main(argv: Sequence[str]) -> int:
     write_atomically(target, text)
     print(f"written: {target}", file=sys.stderr)
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("noise", __doc__, EPILOG, ("--ingest", "--sensor"))
-    parser.add_argument("log", type=Path, metavar="LOG", help="a log of the unit at rest")
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="file to write, in the format of its name")
-    return parser
 
 
 def _table_of(sensor: str, noise: JSON) -> str:

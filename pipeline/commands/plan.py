@@ -37,7 +37,10 @@ examples:
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline plan``."""
     arguments = vars(_parser().parse_args(_joined(argv)))
-    _register_effects(arguments)
+    campaign: Path | None = arguments["campaign"]
+    of_campaign = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
+    for effect in read_effect_files([*of_campaign, *arguments["effects"]]).values():
+        register(effect)
     first = unit_of(arguments, _described_unit(arguments))
     document = plan_of(first)
     second = plan_of(_other(arguments["against"], arguments, first)) if arguments["against"] is not None else None
@@ -81,13 +84,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--no-extra", dest="extra", action="store_false", default=True, help="do not propose additional recordings")
     add_recording_options(parser)
     return parser
-
-
-def _register_effects(arguments: Mapping[str, Any]) -> None:
-    campaign: Path | None = arguments["campaign"]
-    of_campaign = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
-    for effect in read_effect_files([*of_campaign, *arguments["effects"]]).values():
-        register(effect)
 
 
 def unit_of(arguments: Mapping[str, Any], base: UnitDescription | None) -> UnitDescription:

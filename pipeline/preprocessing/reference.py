@@ -70,7 +70,7 @@ QUARTER = 0.25  # of an interval, within which a delay between samples is known
 BETTER = 0.5  # share of the power of the difference of two signals below which they are alike
 NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
 SURE = 5.0  # standard deviations of the sum of squares that the ends of the window add
-ALIGN = "align the table's log with the sensor's rows, or give it a time column of its own (ingest=table_log)"
+ALIGN = "align the table's log with the sensor's rows, or give it a separate time column (ingest=table_log)"
 
 
 @dataclass(frozen=True)

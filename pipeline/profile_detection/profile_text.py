@@ -13,7 +13,7 @@ from pipeline.profile_detection.proposal import UNITS_OF, fields_of
 from pipeline.profile_detection.unit_guesses import OF_SENSOR, UNKNOWN
 
 if TYPE_CHECKING:
-    from pipeline.profile_detection.proposal import Entries, Proposal
+    from pipeline.profile_detection.proposal import Proposal
 
 WIDTH = 116  # of comments in a proposed profile
 WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
@@ -30,8 +30,7 @@ def as_yaml(proposal: Proposal, name: str) -> str:
     lines += [f"name: {_scalar(name)} # name of the profile, for the report", ""]
     if proposal.topic is not None:
         lines += ["mcap: # logs of messages of every format", "  topics:", f"    {_scalar(proposal.topic)}:"]
-        lines += _entries(fields_of(proposal.columns[0]), proposal.evidence, "      ")
-        return "\n".join(lines + _not_used(proposal, 0, "      ")) + "\n"
+        return "\n".join(lines + _entries(proposal, 0, "      ")) + "\n"
     lines += ["csv:"]
     for key, value in proposal.csv.items():
         if key in proposal.evidence:
@@ -41,18 +40,28 @@ def as_yaml(proposal: Proposal, name: str) -> str:
         lines += ["  columns: {} # described by part", "  parts: # files of one recording, joined on equal time"]
         for part, file in enumerate(proposal.parts):
             lines += [f"    - file: {_scalar(file)}", "      columns:"]
-            lines += _entries(proposal.columns[part], proposal.evidence, "        ")
-            lines += _not_used(proposal, part, "        ")
+            lines += _entries(proposal, part, "        ")
     else:
         lines += ["  columns: # channel: the column's name (or index from 0) and its unit"]
-        lines += _entries(proposal.columns[0], proposal.evidence, "    ")
-        lines += _not_used(proposal, 0, "    ")
+        lines += _entries(proposal, 0, "    ")
     return "\n".join(lines) + "\n"
 
 
-def _not_used(proposal: Proposal, part: int, indent: str) -> list[str]:
-    used = {entry["column"] for entry in proposal.columns[part].values()}
-    return [f"{indent}# not used: {c} ({content})" for c, content in proposal.seen[part].items() if c not in used]
+def _entries(proposal: Proposal, part: int, indent: str) -> list[str]:
+    """Return the entries of a part, the first of each sensor with its evidence, and the columns without an entry."""
+    lines: list[str] = []
+    explained: set[str] = set()
+    columns, evidence = proposal.columns[part], proposal.evidence
+    for channel, entry in (columns if proposal.topic is None else fields_of(columns)).items():
+        key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
+        if key in evidence and key not in explained:
+            lines += _comment(evidence[key], indent)
+            explained.add(key)
+        inner = ", ".join(f"{k}: {_scalar(v)}" for k, v in entry.items())
+        lines.append(f"{indent}{channel}: {{{inner}}}")
+    used = {entry["column"] for entry in columns.values()}
+    unused = [f"{c} ({content})" for c, content in proposal.seen[part].items() if c not in used]
+    return lines + [f"{indent}# not used: {text}" for text in unused]
 
 
 def not_found(proposal: Proposal) -> list[str]:
@@ -72,19 +81,6 @@ def not_found(proposal: Proposal) -> list[str]:
     if "temperature" not in channels:
         missing.append("the temperature. If a column holds it, add temperature with the column and unit: degC.")
     return [line for text in missing for line in textwrap.wrap(f"NOT FOUND: {text}", WIDTH, subsequent_indent="  ")]
-
-
-def _entries(entries: Entries, evidence: dict[str, str], indent: str) -> list[str]:
-    lines: list[str] = []
-    explained: set[str] = set()
-    for channel, entry in entries.items():
-        key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
-        if key in evidence and key not in explained:
-            lines += _comment(evidence[key], indent)
-            explained.add(key)
-        inner = ", ".join(f"{k}: {_scalar(v)}" for k, v in entry.items())
-        lines.append(f"{indent}{channel}: {{{inner}}}")
-    return lines
 
 
 def _comment(text: str, indent: str = "") -> list[str]:

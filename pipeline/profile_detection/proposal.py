@@ -207,7 +207,7 @@ def _labels(log: Log) -> list[str]:
             named = ", ".join(labels[:MOST_LABELS]) + " .." * (len(labels) > MOST_LABELS)
             found.append(
                 f"column {log.names[index]} labels {len(labels)} parts ({named}), which may not follow each other in "
-                "time: give each rest and turn as a window or a file of its own, see docs/by_hand.md#parts"
+                "time: give each rest and turn as a window or a separate file, see docs/by_hand.md#parts"
             )
     return found
 
@@ -238,7 +238,7 @@ def _gyroscope(
     parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: dict[str, Any]
 ) -> Guess:
     """Return the unit of the rates from the table, from gravity, or, for counts, from the configuration."""
-    moves, why_none = list[Move](), "no accelerometer beside it that determines the unit"
+    moves, why_none = list[Move](), "no accelerometer in the log that determines the unit"
     if force is not None and not parts[0].steady:
         why_none = "the rows are not one series in time, so the turns of gravity do not determine the unit"
     elif force is not None:

@@ -155,7 +155,7 @@ def _table(recording: Recording) -> list[Line]:
         texts.append("attitude")
     clock = recording.source.get("table_clock")
     if clock:
-        texts.append(f"a clock of its own, {clock['offset_s']:.6g} s ahead and gaining {clock['drift_ppm']:.3g} ppm")
+        texts.append(f"a separate clock, {clock['offset_s']:.6g} s ahead and gaining {clock['drift_ppm']:.3g} ppm")
     if texts and recording.table_attitude is None and not _turns(recording):
         texts.append("it does not change: the table did not turn, or its encoder is not connected")
     return [("table", "; ".join(texts))] if texts else []

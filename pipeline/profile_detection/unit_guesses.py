@@ -160,7 +160,13 @@ def rate_unit(rate: Values, moves: Sequence[Move], why_none: str, *, timed: bool
         guess = _counts_per_dps(moves, f"whole numbers up to {largest:.4g}: counts; {why_none}", timed=timed)
         return replace(guess, entry=guess.entry | offset)
     if moves and timed:
-        return _degrees_or_radians(moves)
+        misfit = misfit_deg(moves, (1.0, DEGREES))
+        best = int(np.argmin(misfit))
+        unit = ("deg/s", "rad/s")[best]
+        text = f"taken as {unit} they turn gravity to within {misfit[best]:.1f} deg over {len(moves)} moves"
+        if misfit[best] > CONVINCING_DEG:
+            return Guess({"unit": UNKNOWN}, f"{text}, and no better otherwise: not convincing")
+        return Guess({"unit": unit}, f"{text} (the other unit misses by {misfit[1 - best]:.0f} deg)")
     if largest > TOO_FAST_FOR_RADIANS:
         return Guess({"unit": "deg/s"}, f"up to {largest:.4g}, too fast for rad/s, so deg/s")
     return Guess({"unit": UNKNOWN}, f"up to {largest:.4g}; {why_none or 'the time is not known'}: deg/s or rad/s?")
@@ -198,16 +204,6 @@ def _usual_counts(measured: float, close: float) -> tuple[dict[str, Any], str]:
     if abs(measured / usual - 1) < close:
         return {"unit": COUNTS, "counts_per_unit": usual}, f"; {usual:g} is the usual number near it"
     return {"unit": COUNTS, "counts_per_unit": float(f"{measured:.3g}")}, ""
-
-
-def _degrees_or_radians(moves: Sequence[Move]) -> Guess:
-    misfit = misfit_deg(moves, (1.0, DEGREES))
-    best = int(np.argmin(misfit))
-    unit = ("deg/s", "rad/s")[best]
-    text = f"taken as {unit} they turn gravity to within {misfit[best]:.1f} deg over {len(moves)} moves"
-    if misfit[best] > CONVINCING_DEG:
-        return Guess({"unit": UNKNOWN}, f"{text}, and no better otherwise: not convincing")
-    return Guess({"unit": unit}, f"{text} (the other unit misses by {misfit[1 - best]:.0f} deg)")
 
 
 def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Guess:
