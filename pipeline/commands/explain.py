@@ -6,7 +6,7 @@ import json
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from pipeline.commands import parser_of
 from pipeline.commands.convert import sensor_config
@@ -35,14 +35,6 @@ examples:
 """
 
 
-class Selection(NamedTuple):
-    """Folder of a campaign's results, and the diagnoses and failures of some of its units."""
-
-    folder: Path
-    diagnoses: dict[str, JSON]
-    failures: dict[str, JSON]
-
-
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline explain C [UNIT ...]``."""
     parser = parser_of("explain", __doc__, EPILOG, ("--sensor", "--results"))
@@ -60,12 +52,15 @@ def main(argv: Sequence[str]) -> int:
         except InputError as error:
             raise InputError(f"is no diagnosis, and no calibration: {error.message}", error.file) from error
         return 0
-    sys.stdout.write(explain(find(arguments.campaign, arguments.units, Path(arguments.results))))
+    sys.stdout.write(explain(*find(arguments.campaign, arguments.units, Path(arguments.results))))
     return 0
 
 
-def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
-    """Return the diagnoses and failures of the units; ``MissingInputError`` if there are none."""
+def find(campaign: str, units: Sequence[str], results: Path) -> tuple[Path, dict[str, JSON], dict[str, JSON]]:
+    """Return the folder of the results, and the diagnoses and failures of the units.
+
+    Raises ``MissingInputError`` if there are none.
+    """
     path = Path(campaign)
     if is_published(path):
         folder, files, failures = path.parent.parent, {path.stem: path}, {}
@@ -91,12 +86,11 @@ def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
     for unit, document in diagnoses.items():
         if not _is_diagnosis(document):
             raise InputError("is no diagnosis: it is damaged, or not of this product", str(files[unit]))
-    return Selection(folder, diagnoses, {unit: f for unit, f in failures.items() if not units or unit in units})
+    return folder, diagnoses, {unit: f for unit, f in failures.items() if not units or unit in units}
 
 
-def explain(selection: Selection) -> str:
+def explain(folder: Path, diagnoses: dict[str, JSON], failures: dict[str, JSON]) -> str:
     """Return the diagnoses as text, each with the error on held-out motion and the commands that add effects."""
-    folder, diagnoses, failures = selection
     entries, results = read_history(folder), str(folder.parent)
     settings = (entries[-1].get("settings") if entries else None) or {"campaign": folder.name}
     units: list[JSON] = []

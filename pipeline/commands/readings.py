@@ -121,10 +121,24 @@ def config_of_log(
     Both may be options of ``campaign`` or, by default, of the campaign that contains the log. ``more``: overrides.
     """
     campaign = campaign or campaign_of(file)
-    return composed(named(profile, file, campaign) if profile else DEFAULT_PROFILE, sensor, campaign, more)
+    profile = _named(profile, file, campaign) if profile else DEFAULT_PROFILE
+    path = Path(profile)
+    layers = ["procedure=multi_position", *([f"sensor={sensor}"] if sensor else []), *more]
+    with tempfile.TemporaryDirectory() as folder:
+        directory = campaign or Path(folder)
+        if path.suffix in (".yaml", ".yml"):
+            if not path.is_file():
+                raise ConfigurationError("there is no such file", profile)
+            directory = Path(folder)
+            (directory / "configs" / "ingest").mkdir(parents=True)
+            copyfile(path, directory / "configs" / "ingest" / f"{path.stem}.yaml")
+        try:
+            return Composer(directory).unit("check", [*layers, f"ingest={path.stem}"])
+        except Problem as problem:
+            raise ConfigurationError(str(problem), profile if directory == Path(folder) else None) from None
 
 
-def named(profile: str, file: Path, campaign: Path | None) -> str:
+def _named(profile: str, file: Path, campaign: Path | None) -> str:
     """Return a known name of a profile unchanged, else the path of the only saved file with that name.
 
     The search includes the working directory, the folders above the log, and ``configs/ingest`` of each of these and of
@@ -144,24 +158,6 @@ def named(profile: str, file: Path, campaign: Path | None) -> str:
         valid = nearest(profile, {f.stem for place in known for f in place.parent.glob("*.yaml")})
         raise ConfigurationError(f"--ingest {profile}: no such ingest{valid}; name a profile of your own by its file")
     return str(next(iter(saved)))
-
-
-def composed(profile: str, sensor: str | None, campaign: Path | None, more: Sequence[str] = ()) -> dict[str, Any]:
-    """Return a configuration with a profile (name or file), a sensor and overrides ``more``."""
-    path = Path(profile)
-    layers = ["procedure=multi_position", *([f"sensor={sensor}"] if sensor else []), *more]
-    with tempfile.TemporaryDirectory() as folder:
-        directory = campaign or Path(folder)
-        if path.suffix in (".yaml", ".yml"):
-            if not path.is_file():
-                raise ConfigurationError("there is no such file", profile)
-            directory = Path(folder)
-            (directory / "configs" / "ingest").mkdir(parents=True)
-            copyfile(path, directory / "configs" / "ingest" / f"{path.stem}.yaml")
-        try:
-            return Composer(directory).unit("check", [*layers, f"ingest={path.stem}"])
-        except Problem as problem:
-            raise ConfigurationError(str(problem), profile if directory == Path(folder) else None) from None
 
 
 def complete_rows(file: Path, folder: Path) -> Path:

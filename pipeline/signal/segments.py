@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from itertools import groupby, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -200,12 +200,12 @@ class _Session:
 
     def _groups(self) -> list[list[Move]]:
         """Group successive moves of one kind; a new mounting of the sensor begins a new group."""
-        group, numbers = 0, [0] * len(self.moves)
-        for k, (last, move) in enumerate(pairwise(self.moves), 1):
-            group += last.kind != move.kind or bool(self.handled[last.stop : move.start].any())
-            numbers[k] = group
-        pairs = zip(numbers, self.moves, strict=True)
-        return [[move for _, move in together] for _, together in groupby(pairs, key=lambda pair: pair[0])]
+        groups = [[move] for move in self.moves[:1]]
+        for last, move in pairwise(self.moves):
+            if last.kind != move.kind or self.handled[last.stop : move.start].any():
+                groups.append([])
+            groups[-1].append(move)
+        return groups
 
     def segments(self, group: list[Move]) -> list[Segment]:
         """Return the segments of a group of moves: two where it is for both sensors, none for a transit."""
