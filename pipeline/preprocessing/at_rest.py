@@ -44,7 +44,6 @@ from pipeline.signal.rests import RATE_AT_REST_DPS, rests_from_table, runs
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.errors import IngestError
     from pipeline.records import Mask, Recording, Values
 
 
@@ -106,7 +105,7 @@ def _doubted(
         if louder > OF_RESTS * faster:
             details.append(
                 f"the {sensor} scatters {louder:.3g} times as much as in the rests of the other recordings; "
-                "its noise would be taken for that of all"
+                "its noise would be used for all of them"
             )
         elif quieter > OF_RESTS * slower:
             details.append(
@@ -182,7 +181,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_config
         raise refusal(
             recording,
             "not_at_rest",
-            f"it is for the noise at rest, and no {SHORTEST_S:g} s of it rest: {why} "
+            f"it is for the noise at rest, and no {SHORTEST_S:g} s of it are at rest: {why} "
             f"({int(moving.sum())} of {count} stretches of {size * recording.interval:.3g} s move)",
             "remove it, the noise is then taken from the rests of the other recordings, or record it again",
         )
@@ -306,35 +305,30 @@ def _check_spans(recording: Recording) -> None:
     rate, axis = recording.logged_rate, axis_index(recording)
     if rate is None:
         return
+    stuck: list[tuple[str, float, float, str]] = []  # channel, its span, the required one, unit
     if recording.gyroscope is not None:
         required, spans = _span(rate), [_span(w) for w in recording.gyroscope.T]
         turned_other = max(spans) >= SPANNED * required and int(np.argmax(spans)) != axis  # see check_mounting
         if required > LEAST_RATE_DPS and spans[axis] < SPANNED * required and not turned_other:
-            raise _stuck(recording, TRIADS["gyroscope"][axis], spans[axis], required, "deg/s")
+            stuck.append((TRIADS["gyroscope"][axis], spans[axis], required, "deg/s"))
     angle = recording.table_angle
     if angle is None:
         angle = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))
-    if recording.accelerometer is None or np.ptp(angle) < HALF_TURN_DEG:
-        return
-    spans = [_span(f) for f in recording.accelerometer.T]
-    across = [(axis + 1) % 3, (axis + 2) % 3]
-    if max(spans[i] for i in across) < LEVEL_G or spans[axis] > LEVEL_G:
-        return  # a turn about the vertical, or about another axis: see check_mounting
-    for i in across:
-        if spans[i] < SPANNED:
-            raise _stuck(recording, TRIADS["accelerometer"][i], spans[i], 1.0, "g")
+    if recording.accelerometer is not None and np.ptp(angle) >= HALF_TURN_DEG:
+        spans, across = [_span(f) for f in recording.accelerometer.T], [(axis + 1) % 3, (axis + 2) % 3]
+        # Not in a turn about the vertical or about another axis: see check_mounting.
+        if max(spans[i] for i in across) >= LEVEL_G >= spans[axis]:
+            stuck += [(TRIADS["accelerometer"][i], spans[i], 1.0, "g") for i in across if spans[i] < SPANNED]
+    for channel, span, required, unit in stuck:
+        raise refusal(
+            recording,
+            "stuck",
+            f"{channel} stays within {span:.3g} {unit} in nine tenths of the rows, while the table's motion about "
+            f"{recording.axis} makes it vary by {required:.3g} {unit}",
+            "is the column right, and does this axis of the sensor work?",
+        )
 
 
 def _span(values: Values) -> float:
     low, high = quantiles(values, *INNER)
     return float(high - low)
-
-
-def _stuck(recording: Recording, channel: str, spanned: float, required: float, unit: str) -> IngestError:
-    return refusal(
-        recording,
-        "stuck",
-        f"{channel} stays within {spanned:.3g} {unit} in nine tenths of the rows, while the table's motion about "
-        f"{recording.axis} makes it vary by {required:.3g} {unit}",
-        "is the column right, and the sensor's axis alive?",
-    )

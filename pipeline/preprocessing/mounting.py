@@ -261,11 +261,11 @@ def _applied(turn: Turn, doubt: Note | None, as_found: str) -> Recording:
     if bench.conventional and not as_found:
         return replace(recording, notes=tuple(notes))
     detail = (
-        f"{as_found or 'as stated'}, {words(bench)}: the angle is taken {bench.sense:+d} times and "
+        f"{as_found or 'as stated'}, {words(bench)}: the angle used is {bench.sense:+d} times the logged one, "
         f"{bench.offset:+.6g} deg"
     )
     if bench.vertical:
-        detail = f"as stated, body {bench.up} points up throughout; the angle is taken {bench.sense:+d} times"
+        detail = f"as stated, body {bench.up} always points up; the angle used is {bench.sense:+d} times the logged one"
     notes.append(Note("N-FOUND" if as_found else "N-MOUNTING", recording.samples, 0, 0, detail))
     return replace(
         recording,
@@ -341,8 +341,8 @@ def _face(turn: Turn, found: Bench, tolerance: float) -> _Departure | None:
             return None
     code = "wrong_sense" if found.sense != stated.sense else "wrong_face" if found.up != stated.up else "wrong_zero"
     problem = (
-        f"{turn.name} is mounted otherwise than stated, which is {words(stated)}, to {allowed:.2g} deg "
-        "(procedure.mounting_tolerance_deg)"
+        f"{turn.name} is mounted otherwise than stated, by more than {allowed:.2g} deg "
+        f"(procedure.mounting_tolerance_deg); stated is {words(stated)}"
     )
     return _Departure(turn, code, problem, _differing(found, stated, tolerance), found)
 
@@ -362,19 +362,19 @@ def _vertical(turn: Turn) -> _Departure | None:
     if fit.gravity is None:
         return None
     if fit.vertical is None:
-        problem = f"in {name} the turn axis is stated to stand vertical ({stated.up} up), and gravity turns"
+        problem = f"in {name} the turn axis is stated to be vertical ({stated.up} up), but gravity turns"
         return _Departure(turn, "wrong_face", problem, {"up": usual_up(stated.axis)})
     up = nearest_axis(fit.vertical)
     if up[1] != stated.axis:
-        problem = f"in {name} the table is said to turn about {stated.axis}, and gravity stays along body {up}"
+        problem = f"in {name} the table is said to turn about {stated.axis}, but gravity stays along body {up}"
         return _Departure(turn, "wrong_axis", problem, {"axis": up[1], "up": up})
     if up != stated.up:
         problem = (
-            f"in {name} gravity stays along body {up} while the table turns: the turn axis stands vertical, and stated "
-            f"is {stated.up} up"
+            f"in {name} gravity stays along body {up} while the table turns: the turn axis is vertical, and "
+            f"{stated.up} is stated to point up"
         )
         return _Departure(turn, "wrong_face", problem, {"up": up})
     if turn.recording.role == "accelerometer":
-        problem = f"{name} is to calibrate the accelerometer, and about a vertical axis gravity does not turn"
+        problem = f"{name} is for the accelerometer, and about a vertical axis gravity does not turn"
         return _Departure(turn, "wrong_face", problem, {})
     return None

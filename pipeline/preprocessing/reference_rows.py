@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pipeline.preprocessing.evidence import Channel, Limits
     from pipeline.records import Index, Recording, Values
 
+    Found = tuple[str, int, int, int]  # text with the places {name} and {names}; number of rows, first and last sample
 
 BY_NOISE = 10.0  # standard deviations, as of disturbances (pipeline.io.disturbances)
 BENDS = 3.0  # times the second difference: in a move as long as one interval, it is a quarter of the rate
@@ -67,10 +68,14 @@ class Comparison:
             return None
         alone = all(w.name in OF_SENSOR for w in others)
         gross, doubt = zip(*(self._rows(claim, w, alone=alone) for w in others), strict=True)
-        if note := self._worst_row(claim, others, gross) or self._worst_stretch(claim, others):
-            return True, note
-        note = self._worst_row(claim, others, doubt)
-        return (False, note) if note else None
+        contradiction = self._worst_row(claim, others, gross) or self._worst_stretch(claim, others)
+        found = contradiction or self._worst_row(claim, others, doubt)
+        if not found:
+            return None
+        name, *names = (self.limits.column(self.recording, c.name) for c in (claim, *others))
+        text, count, first, last = found
+        t, detail = self.recording.time, text.format(name=name, names=" and ".join(names))
+        return contradiction is not None, Note("N-REFERENCE", count, 0, 0, detail, float(t[first]), float(t[last]))
 
     def _rows(self, claim: Channel, other: Channel, *, alone: bool) -> tuple[Values, Values]:
         """Return the excess of each value over what another channel allows: by effects, by accuracy: (m,) arrays."""
@@ -95,7 +100,7 @@ class Comparison:
             gross, stated = off - gross, off - stated
         return np.where(np.isfinite(gross), gross, -np.inf), np.where(np.isfinite(stated), stated, -np.inf)
 
-    def _worst_row(self, claim: Channel, others: list[Channel], excess: Sequence[Values]) -> Note | None:
+    def _worst_row(self, claim: Channel, others: list[Channel], excess: Sequence[Values]) -> Found | None:
         least = np.min(excess, axis=0)
         rows = np.flatnonzero(least > 0.0)
         if not rows.size:
@@ -107,15 +112,14 @@ class Comparison:
         looks = "it looks like a spike or a jump"
         if rows.size > MANY:
             looks = "does it follow this motion, or is it frozen, reversed in time, or of another recording?"
-        name, names = self._names(claim, others)
-        message = (
-            f"{name} {'turns at' if claim.of_intervals else 'is'} {claim.low[worst]:.4g} deg/s in "
-            f"{place(self.recording, first, last)}, while {names} show {low[min(worst, len(low) - 1)]:.4g} deg/s "
+        text = (
+            f"{{name}} {'turns at' if claim.of_intervals else 'is'} {claim.low[worst]:.4g} deg/s in "
+            f"{place(self.recording, first, last)}, while {{names}} show {low[min(worst, len(low) - 1)]:.4g} deg/s "
             f"({rows.size} such {'place' if rows.size == 1 else 'places'}): {looks}"
         )
-        return self._note(message, rows.size, first, last)
+        return text, rows.size, first, last
 
-    def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Note | None:
+    def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Found | None:
         limits, n = self.limits, len(self.dt)
         for size, starts, known in self.stretches:
             turned, total, bends, _ = known[claim.name]
@@ -140,13 +144,12 @@ class Comparison:
                 shown = sums[int(np.argmin([e[worst] for e in excess]))]
                 first, last = int(starts[rows[0]]), min(int(starts[rows[-1]]) + size, n)
                 part = getattr(self.recording, claim.name)[first : last + 1]
-                name, names = self._names(claim, others)
-                message = (
-                    f"{name}{' stays the same and' if np.all(part == part[0]) else ''} contradicts {names} in "
+                text = (
+                    f"{{name}}{' stays the same and' if np.all(part == part[0]) else ''} contradicts {{names}} in "
                     f"{place(self.recording, first, last)}: it turns by {turned[worst]:.4g} deg and they by "
                     f"{shown[worst]:.4g} deg in one of {rows.size} such stretches"
                 )
-                return self._note(message, rows.size, first, last)
+                return text, rows.size, first, last
         return None
 
     def _sums(self, channel: Channel, starts: Index) -> tuple[Values, Values, Values, Values]:
@@ -159,14 +162,6 @@ class Comparison:
         swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
         angle, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
         return angle, total, bends, swing
-
-    def _names(self, claim: Channel, others: list[Channel]) -> tuple[str, str]:
-        name, *names = (self.limits.column(self.recording, c.name) for c in (claim, *others))
-        return name, " and ".join(names)
-
-    def _note(self, message: str, count: int, first: int, last: int) -> Note:
-        t = self.recording.time
-        return Note("N-REFERENCE", count, 0, 0, message, float(t[first]), float(t[last]))
 
 
 def _near(other: Channel, claim: Channel, reach: int) -> tuple[Values, Values, Values]:

@@ -202,9 +202,9 @@ def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[
             off = min(rotations, key=lambda v: float(np.linalg.norm(v)))
             if fast.turn.recording.role == "gyroscope" and np.max(np.abs(off)) > allowed:
                 details[fast.turn.name] = (
-                    f"the unit does not sit in {fast.turn.name} as in the turns for the accelerometer, by more than "
-                    f"{allowed:.2g} deg: by gravity it is rotated by {_in_words(off)}, and the gyroscope's matrix is "
-                    "off by as much; set table.seat_deg=1 to estimate it (docs/mounting.md)"
+                    f"the mounting of the unit in {fast.turn.name} differs from that in the turns for the "
+                    f"accelerometer, by more than {allowed:.2g} deg: by gravity it is rotated by {_in_words(off)}, and "
+                    "the gyroscope's matrix is wrong by as much; set table.seat_deg=1 to estimate it (docs/mounting.md)"
                 )
     return {t.name: Note("N-SEATS", t.recording.samples, 0, 0, details[t.name]) for t in turns if t.name in details}
 
@@ -240,9 +240,9 @@ def _seats_in_words(slow: Sequence[_Conventional], found: _Seats, allowed: float
     if found.zeros is None:
         seats = "; ".join(f"{c.turn.name} {_in_words(s)}" for c, s in zip(slow, found.seats, strict=True))
         return (
-            f"the unit does not sit alike in the turns, by more than {allowed:.2g} deg; its rotation against the mean "
-            f"of the turns: {seats}; set table.seat_deg=1 to estimate them, or mount it once for all turns "
-            "(docs/mounting.md)"
+            f"the mounting of the unit differs between the turns, by more than {allowed:.2g} deg; its rotation against "
+            f"the mean of the turns: {seats}; set table.seat_deg=1 to estimate it, or mount the unit once for all "
+            "turns (docs/mounting.md)"
         )
     settings = ", ".join(
         f"procedure.recordings.{c.turn.name}.zero_deg={c.bench.zero_deg + c.bench.sense * z:.2f}"
