@@ -191,8 +191,10 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     pieces: Spans = []
     for i, (start, stop) in enumerate(stretches):
         turns = np.any(off[i] > limit[i], axis=1) | (of_parts[i][1] > loud[i])
-        # Without the samples within half a window of the middle of a window in which the unit turns.
-        quiet = np.convolve(turns, np.ones(2 * (size // 2) + 1))[: stop - start] < 0.5
+        # Samples farther than half a window from the middle of each window in which the unit turns.
+        near = 2 * (size // 2) + 1
+        count = np.cumsum(np.pad(turns, (near, near - 1)))
+        quiet = (count[near:] == count[:-near])[: stop - start]
         turned = np.vstack([np.zeros(3), np.cumsum((parts[i] - reference[i]) * interval, axis=0)])
         found = _rests(quiet, turned, shortest)
         if not (found or resting[i]):
