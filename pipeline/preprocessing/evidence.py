@@ -159,12 +159,7 @@ def of_rate(recording: Recording, name: str, rate: Values, known: Mask | None = 
     return Channel(name, low, high, turned, noise)
 
 
-def opposite(channels: Sequence[Channel]) -> bool:
-    """Return whether some channel is another one with the opposite sign."""
-    return any(_alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels)
-
-
-def _alike(one: Values, two: Values) -> float:
+def alike(one: Values, two: Values) -> float:
     """Return the correlation of two angles turned in blocks; 0 if one does not turn."""
     starts = np.arange(0, len(one), SIGN_BLOCK)
     a, b = np.add.reduceat(one, starts), np.add.reduceat(two, starts)
@@ -199,10 +194,9 @@ def _gravity_turned(recording: Recording) -> Values | None:
 
 def of_gravity(recording: Recording, turned: Values, channels: Sequence[Channel]) -> Channel:
     """Return the rotation by gravity, with the sign of the gyroscope or, without it, of the most similar channel."""
-    alike = {c.name: _alike(turned, c.turned) for c in channels}
-    if abs(alike.get("gyroscope", 0.0)) > OPPOSITE:
-        alike = {"gyroscope": alike["gyroscope"]}
-    sign = -1.0 if max(alike.values(), key=abs) < 0.0 else 1.0
+    correlations = {c.name: alike(turned, c.turned) for c in channels}
+    sure = abs(correlations.get("gyroscope", 0.0)) > OPPOSITE
+    sign = -1.0 if (correlations["gyroscope"] if sure else max(correlations.values(), key=abs)) < 0.0 else 1.0
     noise = float(noise_of_steps(np.abs(np.diff(turned)))) / recording.interval
     return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
 

@@ -29,14 +29,15 @@ import numpy as np
 
 from pipeline.preprocessing.evidence import (
     LEAST_RATE_DPS,
+    OPPOSITE,
     Limits,
+    alike,
     axis_index,
     gravity_turned,
     largest_but,
     of_gravity,
     of_rate,
     of_table,
-    opposite,
     quantiles,
     ratio_quartiles,
     refusal,
@@ -189,7 +190,7 @@ def _slopes(reading: Values, rate: Values) -> Values:
 
 def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> tuple[list[Note], Delay | None]:
     channels, axis = of_table(recording), axis_index(recording)
-    if opposite(channels):
+    if any(alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels):
         rate, angle = (limits.column(recording, name) for name in ("table_rate", "table_angle"))
         problem = f"{rate} and the change of {angle} have opposite signs"
         hint = f"negate the column of one, or leave {rate} out (ingest.csv.columns.table_rate=null)"

@@ -454,7 +454,7 @@ def cases() -> dict[str, Case]:
         "48": one(
             with_angle(TABLE_ANGLE, RATE, upright=True),
             fault="wrong_face",
-            says=r"the turn axis stands vertical, and stated is \+z up; .*procedure\.recordings\.log\.up=\+x",
+            says=r"the turn axis is vertical, and \+z is stated to point up; .*procedure\.recordings\.log\.up=\+x",
         ),
         "41": Case(
             {FILE: whole, "table.csv": table_log(5.25, 40e-6)},
