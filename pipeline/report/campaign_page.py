@@ -205,7 +205,7 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
         finding = (
             f"{sensor.capitalize()}: {len(far)} of {count} units are beyond {FAR:g} × the noise floor; worst: {named}"
         )
-    dots = f"the {FARTHEST} farthest from the noise as dots, median and 5 to 95 % of all" if many else "each unit a dot"
+    dots = f"the {FARTHEST} farthest from the noise as dots, median and 5 to 95 % of all" if many else "one dot a unit"
     figure = chart(
         Figure(f"fleet-{sensor}", finding, f"Error on held-out motion, {dots}. {words}", tuple(legend)),
         f"Held-out error of {count} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "

@@ -79,7 +79,7 @@ def test_an_error_far_above_the_noise_is_told_with_that_of_held_out_moves(
     said = capsys.readouterr().out
     assert "0.1 deg/s, 10 times the noise floor." in said
     assert "explain up to 0.225 deg/s: the uncertainty of the calibration" in said
-    assert "explains an error so far above the noise; it does not show that the calibration is good" in said
+    assert "explains an error this far above the noise, but does not show that the calibration is good" in said
     assert "direction of gravity by 2.9 deg (rms); noise and stated uncertainties explain at most 8.8 deg" in said
 
 

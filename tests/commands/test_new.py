@@ -72,7 +72,7 @@ def test_the_readme_says_how_to_mount_and_record_and_what_stays_unseen(tmp_path:
     )
     assert rows["accel_z.csv"].endswith(f"| {72 * 1.45 + 1:.0f} s |")
     assert "| lever_arm | " in text
-    unseen = text.partition("## What stays unseen")[2]
+    unseen = text.partition("## What the recordings cannot show")[2]
     assert "- gyroscope, table_tilt: the direction of gravity does not change a rate" in unseen
 
 

@@ -156,7 +156,7 @@ def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_
     assert figure is not None
     density = np.sqrt(np.mean([part["terms"]["white"]["value"] ** 2 for part in noise["axes"].values()]))
     assert density == pytest.approx(0.003 * np.sqrt(0.12), rel=0.05)
-    assert figure.finding == f"White noise N = {density:.5f} g/√Hz, as the sensor file says"
+    assert figure.finding == f"White noise N = {density:.5f} g/√Hz, as the sensor file states"
     assert "static, 108 s at rest, before any filter" in figure.caption
     assert (
         "needs a wander of 0.000900 g, correlation time 50.0 s, against 0.000100 expected: it is inflated"
@@ -245,7 +245,7 @@ def test_the_stairs_go_on_to_what_the_missing_effect_would_bring() -> None:
     figure = error_steps("accelerometer", held_out, found, vector=True)
     assert figure is not None
     assert "+ quadratic nonlinearity, if added" in figure.svg
-    assert "White noise is that of the static recording, bias wander that of the sensor file" in figure.caption
+    assert "White noise is known from the static recording, bias wander from the sensor file" in figure.caption
     assert figure.finding == (
         "The error of the vector ends at 0.200 g, 10.0 × the noise floor; with the missing effects, at 0.0210"
     )
@@ -271,7 +271,7 @@ def test_every_figure_of_the_page_says_its_finding(unit: Unit) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "cause"), [(1.0, "as the sensor file says"), (6.0, "vibration at rest"), (0.1, "a filter")]
+    ("factor", "cause"), [(1.0, "as the sensor file states"), (6.0, "vibration at rest"), (0.1, "a filter")]
 )
 def test_white_noise_far_from_the_data_sheet_gets_a_likely_cause(factor: float, cause: str) -> None:
     noise = noise_at_rest(2000, factor * 1e-3 * np.sqrt(0.5 / 0.01), 0.01)
