@@ -106,7 +106,7 @@ def render(
         sensors=[s for s in SENSORS if frame[f"{s}_error_after"].notna().any()] or SENSORS,
         units=SENSOR_UNITS,
         kept=sorted(set(frame) - set(COLUMNS)),
-        beside=page,
+        page=page,
     )
     return text
 

@@ -337,7 +337,7 @@ def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, shared: Valu
         worst = f"{plain(str(names[most]))} by {number(abs(float(lots.deviation[i, most])), 2)}"
         refused = f"it differs from its {siblings} siblings (p = {number(p, 2)})"
     elif not refused and siblings < FEWEST:
-        refused = f"without outliers {siblings} siblings are left, {FEWEST} or more are needed"
+        refused = f"without outliers {siblings} siblings remain, {FEWEST} or more are needed"
     predicted = Prediction(*(values[i] for values in lots.predicted))
     return Prior(estimate.lot, siblings, refused, outlier, p, worst, predicted, known, shared)
 

@@ -2,8 +2,8 @@
 
 Ranking: bars of delta BIC. Brackets join effects with nearly equal signals: the data identify the group, but not the
 effect within it. Added-variable plot: readings against the column of one coefficient, both minus their regression on
-all other columns; the slope through the origin is the coefficient. If the points leave the line, the effect has another
-shape. All points are the binned data of the diagnosis: nothing is fitted here.
+all other columns; the slope through the origin is the coefficient. If the points are off the line, the effect has
+another shape. All points are the binned data of the diagnosis: nothing is fitted here.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a 
 EXCLUDED = 0.5  # of the upper limit by the prior alone, below which the recordings exclude an effect: convention
 MOST_LIMITS = 8  # upper limits that a chart shows
 ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, more for correlated bins
-MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they leave it by more
+MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they are farther off
 SIGNALS = {
     "temperature": "temperature, degC",
     "time": "time since power-on, s",

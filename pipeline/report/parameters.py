@@ -118,7 +118,7 @@ def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
             found.append((p, f"Scale factor error {axes}", sensor_config.get("scale_factor")))
     for p in fitted[12:]:
         held = is_held(p.name, {"value": p.value, "unit": p.unit, "standard_uncertainty": p.standard_uncertainty})
-        name = f"{p.words} (not determined, held at 0)" if held else p.words
+        name = f"{p.words} (not determined, fixed at 0)" if held else p.words
         found.append((p, name, effects.get(p.name.partition(".")[0])))
     bounds = (limit if isinstance(limit, int | float) and limit > 0 else None for *_, limit in found)
     return [
@@ -156,7 +156,7 @@ def parameter_texts(parameters: JSON | None, *, uncertain: bool = True) -> list[
     for name, given in (parameters or {}).items():
         p = given if isinstance(given, dict) else {"value": given}
         if is_held(name, p):
-            texts.append(f"{name} held at 0")
+            texts.append(f"{name} fixed at 0")
             continue
         standard = p.get("standard_uncertainty")
         expanded = p.get("expanded_uncertainty", 2.0 * standard if standard else None)

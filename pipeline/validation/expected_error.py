@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 LACK_OF_FIT = "lack of fit"  # the part of a line of the budget that noise does not explain: 0 in a correct model
 TAIL = 0.005  # probability on each side of a 99 % interval
-# Probabilities at which the factors are taken; each stands for the probability up to the middle of its neighbours.
+# Probabilities at which the factors are computed; the weight of each is the probability between the middles.
 LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
 WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
 BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time

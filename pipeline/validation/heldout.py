@@ -75,7 +75,7 @@ def validate(
     *,
     other: SensorCalibration | None = None,
 ) -> dict[str, Any]:
-    """Return a sensor's part of ``validations/<unit>.json``; arguments as of ``HeldOutCase``.
+    """Return a sensor's part of ``validations/<unit>.json``; see ``HeldOutCase`` for the arguments.
 
     The part has ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor,
     vector_noise_floor, steps`` of the published file, and ``held_out`` (false: the samples of the fit are used),
@@ -91,7 +91,7 @@ def validate(
         reason = _why_not_held_out(case)
         if count := _fitted_exactly(calibration):
             reason += (
-                f"; the fit passes through its {count} rests exactly, so that their error says nothing: record more"
+                f"; the fit passes through its {count} rests exactly, so that their error does not test it: record more"
             )
         elif samples := case.fit_samples():
             reason += "; judged on the samples of the fit"
@@ -323,7 +323,7 @@ def _why_not_held_out(case: HeldOutCase) -> str:
 
 
 def _fitted_exactly(calibration: SensorCalibration) -> int:
-    """Return the number of rests by hand that a fit passes through, as it has a parameter for each; 0 for others."""
+    """Return the number of rests by hand if the fit has a parameter for each, and so no residual; 0 otherwise."""
     for details in (stage.details for stage in calibration.stages if stage.details.get("rests_used")):
         if details["orientations_used"] + len(details[KNOWN_BY_LIMIT]) <= len(NAMES):
             return int(details["orientations_used"])
@@ -351,7 +351,7 @@ def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: floa
     unit, on_table = unit_of(case.calibration.sensor), case.settings["table"].get("motion") != "none"
     return (
         f"the calibration makes held-out motion worse: {sizes[0]:.3g} {unit} rms before it, {sizes[1]:.3g} {unit} "
-        f"after, where noise and stated uncertainties leave at most {allowed:.3g} {unit}. Check that fit and "
+        f"after, where noise and stated uncertainties explain at most {allowed:.3g} {unit}. Check that fit and "
         f"held-out recordings are of this unit in the same mounting{', and what the table logged' * on_table}"
     )
 

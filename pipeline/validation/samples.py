@@ -148,7 +148,7 @@ class HeldOutCase:
     def _at_rests(self, recording: Recording, rests: Sequence[Rest]) -> Samples | None:
         """Return the mean readings of the rests of a recording, or None without any.
 
-        The rate at which the unit creeps, as far as the accelerometer shows it, is subtracted from those of a
+        The rate at which the unit creeps, as far as the accelerometer shows it, is subtracted from the means of a
         gyroscope. Its uncertainty counts as white noise of the rest (``pipeline.signal.quiet_motion``).
         """
         sensor, noise = self.calibration.sensor, self.noise
@@ -242,7 +242,7 @@ def _truth_of_other(reading: Values | None, calibration: SensorCalibration | Non
 
 
 def reference_vector(calibration: SensorCalibration, samples: Samples) -> Values:
-    """Return the reference's magnitude along its direction, or along that of the calibrated reading: (n, 3) array."""
+    """Return the reference's magnitude along its direction, else along the calibrated reading: (n, 3) array."""
     reading = linear_truth(calibration, samples.reading)
     direction = reading
     if samples.motion is not None:

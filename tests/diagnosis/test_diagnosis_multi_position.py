@@ -151,7 +151,7 @@ def test_six_positions_are_not_enough_and_the_advice_says_what_is() -> None:
     assert "record 40 rests" in part["next_experiment"]
     noise = estimate_noise("accelerometer", unit.recordings, unit.settings["sensor"]["accelerometer"])
     judged = validate(unit.calibrated("accelerometer"), unit.recordings, noise, unit.settings)
-    assert judged["reason"].endswith("through its 6 rests exactly, so that their error says nothing: record more")
+    assert judged["reason"].endswith("through its 6 rests exactly, so that their error does not test it: record more")
     assert all(step["rms_error"] is None for step in judged["steps"])
     unit.settings["procedure"]["faces"] = {"accuracy_deg": 1.0}
     assert "beside those on the six faces" in unit.diagnosed("accelerometer")["next_experiment"]

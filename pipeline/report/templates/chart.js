@@ -12,7 +12,7 @@ const place = (axis, value, range = axis.view) => axis.start + (value - range.lo
 const valueAt = (axis, at, range = axis.view) => range.low + (at - axis.start) / (axis.stop - axis.start) * (range.high - range.low);
 const plain = (value, digits = 4) => value === 0 ? "0" : Math.abs(value) >= 1e-4 && Math.abs(value) < 1e6 ? String(+value.toPrecision(digits)) : value.toExponential(Math.min(digits - 1, 2));
 const say = (axis, value, digits) => plain(axis.kind === "log" ? 10 ** value : value, digits).replace("-", "\u2212");
-const told = (axis, value) => { // with the digits that a coordinate holds: a tenth of a pixel, or 16 bits
+const told = (axis, value) => { // with the digits of a coordinate: a tenth of a pixel, or 16 bits
   if (axis.names) return axis.names[Math.min(Math.max(Math.round(value), 1), axis.names.length) - 1];
   const step = (axis.full.high - axis.full.low) / (axis.exact ? 2 * MOST : Math.abs(axis.stop - axis.start) * SUBDIVISION);
   const share = axis.kind === "log" ? Math.LN10 * step : step / Math.abs(value);
@@ -81,7 +81,7 @@ function detail(path, x, y, zoomed) { // draws the samples of a curve within the
 
 function prepare(svg) {
   const figure = svg.closest("figure"), x = scaleOf(svg), names = window.chartNames?.[svg.dataset.names], values = window.chartValues?.[svg.getAttribute("aria-labelledby").split("-t ")[0]];
-  const readable = names ? ".dots" : ".line, .dots, .strokes"; // beside dots that are units, lines are of many units
+  const readable = names ? ".dots" : ".line, .dots, .strokes"; // where dots are units, lines summarise many units
   const panels = [...svg.querySelectorAll(".panel")].map((group) => ({ group, y: scaleOf(group), layers: group.querySelector(".layers"), grid: group.querySelector(".grid"), ticks: group.querySelector(".ticks") }));
   const xTicks = svg.querySelector(":scope > .ticks"), xTop = +xTicks.firstElementChild?.getAttribute("y");
   const readout = document.createElement("div"), cursor = document.createElementNS(SVG, "path"), frame = document.createElementNS(SVG, "rect");
@@ -304,5 +304,5 @@ for (const figure of document.querySelectorAll("figure")) {
   figure.prepend(tools);
 }
 for (const hint of document.querySelectorAll(".chart-hint")) hint.hidden = false;
-if (window.parent !== window) // shown inside of another page, such as a report of Snakemake: links to neighbours lead nowhere
+if (window.parent !== window) // shown inside of another page, such as a report of Snakemake: links to other pages do not work
   for (const link of document.querySelectorAll("a[href]:not([href^='#'])")) link.replaceWith(...link.childNodes);

@@ -19,7 +19,7 @@ function csvOf(figure, svg) {
       x.exact = y.exact = Boolean(full);
       const colour = [...path.classList].find((c) => /^c\d$/.test(c));
       const series = figure.querySelector(`.legend .${colour}`)?.parentNode.textContent.trim() ?? "";
-      const ofUnits = names && path.matches(".dots"); // a line beside them is of many units
+      const ofUnits = names && path.matches(".dots"); // a line next to them summarises many units
       for (const p of full ? full.map((v, i) => [x.samples[i], v, v]).filter(([, v]) => !Number.isNaN(v)) : pointsOf(path)) {
         const unit = ofUnits ? unitAt(x, p) : null, range = !full && path.classList.contains("strokes"), ends = [p[1], p[2]].map((v) => read(y, v));
         const place = ofUnits && p.unit === undefined ? String(unit + 1) : read(x, p[0]);

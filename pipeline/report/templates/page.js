@@ -25,7 +25,7 @@ for (const button of document.querySelectorAll(".copy button")) {
     else select();
   });
 }
-// The contents mark the part that is read, and list its own parts.
+// The contents mark the part in view, and list its sections.
 const contents = document.querySelector(".contents");
 if (contents) {
   const links = [...contents.querySelectorAll("a")], heads = links.map((link) => document.getElementById(link.hash.slice(1)));

@@ -80,7 +80,7 @@ for (const [event, now] of [["beforeprint", true], ["afterprint", false]]) addEv
 document.querySelector("p.pager")?.remove();
 box.closest("p").hidden = false;
 box.addEventListener("input", state.draw);
-box.addEventListener("focus", () => { // offers the words of those columns that few words describe
+box.addEventListener("focus", () => { // suggests the words of columns with few different values
   const offered = new Set();
   for (const column of all.tHead.rows[1].cells) {
     const words = new Set(state.rows.map((row) => text(row, column.cellIndex)));
