@@ -21,8 +21,7 @@ from pipeline.errors import InputError, MissingInputError
 from pipeline.files import read_json
 from pipeline.pack import DOCUMENTS, read_published
 from pipeline.records import SENSORS
-from pipeline.report.parameters import fitted_parameters, reading_errors
-from pipeline.report.summary import COLUMNS
+from pipeline.report.parameters import COLUMNS, fitted_parameters, reading_errors
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -20,8 +20,7 @@ from pipeline.report.fleet import parameter_table, wide
 from pipeline.report.held_out_section import FAR
 from pipeline.report.numbers import number, percent, plain, unit_text
 from pipeline.report.pages import script_data, template
-from pipeline.report.parameters import CROSS_AXIS
-from pipeline.report.summary import COLUMNS
+from pipeline.report.parameters import COLUMNS, CROSS_AXIS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

@@ -35,7 +35,7 @@ import pyarrow.parquet as pq
 
 from pipeline.files import write_atomically
 from pipeline.records import MEDIAN_SIZE, SENSORS
-from pipeline.report.summary import COLUMNS, PARAMETERS
+from pipeline.report.parameters import COLUMNS, PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -13,12 +13,14 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
+from pipeline.estimation.candidates import is_held
 from pipeline.report import numbers
-from pipeline.report.parameters import monte_carlo_of, parameter_texts, stage_details
+from pipeline.report.numbers import measured, number, plain, unit_text
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
 
+JSON = dict[str, Any]
 FOLDER = Path(__file__).parent / "templates"
 OF_NUMBERS = ("aligned", "measured", "number", "percent", "percent_change", "probability", "span", "typeset")  # filters
 PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
@@ -26,7 +28,7 @@ PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</s
 
 def _figure(value: object) -> str:
     """Return a number for a cell, empty for another value."""
-    return numbers.number(value) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
+    return number(value) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
 
 
 @cache
@@ -39,7 +41,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {name: getattr(numbers, name) for name in OF_NUMBERS}
-    environment.filters |= {"words": numbers.plain, "figure": _figure, "unit": numbers.unit_text}
+    environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}
     environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
     environment.filters |= {"script_data": script_data, "numeric": "#{}".format}
     environment.globals |= {"asset": asset, "unit_link": unit_link}
@@ -100,3 +102,56 @@ def failure_page(unit: str, failure: Mapping[str, Any]) -> str:
         f"({escape(failure['code'])}).</p><pre>{cause}</pre>\n"
         '<p><a href="../index.html">The campaign</a></p></body></html>\n'
     )
+
+
+def stage_details(stage: JSON) -> list[str]:
+    """Return the details of a stage of the fit that have one value, as texts."""
+    details = {k: v for k, v in (stage.get("details") or {}).items() if isinstance(v, int | float | str | bool)}
+    shown = {k: number(v, 4) if isinstance(v, float) else f"{v:,}" if type(v) is int else v for k, v in details.items()}
+    texts = {k: f"{plain(k)}: {text}" for k, text in shown.items()}
+    if details.get("samples_left_out"):
+        texts["samples_left_out"] += (
+            " (marked samples, and samples that the method does not use: outside of rests or steady turns, "
+            "or of a vague log)"
+        )
+    return list(texts.values())
+
+
+def parameter_texts(parameters: JSON | None, *, uncertain: bool = True) -> list[str]:
+    """Return ``name = value ± uncertainty unit`` for each parameter of an effect or a stage.
+
+    Where only a standard uncertainty is stated, twice its value is shown, which covers about 95 %.
+    """
+    texts = []
+    for name, given in (parameters or {}).items():
+        p = given if isinstance(given, dict) else {"value": given}
+        if is_held(name, p):
+            texts.append(f"{name} fixed at 0")
+            continue
+        standard = p.get("standard_uncertainty")
+        expanded = p.get("expanded_uncertainty", 2.0 * standard if standard else None)
+        value = measured(p.get("value"), expanded if uncertain else None)
+        texts.append(f"{name} = {value} {unit_text(p.get('unit'))}".rstrip())
+    return texts
+
+
+def monte_carlo_of(budget: JSON) -> JSON | None:
+    """Return the result of the Monte Carlo run of an uncertainty budget for the page; None without a run.
+
+    ``finding``: a sentence; ``rows``: the index of each uncertain parameter.
+    """
+    run = budget.get("monte_carlo")
+    if not run:
+        return None
+    if not run["trials"]:
+        return {"finding": f"No Monte Carlo run: {run['reason']}.", "rows": []}
+    rows = [j for j, U in enumerate(run["expanded_uncertainty"]) if U > 0.0]
+    validated = sum(run["validated"][j] for j in rows)
+    digit = "second" if run["digits"] == 2 else "first"
+    finding = (
+        f"Monte Carlo, {run['trials']:,} trials: the interval of {validated} of {len(rows)} parameters agrees with the "
+        f"budget's to half a unit of the {digit} digit of u."
+    )
+    if validated < len(rows):
+        finding += " Where it does not, use the Monte Carlo interval."
+    return {"finding": finding, "rows": rows}

@@ -1,10 +1,13 @@
-"""The fitted parameters of a sensor with their uncertainties, and texts of the pages about the fit.
+"""The fitted parameters of a sensor with their uncertainties, and the row of a unit in the tables of the campaign.
 
 The calibration file contains the matrix M of ``truth = M (reading - bias - effects)``. A sensor file states scale
 factor errors and cross-axis sensitivities, which are elements of ``K = M^-1`` in ``reading = bias + K truth +
 effects``:
 
     dK = -K dM K,    cov(K) = J cov(M) J^T,    J = K (x) K^T    (rows of M one after the other)
+
+In a row of the tables, the columns of every campaign (``COLUMNS``) come first, then the other columns of ``units.csv``.
+If such a column has the name of one in ``COLUMNS``, it gets the prefix ``sheet_``.
 """
 
 from __future__ import annotations
@@ -15,18 +18,26 @@ import numpy as np
 
 from pipeline.errors import first
 from pipeline.estimation.candidates import is_held
-from pipeline.records import AXES
-from pipeline.report.numbers import measured, number, percent, plain, unit_text
+from pipeline.model.calibration_file import beyond_uncertainty, left_out
+from pipeline.records import AXES, SENSORS
+from pipeline.report.held_out_section import first_and_last_step, passes
+from pipeline.report.numbers import percent, plain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 JSON = dict[str, Any]
-LEFT_OUT = (
-    "marked samples, and samples that the method does not use: outside of rests or steady turns, or of a vague log"
-)
 CROSS_AXIS = "cross_axis"  # elements of K outside its diagonal, as a sensor file limits them
 NAMED = 5  # parameters beyond the limits of the sensor file that a page lists at its top
+UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
+SENSOR_COLUMNS = (
+    "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
+    "answers",
+)  # fmt: skip
+OF_CALIBRATION = tuple(f"{s}_{c}" for c in ("implausible", "not_in_uncertainty", "not_held_out") for s in SENSORS)
+COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, "left_out")
+PARAMETERS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "fitted")
+SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
 
 
@@ -137,51 +148,64 @@ def beyond_limits(rows: Sequence[JSON], *, mounted: bool) -> list[str]:
     return first([f"{row['name'].lower()} ({percent(row['share'])})" for row in largest], NAMED)
 
 
-def stage_details(stage: JSON) -> list[str]:
-    """Return the details of a stage of the fit that have one value, as texts."""
-    details = {k: v for k, v in (stage.get("details") or {}).items() if isinstance(v, int | float | str | bool)}
-    shown = {k: number(v, 4) if isinstance(v, float) else f"{v:,}" if type(v) is int else v for k, v in details.items()}
-    texts = {k: f"{plain(k)}: {text}" for k, text in shown.items()}
-    if details.get("samples_left_out"):
-        texts["samples_left_out"] += f" ({LEFT_OUT})"
-    return list(texts.values())
+def summary_row(
+    unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, units_table_row: dict[str, str]
+) -> JSON:
+    """Return a unit's row: a dict from column to value, or None.
 
-
-def parameter_texts(parameters: JSON | None, *, uncertain: bool = True) -> list[str]:
-    """Return ``name = value ± uncertainty unit`` for each parameter of an effect or a stage.
-
-    Where only a standard uncertainty is stated, twice its value is shown, which covers about 95 %.
+    ``calibration, validation, diagnosis``: as in their files; ``units_table_row``: the unit's row of ``units.csv``.
     """
-    texts = []
-    for name, given in (parameters or {}).items():
-        p = given if isinstance(given, dict) else {"value": given}
-        if is_held(name, p):
-            texts.append(f"{name} fixed at 0")
-            continue
-        standard = p.get("standard_uncertainty")
-        expanded = p.get("expanded_uncertainty", 2.0 * standard if standard else None)
-        value = measured(p.get("value"), expanded if uncertain else None)
-        texts.append(f"{name} = {value} {unit_text(p.get('unit'))}".rstrip())
-    return texts
+    error = calibration.get("error") or {}
+    file = f"{error['file']}: " if error.get("file") else ""
+    row: JSON = dict.fromkeys(COLUMNS) | {
+        "unit": unit,
+        **{key: units_table_row.get(key) or None for key in ("serial", "lot", "date")},
+        "status": calibration.get("status"),
+        "error": f"{file}{error['message']}" if error.get("message") else None,
+        "sensor": calibration.get("sensor"),
+        "method": calibration.get("method"),
+        "pass": passes(calibration, validation),
+        "left_out": "; ".join(left_out(calibration.get("inputs"))) or None,
+    }
+    for sensor in SENSORS:
+        held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
+        raw, final = first_and_last_step(held_out)
+        selected = found.get("selected") if found.get("verdict") == "missing_effect" else None
+        errors = [step.get(error) for error in ("rms_error", "mean_abs_error") for step in (raw, final)]
+        texts = [found.get("verdict"), ";".join(selected or []) or None, found.get("reason") or None]
+        texts.append(len(found.get("answer_set") or []) or None)
+        values = [*errors, held_out.get("noise_floor"), *texts]
+        row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
+        part = calibration.get(sensor)
+        implausible = (part or {}).get("implausible") or []
+        row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
+        row[f"{sensor}_not_held_out"] = held_out.get("reason")
+        row[f"{sensor}_not_in_uncertainty"] = "; ".join(source for source, _ in beyond_uncertainty(part)) or None
+    for key, value in units_table_row.items():
+        if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
+            row[f"sheet_{key}" if key in COLUMNS else key] = value
+    return row
 
 
-def monte_carlo_of(budget: JSON) -> JSON | None:
-    """Return the result of the Monte Carlo run of an uncertainty budget for the page; None without a run.
+def sheet_columns(row: JSON) -> dict[str, str]:
+    """Return the values of a row that are from ``units.csv``."""
+    return {k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in COLUMNS)}
 
-    ``finding``: a sentence; ``rows``: the index of each uncertain parameter.
+
+def unit_parameters(calibration: JSON, sensor_configs: JSON) -> list[tuple[Any, ...]]:
+    """Return a row with the columns ``PARAMETERS`` for each parameter of a unit; none for a failed unit.
+
+    These are the fitted parameters, and the elements of K that a sensor file limits. ``sensor_configs``: the section
+    ``sensor`` of the configuration.
     """
-    run = budget.get("monte_carlo")
-    if not run:
-        return None
-    if not run["trials"]:
-        return {"finding": f"No Monte Carlo run: {run['reason']}.", "rows": []}
-    rows = [j for j, U in enumerate(run["expanded_uncertainty"]) if U > 0.0]
-    validated = sum(run["validated"][j] for j in rows)
-    digit = "second" if run["digits"] == 2 else "first"
-    finding = (
-        f"Monte Carlo, {run['trials']:,} trials: the interval of {validated} of {len(rows)} parameters agrees with the "
-        f"budget's to half a unit of the {digit} digit of u."
-    )
-    if validated < len(rows):
-        finding += " Where it does not, use the Monte Carlo interval."
-    return {"finding": finding, "rows": rows}
+    rows = []
+    for sensor in [s for s in SENSORS if calibration.get(s)]:
+        fitted = fitted_parameters(calibration[sensor])
+        limits = {row["p"]: row for row in parameter_rows(calibration[sensor], sensor_configs.get(sensor) or {})}
+        limits = {p: row for p, row in limits.items() if row["limit"]}
+        for p in dict.fromkeys([*fitted, *limits]):
+            label, limit = (limits[p]["name"], limits[p]["limit"]) if p in limits else (None, None)
+            name = f"{sensor}_{p.name.replace('.', '_')}"
+            figures = p.value, p.standard_uncertainty, p.expanded_uncertainty, limit
+            rows.append((sensor, name, label, p.unit, *figures, p in fitted))
+    return rows

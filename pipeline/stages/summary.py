@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import PipelineError
 from pipeline.history import unit_state
 from pipeline.report.pages import failure_page
-from pipeline.report.summary import sheet_columns, summary_row, unit_parameters
+from pipeline.report.parameters import sheet_columns, summary_row, unit_parameters
 
 if TYPE_CHECKING:
     from pipeline.pack import Files, Pack

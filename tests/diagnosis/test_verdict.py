@@ -13,7 +13,7 @@ from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged, verdic
 from pipeline.estimation.noise import estimate_noise
 from pipeline.outcome import commands_of
 from pipeline.records import Note, Recording
-from pipeline.report.summary import summary_row
+from pipeline.report.parameters import summary_row
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
 from pipeline.study.run import calibrated, settings_of

@@ -14,7 +14,7 @@ from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through
 from pipeline.records import LIMIT, SensorCalibration
-from pipeline.report.parameters import monte_carlo_of
+from pipeline.report.pages import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from tests.hand_session import hand_held

@@ -17,7 +17,7 @@ from pipeline.errors import InputError, MissingInputError
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.records import Recording
 from pipeline.report.fleet import write_summary
-from pipeline.report.summary import summary_row
+from pipeline.report.parameters import summary_row
 
 from .conftest import Unit, build_unit
 

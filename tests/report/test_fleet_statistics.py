@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from pipeline.report.fleet import _missing_effects, fleet_statistics, parameter_table, write_parameters
-from pipeline.report.summary import unit_parameters
+from pipeline.report.parameters import unit_parameters
 
 if TYPE_CHECKING:
     from pathlib import Path

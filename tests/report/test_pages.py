@@ -15,7 +15,7 @@ import pytest
 from pipeline.report import campaign_page
 from pipeline.report.chart import Figure, Panel, Samples, chart
 from pipeline.report.fleet import parameter_table, write_summary
-from pipeline.report.summary import COLUMNS, summary_row, unit_parameters
+from pipeline.report.parameters import COLUMNS, summary_row, unit_parameters
 from pipeline.report.unit_page import render
 
 from .conftest import SHEET, Unit, build_unit

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.report.campaign_page import ENDS, strips
 from pipeline.report.fleet import parameter_table
-from pipeline.report.summary import unit_parameters
+from pipeline.report.parameters import unit_parameters
 
 if TYPE_CHECKING:
     import pandas as pd
