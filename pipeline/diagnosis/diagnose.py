@@ -139,7 +139,7 @@ def evidence_of(
             return None
         try:
             judged_on = HeldOutCase(fit(), recordings, case.noise, settings, found.other)
-            error = last_error(judged_on, smoothed=smoothed)
+            error = last_error(judged_on, judged_on.held_out_samples(smoothed=smoothed))
         except ConvergenceError:  # the fit's effects cannot be subtracted from the held-out readings
             return None
         return None if error is None else HeldOut(error[0], *error[1])

@@ -45,11 +45,6 @@ SIGNALS = {
 }
 
 
-def evidence_figures(sensor: str, found: JSON) -> list[Figure | None]:
-    """Return the charts of a sensor's diagnosis; None in place of a chart without data."""
-    return [ranking(sensor, found), added_variable(sensor, found), *unexplained(sensor, found)]
-
-
 def limit_rows(sensor: str, found: JSON, sensor_config: JSON) -> list[JSON]:
     """Return the upper limits of each effect that was not selected as text, and as share of the sensor file's limit.
 

@@ -14,7 +14,14 @@ from pipeline.model.calibration_file import beyond_uncertainty, left_out, senten
 from pipeline.outcome import VERDICTS, commands_of, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, Line, Panel, chart
-from pipeline.report.diagnosis_section import evidence_figures, limit_rows, ranking_rows, upper_limits
+from pipeline.report.diagnosis_section import (
+    added_variable,
+    limit_rows,
+    ranking,
+    ranking_rows,
+    unexplained,
+    upper_limits,
+)
 from pipeline.report.held_out_section import (
     FAR,
     attitude_over_time,
@@ -132,7 +139,12 @@ def _sensor(
         "rests": rest_rows(part),
         "diagnosis": found,
         "ranking": ranking_rows(found),
-        "evidence_figures": [*evidence_figures(sensor, found), upper_limits(sensor, limits)],
+        "evidence_figures": [
+            ranking(sensor, found),
+            added_variable(sensor, found),
+            *unexplained(sensor, found),
+            upper_limits(sensor, limits),
+        ],
         "limits": limits,
         "implausible": sentences(sensor, part),
         "beyond": beyond_uncertainty(part),

@@ -207,14 +207,6 @@ def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[Lin
     return [max(low - earth, 0.0), high + earth]
 
 
-def last_error(case: HeldOutCase, *, smoothed: bool = False) -> tuple[float, list[float]] | None:
-    """Return the rms error after the last step and its interval; None without held-out motion or interval.
-
-    With ``smoothed``, the reference of a filtered recording passes its filter as well: the filter then causes no error.
-    """
-    return _error_and_interval(case, case.held_out_samples(smoothed=smoothed))
-
-
 def static_error(case: HeldOutCase) -> tuple[float, list[float]] | None:
     """Return the error of the mean of the static recording, and its interval as a held-out rest; None without one.
 
@@ -222,7 +214,7 @@ def static_error(case: HeldOutCase) -> tuple[float, list[float]] | None:
     its component in the recording are unknown.
     """
     static = {r.name: [Rest(0, r.samples)] for r in case.recordings if r.role == "static" and r.samples}
-    judged = _error_and_interval(case, [s for s in case.at_rests(static) if s.known.any()])
+    judged = last_error(case, [s for s in case.at_rests(static) if s.known.any()])
     if judged is None:
         return None
     error, (low, high) = judged
@@ -230,8 +222,8 @@ def static_error(case: HeldOutCase) -> tuple[float, list[float]] | None:
     return error, [max(low - turning, 0.0), high + turning]
 
 
-def _error_and_interval(case: HeldOutCase, samples: Sequence[Samples]) -> tuple[float, list[float]] | None:
-    """Return the rms error of samples after the last step and its interval; None where either is unknown."""
+def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> tuple[float, list[float]] | None:
+    """Return the rms error of samples after the last step and its interval; None without samples or interval."""
     errors = [last_error_of_magnitude(case.calibration, s) for s in samples]
     parts = [linearized(case.calibration, s) for s in samples if s.known.any()]
     complete = [p for p in parts if p is not None]

@@ -114,7 +114,10 @@ class HeldOutCase:
         return any(r.role == "rests" for r in self.recordings)
 
     def held_out_samples(self, *, smoothed: bool = False) -> list[Samples]:
-        """Return the samples of recordings of role ``validation``, else those of held-out rests."""
+        """Return the samples of recordings of role ``validation``, else those of held-out rests.
+
+        ``smoothed``: see ``samples_of_motion``.
+        """
         found = self._in_motion("validation", smoothed=smoothed)
         if found or not self.by_hand:
             return found

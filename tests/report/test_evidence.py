@@ -59,7 +59,7 @@ def test_bars_end_where_their_evidence_is_and_the_gate_stands_at_ten() -> None:
         assert start == zero
         assert (end - zero) / (gate - zero) == pytest.approx(float(scaled(value, "symlog")), abs=0.01)
     assert scaled([10.0, -5.0, -1000.0], "symlog").tolist() == [1.0, -0.5, -3.0]
-    assert "1 more has less evidence" in figure.caption
+    assert "1 more effect has less evidence" in figure.caption
 
 
 def test_effects_that_cannot_be_seen_are_named_and_look_alikes_are_bracketed() -> None:
@@ -167,7 +167,7 @@ def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_
     calm = allan("accelerometer", noise, sheet | {"noise_density": 1e-3}, wander | {"inflated": False})
     assert calm is not None
     assert "inflated" not in calm.caption
-    assert "1.5 × that of the sensor file" in calm.finding
+    assert "1.5 × the value of the sensor file" in calm.finding
     assert allan("accelerometer", noise_at_rest(50), sheet, wander) is None
     assert allan("accelerometer", None, sheet, wander) is None
 
