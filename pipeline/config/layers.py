@@ -14,7 +14,7 @@ where
     overrides: [filter=rc_low_pass]   # Hydra overrides of every unit, and settings of the run
     models: {mpu6050: [filter=none]}  # of the units of a sensor model
     lots: {"12": [filter.order=2]}    # of the units of a production lot
-    compare: [[U1, U2]]               # comparisons on the campaign's page; see pipeline.config.comparisons
+    compare: [[U1, U2]]               # comparisons on the campaign's page; see pipeline.config.campaign
     simulate: true                    # the run simulates the recordings that simulation.yaml in this folder describes
     page: thesis                      # the run writes this page in addition to the campaign's page
 """

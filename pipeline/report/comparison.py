@@ -1,6 +1,6 @@
 """Comparison of groups of units on the campaign's page: means and differences with uncertainties, charts and tables.
 
-The groups are those that the configuration resolves (``pipeline.config.comparisons``). Errors are positive and differ
+The groups are those that the configuration resolves (``pipeline.config.campaign``). Errors are positive and differ
 by factors, so their logarithms are compared: the mean of a group is the geometric mean, a difference is a ratio. Of n
 units with values v_i, the mean and its standard uncertainty are
 
@@ -269,7 +269,7 @@ def against_truth(figures: JSON, truth: JSON) -> float | None:
 
 
 def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
-    """Return the data of a comparison, as ``pipeline.config.comparisons`` resolves it, for the page.
+    """Return the data of a comparison, as ``pipeline.config.campaign`` resolves it, for the page.
 
     ``figures``: ``unit_figures`` of all units, none of failed ones; ``name``: an identifier, unique on the page.
     """

@@ -23,8 +23,7 @@ from pipeline.report.group_charts import Point, curves, stems
 from pipeline.report.held_out_section import held_out_over_time
 from pipeline.report.numbers import MINUS, NOTHING, number
 from pipeline.report.pages import template
-from pipeline.thesis.conclusions import KINDS, Errors, conclusions, verdict_of
-from pipeline.thesis.errata import agreements, evidence, scatters
+from pipeline.thesis.findings import KINDS, Errors, agreements, conclusions, evidence, scatters, verdict_of
 from pipeline.thesis.seeds import CAUSES, device_of
 from pipeline.thesis.tables import (
     CONTINUOUS,

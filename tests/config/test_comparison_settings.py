@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from pipeline.config import load_campaign
-from pipeline.config.comparisons import resolve_comparisons
+from pipeline.config.campaign import resolve_comparisons
 from pipeline.errors import ConfigurationError
 
 SHEET = """unit,serial,method,rate_dps,overrides

@@ -15,7 +15,7 @@ from pipeline.records import Recording, SensorCalibration, coverage_factor
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_description
-from pipeline.thesis.errata import TRUE_SCALE
+from pipeline.thesis.findings import TRUE_SCALE
 from pipeline.thesis.seeds import FOUND, study_of
 from pipeline.thesis.tables import DEVICES, SILENT, read_printed
 from pipeline.validation.samples import samples_of_motion

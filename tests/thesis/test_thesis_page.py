@@ -10,8 +10,7 @@ import pytest
 from pipeline.io.yaml_file import read_yaml
 from pipeline.records import Recording
 from pipeline.signal.filters import apply_filter
-from pipeline.thesis.conclusions import CONFIRMED, REFUTED, conclusions, gain_of_filter
-from pipeline.thesis.errata import agreements, scatters
+from pipeline.thesis.findings import CONFIRMED, REFUTED, agreements, conclusions, gain_of_filter, scatters
 from pipeline.thesis.page import key_of, render
 from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S, sets_of
 from pipeline.thesis.tables import Results, all_tables, with_differences
