@@ -34,7 +34,7 @@ from pipeline.estimation.design import Term
 from pipeline.estimation.gauss_markov import WHITE, Setting
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import Fit, fit
-from pipeline.estimation.multi_position.likelihood import NEW, NoiseHypothesis, project_out
+from pipeline.estimation.multi_position.model import NEW, NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
 from pipeline.estimation.multi_position.selection import FAR, Selection, posterior
 from pipeline.estimation.selection import GATE_BIC

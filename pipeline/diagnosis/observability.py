@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.candidates import MOUNTING, ZERO
-from pipeline.estimation.multi_position.model import refusal
+from pipeline.estimation.multi_position.selection import refusal
 from pipeline.estimation.selection import GATE_BIC, Selection
 from pipeline.model.effects import catalogue, effect
 

@@ -33,7 +33,7 @@ import scipy
 
 from pipeline.estimation.design import Term
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
-from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, log_likelihood, project_out
+from pipeline.estimation.multi_position.model import NoiseHypothesis, log_likelihood, project_out
 from pipeline.estimation.ranking import RIDGE
 from pipeline.estimation.selection import ALIKE, DELAYS, GATE_BIC, GATE_P, Selection
 

@@ -30,8 +30,7 @@ from pipeline.estimation.monte_carlo import KEY, beside_trials, quadratic_result
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, AccelerometerModel, limit_of_misalignment
 from pipeline.estimation.multi_position.fit import Fit
 from pipeline.estimation.multi_position.fit import fit as fit_model
-from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, prior_hypotheses
-from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.model import NoiseHypothesis, State, prior_hypotheses
 from pipeline.estimation.multi_position.result import (
     NOT_INCLUDED,
     after_stage,

@@ -19,8 +19,7 @@ from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
 from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, model_of
-from pipeline.estimation.multi_position.likelihood import NEW, prior_hypotheses
-from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.model import NEW, State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import noise_of, prior_of

@@ -38,8 +38,7 @@ from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import Posterior
 from pipeline.estimation.least_squares import ScaledColumns, gauss_newton
-from pipeline.estimation.multi_position.likelihood import NEW, NoiseHypothesis, project_out
-from pipeline.estimation.multi_position.model import Equations, Model, State, stepped
+from pipeline.estimation.multi_position.model import NEW, Equations, Model, NoiseHypothesis, State, project_out, stepped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -24,9 +24,8 @@ from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, tr
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
 from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_observable
-from pipeline.estimation.multi_position.likelihood import prior_hypotheses, selection_hypotheses
-from pipeline.estimation.multi_position.model import Model, State, refusal, stepped
-from pipeline.estimation.multi_position.selection import Selection, fit_configured
+from pipeline.estimation.multi_position.model import Model, State, prior_hypotheses, selection_hypotheses, stepped
+from pipeline.estimation.multi_position.selection import Selection, fit_configured, refusal
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.table_errors import TIME_BASE

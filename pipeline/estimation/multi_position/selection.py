@@ -2,7 +2,7 @@
 
     delta BIC > 10   and   m p < 0.01
 
-with the gain, delta BIC and p of ``likelihood`` and m the number of candidates. After each acceptance all parameters
+with the gain, delta BIC and p of ``model`` and m the number of candidates. After each acceptance all parameters
 are fitted and every column is computed again. An effect that would need more than ten times its limit in the sensor
 file is not accepted as an explanation of a few rests. A selected effect whose delta BIC has become negative is dropped.
 A selected effect that another one replaces with delta BIC > 10 is exchanged.
@@ -26,18 +26,25 @@ from pipeline.estimation.design import Term
 from pipeline.estimation.evidence import Problem, linear_problem
 from pipeline.estimation.gauss_markov import random_walks
 from pipeline.estimation.multi_position.fit import Fit, fit
-from pipeline.estimation.multi_position.likelihood import NEW, NoiseHypothesis, project_out, selection_hypotheses
-from pipeline.estimation.multi_position.model import Model, State, refusal
+from pipeline.estimation.multi_position.model import (
+    NEW,
+    Model,
+    NoiseHypothesis,
+    State,
+    project_out,
+    selection_hypotheses,
+)
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
 from pipeline.model.effects import catalogue, effect
+from pipeline.model.effects.base import Effect, Owner
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from typing import Any
 
-    from pipeline.model.effects.base import Effect
+    from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Noise, SensorCalibration, Values
 
 
@@ -253,6 +260,21 @@ class Selection:
 def _nonlinear(this: Effect, sensor: str) -> Mask:
     """Return which parameters of an effect are not linear: (p,) array."""
     return np.array([p.name in this.nonlinear for p in this.parameters(sensor)])
+
+
+def refusal(this: Effect, sensor: str, rests: Rests) -> str:
+    """Return why an effect cannot be in a model without a table; empty if it can."""
+    unknown = [need for need in this.needs if need != "temperature"]
+    checks = [
+        (sensor not in this.sensors, f"{this.name} is no effect of the {sensor}"),
+        (sensor in this.unseen, this.unseen.get(sensor, "")),
+        (this.owner == Owner.TABLE or this.moves, "there is no table"),
+        (this.owner == Owner.MOUNTING, "by hand nobody knows the unit's heading, nor about which point it turns"),
+        ("temperature" in this.needs and np.isnan(rests.temperature).any(), "the recordings hold no temperature"),
+        (bool(unknown), f"without a table nobody knows the {' and '.join(unknown)}"),
+        (this.needs_clock and not rests.clock_shared, "the time between the recordings is not known"),
+    ]
+    return next((reason for applies, reason in checks if applies), "")
 
 
 def posterior(selection: Selection, hidden: Collection[str]) -> Answers:

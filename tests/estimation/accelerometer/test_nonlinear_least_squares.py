@@ -13,8 +13,7 @@ from pipeline.estimation.accelerometer.nonlinear_least_squares import fit, trian
 from pipeline.estimation.gauss_markov import Prior
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.fit import fit as fit_model
-from pipeline.estimation.multi_position.likelihood import prior_hypotheses
-from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.model import State, prior_hypotheses
 from pipeline.estimation.rest_means import gathered, held_out_rests, rest_means
 from pipeline.estimation.stages import apply_correction
 from pipeline.model.calibration_file import not_determined

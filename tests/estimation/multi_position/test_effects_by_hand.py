@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from pipeline.errors import NotObservableError
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.multi_position.accelerometer import model_of
-from pipeline.estimation.multi_position.likelihood import selection_hypotheses
+from pipeline.estimation.multi_position.model import selection_hypotheses
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of
 from pipeline.estimation.noise import estimate_noise
 from pipeline.validation.heldout import validate

@@ -7,8 +7,7 @@ import pytest
 from scipy.special import chdtrc, fdtrc
 
 from pipeline.estimation.gauss_markov import Setting
-from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
-from pipeline.estimation.multi_position.model import Equations
+from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis, project_out
 
 WHITE = [NoiseHypothesis(Setting(0.0, 1.0), (0.0,))]
 
