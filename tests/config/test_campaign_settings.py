@@ -34,6 +34,13 @@ def test_each_layer_of_precedence_is_stronger_than_the_one_before(tmp_path: Path
     assert [swapped[u].config["filter"]["name"] for u in swapped] == ["high_pass", "none", "none", "none"]
 
 
+def test_the_command_line_is_stronger_than_the_campaign_for_settings_of_the_run(tmp_path: Path) -> None:
+    directory = campaign(tmp_path, "unit\nU1\nU2\nU3\n", "overrides: [batch_size=1, publish_limit=7]")
+    assert (len(load(directory).batches), load(directory).publish_limit) == (3, 7)
+    stated = load(directory, overrides=["batch_size=2"])
+    assert (len(stated.batches), stated.publish_limit) == (2, 7)
+
+
 def test_a_plain_string_is_one_override(tmp_path: Path) -> None:
     directory = campaign(tmp_path, "unit\nU1\n")
     assert load(directory, overrides="table.gravity_g=0.998").units["U1"].config["table"]["gravity_g"] == 0.998

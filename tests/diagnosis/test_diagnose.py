@@ -15,6 +15,7 @@ from bench_session import CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, Course
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
+from pipeline.estimation import reference_least_squares
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
 from pipeline.model.effects import effect_from, forget, register
@@ -134,10 +135,31 @@ def test_the_second_of_two_effects_is_named_beside_a_configured_one() -> None:
     assert "g_sensitivity" not in {entry["effect"] for entry in part["ranking"]}
 
 
+@pytest.mark.parametrize(("offset", "verdict"), [(0.007, "nothing_missing"), (0.05, "reference_in_doubt")])
+def test_a_static_recording_may_face_another_way_and_no_more(offset: float, verdict: str) -> None:
+    """Earth's rotation is 0.0042 deg/s; the bias of the turns holds an unknown part of it, and so does the rest."""
+    away = np.array([0.0, 0.0, offset])
+    recordings = [
+        replace(r, gyroscope=r.gyroscope + away) if r.role == "static" and r.gyroscope is not None else r
+        for r in record(Session(3, static=True, white=0.1, wander=0.1))
+    ]
+    method = {"method": {"gyroscope": "reference_least_squares"}}
+    sheet = SHEET["gyroscope"] | {"bias_wander": 3e-4, "counts_per_unit": 1e5}
+    noise = estimate_noise("gyroscope", recordings, sheet)
+    of_unit = settings("gyroscope") | method | {"sensor": SHEET | {"gyroscope": sheet}}
+    fitted = reference_least_squares.fit("gyroscope", recordings, None, of_unit)
+    found = diagnose(fitted, recordings, noise, of_unit)
+    assert found["verdict"] == verdict, found["reason"]
+
+
 def test_a_part_holds_every_field_and_is_json() -> None:
     part = json.loads(json.dumps(named("accelerometer", "quadratic_nonlinearity")))
     assert set(part) >= KEYS
     assert all(set(entry) == ENTRY for entry in part["ranking"])
+    others = [entry["delta_bic"] for entry in part["ranking"] if entry["effect"] not in part["selected"]]
+    assert others == sorted(others, reverse=True)
+    assert len(others) > 10
+
     listed = {e["effect"] for e in part["ranking"]} | {e["effect"] for e in part["not_observable"]}
     assert {"warm_up", "table_tilt", "lever_arm", "low_pass_lag", "bias_drift"} <= listed
 

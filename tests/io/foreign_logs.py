@@ -95,8 +95,11 @@ def write_raw_ulog(path: Path, truth: Truth, messages: dict[str, tuple[str, NDAr
     return path
 
 
-def write_dataflash(path: Path, truth: Truth, instances: int = 2) -> Path:
-    """Write a DataFlash log with the formats, units and multipliers that ArduPilot 4 writes, by pymavlink."""
+def write_dataflash(path: Path, truth: Truth, instances: int = 2, warmth: str = "f") -> Path:
+    """Write a DataFlash log with the formats, units and multipliers that ArduPilot 4 writes, by pymavlink.
+
+    ``warmth``: format of the temperature; ``c``: in whole hundredths.
+    """
     log = DFReader_binary.__new__(DFReader_binary)
     log.formats = {0x80: DFFormat(0x80, "FMT", 89, "BBnNZ", "Type,Length,Name,Format,Columns")}
     columns = "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"
@@ -104,7 +107,7 @@ def write_dataflash(path: Path, truth: Truth, instances: int = 2) -> Path:
         "UNIT": DFFormat(177, "UNIT", 0, "QbZ", "TimeUS,Id,Label"),
         "MULT": DFFormat(178, "MULT", 0, "Qbd", "TimeUS,Id,Mult"),
         "FMTU": DFFormat(179, "FMTU", 0, "QBNN", "TimeUS,FmtType,UnitIds,MultIds"),
-        "IMU": DFFormat(180, "IMU", 0, "QBffffffIIfBBHH", columns),
+        "IMU": DFFormat(180, "IMU", 0, f"QBffffffII{warmth}BBHH", columns),
     }
     out = [log.make_format_msgbuf(log.formats[0x80]), *(log.make_format_msgbuf(f) for f in known.values())]
     for letter, label in {"s": b"s", "#": b"instance", "E": b"rad/s", "o": b"m/s/s", "O": b"degC", "z": b"Hz"}.items():
@@ -113,7 +116,8 @@ def write_dataflash(path: Path, truth: Truth, instances: int = 2) -> Path:
     out.append(log.make_msgbuf(known["FMTU"], [0, 180, b"s#EEEooo--O--zz", b"F-000000-00--00"[:15]]))
     for us, rate, force, warm in zip(truth.time_us.tolist(), truth.rate, truth.force, truth.warmth, strict=True):
         for i in range(instances):
-            values = [us, i, *rate, *(force + i), 0, 0, warm, 1, 1, 1000, 1000]
+            stored = round(100 * warm) if warmth == "c" else warm
+            values = [us, i, *rate, *(force + i), 0, 0, stored, 1, 1, 1000, 1000]
             out.append(log.make_msgbuf(known["IMU"], values))
     path.write_bytes(b"".join(out))
     return path

@@ -115,6 +115,16 @@ def test_ulog_agrees_with_pyulog(tmp_path: Path) -> None:
     )
 
 
+def test_hundredths_in_a_dataflash_log_are_read_as_pymavlink_reads_them(tmp_path: Path) -> None:
+    truth = Truth()
+    path = write_dataflash(tmp_path / "log.bin", truth, warmth="c")
+    with DFReader_binary(str(path)) as log:
+        messages = [m for m in iter(lambda: log.recv_match(type="IMU"), None) if m.I == 0]
+    table = read(path, "ardupilot")
+    np.testing.assert_allclose(table.values["temperature"], [m.T for m in messages], rtol=1e-12)
+    np.testing.assert_allclose(table.values["temperature"], truth.warmth, atol=0.0051)
+
+
 def test_the_loggers_times_of_a_ulog_are_those_of_its_messages(tmp_path: Path) -> None:
     path = write_ulog(tmp_path / "log.ulg", Truth())
     stamps = ULog(str(path)).get_dataset("sensor_combined").data["timestamp"].astype(np.int64)

@@ -113,6 +113,19 @@ def test_a_static_recording_of_another_unit_is_in_doubt(number: int, doubts: int
     assert len(doubts_of("accelerometer", checked)) == doubts
 
 
+def test_of_a_static_recording_that_tilts_slowly_only_what_rests_is_used() -> None:
+    """No second of it is louder than another: 0.05 deg/s turns gravity by 0.9 mg in one, and by 87 mg in the end."""
+    time = 0.1 * np.arange(3000)
+    tilt = np.radians(0.05 * np.clip(time - 200.0, 0.0, None))
+    force = np.column_stack([np.sin(tilt), np.zeros(3000), np.cos(tilt)])
+    force += 2e-3 * np.random.default_rng(4).standard_normal(force.shape)
+    static = Recording("static", "static", None, (time * 1e9).astype(np.int64), force)
+    (found,) = check_static([static], {"sensor": {"accelerometer": {"bias_wander": 1e-4, "noise_density": 9e-4}}})
+    assert [note.code for note in found.notes] == ["N-MOVED"]
+    assert found.time[0] == 0.0
+    assert 190.0 < found.time[-1] < 220.0  # 12 mg, six standard deviations, are reached after 14 s
+
+
 def test_gravity_that_was_left_at_1_g_is_noted_with_that_of_the_latitude() -> None:
     placed = SETTINGS | {"table": SETTINGS["table"] | {"latitude_deg": 52.2946, "azimuth_deg": 0.0}}
     details = [n.detail for r in check_recordings(list(sound()), placed) for n in r.notes if n.code == "N-GRAVITY"]

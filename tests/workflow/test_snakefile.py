@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from pipeline.config import code_digest
+
 from .conftest import ROOT, Bench, Run
 from .schemas import validator, violations
 
@@ -100,6 +102,21 @@ def test_a_mended_unit_reruns_its_batch_only(runs: Mended) -> None:
     assert runs.mended.code == 0
     assert any(REFERENCE in job for job in runs.mended.jobs)
     assert not [job for job in runs.mended.jobs if STAGED in job]
+
+
+def test_a_change_in_the_code_of_a_method_makes_its_fits_again(runs: Mended) -> None:
+    """Snakemake runs a job again where its command differs, which holds a digest of the code."""
+    found = re.findall(r" fit .*--sensor (\S+) --stage (\S+) .*--code (\S+) ", runs.first.output)
+    codes = {(sensor, stage): code for sensor, stage, code in found}
+    modules = {
+        ("accelerometer", "reference_least_squares"): "reference_least_squares",
+        ("gyroscope", "reference_least_squares"): "reference_least_squares",
+        ("accelerometer", "misalignment"): "accelerometer.staged",
+        ("gyroscope", "bias"): "gyroscope.staged",
+    }
+    for job, module in modules.items():
+        assert codes[job].endswith(code_digest(f"pipeline.estimation.{module}"))
+        assert code_digest("pipeline.stages.fit") in codes[job]
 
 
 def test_every_file_of_a_unit_is_published_under_its_stable_path(bench: Bench) -> None:
