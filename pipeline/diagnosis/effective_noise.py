@@ -1,12 +1,12 @@
-"""The white noise that would scatter averages as much as a calibration errs in motion.
+"""Compute the effective noise in motion: white noise whose averages scatter as much as those of the error in motion.
 
     n_e(t)^2 = t var(mean of the error over t),    over_white = n_e / n,   n^2 = white^2 dt
 
-where the error is that of the calibrated readings on held-out motion less its mean, which an estimator takes as bias,
-and the variance is over stretches of length t, one after the other, and the axes (of the magnitude where no attitude is
-logged). White noise alone gives n at every t. Effects that are not compensated add errors which last as long as the
-motion does: so figures of an estimator that fit its motion are several times those at rest. The share of an effect that
-the diagnosis found is n_e of its own error, by the parameters of the diagnosis.
+The error is that of the calibrated readings on held-out motion, of the vector or, without a logged attitude, of the
+magnitude. Its mean is subtracted, since an estimator takes it as bias. The variance is over consecutive stretches of
+length t and the axes. White noise alone gives n at every t. Effects that are not compensated add errors that last as
+long as the motion, so an estimator needs several times the noise at rest. The share of an effect that the diagnosis
+found is n_e of the effect's own error, by the parameters of the diagnosis.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.model.effects import effect_of
-from pipeline.model.effects.base import truth
+from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.measurement import linear_truth
 from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, Values
 from pipeline.validation.error_breakdown import last_step
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 AVERAGING_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
-FEWEST = 8  # stretches, which tell a standard deviation to a quarter
+FEWEST = 8  # stretches, which determine a standard deviation to a quarter
 
 
 def effective_noise(
@@ -41,39 +41,39 @@ def effective_noise(
 ) -> dict[str, Any] | None:
     """Return the effective noise of a sensor; None without held-out motion.
 
-    ``found``: the sensor's diagnosis; ``other``: calibration of the other sensor. The result has ``unit``,
+    ``found``: the sensor's diagnosis. ``other``: calibration of the other sensor. The result has ``unit``,
     ``recordings``, ``motion`` (rms rate in deg/s, rms change of the specific force in g, duration in s), ``white`` (n)
     and ``densities``: for each averaging time ``density``, ``over_white`` and the share of each effect.
     """
-    sensor = calibration.sensor
     held_out = [r for r in recordings if r.role == "validation"]
-    samples = [(r, s) for r in held_out if (s := samples_of_motion(sensor, r, noise, table, other=other)) is not None]
-    errors = [(r, s, e) for r, s in samples if (e := _error(calibration, s)) is not None]
+    of_motion = ((r, samples_of_motion(calibration.sensor, r, noise, table, other=other)) for r in held_out)
+    samples = [(r, s) for r, s in of_motion if s is not None]
+    errors = [(r, (s.time, e)) for r, s in samples if (e := _error(calibration, s)) is not None]
     if not errors:
         return None
-    effects = {name: [_of_effect(calibration, s, found, name) for _, s in samples] for name in found["selected"]}
-    white = float(np.sqrt(np.mean(noise.white**2) * errors[0][0].interval))
+    of_effects = {}
+    for name in found["selected"]:
+        of_effect = [(s.time, _of_effect(calibration, s, found, name)) for _, s in samples]
+        if all(error is not None for _, error in of_effect):
+            of_effects[name] = of_effect
     interval = errors[0][0].interval
+    white = float(np.sqrt(np.mean(noise.white**2) * interval))
     densities = []
     for time in dict.fromkeys(max(1, round(t / interval)) * interval for t in AVERAGING_S):  # whole samples
-        density = _density([(s.time, e) for _, s, e in errors], time)
+        density = _density([error for _, error in errors], time)
         if density is None:
             continue
-        parts = [
-            {"effect": name, "density": _density([(s.time, e) for (_, s), e in zip(samples, of, strict=True)], time)}
-            for name, of in effects.items()
-            if all(e is not None for e in of)
-        ]
+        shares = [{"effect": name, "density": _density(error, time)} for name, error in of_effects.items()]
         ratio = density / white if white > 0 else None
         densities.append(
-            {"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": parts}
+            {"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": shares}
         )
     if not densities:
         return None
     return {
-        "unit": f"{'g' if sensor == 'accelerometer' else 'deg/s'}/sqrt(Hz)",
-        "recordings": [r.name for r, _, _ in errors],
-        "motion": _motion([r for r, _, _ in errors]),
+        "unit": f"{unit_of(calibration.sensor)}/sqrt(Hz)",
+        "recordings": [r.name for r, _ in errors],
+        "motion": _motion([r for r, _ in errors]),
         "white": white,
         "densities": densities,
     }
@@ -81,15 +81,15 @@ def effective_noise(
 
 def _error(calibration: SensorCalibration, samples: Samples) -> Values | None:
     """Return the error of calibrated readings, (n, 3), or of their magnitude, (n, 1); None if an effect is left out."""
-    found = last_step(calibration, samples)
-    if found is None:
+    corrected = last_step(calibration, samples)
+    if corrected is None:
         return None
-    vector, magnitude, true = found
+    vector, magnitude, true = corrected
     return (np.linalg.norm(vector, axis=1) - magnitude)[:, None] if true is None else vector - true
 
 
 def _of_effect(calibration: SensorCalibration, samples: Samples, found: Mapping[str, Any], name: str) -> Values | None:
-    """Return the error that an effect of the diagnosis leaves: (n, 3); None where motion or parameters are unknown."""
+    """Return the error by an effect of the diagnosis: (n, 3); None if motion or parameters are unknown."""
     entry = next((e for e in found["ranking"] if e["effect"] == name), None)
     motion = samples.motion
     if entry is None or motion is None or not entry.get("parameters"):
@@ -106,14 +106,13 @@ def _of_effect(calibration: SensorCalibration, samples: Samples, found: Mapping[
 
 
 def _density(parts: Sequence[tuple[Values, Values | None]], time: float) -> float | None:
-    """Return n_e of errors at sample times; None where an averaging time holds no sample or there are few of them."""
+    """Return n_e from the times and errors of recordings; None for too few stretches or samples in a stretch."""
     squares, count = 0.0, 0
-    for at, error in parts:
-        if error is None or len(at) < 2:
+    for times, error in parts:
+        if error is None or len(times) < 2:
             continue
-        known = np.isfinite(error).all(axis=1)
-        size = round(time / float(np.median(np.diff(at))))
-        values = error[known]
+        size = round(time / float(np.median(np.diff(times))))
+        values = error[np.isfinite(error).all(axis=1)]
         stretches = len(values) // size if size else 0
         if not stretches:
             continue
@@ -124,7 +123,7 @@ def _density(parts: Sequence[tuple[Values, Values | None]], time: float) -> floa
 
 
 def _motion(recordings: Sequence[Recording]) -> dict[str, float | None]:
-    """Return how much held-out motion moves, by the readings."""
+    """Return the extent of held-out motion by the readings."""
     rates = [r.gyroscope - np.nanmedian(r.gyroscope, axis=0) for r in recordings if r.gyroscope is not None]
     forces = [r.accelerometer - np.nanmean(r.accelerometer, axis=0) for r in recordings if r.accelerometer is not None]
     rms = [float(np.sqrt(np.nanmean(np.sum(np.concatenate(v) ** 2, axis=1)))) if v else None for v in (rates, forces)]

@@ -1,144 +1,299 @@
-"""The formula of physics that the catalogue does not hold, judged against catalogue and recordings, as an effect file.
+"""Search for a formula of physics outside the catalogue, and write it as an effect file.
 
-The search (``pipeline.diagnosis.functional_form_search``) is made in addition to the selected effects, and again
-without them, since they may have been selected instead of the form. With each form in the base, effects are selected
-again. Of these models, and that of the catalogue alone, the one with the least
+Every form of the grammar (``pipeline.diagnosis.functional_forms``) is scored as an effect would be: base and effects
+are projected out, and the noise is that of the engine. On the a axes that it improves, its score is
+
+    2 (max log L' - max log L) - (r a + s) log N - 2 C log 10
+
+with r coefficients, s scanned constants, N readings and complexity C: each choice of the grammar is one of about ten.
+Constants are scanned coarsely, then more finely about the best. Further terms are added if their scores are clear.
+
+The search is made in addition to the selected effects, and again without them, since they may have been selected
+instead of the form. With the form in the base, effects are selected again. Of these models and the catalogue's alone,
+the one with the least
 
     -2 log L + k log N + 2 C log 10
 
-is reported, with k parameters of effects and scanned constants, N readings and the complexity C of the form. Stability
-is the share of resamples in which the form has the best score of all finalists. Each resample leaves out one recording,
-or a fifth of every recording. Resamples in which no form has a clear score are not counted. The front lists, by
-complexity, the forms that gain more than all simpler ones.
+is reported, with k parameters of effects and scanned constants. Stability is the share of resamples in which the form
+has the best score of all finalists. Each resample leaves out one recording, or a fifth of every recording. The front
+lists, by complexity, the forms that gain more than all simpler ones.
 """
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import chain, count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.diagnosis import functional_forms as forms
-from pipeline.diagnosis.functional_form_search import CLEARLY, PRICE, Forms, Scored, search, without_effects
+from pipeline.diagnosis.functional_forms import Form, Span
 from pipeline.diagnosis.residual_dependence import dependences
-from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
+from pipeline.diagnosis.residual_regression import Gain, ProjectedCurves, Scan
 from pipeline.diagnosis.words import listed
 from pipeline.estimation.design import Term
-from pipeline.estimation.generalized_least_squares import Fit, fit_terms
-from pipeline.estimation.observations import Observations, without_each_recording, without_rows
+from pipeline.estimation.generalized_least_squares import fit_terms
+from pipeline.estimation.observations import without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.model.effects import catalogue, effect_from, forget, register
-from pipeline.model.effects.base import Effect, unit_of
+from pipeline.model.effects.base import unit_of
 from pipeline.model.formula import SIGNALS, parse
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from pipeline.diagnosis.findings import Case
     from pipeline.records import Values
 
+PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
+CLEARLY = 10.0  # score of a form, and of a further term: "very strong" (Raftery, Sociological Methodology 25, 1995)
+SLOWLY = 30.0  # the same of a form in time and temperature alone: HIGHEST_GATE of the selection
+MORE = 0.02  # least delta BIC of a further term over that of the first: less may be rounding of the first's constants
+MOST_TERMS = 3
+REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
+ROUNDS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
+VALUES_AT_ONCE = 4_000_000  # of columns that are scanned together: 32 MB
+PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
-NEEDED = {"temperature": "bias_temperature"}  # covariate: the effect that is observable where the covariate varies
-FINALISTS = 8  # forms that compete in the resamples
+NEEDED = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
+FINALISTS = 8  # forms that are compared in the resamples
 FOLDS = 5  # parts of every recording that are left out in turn
 LISTED = 6  # entries of the front
 
 
 @dataclass(frozen=True)
+class Scored:
+    """A form and its gain."""
+
+    form: Form
+    gain: Gain
+
+    @property
+    def score(self) -> float:
+        """Delta BIC minus the price of the form's complexity."""
+        return self.gain.delta_bic - PRICE * self.form.complexity
+
+    @property
+    def clear(self) -> bool:
+        """Whether the evidence is very strong; another wander than the model's looks like a slow form."""
+        return self.score > (SLOWLY if self.form.signals <= {"time", "temperature"} else CLEARLY)
+
+
+class Forms:
+    """The forms that a unit's recordings can show, and the gain of each in addition to a fit."""
+
+    def __init__(self, selection: Selection) -> None:
+        self.selection, self.sensor = selection, selection.observations.sensor
+        self._columns: dict[str, Values] = {}
+        self.explain(())
+
+    def explain(self, formulas: Sequence[str]) -> None:
+        """Project formulas out of the residual and of all forms from now on."""
+        self.explained = forms.columns_of(formulas, self.sensor) if formulas else None
+        self.scan = Scan(self.selection, self.explained)
+
+    def column(self, text: str) -> Values:
+        """Return a formula's values: (n, 1) array, or (n, 3) if the formula contains ``u``."""
+        if text not in self._columns:
+            self._columns[text] = self.scan.values(forms.columns_of([text], self.sensor))[:, :, 0]
+        return self._columns[text]
+
+    def columns(self, form: Form) -> Values:
+        """Return the values of a form's columns: (n, 1, r) or (n, 3, r) array."""
+        columns = np.stack([self.column(text) for text in form.factor.texts], axis=-1)
+        return columns * self.column(form.modulator.texts[0])[:, :, None] if form.modulator else columns
+
+    def gains(self, tried: Sequence[Form], *, coarse: bool = False) -> list[Gain]:
+        """Return the gain of each form; ``coarse``: under the noise of the fit, the least wander and a middle one."""
+        scan = self.scan
+        if coarse:
+            ordered = sorted(self.selection.settings, key=lambda setting: setting.ratio)
+            few = dict.fromkeys([self.selection.fit.setting, ordered[0], ordered[len(ordered) // 2]])
+            scan = Scan(replace(self.selection, settings=[*few]), self.explained)
+        found: dict[int, Gain] = {}
+        alike: dict[tuple[int, int], list[int]] = {}  # forms whose columns have the same shape
+        for k, form in enumerate(tried):
+            alike.setdefault((len(form.factor.texts), 3 if "u" in form.signals else 1), []).append(k)
+        for (r, axes), members in alike.items():
+            size = max(8, VALUES_AT_ONCE // (len(self.selection.observations.weight) * r * axes))
+            for first in range(0, len(members), size):
+                some = members[first : first + size]
+                columns = np.stack([self.columns(tried[k]) for k in some], axis=-2)
+                scanned = np.array([tried[k].scanned for k in some])
+                found |= dict(zip(some, scan.best_axes(scan.drops(columns), r, scanned), strict=True))
+        return [found[k] for k in range(len(tried))]
+
+    def ranked(self) -> list[Scored]:
+        """Return the best form of each name, best score first."""
+        spans = self._spans
+        best = _best_of_each(map(Scored, self._tried, self.gains(self._tried, coarse=True)))[:REFINED]
+        refined = [each.form for each in best]
+        best = _best_of_each(map(Scored, refined, self.gains(refined)))
+        for spacing in ROUNDS:
+            near = [
+                Form(factor, each.form.modulator)
+                for each in best
+                if each.form.factor.signal in spans
+                for factor in forms.finer(each.form.factor, spans[each.form.factor.signal], spacing)
+            ]
+            best = _best_of_each([*best, *map(Scored, near, self.gains(near))])
+        return _best_of_each([*best, *(self._polynomial(span) for span in [*spans.values(), None])])
+
+    @cached_property
+    def _spans(self) -> dict[str, Span]:
+        observations = self.selection.observations
+        names = ["fx", "fy", "fz", *forms.available_signals(observations)]
+        return {name: Span.of(observations, name) for name in names}
+
+    @cached_property
+    def _tried(self) -> list[Form]:
+        """Return the forms of the coarse scan without those of the catalogue; of equal forms the simplest."""
+        spans = self._spans
+        turning = any(part.motion.axis is not None for part in self.selection.observations.parts)
+        factors = forms.factors(spans, turning=turning)
+        pairs = [
+            Form(factor, modulator)
+            for modulator in forms.modulators(spans)
+            for factor in factors
+            if modulator is None or factor.signal != modulator.signal or factor.kind == "step"
+        ]
+        rows = np.random.default_rng(0).integers(len(self.selection.observations.weight), size=PROBED)
+        declared = [getattr(e, "declared", None) for e in catalogue().values() if self.sensor in e.sensors]
+        terms = [term for each in declared if each for term in each.terms.values()]
+        known = [term.formulas[""].text for term in terms if "" in term.formulas and not term.shared]
+        seen = {_digest(self.column(text)[rows]) for text in known}
+        distinct = []
+        for form in sorted(pairs, key=lambda form: form.complexity):
+            digest = _digest(self.columns(form)[rows])
+            if digest not in seen:
+                seen.add(digest)
+                distinct.append(form)
+        return distinct + [Form(band) for band in (forms.bands(spans["speed"]) if "speed" in spans else [])]
+
+    def _polynomial(self, span: Span | None) -> Scored:
+        """Return the polynomial of the best order, without powers that base or effects contain; None: in ``u``."""
+        signal, of_u = ("u", "fz" if self.sensor == "accelerometer" else "wz") if span is None else (span.signal, "")
+        texts = forms.powers(span or Span.of(self.selection.observations, of_u), signal)
+        projected = ProjectedCurves(self.scan, forms.columns_of(texts, self.sensor))
+        new = projected.independent(range(len(texts)))
+        drops = projected.drop(new) if new else np.zeros((*self.scan.left.shape, 1))
+        gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
+        best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
+        index = new[: best + 1]
+        formulas = tuple(texts[k] for k in index)
+        return Scored(Form(forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)), gains[best])
+
+
+def _digest(values: Values) -> bytes:
+    """Return the same bytes for forms whose values differ by a factor alone."""
+    flat, size = values.ravel(), float(np.linalg.norm(values))
+    first = float(flat[np.argmax(np.abs(flat) > 1e-6 * size)]) if size > 0.0 else 1.0
+    return np.round(values.reshape(len(values), -1) / (size * np.sign(first) or 1.0), 9).tobytes()
+
+
+def _best_of_each(scored: Iterable[Scored]) -> list[Scored]:
+    """Return the form with the best constants of each name, best score first."""
+    best: dict[tuple[str, ...], Scored] = {}
+    for each in scored:
+        name = each.form.name
+        if name not in best or each.score > best[name].score:
+            best[name] = each
+    return sorted(best.values(), key=lambda each: -each.score)
+
+
+def search(selection: Selection) -> tuple[list[Scored], list[Scored]]:
+    """Return the terms of the best form, none if none is clear, and all forms of one term, best first."""
+    terms: list[Scored] = []
+    grammar = Forms(selection)
+    first = ranked = grammar.ranked()
+    while ranked and ranked[0].clear and (not terms or ranked[0].gain.delta_bic > MORE * terms[0].gain.delta_bic):
+        terms.append(ranked[0])
+        if len(terms) == MOST_TERMS:
+            break
+        grammar.explain([text for term in terms for text in term.form.formulas])
+        ranked = [each for each in grammar.ranked() if not any(each.form.refines(term.form) for term in terms)]
+    return terms, first
+
+
+@dataclass(frozen=True)
 class Discovery:
-    """What was found beyond the catalogue."""
+    """The result of a search outside the catalogue."""
 
     context: Selection  # in whose residual the form was found
-    reported: Selection  # with the form in its base, where there is one
-    unknown: list[dict[str, Any]]  # covariates on which the residual depends, the form first
+    reported: Selection  # with the form in its base, if there is one
+    unknown: list[dict[str, Any]]  # entries of ``unexplained``, the form first
     suggested: dict[str, Any] | None = None  # the effect's definition
     front: list[dict[str, Any]] = field(default_factory=list)
 
 
-def why_not_suggested(found: Discovery, hidden: Mapping[str, str]) -> str | None:
-    """Return why a form that was found is not offered as an effect: not stable, or of a signal that shows no effect."""
-    covariate = found.unknown[0]["covariate"]
+def why_not_suggested(discovery: Discovery, hidden: Mapping[str, str]) -> str | None:
+    """Return why the form is not offered as an effect: unstable, or of a signal whose effects are not observable."""
+    covariate = discovery.unknown[0]["covariate"]
     if covariate in NEEDED and NEEDED[covariate] in hidden:
         return f"effects of the {covariate} are not observable: {hidden[NEEDED[covariate]]}"
-    stability = found.front[0]["stability"] if found.front else None
+    stability = discovery.front[0]["stability"] if discovery.front else None
     if stability is not None and stability < LEAST_STABLE:
         return f"it is not stable: another formula is the best in {100 * (1 - stability):.0f} % of the resamples"
     return None
 
 
-def dependent(selection: Selection) -> list[dict[str, Any]]:
-    """Return the covariates on which the residual depends, the likeliest first: ``covariate, p_value, delta_bic``."""
-    return [{"covariate": name, "p_value": p, "delta_bic": delta} for name, p, delta in dependences(selection)]
-
-
 def discover(selection: Selection, unknown: list[dict[str, Any]], case: Case) -> Discovery:
     """Search for a formula in addition to base, configured and selected effects.
 
-    ``unknown`` is what ``dependent`` returned of the selection. Where the residual stays far above the noise with the
-    best form, the form is not what is missing, and none is suggested.
+    ``unknown``: the ``dependences`` of the selection. No form is suggested if the residual with it is far above the
+    noise: then something else is missing.
     """
     noise = case.noise
     floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
-    best, least = Discovery(selection, selection, unknown), _worth(selection, []) + CLEARLY
-    for context in [selection, without_effects(selection)] if selection.names else [selection]:
+    best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + CLEARLY
+    alone = replace(selection, names=[], fit=selection.base)
+    for context in [selection, alone] if selection.names else [selection]:
         terms, ranked = search(context)
         if not terms:
             continue
         entry = _entry(context, terms)
-        definition = suggested_effect([entry], selection.observations.sensor, catalogue())
+        definition = suggested_effect([entry], case.sensor, catalogue())
         assert definition is not None  # noqa: S101  (there is an entry)
         form = effect_from(definition, "a first guess")
-        if 0.0 < FAR_ABOVE * floor < _beside(context, form).residual_rms:
+        added = [*context.fit.terms, Term(form, np.zeros(len(form.parameters(case.sensor))))]
+        residual_rms = fit_terms(context.observations, added, context.start, context.settings).residual_rms
+        if 0.0 < FAR_ABOVE * floor < residual_rms:
             continue
-        with _registered(form):
-            names = [*case.configured, definition["name"]]
-            again = select(context.observations, names, noise, case.sensor_config, accelerometer=case.accelerometer)
-        if _worth(again, terms) <= least:
-            continue
-        least = _worth(again, terms)
-        best = Discovery(context, again, [entry, *unknown], definition, _front(context, terms, ranked))
-    return replace(best, unknown=_explained(selection, best)) if best.suggested else best
+        names = [*case.configured, form.name]
+        register(form)
+        try:
+            reselected = select(
+                context.observations, names, noise, case.sensor_config, accelerometer=case.accelerometer
+            )
+        finally:
+            forget(form.name)
+        criterion = _criterion(reselected, terms)
+        if criterion > least:
+            least, front = criterion, _front(context, terms, ranked)
+            best = Discovery(context, reselected, [entry, *unknown], definition, front)
+    return replace(best, unknown=_explained(best)) if best.suggested else best
 
 
-def _worth(selection: Selection, terms: Sequence[Scored]) -> float:
+def _criterion(selection: Selection, terms: Sequence[Scored]) -> float:
     """Return 2 log L minus the price of all parameters and of the formula."""
     fitted = sum(len(term.values) for term in selection.fit.terms) + sum(term.form.scanned for term in terms)
     price = PRICE * sum(term.form.complexity for term in terms)
     return 2.0 * selection.fit.log_likelihood - fitted * float(np.log(3.0 * selection.observations.samples)) - price
 
 
-def _beside(context: Selection, form: Effect) -> Fit:
-    """Fit a form in addition to the effects of a selection."""
-    terms = [*context.fit.terms, Term(form, np.zeros(len(form.parameters(context.observations.sensor))))]
-    return fit_terms(context.observations, terms, context.start, context.settings)
-
-
-@contextmanager
-def _registered(form: Effect) -> Iterator[None]:
-    """Hold a form in the catalogue for the time of a ``with`` block."""
-    register(form)
-    try:
-        yield
-    finally:
-        forget(form.name)
-
-
 def _entry(selection: Selection, terms: Sequence[Scored]) -> dict[str, Any]:
-    """Return a form as an entry of ``unexplained``: words, formulas, and the coefficients on each of its axes."""
+    """Return a form as an entry of ``unexplained``: phrase, formulas, and the coefficients on each of its axes."""
     sensor, first = selection.observations.sensor, terms[0]
     texts = [text for term in terms for text in term.form.formulas]
     projected = ProjectedCurves(Scan(selection), forms.columns_of(texts, sensor))
-    found = projected.coefficients(range(len(texts)), terms[-1].gain.setting)
+    coefficients = projected.coefficients(range(len(texts)), terms[-1].gain.setting)
     axes = sorted({axis for term in terms for axis in term.gain.axes})
-    words, sizes, at = [], [], 0
-    for term in terms:
-        own = found[:, at : at + len(term.form.formulas)]
-        at += own.shape[1]
-        sizes.append(_size(selection, term, own))
-        words.append(forms.described(term.form, sizes[-1], term.gain.axes, sensor))
+    edges = np.cumsum([len(term.form.formulas) for term in terms])[:-1]
+    of_terms = np.split(coefficients, edges, axis=1)
+    sizes = [forms.sizes_of(t.form, c, selection.observations) for t, c in zip(terms, of_terms, strict=True)]
+    words = [forms.described(t.form, size, t.gain.axes, sensor) for t, size in zip(terms, sizes, strict=True)]
     return {
         "covariate": first.form.covariate,
         "p_value": first.gain.p_value,
@@ -147,7 +302,7 @@ def _entry(selection: Selection, terms: Sequence[Scored]) -> dict[str, Any]:
         "axes": ["xyz"[c] for c in axes],
         "formulas": texts,
         "units": [term.form.unit(sensor) for term in terms for _ in term.form.formulas],
-        "coefficients": [found[c].tolist() for c in axes],
+        "coefficients": [coefficients[c].tolist() for c in axes],
         "size": float(np.abs(sizes[0][list(first.gain.axes)]).max()),
         "unit": "1" if first.form.kind == "ripple" else unit_of(sensor),
         "delta_bic": sum(term.gain.delta_bic for term in terms),
@@ -155,29 +310,17 @@ def _entry(selection: Selection, terms: Sequence[Scored]) -> dict[str, Any]:
     }
 
 
-def _size(selection: Selection, term: Scored, coefficients: Values) -> Values:
-    """Return amplitude, height or whole change of a term on each axis: (3,) array."""
-    if term.form.factor.kind == "harmonic" and term.form.kind in ("harmonic", "ripple"):
-        return np.asarray(np.sqrt(np.sum(coefficients**2, axis=1)), np.float64)
-    if term.form.kind in ("step", "band") and term.form.modulator is None:
-        return coefficients[:, 0]
-    columns = forms.columns_of(term.form.formulas, selection.observations.sensor)
-    values = np.concatenate([columns(part.motion) for part in selection.observations.parts])
-    each = values if values.ndim == 3 else np.repeat(values[:, None], 3, axis=1)
-    return np.asarray(np.ptp(np.einsum("ncr,cr->nc", each, coefficients), axis=0), np.float64)
-
-
-def _explained(selection: Selection, found: Discovery) -> list[dict[str, Any]]:
-    """Return the entries, the form's first; of the others it is said whether the form explains them too."""
+def _explained(found: Discovery) -> list[dict[str, Any]]:
+    """Return the entries of ``unexplained`` with the form's covariate where the form explains the dependence too."""
     form, *others = found.unknown
-    columns = forms.columns_of(form["formulas"], selection.observations.sensor)
-    still = {name for name, _, _ in dependences(found.context, columns)}
+    columns = forms.columns_of(form["formulas"], found.context.observations.sensor)
+    remaining = {entry["covariate"] for entry in dependences(found.context, columns)}
     rest = [entry for entry in others if entry["covariate"] != form["covariate"]]
-    return [form, *({**e, "explained_by": None if e["covariate"] in still else form["covariate"]} for e in rest)]
+    return [form, *({**e, "explained_by": None if e["covariate"] in remaining else form["covariate"]} for e in rest)]
 
 
 def _front(selection: Selection, terms: Sequence[Scored], ranked: Sequence[Scored]) -> list[dict[str, Any]]:
-    """Return the forms of one term that gain more than all simpler ones, and before them the one that is suggested."""
+    """Return the forms of one term that gain more than all simpler ones, and before them the suggested one."""
     finalists = list(ranked[:FINALISTS])
     stable = _stability(selection, finalists)
     shown: list[Scored] = []
@@ -201,32 +344,26 @@ def _front(selection: Selection, terms: Sequence[Scored], ranked: Sequence[Score
 
 
 def _stability(selection: Selection, finalists: Sequence[Scored]) -> list[float]:
-    """Return in which share of the resamples each form has the best score."""
+    """Return the share of the resamples with a clear score in which each form has the best score."""
+    observations, lengths = selection.observations, [len(part.weight) for part in selection.observations.parts]
+    folds = ([np.arange(n) * FOLDS // n == fold for n in lengths] for fold in range(FOLDS))
+    resamples = chain(without_each_recording(observations), (without_rows(observations, rows) for rows in folds))
     wins, counted = np.zeros(len(finalists)), 0
-    for observations in _resamples(selection.observations):
-        tried = Forms(replace(selection, observations=observations))
-        gains = tried.gains([each.form for each in finalists])
-        scores = [g.delta_bic - PRICE * each.form.complexity for g, each in zip(gains, finalists, strict=True)]
+    for resample in resamples:
+        gains = Forms(replace(selection, observations=resample)).gains([each.form for each in finalists])
+        scores = [Scored(each.form, gain).score for each, gain in zip(finalists, gains, strict=True)]
         if max(scores) > CLEARLY:
             wins[int(np.argmax(scores))] += 1
             counted += 1
     return [float(share) for share in wins / max(counted, 1)]
 
 
-def _resamples(observations: Observations) -> Iterator[Observations]:
-    """Yield the observations without each recording, then without each fifth of every recording."""
-    yield from without_each_recording(observations)
-    lengths = [len(part.weight) for part in observations.parts]
-    for fold in range(FOLDS):
-        yield without_rows(observations, [np.arange(n) * FOLDS // n == fold for n in lengths])
-
-
 def suggested_effect(
     unknown: Sequence[Mapping[str, Any]], sensor: str, taken: Collection[str] = ()
 ) -> dict[str, Any] | None:
-    """Return the definition of an effect with the form of the first entry of ``unexplained``; None without one.
+    """Return the definition of an effect with the form of the first entry of ``unexplained``; None without a form.
 
-    Its name is none of those that are ``taken``.
+    Its name differs from those in ``taken``.
     """
     if not unknown or not unknown[0].get("formulas"):
         return None
@@ -248,7 +385,7 @@ def suggested_effect(
 
 
 def effect_file(definition: Mapping[str, Any], unit: str) -> str:
-    """Return the text of an effect file, ready to be copied into a campaign's ``effects/``; a unit showed it."""
+    """Return the text of an effect file for a campaign's ``effects/``, from the definition that a unit suggests."""
     import yaml  # noqa: PLC0415  (only a unit with unknown physics pays for it)
 
     name, sensor = definition["name"], definition["sensors"][0]

@@ -1,12 +1,12 @@
-"""A grammar of effects that the catalogue may not hold, as formulas of an effect file, each with the unit that it has.
+"""A grammar of effects outside the catalogue: formulas of an effect file, each with its unit.
 
     form   := factor, or modulator * factor        modulator := u, abs(u), u ** 2, u ** 3, fx, fy, fz, speed, T, time
     factor := s ** p | abs(u) | sign(u) | step(s - a) | (1 + tanh((s - a) / w)) / 2 | exp(+-(s - a) / c)
               | cos and sin(n angle) | band(speed, a, b) | polynomial in (s - a) / w           T = temperature - 25
 
-What a function is applied to has no unit, by construction; the unit of a product is the product of the units, and that
-of a coefficient follows: unit of the sensor over unit of the form. Complexity counts a form's signals, functions,
-powers and cycles; its scanned constants a, w, c count as parameters of the fit.
+The arguments of functions have no unit. The unit of a product is the product of the units; that of a coefficient is the
+unit of the sensor over that of the form. Complexity counts the signals, functions, powers and cycles of a form. Its
+scanned constants a, w, c count as parameters of the fit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from pipeline.diagnosis.words import listed
 from pipeline.model.effects.base import truth, unit_of
-from pipeline.model.formula import Formula, parse
+from pipeline.model.formula import parse
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -32,38 +32,38 @@ if TYPE_CHECKING:
 CYCLES = range(1, 13)
 POWERS = range(1, 6)
 ORDER = 5  # of a polynomial; as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
-PLACES = 20  # a step is then placed to 1/40 of the span before the finer scans
-SPEEDS = 40  # at most, between which steps are tried
-SHARPEST = 1.0 / 80.0  # width of a soft step, share of the span: smoothed temperatures make a sharp one as wide as that
-CONSTANTS = tuple(np.geomspace(0.06, 1.5, 9))  # of the span; the finer scans close the factors of 1.5 between them
-FINER = 4  # places or constants to each side of the best, in each finer scan
-WIDTHS = (0.5, 1.0, 2.0)  # of a soft step, in those of the scan before
-SAME_SPEED = 0.02  # relative difference of speeds that are one speed of the procedure
+PLACES = 20  # of a step in the coarse scan, which places it to 1/40 of the span
+SPEEDS = 40  # largest number of speeds between which steps are tried
+SHARPEST = 1.0 / 80.0  # least width of a soft step, share of the span: smoothing makes a sharp step this wide
+CONSTANTS = tuple(
+    np.geomspace(0.06, 1.5, 9)
+)  # share of the span; the finer scans close the factors of 1.5 between them
+FINER = 4  # places or constants to each side of the best one in each finer scan
+WIDTHS = (0.5, 1.0, 2.0)  # of a soft step in a finer scan, over that of the scan before
+SAME_SPEED = 0.02  # relative difference of values that are one speed of the procedure
 UNITS = {"temperature": "degC", "time": "s", "speed": "deg/s", "angle": "deg"} | {f"f{a}": "g" for a in "xyz"}
-ORIGIN = "(temperature - 25)"  # powers of the temperature count from that of data sheets, as the catalogue's
+ORIGIN = "(temperature - 25)"  # data sheets and the catalogue also state powers of the temperature above 25 degC
 NAMES = {"u": "the axis' own signal", "speed": "the speed", "time": "the time", ORIGIN: "the temperature above 25 degC"}
 
 
 def columns_of(formulas: Iterable[str], sensor: str) -> Curves:
-    """Return what evaluates formulas: motion to (n, q) columns, or to (n, 3, q) where one contains ``u``."""
+    """Return the function from motion to the values of formulas: (n, 1, q), or (n, 3, q) if one contains ``u``.
+
+    The values are zero in a recording without a signal of the formula.
+    """
     parsed = [parse(text) for text in formulas]
 
     def columns(motion: Motion) -> Values:
-        signals = signals_of(motion)
-        if not any("u" in formula.signals for formula in parsed):
-            return np.stack([value(formula, signals) for formula in parsed], axis=1)
-        u = truth(sensor, motion)
-        each = [[value(f, signals | {"u": u[:, c]}) for f in parsed] for c in range(3)]
-        return np.stack([np.stack(axis, axis=1) for axis in each], axis=1)
+        n, u = len(motion.time), truth(sensor, motion)
+        signals = {name: value for name, value in signals_of(motion).items() if value is not None}
+        of_axes = []
+        for c in range(3 if any("u" in formula.signals for formula in parsed) else 1):
+            known = signals | {"u": u[:, c]}
+            values = [np.broadcast_to(f(known), (n,)) if f.signals <= known.keys() else np.zeros(n) for f in parsed]
+            of_axes.append(np.stack(values, axis=1))
+        return np.stack(of_axes, axis=1)
 
     return columns
-
-
-def value(formula: Formula, signals: dict[str, Values | None]) -> Values:
-    """Return a formula's values, zero in a recording that lacks one of its signals."""
-    known = {name: value for name, value in signals.items() if value is not None}
-    size = len(known["time"])
-    return np.broadcast_to(formula(known), (size,)) if formula.signals <= set(known) else np.zeros(size)
 
 
 def signals_of(motion: Motion) -> dict[str, Values | None]:
@@ -80,9 +80,17 @@ def signals_of(motion: Motion) -> dict[str, Values | None]:
     return found
 
 
+def available_signals(observations: Observations) -> list[str]:
+    """Return those of speed, temperature and time that all recordings hold; the speed if the table turns."""
+    motions = [part.motion for part in observations.parts]
+    names = ["speed"] if any(np.any(~m.still) for m in motions) else []
+    names += ["temperature"] if all(m.temperature is not None for m in motions) else []
+    return names + (["time"] if observations.clock_shared else [])
+
+
 @dataclass(frozen=True)
 class Span:
-    """The sorted values of a signal over all rows."""
+    """The sorted values of a signal in all rows."""
 
     signal: str
     values: Values
@@ -105,19 +113,18 @@ class Span:
 
     @property
     def size(self) -> float:
-        """Largest less smallest."""
+        """Largest less smallest value."""
         return max(self.high - self.low, 1e-12)
 
     def places(self) -> Values:
-        """Return where steps are tried: evenly over the span; for a speed, between the speeds that were held."""
+        """Return the places of steps in the coarse scan: evenly over the span, or between constant speeds."""
         if self.signal != "speed":
             return self.low + self.size * (np.arange(PLACES) + 0.5) / PLACES
         moving = self.values[self.values > SAME_SPEED * self.high / SPEEDS]
-        held = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, SPEEDS)) if len(moving) else moving)
-        held = np.concatenate([[0.0], held])
-        apart = np.diff(held) > SAME_SPEED * held[1:]
-        middle: Values = 0.5 * (held[1:] + held[:-1])
-        return middle[apart]
+        speeds = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, SPEEDS)) if len(moving) else moving)
+        speeds = np.concatenate([[0.0], speeds])
+        middle: Values = 0.5 * (speeds[1:] + speeds[:-1])
+        return middle[np.diff(speeds) > SAME_SPEED * speeds[1:]]
 
     def rounded(self, value: float) -> float:
         """Return a value to a ten-thousandth of the span, which keeps formulas short."""
@@ -126,11 +133,11 @@ class Span:
 
 @dataclass(frozen=True)
 class Factor:
-    """A function of one signal: its columns as formulas, its exponents of units, and what was scanned to find it."""
+    """A function of one signal."""
 
     kind: str
     signal: str
-    texts: tuple[str, ...]
+    texts: tuple[str, ...]  # its columns as formulas
     words: str  # a noun phrase
     complexity: int = 2  # its signal and its function
     power: int = 0  # of the signal's unit; 0: without a unit
@@ -139,7 +146,7 @@ class Factor:
 
 @dataclass(frozen=True)
 class Form:
-    """A functional form that is tried: a factor, or its product with a modulator."""
+    """A functional form: a factor, or its product with a modulator."""
 
     factor: Factor
     modulator: Factor | None = None
@@ -151,6 +158,16 @@ class Form:
         return "ripple" if ripple else self.factor.kind
 
     @property
+    def is_height(self) -> bool:
+        """Whether its coefficient is the height of a step or band."""
+        return self.factor.kind in ("step", "band") and self.modulator is None
+
+    @property
+    def signals(self) -> set[str]:
+        """The signals of factor and modulator."""
+        return {factor.signal for factor in (self.factor, self.modulator) if factor}
+
+    @property
     def formulas(self) -> tuple[str, ...]:
         """One for each coefficient."""
         times = f"{self.modulator.texts[0]} * " if self.modulator else ""
@@ -158,63 +175,40 @@ class Form:
 
     @property
     def covariate(self) -> str:
-        """The covariate of ``pipeline.diagnosis.residual_dependence`` that the form is told by."""
-        signals = [self.factor.signal, *([self.modulator.signal] if self.modulator else [])]
-        known = {"speed": "rate"}
-        order = ["angle", "temperature", "time", "rate"]
-        named = [known.get(name, name) for name in signals]
-        of_force = any(name.startswith("f") or name == "u" for name in signals)
-        return next((name for name in order if name in named), "specific_force" if of_force else "rate")
+        """The covariate of ``pipeline.diagnosis.residual_dependence`` that stands for the form."""
+        slow = next((name for name in ("angle", "temperature", "time") if name in self.signals), None)
+        return slow or ("rate" if "speed" in self.signals else "specific_force")
 
     @property
     def scanned(self) -> int:
-        """How many nonlinear parameters were scanned to find it."""
+        """Number of scanned constants."""
         return len(self.factor.constants)
 
     @property
     def complexity(self) -> int:
-        """Number of choices that the grammar takes to state it."""
+        """Number of choices of the grammar."""
         return self.factor.complexity + (self.modulator.complexity if self.modulator else 0)
 
     def refines(self, other: Form) -> bool:
-        """Return whether it differs from another form by its constants alone, as two steps do."""
+        """Return whether two factors differ in their constants alone, as two steps do."""
         same = self.factor.kind == other.factor.kind and self.factor.signal == other.factor.signal
         return same and bool(self.factor.constants)
 
     @property
     def name(self) -> tuple[str, ...]:
-        """What stays the same when its constants change."""
+        """What all forms have in common that differ in their constants alone."""
         scanned = (self.factor.kind, self.factor.signal, str(self.scanned))
-        own = scanned if self.factor.constants else self.factor.texts
-        return (*own, *(self.modulator.texts if self.modulator else ()))
+        factor = scanned if self.factor.constants else self.factor.texts
+        return (*factor, *(self.modulator.texts if self.modulator else ()))
 
     def unit(self, sensor: str) -> str:
         """Return the unit of a coefficient: that of the sensor over that of the form."""
         exponents = Counter({unit_of(sensor): 1})
         for factor in filter(None, (self.factor, self.modulator)):
             exponents[UNITS.get(factor.signal, unit_of(sensor))] -= factor.power
-        own = exponents.pop(unit_of(sensor))
-        above = unit_of(sensor) if own == 1 else "1"
-        below = {**({unit_of(sensor): own} if own < 0 else {}), **{u: e for u, e in exponents.items() if e < 0}}
-        return above + "".join(f"/{_power(unit, -e)}" for unit, e in below.items()) if below else above
-
-    def described(self) -> str:
-        """Return the form as a noun phrase, in which ``{size}`` stands for its size."""
-        times = ""
-        if self.modulator:
-            text = self.modulator.texts[0]
-            name = "the rate" if self.kind == "ripple" else NAMES.get(text, text)
-            times = f" in proportion to {name}"
-        height = self.factor.kind in ("step", "band") and not times
-        lead = (
-            ", amplitude {size}" if self.factor.kind == "harmonic" else ", of {size}" if height else ", {size} in all"
-        )
-        return f"{self.factor.words}{times}{lead}"
-
-
-def _power(unit: str, exponent: int) -> str:
-    inside = f"({unit})" if "/" in unit else unit
-    return inside if exponent == 1 else f"{inside}^{exponent}"
+        above = unit_of(sensor) if exponents[unit_of(sensor)] == 1 else "1"
+        below = [(f"({u})" if "/" in u else u) + (f"^{-e}" if e < -1 else "") for u, e in exponents.items() if e < 0]
+        return "/".join([above, *below])
 
 
 def power(signal: str, p: int) -> Factor:
@@ -224,17 +218,20 @@ def power(signal: str, p: int) -> Factor:
     return Factor("power", signal, (text,), f"a part in proportion to {text}", 1 + (p > 1), p)
 
 
-def modulators(signals: Sequence[str]) -> list[Factor | None]:
-    """Return what a factor may be multiplied with; None: nothing."""
-    absolute = Factor("magnitude", "u", ("abs(u)",), "a part in proportion to abs(u)", 2, 1)
-    of_u = [power("u", 1), absolute, power("u", 2), power("u", 3)]
-    return [None, *of_u, *(power(name, 1) for name in signals if name not in ("u", "angle"))]
+def _function(name: str, p: int) -> Factor:
+    """Return a function of ``u``, whose unit is that of ``u`` to the power p."""
+    return Factor("magnitude", "u", (f"{name}(u)",), f"a part in proportion to {name}(u)", 2, p)
+
+
+def modulators(signals: Iterable[str]) -> list[Factor | None]:
+    """Return the modulators of a factor; None: no modulator."""
+    of_u = [power("u", 1), _function("abs", 1), power("u", 2), power("u", 3)]
+    return [None, *of_u, *(power(name, 1) for name in signals)]
 
 
 def factors(spans: dict[str, Span], *, turning: bool) -> list[Factor]:
-    """Return the factors with one column, constants as in the coarse scan, and the harmonics."""
-    found = [power(name, p) for name in spans for p in POWERS] + [power("u", p) for p in POWERS]
-    found += [Factor("magnitude", "u", (f"{f}(u)",), f"a part in proportion to {f}(u)", 2, p) for f, p in OF_SIGN]
+    """Return the factors of the coarse scan that have one column, and the harmonics."""
+    found = [power(name, p) for name in [*spans, "u"] for p in POWERS] + [_function("abs", 1), _function("sign", 0)]
     for span in spans.values():
         if span.signal in ("temperature", "time", "speed"):
             found += [step(span, a) for a in span.places()]
@@ -244,11 +241,8 @@ def factors(spans: dict[str, Span], *, turning: bool) -> list[Factor]:
     return found + ([harmonic(n) for n in CYCLES] if turning else [])
 
 
-OF_SIGN = (("abs", 1), ("sign", 0))
-
-
 def harmonic(n: int) -> Factor:
-    """Return the cosine and sine of so many cycles a turn."""
+    """Return cosine and sine of n cycles a turn."""
     words = f"{n} cycle{'' if n == 1 else 's'} per turn of the table"
     return Factor("harmonic", "angle", tuple(f"{f}({n} * radians(angle))" for f in ("cos", "sin")), words)
 
@@ -269,7 +263,7 @@ def exponential(span: Span, constant: float, *, growth: bool) -> Factor:
     s, signal = float(f"{constant:.4g}"), span.signal
     text = f"({signal} - {span.rounded(span.high):g})" if growth else f"({span.rounded(span.low):g} - {signal})"
     words = f"an exponential of the {signal} that {'grows' if growth else 'decays'} with a constant of {s:.3g} "
-    kind = "exponential" if not growth else "growth"
+    kind = "growth" if growth else "exponential"
     return Factor(kind, signal, (f"exp({text} / {s:g})",), words + UNITS[signal], constants=(s,))
 
 
@@ -279,12 +273,12 @@ def bands(span: Span) -> list[Factor]:
     for low, high in combinations(span.places().tolist(), 2):
         text = f"band({span.signal}, {low:.5g}, {high:.5g})"
         words = f"a band from {low:.3g} to {high:.3g} {UNITS[span.signal]}"
-        found.append(Factor("band", span.signal, (text,), words, 2, constants=(low, high)))
+        found.append(Factor("band", span.signal, (text,), words, constants=(low, high)))
     return found
 
 
 def powers(span: Span, name: str) -> tuple[str, ...]:
-    """Return the powers 1 to 5 of a signal, centred and scaled to its span; ``u`` and forces are scaled only."""
+    """Return the powers 1 to 5 of a signal, scaled to its span and, but for ``u`` and forces, centred."""
     middle, half = span.rounded(0.5 * (span.low + span.high)), span.rounded(0.5 * span.size)
     x = f"(({name} - {middle:g}) / {half:g})"
     if name == "u" or name.startswith("f"):
@@ -299,31 +293,47 @@ def polynomial(signal: str, formulas: tuple[str, ...], order: int) -> Factor:
     return Factor("polynomial", signal, formulas, words, 1 + len(formulas))
 
 
-def finer(factor: Factor, span: Span, apart: float) -> Iterator[Factor]:
-    """Yield factors of the same kind about one, ``apart`` of the coarse scan's distance between them."""
-    steps = apart * np.arange(-FINER, FINER + 1) / FINER
+def finer(factor: Factor, span: Span, spacing: float) -> Iterator[Factor]:
+    """Yield factors of the same kind near one; ``spacing``: their largest distance over that of the coarse scan."""
+    steps = spacing * np.arange(-FINER, FINER + 1) / FINER
     if factor.kind == "step":
         places = factor.constants[0] + steps * span.size / PLACES
-        if len(factor.constants) == 1:
-            yield from (step(span, a) for a in places)
-            return
-        for width in factor.constants[1] * np.array(WIDTHS):
-            yield from (step(span, a, max(width, SHARPEST * span.size)) for a in places)
+        widths: list[float | None] = [None]
+        if len(factor.constants) > 1:
+            widths = [max(w * factor.constants[1], SHARPEST * span.size) for w in WIDTHS]
+        yield from (step(span, a, width) for width in widths for a in places)
     elif factor.kind in ("exponential", "growth"):
         constants = factor.constants[0] * (CONSTANTS[1] / CONSTANTS[0]) ** steps
         yield from (exponential(span, c, growth=factor.kind == "growth") for c in constants)
 
 
+def sizes_of(form: Form, coefficients: Values, observations: Observations) -> Values:
+    """Return the amplitude, height or whole change of a form on each axis: (3,) array."""
+    if form.factor.kind == "harmonic":
+        return np.asarray(np.linalg.norm(coefficients, axis=1), np.float64)
+    if form.is_height:
+        return coefficients[:, 0]
+    columns = columns_of(form.formulas, observations.sensor)
+    values = np.concatenate([columns(part.motion) for part in observations.parts])
+    return np.asarray(np.ptp(np.sum(values * coefficients, axis=2), axis=0), np.float64)
+
+
 def described(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> str:
     """Return a fitted form as a noun phrase: ``a step at 31.0 degC, of 3.9 mg on x and -2.1 mg on z``.
 
-    ``sizes`` are amplitude, height or whole change on each axis, unit of the sensor; signed where a sign has a meaning.
+    ``sizes``: those of ``sizes_of``. Heights have a sign.
     """
     unit, scale = unit_of(sensor), 1.0
     if form.kind == "ripple":
         unit, scale = "%", 100.0
     elif sensor == "accelerometer" and float(np.abs(sizes).max()) < 0.1:
         unit, scale = "mg", 1e3
-    signed = form.kind in ("step", "band") and form.modulator is None
-    values = scale * (sizes if signed else np.abs(sizes))
-    return form.described().format(size=listed([f"{values[c]:.3g} {unit} on {'xyz'[c]}" for c in axes]))
+    values = scale * (sizes if form.is_height else np.abs(sizes))
+    size = listed([f"{values[c]:.3g} {unit} on {'xyz'[c]}" for c in axes])
+    phrase = form.factor.words
+    if form.modulator:
+        text = form.modulator.texts[0]
+        phrase += f" in proportion to {'the rate' if form.kind == 'ripple' else NAMES.get(text, text)}"
+    if form.factor.kind == "harmonic":
+        return f"{phrase}, amplitude {size}"
+    return f"{phrase}, of {size}" if form.is_height else f"{phrase}, {size} in all"

@@ -1,15 +1,15 @@
-"""Errors that a method's own approximations leave, compared with a free fit of the same recordings.
+"""Compute the errors that a method's approximations cause, from a free fit of the same recordings.
 
-A method says ``truth = M (reading - b_m - z_m)``; bias b, matrix K and effects z of the free fit predict the reading.
-In a motion u that the recording's filter turns into u_f, with E = M K - 1, the calibrated reading is off by
+A method states ``truth = M (reading - b_m - z_m)``. The free fit predicts the reading by bias b, matrix K and effects
+z. In a motion u that the recording's filter turns into u_f, with E = M K - 1, the calibrated reading is wrong by
 
     M (b - b_m) [bias]  +  E u_f [diagonal: scale_factor; symmetric part off it: non_orthogonality, half of the angle by
     which two axes depart from 90 deg; antisymmetric: rotation]  +  M (z - z_m) [two_sided]  +  u_f - u [filter_delay]
 
-each with the share ``mean(e_k^2) / sum_j mean(e_j^2)``, and of the error of the magnitude, ``|u_f + e_k| - |u_f|``, for
-the filter ``|u_f| - |u(t - delay)|``. An error is named where it exceeds ``SURE`` standard uncertainties of both fits,
-as if these were independent (which is never too small), and a fiftieth of either error. Where an effect is missing,
-bias and sides are not compared: the effect shifts both in the method's fit.
+Each error e_k has the share ``mean(e_k^2) / sum_j mean(e_j^2)``, also of the error of the magnitude, ``|u_f + e_k| -
+|u_f|``, for the filter ``|u_f| - |u(t - delay)|``. An error is named if it exceeds ``SURE`` standard uncertainties of
+both fits and a fiftieth of either error. Both fits count as independent, which never makes the uncertainty too small.
+If an effect is missing, bias and sides are not compared, since the effect shifts both in the method's fit.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from pipeline.diagnosis.words import template
 from pipeline.estimation.generalized_least_squares import Fit, fit_terms
@@ -32,64 +33,41 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion, Recording, SensorCalibration, Values
 
-    Errors = dict[str, tuple[Values, Values]]  # by cause: of the vector (n, 3), and of its magnitude (n,)
-
 FREE = ("reference_least_squares", "effects")  # stages that leave bias and matrix free
-LEAST_SHARE = 0.02  # of the mean square: a part that adds less than 1 % to the rms error is not named
+LEAST_SHARE = 0.02  # of the mean square: a smaller part adds less than 1 % to the rms error
 SURE = 5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
 
 
 def method_errors(
     calibration: SensorCalibration, selection: Selection, recordings: Sequence[Recording], settings: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Return what the method's approximations leave, the largest share first; nothing where its fit is free.
+    """Return the errors by the method's approximations, the largest share first; none if its fit is free.
 
-    ``selection``: the free fit, with what was selected. ``recordings``: all of the unit, filtered. ``settings``:
-    sections ``table``, ``method`` and, for a given calibration, ``sensor``. Returns ``name, meaning, size, unit,
-    share`` of each error on the method's own recordings; in addition ``rms`` (there, unit of the sensor),
-    ``held_out_share`` and ``held_out_magnitude_share`` (on held-out motion, or None).
+    ``selection``: the free fit. ``recordings``: all of the unit, filtered. ``settings``: sections ``table``, ``method``
+    and, for a given calibration, ``sensor``. Entries: ``name, meaning, size, unit, share, rms`` on the recordings of
+    the fit (rms in the unit of the sensor), ``held_out_share`` and ``held_out_magnitude_share`` (or None).
     """
     stages = [stage.name for stage in calibration.stages]
     if not stages or stages[-1] in FREE:
         return []
-    difference = _difference_of(calibration, selection, settings)
-    own = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == calibration.sensor])
-    held_out = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == "validation"])
-    rms = {name: _rms(vector) for name, (vector, _) in own.items()}
-    held = _shares({name: _rms(vector) for name, (vector, _) in held_out.items()})
-    magnitude = _shares({name: _rms(error[:, None]) for name, (_, error) in held_out.items()})
+    free, names = selection.base, [effect.name for effect in calibration.effects]
+    fitted = {term.effect.name for term in free.terms}
+    more = [t for t in selection.fit.terms if t.effect.name in names and t.effect.name not in fitted]
+    if more:
+        free = fit_terms(selection.observations, [*free.terms, *more], free, selection.settings)
+    of_free = free.covariance, np.kron(calibration.matrix, np.eye(3))
+    difference = _Difference.of(calibration, free.bias, free.K, of_free, settings)
+    of_turns, of_held_out = (
+        _errors(difference, free, [r for r in recordings if r.role == role], settings["table"])
+        for role in (calibration.sensor, "validation")
+    )
+    shares = {
+        "held_out_share": _shares({name: _rms(error) for name, (error, _) in of_held_out.items()}),
+        "held_out_magnitude_share": _shares({name: _rms(error) for name, (_, error) in of_held_out.items()}),
+    }
+    rms = {name: _rms(error) for name, (error, _) in of_turns.items()}
     printed = bool((settings.get("method") or {}).get("as_printed"))
-
-    def meaning(name: str) -> str:
-        return _meaning(name, calibration.sensor, stages, recordings, printed=printed)
-
-    return _named(difference, rms, difference.certain(selection.names), recordings, meaning, held, magnitude)
-
-
-def _named(  # noqa: PLR0917  (what the entries hold)
-    difference: _Difference,
-    rms: Mapping[str, float],
-    sure: Mapping[str, bool],
-    recordings: Sequence[Recording],
-    meaning: Callable[[str], str],
-    held: Mapping[str, float],
-    magnitude: Mapping[str, float],
-) -> list[dict[str, Any]]:
-    """Return the errors that are worth naming, the largest share first."""
-    found = [
-        {
-            "name": name,
-            "meaning": meaning(name),
-            **_size(name, difference, rms[name], recordings),
-            "share": share,
-            "rms": rms[name],
-            "held_out_share": held.get(name),
-            "held_out_magnitude_share": magnitude.get(name),
-        }
-        for name, share in _shares(rms).items()
-        if max(share, magnitude.get(name, 0.0)) > LEAST_SHARE and sure.get(name, True)
-    ]
-    return sorted(found, key=lambda entry: -float(entry["share"]))
+    return _named(difference, rms, recordings, selection.names, shares, printed=printed)
 
 
 def given_differences(
@@ -98,147 +76,120 @@ def given_differences(
     recordings: Sequence[Recording],
     settings: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
-    """Return what a given calibration and a free fit of rests and moves by hand differ in, the largest share first.
+    """Return the differences of a given calibration from a free fit of rests and moves by hand, as ``method_errors``.
 
-    Bias and the symmetric part of E only: by hand, nothing ties the sensor's axes to a body. Shares are those of a
-    truth of any direction, 1 g or the rms rate of the recordings. Nothing for a method that fits.
+    They are bias and the symmetric part of E, since by hand the sensor's axes have no relation to a body. Shares are
+    those of a truth of any direction, 1 g or the rms rate of the recordings. None for a method that fits.
     """
     if [stage.name for stage in calibration.stages] != ["given"]:
         return []
-    free, sensor = free_fit(), calibration.sensor
-    known = _own_covariance(calibration, settings), free.covariance
-    K = np.linalg.inv(free.matrix)
-    M, maps = calibration.matrix, (np.kron(np.eye(3), K.T), np.kron(calibration.matrix @ K, K.T))
-    variance = np.zeros(12)
-    for covariance, of_matrix in zip(known, maps, strict=True):
-        if covariance is not None:
-            both = np.block([[M, np.zeros((3, 9))], [np.zeros((9, 3)), of_matrix]])
-            variance += np.diag(both @ covariance[:12, :12] @ both.T)
-    d, uncertainty = M @ (free.bias - calibration.bias), np.sqrt(np.clip(variance, 0.0, None))
-    parts = _parts_of(M @ K - np.eye(3))
-    del parts["rotation"]
-    difference = _Difference(calibration, d, parts, uncertainty, None)
+    free = free_fit()
+    K = np.asarray(np.linalg.inv(free.matrix), np.float64)
+    of_free = free.covariance, np.kron(calibration.matrix @ K, K.T)
+    difference = _Difference.of(calibration, free.bias, K, of_free, settings)
+    del difference.matrices["rotation"]
     rates = [np.sum(w**2, axis=1) for r in recordings if (w := r.reading("gyroscope")) is not None]
-    size = 1.0 if sensor == "accelerometer" else float(np.sqrt(np.nanmean(np.concatenate(rates))))
-    rms = {"bias": float(np.linalg.norm(d))}
-    rms |= {name: size * float(np.linalg.norm(part)) / np.sqrt(3.0) for name, part in parts.items()}
-    return _named(
-        difference,
-        rms,
-        difference.certain([]),
-        recordings,
-        lambda name: _meaning(name, sensor, ["given"], recordings, printed=False),
-        {},
-        {},
-    )
-
-
-def _parts_of(E: Values) -> dict[str, Values]:
-    """Return the parts of ``M K - 1``, by name."""
-    diagonal = np.diag(np.diag(E))
-    return {
-        "scale_factor": diagonal,
-        "non_orthogonality": 0.5 * (E + E.T) - diagonal,
-        "rotation": 0.5 * (E - E.T),
-    }
+    size = 1.0 if calibration.sensor == "accelerometer" else float(np.sqrt(np.nanmean(np.concatenate(rates))))
+    rms = {"bias": float(np.linalg.norm(difference.bias))}
+    rms |= {name: size * float(np.linalg.norm(part)) / np.sqrt(3.0) for name, part in difference.matrices.items()}
+    return _named(difference, rms, recordings)
 
 
 @dataclass(frozen=True)
 class _Difference:
-    """A method compared with the free fit."""
+    """The difference of a method from the free fit."""
 
     method: SensorCalibration
     bias: Values  # (3,): M (b - b_m)
-    matrices: dict[str, Values]  # the parts of E: (3, 3) each
+    matrices: dict[str, Values]  # (3, 3) parts of E
     uncertainty: Values  # (12,), of bias and E
-    free: Fit | None  # None by hand, where effects are not compared
 
-    def parts(self, motion: Motion) -> dict[str, Values]:
-        """Return the error of the calibrated reading by its cause, without the filter's: (n, 3) arrays."""
-        u = truth(self.method.sensor, motion)
-        of_matrix = {name: u @ matrix.T for name, matrix in self.matrices.items()}
-        two_sided = self._of_effects(motion) @ self.method.matrix.T
-        return {"bias": np.broadcast_to(self.bias, u.shape), **of_matrix, "two_sided": two_sided}
+    @classmethod
+    def of(
+        cls,
+        method: SensorCalibration,
+        bias: Values,
+        K: Values,
+        of_free: tuple[Values | None, Any],
+        settings: Mapping[str, Any],
+    ) -> _Difference:
+        """Return the difference from a free fit.
 
-    def _of_effects(self, motion: Motion) -> Values:
-        """Return what the method's effects add at the free fit's values, minus what they add at the method's."""
-        added = np.zeros((len(motion.time), 3))
-        assert self.free is not None  # noqa: S101  (on a table)
-        fitted = {term.effect.name: term.values for term in self.free.terms}
+        ``of_free``: covariance of the free fit's bias and matrix, and (9, 9) derivative of E to this matrix.
+        """
+        M, variance = method.matrix, np.zeros(12)
+        for covariance, derivative in (of_free, (_covariance(method, settings), np.kron(np.eye(3), K.T))):
+            if covariance is not None:
+                J = block_diag(M, derivative)
+                variance += np.diag(J @ covariance[:12, :12] @ J.T)
+        E = M @ K - np.eye(3)
+        diagonal = np.diag(np.diag(E))
+        parts = {
+            "scale_factor": diagonal,
+            "non_orthogonality": 0.5 * (E + E.T) - diagonal,
+            "rotation": 0.5 * (E - E.T),
+        }
+        return cls(method, M @ (bias - method.bias), parts, np.sqrt(np.clip(variance, 0.0, None)))
+
+    def errors(self, motion: Motion, free: Fit) -> dict[str, Values]:
+        """Return the error of the calibrated reading by cause, without that of the filter: (n, 3) arrays."""
+        u, added = truth(self.method.sensor, motion), np.zeros((len(motion.time), 3))
+        fitted = {term.effect.name: term.values for term in free.terms}
         for effect in self.method.effects:
             this = effect_of(effect)
             if not this.moves and this.available(motion):
-                added -= this.reading(self.method.sensor, motion, self.free.K, effect.values)
+                added -= this.reading(self.method.sensor, motion, free.K, effect.values)
                 if effect.name in fitted:
-                    added += this.reading(self.method.sensor, motion, self.free.K, fitted[effect.name])
-        return added
+                    added += this.reading(self.method.sensor, motion, free.K, fitted[effect.name])
+        of_matrix = {name: u @ matrix.T for name, matrix in self.matrices.items()}
+        return {"bias": np.broadcast_to(self.bias, u.shape), **of_matrix, "two_sided": added @ self.method.matrix.T}
 
     def certain(self, selected: Sequence[str]) -> dict[str, bool]:
         """Return which parts exceed the noise of the two fits."""
         u = self.uncertainty[3:].reshape(3, 3)
         least = SURE * np.where(np.eye(3) > 0.0, u, np.hypot(u, u.T) / 2.0)
-        whole = {effect.name for effect in self.method.effects}.issuperset(selected)
-        of_bias = whole and bool(np.any(np.abs(self.bias) > SURE * self.uncertainty[:3]))
+        complete = {effect.name for effect in self.method.effects}.issuperset(selected)
+        of_bias = complete and bool(np.any(np.abs(self.bias) > SURE * self.uncertainty[:3]))
         of_matrix = {name: bool(np.any(np.abs(matrix) > least)) for name, matrix in self.matrices.items()}
-        return {"two_sided": whole, "bias": of_bias, **of_matrix}
+        return {"two_sided": complete, "bias": of_bias, **of_matrix}
 
 
-def _own_covariance(calibration: SensorCalibration, settings: Mapping[str, Any]) -> Values:
+def _covariance(calibration: SensorCalibration, settings: Mapping[str, Any]) -> Values:
     """Return the covariance of bias and matrix: (12, 12).
 
-    Where a given calibration states none, its bias has at least the wander that the sensor file states.
+    If a given calibration states none, its bias varies by at least the wander of the sensor file.
     """
-    own = np.zeros((12, 12)) if calibration.covariance is None else calibration.covariance[:12, :12]
-    if own.any() or [stage.name for stage in calibration.stages] != ["given"]:
-        return own
+    covariance = np.zeros((12, 12)) if calibration.covariance is None else calibration.covariance[:12, :12]
+    if covariance.any() or [stage.name for stage in calibration.stages] != ["given"]:
+        return covariance
     wander = float(settings["sensor"][calibration.sensor]["bias_wander"])
     return np.diag([wander**2] * 3 + [0.0] * 9)
 
 
-def _difference_of(calibration: SensorCalibration, selection: Selection, settings: Mapping[str, Any]) -> _Difference:
-    """Compare with the free fit of base, configured effects and those selected that the method has too."""
-    free, names = selection.base, [effect.name for effect in calibration.effects]
-    known = {term.effect.name for term in free.terms}
-    more = [t for t in selection.fit.terms if t.effect.name in names and t.effect.name not in known]
-    if more:
-        free = fit_terms(selection.observations, [*free.terms, *more], free, selection.settings)
-    M = calibration.matrix
-    own = _own_covariance(calibration, settings)
-    of_free, of_method = np.zeros((12, 12)), np.zeros((12, 12))
-    of_free[:3, :3] = of_method[:3, :3] = M
-    of_free[3:, 3:], of_method[3:, 3:] = np.kron(M, np.eye(3)), np.kron(np.eye(3), free.K.T)
-    covariance = of_free @ free.covariance[:12, :12] @ of_free.T + of_method @ own @ of_method.T
-    uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    parts = _parts_of(M @ free.K - np.eye(3))
-    return _Difference(calibration, M @ (free.bias - calibration.bias), parts, uncertainty, free)
-
-
-def _errors(difference: _Difference, recording: Recording, table: Mapping[str, Any]) -> Errors:
-    """Return the errors in one recording by their cause; none where no motion is known."""
+def _errors(
+    difference: _Difference, free: Fit, recordings: Sequence[Recording], table: Mapping[str, Any]
+) -> dict[str, tuple[Values, Values]]:
+    """Return the errors by cause in the recordings with a known motion: (n, 3), and of the magnitude: (n,)."""
     sensor = difference.method.sensor
-    if recording.samples < 6 or recording.reading(sensor) is None:
-        return {}
-    before = table_motion(recording, table)
-    if before is None:
-        return {}
-    filtered = recording.filter["name"] != "none"
-    motion = filtered_motion(replace(before, at_offset=None, at_lag=None), recording) if filtered else before
-    u = truth(sensor, motion)
-    size = np.linalg.norm(u, axis=1)
-    found: Errors = {name: (e, np.linalg.norm(u + e, axis=1) - size) for name, e in difference.parts(motion).items()}
-    if filtered:
-        plain = truth(sensor, before)
-        late = recording.time - float(recording.filter.get("delay_s", 0.0))
-        found["filter_delay"] = (u - plain, size - np.interp(late, recording.time, np.linalg.norm(plain, axis=1)))
-    return found
-
-
-def _together(found: Sequence[Errors]) -> Errors:
-    """Return the errors of several recordings one after the other."""
-    every = {name: [errors[name] for errors in found if name in errors] for errors in found for name in errors}
+    found: dict[str, list[tuple[Values, Values]]] = {}
+    for recording in recordings:
+        before = table_motion(recording, table)
+        if recording.samples < 6 or recording.reading(sensor) is None or before is None:
+            continue
+        filtered = recording.filter["name"] != "none"
+        motion = filtered_motion(replace(before, at_offset=None, at_lag=None), recording) if filtered else before
+        u = truth(sensor, motion)
+        size = np.linalg.norm(u, axis=1)
+        for name, error in difference.errors(motion, free).items():
+            found.setdefault(name, []).append((error, np.linalg.norm(u + error, axis=1) - size))
+        if filtered:
+            unfiltered = truth(sensor, before)
+            late = recording.time - float(recording.filter.get("delay_s", 0.0))
+            delayed = np.interp(late, recording.time, np.linalg.norm(unfiltered, axis=1))
+            found.setdefault("filter_delay", []).append((u - unfiltered, size - delayed))
     return {
-        name: (np.concatenate([e[0] for e in errors]), np.concatenate([e[1] for e in errors]))
-        for name, errors in every.items()
+        name: (np.concatenate([vector for vector, _ in errors]), np.concatenate([magnitude for _, magnitude in errors]))
+        for name, errors in found.items()
     }
 
 
@@ -247,8 +198,40 @@ def _shares(rms: Mapping[str, float]) -> dict[str, float]:
     return {name: size**2 / total for name, size in rms.items()} if total > 0.0 else {}
 
 
-def _rms(values: Values) -> float:
-    return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
+def _rms(errors: Values) -> float:
+    """Return the rms of errors of (n, 3) vectors or (n,) magnitudes."""
+    return float(np.sqrt(np.sum(errors**2) / len(errors)))
+
+
+def _named(
+    difference: _Difference,
+    rms: Mapping[str, float],
+    recordings: Sequence[Recording],
+    selected: Sequence[str] = (),
+    held_out: Mapping[str, Mapping[str, float]] | None = None,
+    *,
+    printed: bool = False,
+) -> list[dict[str, Any]]:
+    """Return the entries of significant errors, the largest share first; ``held_out``: shares by key and name."""
+    held_out = held_out or {"held_out_share": {}, "held_out_magnitude_share": {}}
+    certain, sensor = difference.certain(selected), difference.method.sensor
+    stages = [stage.name for stage in difference.method.stages]
+    filters = [r.filter for r in recordings if r.filter["name"] != "none"] or [{"name": "none"}]
+    delay = max(float(each.get("delay_s", 0.0)) for each in filters)
+    meaning = template("method_errors.txt").module.meaning  # type: ignore[attr-defined]
+    found = [
+        {
+            "name": name,
+            "meaning": " ".join(meaning(name, sensor, stages, printed, filters[0]["name"], delay).split()),
+            **_size(name, difference, rms[name], recordings),
+            "share": share,
+            "rms": rms[name],
+            **{key: shares.get(name) for key, shares in held_out.items()},
+        }
+        for name, share in _shares(rms).items()
+        if max(share, held_out["held_out_magnitude_share"].get(name, 0.0)) > LEAST_SHARE and certain.get(name, True)
+    ]
+    return sorted(found, key=lambda entry: -float(entry["share"]))
 
 
 def _size(name: str, difference: _Difference, rms: float, recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -256,26 +239,12 @@ def _size(name: str, difference: _Difference, rms: float, recordings: Sequence[R
     sensor = difference.method.sensor
     if name == "bias":
         return {"size": float(np.abs(difference.bias).max()), "unit": unit_of(sensor)}
+    if name == "scale_factor":
+        return {"size": float(np.abs(difference.matrices[name]).max()), "unit": "1"}
     if name in difference.matrices:
-        size = float(np.abs(difference.matrices[name]).max())
-        return (
-            {"size": size, "unit": "1"} if name == "scale_factor" else {"size": float(np.degrees(size)), "unit": "deg"}
-        )
+        return {"size": float(np.degrees(np.abs(difference.matrices[name]).max())), "unit": "deg"}
     if name == "filter_delay":
-        turns = [r for r in recordings if r.role == sensor]
-        return {"size": max(_fastest(r) * float(r.filter.get("delay_s", 0.0)) for r in turns), "unit": "deg"}
+        turns = [(r, rate) for r in recordings if r.role == sensor and (rate := r.logged_rate) is not None]
+        angles = [float(np.abs(rate).max() * r.filter.get("delay_s", 0.0)) for r, rate in turns]
+        return {"size": max(angles, default=0.0), "unit": "deg"}
     return {"size": rms, "unit": unit_of(sensor)}
-
-
-def _fastest(recording: Recording) -> float:
-    """Return the largest rate of a turn, deg/s."""
-    rate = recording.logged_rate
-    return 0.0 if rate is None else float(np.abs(rate).max())
-
-
-def _meaning(name: str, sensor: str, stages: Sequence[str], recordings: Sequence[Recording], *, printed: bool) -> str:
-    """Return what an error is, as the end of a sentence."""
-    filters = [r.filter for r in recordings if r.filter["name"] != "none"] or [{"name": "none"}]
-    delay = max(float(each.get("delay_s", 0.0)) for each in filters)
-    told = template("method_errors.txt").module.meaning(name, sensor, stages, printed, filters[0]["name"], delay)  # type: ignore[attr-defined]
-    return " ".join(told.split())

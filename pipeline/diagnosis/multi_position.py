@@ -1,20 +1,20 @@
-"""What the selection finds in rests and moves by hand, where no table logged the motion.
+"""Select the effects that the model of a sensor lacks, from rests and moves by hand.
 
-The residual of the rests is compared with white noise and the expected bias instability. How firmly a unit
-rests by hand is not known, so that a scatter of the rests beyond that is reported, but alone is no sign of a missing
-effect.
+The residual of the rests is compared with white noise and the expected bias instability. How firmly the unit rested is
+unknown. So a larger scatter of the rests is reported, but alone it is no sign of a missing effect.
 
-Twenty rests are too few to keep every third from a selection. So the selection uses all of them, and cross-validation
-judges it: of ``FOLDS`` models each leaves out every third rest with the move before it. ``held_out_error`` of a ranking
-is that of the selected effects, fitted without those rests; ``cross_validation`` repeats the selection without them.
+Twenty rests are too few to hold some out of a selection. So the selection uses all of them, and cross-validation
+judges it: each of ``FOLDS`` models leaves out every third rest with the move before it. ``held_out_error`` of a ranking
+is that of the selected effects, fitted without those rests. ``cross_validation`` also repeats the selection.
 
-A residual depends on time, temperature (powers 1 to 2 or 3 over their span) or the axis' own specific force (Chebyshev
-polynomials of degree 4 and 5) where curves with coefficients of their own in every axis have delta BIC > 10 and
-m p < 1e-3, m the number of all tests.
+The residual depends on time, temperature (powers 1 to 2 or 3 over their span) or the axis' own specific force
+(Chebyshev polynomials of degree 4 and 5) if such curves, with free coefficients on every axis, have delta BIC > 10 and
+m p < 1e-3, with m the number of all tests.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ from pipeline.diagnosis import functional_forms as forms
 from pipeline.diagnosis.findings import Case, Findings
 from pipeline.diagnosis.method_errors import given_differences
 from pipeline.diagnosis.observability import MORE, never_shown, not_observable_by_hand
-from pipeline.diagnosis.residual_dependence import GATE_P
+from pipeline.diagnosis.residual_dependence import significant
 from pipeline.diagnosis.residual_plots import added_variable_of_rests
 from pipeline.diagnosis.words import listed, plain
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
@@ -36,9 +36,8 @@ from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.model import NEW, NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
-from pipeline.estimation.multi_position.selection import FAR, Selection, posterior
-from pipeline.estimation.selection import GATE_BIC
-from pipeline.model.effects import catalogue, effect, effect_from
+from pipeline.estimation.multi_position.selection import Selection, posterior
+from pipeline.model.effects import catalogue, effect_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -47,31 +46,40 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Noise, Recording, SensorCalibration
 
 NEEDED = MORE
-FAR_ABOVE = 10.0  # times the noise: no unit that somebody sets down or holds rests so badly
-BESIDE_FACES = ", beside those on the six faces: bias and matrix need the faces and turns alone, an effect needs more"
+FAR_ABOVE = 10.0  # times the noise: nobody sets down or holds a unit so badly
+WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
 FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
-SPARE = 2  # equations beyond the parameters, from which on a fold is judged
+SPARE = 2  # least number of equations beyond the parameters in a fold
 LEAST_SPAN = 1.0  # s or degC: of a covariate
 FORCE = ("8 * u ** 4 - 8 * u ** 2 + 1", "16 * u ** 5 - 20 * u ** 3 + 5 * u")  # Chebyshev polynomials of u in g
-WORTH = 0.25  # share of the residual's mean square, of what could be its cause
+WORTH = 0.25  # least share of the residual's mean square that a possible cause explains at its limits
 MOST_NAMED = 3  # effects in a sentence
-FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a word
+FIRM = 2.0  # times the noise: a larger scatter of the rests is reported
 
 
 def findings(case: Case) -> Findings:
-    """Return what the selection finds in rests and moves by hand; as ``require_model``."""
-    model, calibration = _model_of_all_rests(case), case.calibration
+    """Return the findings of the selection in rests and moves by hand.
+
+    Raises ``NotObservableError`` if there are no rests, or if they do not determine bias and matrix.
+    """
+    model, calibration, noise = _model_of_all_rests(case), case.calibration, _without_creep(case)
     given = calibration, case.configured, case.noise, case.sensor_config
     selection = Selection(model, *given)
-    expected = _without_creep(case.noise, case.sensor_config)
-    hidden, unknown = not_observable_by_hand(selection, case.configured), dependences(selection)
-    chi = [_chi(selection, fit, expected) for fit in selection.fits]
-    over, left_over = (_over_noise(selection, selection.fits[k], expected) for k in (0, -1))
+    expected = NoiseHypothesis(WHITE, (0.0,) * model.kinds)
+    if noise is not None:
+        ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
+        expected = replace(expected, bias=Setting(ratio, noise.correlation_time))
+    with_scatter = replace(expected, scatter=selection.fits[-1].noise.scatter)
+    hidden, unknown = not_observable_by_hand(selection, case.configured), _dependences(selection)
+    chi = [
+        float(np.sum(project_out(model.equations(fit.state), [with_scatter]).residual ** 2)) for fit in selection.fits
+    ]
+    over, left_over = (_over_noise(model, selection.fits[k], expected) for k in (0, -1))
     verdict = "missing_effect" if selection.names else "nothing_missing"
     if (unknown and not selection.names) or (left_over or 0.0) > FAR_ABOVE:
         verdict = "unexplained"
-    likely = project_out(model.equations(selection.fits[-1].state), selection.hypotheses).scores()
-    best = selection.hypotheses[int(np.argmax(likely))]
+    scores = project_out(model.equations(selection.fits[-1].state), selection.hypotheses).scores()
+    best = selection.hypotheses[int(np.argmax(scores))]
     signal = selection.first.signal
 
     def calibrated(fit: Fit) -> SensorCalibration:
@@ -79,7 +87,7 @@ def findings(case: Case) -> Findings:
 
     def advice(verdict: str) -> str:
         if verdict == "not_enough_data":
-            return f"{MORE}{BESIDE_FACES if case.settings['procedure'].get('faces') else ''}"
+            return f"{MORE}{WITH_FACES if case.settings['procedure'].get('faces') else ''}"
         if left_over is not None and (left_over > FIRM or verdict == "unexplained"):
             return _of_scatter(_suspects(selection, hidden), left_over)
         warmth = catalogue()["bias_temperature"]
@@ -96,7 +104,7 @@ def findings(case: Case) -> Findings:
         limits=selection.limits,
         answers=posterior(selection, never_shown(hidden, selection.names)),
         shares=lambda name: _shares(selection, name),
-        left=chi,
+        squares=chi,
         drop_alone=lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,
         excess=max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
         held_out=_held_out_errors(selection) if selection.names else [None],
@@ -104,11 +112,9 @@ def findings(case: Case) -> Findings:
         unknown=unknown,
         over_noise=over,
         left_over_noise=left_over,
-        noises=[
-            (h.bias.ratio, h.bias.time, score) for h, score in zip(selection.hypotheses, likely.tolist(), strict=True)
-        ],
+        noises=[(h.bias, score) for h, score in zip(selection.hypotheses, scores.tolist(), strict=True)],
         white=float(np.sqrt(np.mean(model.white**2))),
-        expected_wander=None if expected is None else float(np.sqrt(np.mean(expected.wander**2))),
+        expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
         advice=advice,
         full=(lambda: calibrated(selection.fits[-1])) if selection.names else None,
         other=case.accelerometer if case.sensor == "gyroscope" else None,
@@ -123,7 +129,7 @@ def findings(case: Case) -> Findings:
             "method_errors": given_differences(
                 calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
             ),
-            "cross_validation": _nested(selection, lambda part: Selection(part, *given)),
+            "cross_validation": _cross_validation(selection, lambda part: Selection(part, *given)),
         },
     )
 
@@ -131,24 +137,26 @@ def findings(case: Case) -> Findings:
 def _model_of_all_rests(case: Case) -> Model:
     """Return the model with no rest held out.
 
-    The accelerometer is calibrated by all rests, which shows those that contradict the others; it is taken as it is
-    where it has effects, or where all rests do not determine it.
+    The accelerometer is calibrated again by all rests, which shows rests that contradict the others, unless it has
+    effects or all rests do not determine it.
     """
+    settings = {**case.settings, "procedure": {**case.settings["procedure"], "holdout_every": 0}}
 
-    def with_all_rests(found: SensorCalibration, noise: Noise | None) -> SensorCalibration:
+    def with_all_rests(fitted: SensorCalibration, noise: Noise | None) -> SensorCalibration:
         known = {"noise": {"accelerometer": noise}} if noise is not None else {}
-        if found.effects:
-            return found
+        if fitted.effects:
+            return fitted
         try:
-            return nonlinear_least_squares.fit(case.recordings, None, {**every, **known})
+            return nonlinear_least_squares.fit(case.recordings, None, {**settings, **known})
         except PipelineError:
-            return found
+            return fitted
 
-    every = {**case.settings, "procedure": {**case.settings["procedure"], "holdout_every": 0}}
+    calibration, other = case.calibration, None
     if case.sensor == "accelerometer":
-        return require_model(case.recordings, with_all_rests(case.calibration, case.noise), case.noise, every)
-    other = case.accelerometer and with_all_rests(case.accelerometer, None)
-    return require_model(case.recordings, case.calibration, case.noise, every, other)
+        calibration = with_all_rests(calibration, case.noise)
+    elif case.accelerometer:
+        other = with_all_rests(case.accelerometer, None)
+    return require_model(case.recordings, calibration, case.noise, settings, other)
 
 
 def require_model(
@@ -160,7 +168,7 @@ def require_model(
 ) -> Model:
     """Return the model of rests and moves; see ``pipeline.estimation.multi_position.result.model_of``.
 
-    Raises ``NotObservableError`` if there are no rests, or they do not determine bias and matrix.
+    Raises ``NotObservableError`` if there are no rests, or if they do not determine bias and matrix.
     """
     try:
         model = model_of(recordings, calibration, noise, settings, accelerometer)
@@ -171,17 +179,17 @@ def require_model(
     return model
 
 
-def _without_creep(noise: Noise | None, sensor_config: Mapping[str, Any]) -> Noise | None:
-    """Return the noise with the sensor file's wander, where only rests by hand determine one.
+def _without_creep(case: Case) -> Noise | None:
+    """Return the noise, with the wander of the sensor file unless a static recording determined it.
 
-    A unit that creeps from its attitude moves gravity from one axis to another, which is no wander of a bias.
+    In rests by hand a slow change of the attitude moves gravity between the axes and looks like a wander of the bias.
     """
+    noise, sensor_config = case.noise, case.sensor_config
     if noise is None or noise.source == "static":
         return noise
     wander = np.full(3, float(sensor_config.get("bias_wander") or 0.0))
-    return replace(
-        noise, wander=wander, correlation_time=float(sensor_config.get("wander_time_s") or noise.correlation_time)
-    )
+    time = float(sensor_config.get("wander_time_s") or noise.correlation_time)
+    return replace(noise, wander=wander, correlation_time=time)
 
 
 def _shares(selection: Selection, name: str) -> dict[str, float]:
@@ -195,69 +203,54 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
     return {other: min(float(np.sum((shown.T @ signal) ** 2)) / power, 1.0) for other, shown in others.items()}
 
 
-def _expected(selection: Selection, noise: Noise | None) -> NoiseHypothesis:
-    """Return the noise without scatter of the rests, with the wander that is expected."""
-    nothing = (0.0,) * selection.model.kinds
-    if noise is None:
-        return NoiseHypothesis(WHITE, nothing)
-    ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
-    return NoiseHypothesis(Setting(ratio, noise.correlation_time), nothing)
-
-
-def _chi(selection: Selection, fit: Fit, noise: Noise | None) -> float:
-    """Return the sum of squares of a fit's residual, whitened by the expected noise and the scatter that is left."""
-    expected = replace(_expected(selection, noise), scatter=selection.fits[-1].noise.scatter)
-    found = project_out(selection.model.equations(fit.state), [expected])
-    return float(np.sum(found.residual**2))
-
-
-def _over_noise(selection: Selection, fit: Fit, noise: Noise | None) -> float | None:
-    """Return the rms residual of the rests, of a fit, over that of noise alone; None without a degree of freedom."""
-    equations, rests = selection.model.equations(fit.state), slice(selection.model.rests_equations)
-    L = np.linalg.cholesky(equations.covariance(_expected(selection, noise))[rests, rests])
-    columns, residual = (np.linalg.solve(L, v[rests]) for v in (equations.columns, equations.residual))
+def _over_noise(model: Model, fit: Fit, expected: NoiseHypothesis) -> float | None:
+    """Return the rms residual of the rests over that of noise alone; None without a degree of freedom."""
+    equations, rests = model.equations(fit.state), slice(model.rests_equations)
+    L = np.linalg.cholesky(equations.covariance(expected)[rests, rests])
+    columns, readings = (np.linalg.solve(L, v[rests]) for v in (equations.columns, equations.residual))
     factors = ScaledColumns.of(columns, NEW)
-    left = residual - columns @ factors.solve(residual)
-    return float(np.sqrt(left @ left / (len(left) - factors.rank))) if len(left) > factors.rank else None
+    residual, freedom = readings - columns @ factors.solve(readings), len(readings) - factors.rank
+    return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None
 
 
 def _held_out_errors(selection: Selection) -> list[float | None]:
-    """Return the rms error, g or deg/s, of each of the selection's fits on rests that were left out of it in turn."""
+    """Return the rms error, g or deg/s, of each fit of the selection on rests that are left out of it in turn."""
     model = selection.model
     if model.held_out_error(selection.fits[0].state) is not None:  # a recording for validation
-        return [model.held_out_error(found.state) for found in selection.fits]
-    near = {n: FAR * limit for n, limit in selection.limits.items() if effect(n).nonlinear}
+        return [model.held_out_error(each.state) for each in selection.fits]
     errors: list[float | None] = []
-    for found in selection.fits:
-        folds = [(part, held, fit(part, found.state, selection.hypotheses, near)) for part, held in _folds(model)]
+    for each in selection.fits:
+        folds = [
+            (part, held, fit(part, each.state, selection.hypotheses, selection.bounds))
+            for part, held in _folds(model)
+        ]
         judged = all(len(fitted.residual) >= fitted.rank + SPARE for _, _, fitted in folds)
         square = sum(_squared(part, fitted.state) * held for part, held, fitted in folds) / len(model.rests.time)
         errors.append(float(np.sqrt(square)) if judged else None)
     return errors
 
 
-def _nested(selection: Selection, again: Callable[[Model], Selection]) -> dict[str, Any] | None:
-    """Return the errors of the whole procedure, selection included, on rests that it does not see.
+def _cross_validation(selection: Selection, select: Callable[[Model], Selection]) -> dict[str, Any] | None:
+    """Return the errors of the whole procedure, selection included, on rests that are left out of it in turn.
 
     ``folds``, ``error_before, error_after`` (rms, g or deg/s), and ``named``: the number of folds that selected each
-    effect. None where nothing was selected, or a recording for validation judges.
+    effect. None if nothing was selected, or if there is a recording for validation.
     """
     model = selection.model
     if not selection.names or model.held_out_error(selection.fits[0].state) is not None:
         return None
-    named: dict[str, int] = {}
+    named: Counter[str] = Counter()
     squares = np.zeros(2)
     for part, held in _folds(model):
-        found = again(part)
-        for name in found.names:
-            named[name] = named.get(name, 0) + 1
-        squares += held * np.array([_squared(part, found.fits[k].state) for k in (0, -1)])
+        selected = select(part)
+        named.update(selected.names)
+        squares += held * np.array([_squared(part, selected.fits[k].state) for k in (0, -1)])
     before, after = np.sqrt(squares / len(model.rests.time)).tolist()
-    return {"folds": FOLDS, "error_before": before, "error_after": after, "named": named}
+    return {"folds": FOLDS, "error_before": before, "error_after": after, "named": dict(named)}
 
 
 def _folds(model: Model) -> Iterator[tuple[Model, int]]:
-    """Return the models that leave out every third rest in turn, and how many each leaves out."""
+    """Yield the models that leave out every third rest in turn, each with the number of rests left out."""
     fold = np.arange(len(model.rests.time)) % FOLDS
     for k in range(FOLDS):
         held: Mask = fold == k
@@ -268,71 +261,61 @@ def _squared(model: Model, state: State) -> float:
     return (model.held_out_error(state) or 0.0) ** 2
 
 
-def dependences(selection: Selection) -> list[dict[str, Any]]:
-    """Return the covariates on which the residual still depends, each with its p-value, the likeliest first."""
-    model = selection.model
-    tests = _curves_of(selection)
-    terms = [_curves(covariate, formulas, model.sensor) for covariate, formulas in tests]
-    equations = model.equations(selection.fits[-1].state, terms)
-    found = project_out(equations, selection.hypotheses)
-    before, at = found.of_model()
-    named: dict[str, tuple[float, float]] = {}
-    for j, (covariate, _) in enumerate(tests):
-        count = found.count(j, at)
-        factor = found.correction(j, at, count, equations.scatter) if count else 0.0
-        gain = factor * max(2.0 * (found.with_candidate(j)[0] - before), 0.0)
-        delta = gain - count * float(np.log(len(equations.residual)))
-        p = float(scipy.special.chdtrc(max(count, 1), gain))
-        if delta > GATE_BIC and p * len(tests) < GATE_P and delta > named.get(covariate, (0.0, 1.0))[0]:
-            named[covariate] = (delta, p)
-    ordered = sorted(named.items(), key=lambda item: -item[1][0])
-    return [{"covariate": name, "p_value": p} for name, (_, p) in ordered]
-
-
-def _curves_of(selection: Selection) -> list[tuple[str, Sequence[str]]]:
-    """Return the tests: a covariate and the formulas of its curves."""
-    rests = selection.model.rests
-    tests: list[tuple[str, Sequence[str]]] = []
+def _dependences(selection: Selection) -> list[dict[str, Any]]:
+    """Return the covariates on which the residual depends, each with its p-value, the clearest first."""
+    model, rests = selection.model, selection.model.rests
+    tests: list[tuple[str, Sequence[str]]] = []  # covariate and formulas of its curves
     for covariate, values in (("time", rests.time), ("temperature", rests.temperature)):
         known = rests.clock_shared if covariate == "time" else not np.isnan(values).any()
         if known and np.ptp(values) > LEAST_SPAN:
             powers = forms.powers(forms.Span(covariate, np.sort(values)), covariate)
             tests += [(covariate, powers[:degree]) for degree in (2, 3)]
-    return [*tests, ("specific_force", FORCE)] if selection.model.sensor == "accelerometer" else tests
-
-
-def _curves(covariate: str, formulas: Sequence[str], sensor: str) -> Term:
-    """Return curves with coefficients of their own in every axis, as an effect of size 0."""
-    terms = {f"c{k}": {"formula": text, "unit": "1"} for k, text in enumerate(formulas)}
-    known = {"name": f"curves_of_{covariate}", "owner": "recording", "sensors": [sensor], "meaning": "Curves."}
-    return Term(effect_from({**known, "terms": terms}, "a test of the residual"), np.zeros(3 * len(formulas)))
+    if model.sensor == "accelerometer":
+        tests.append(("specific_force", FORCE))
+    curves = []
+    for covariate, formulas in tests:
+        terms = {f"c{k}": {"formula": text, "unit": "1"} for k, text in enumerate(formulas)}
+        effect = {"name": f"curves_of_{covariate}", "owner": "recording", "sensors": [model.sensor], "terms": terms}
+        definition = effect_from({**effect, "meaning": "Curves."}, "a test of the residual")
+        curves.append(Term(definition, np.zeros(3 * len(formulas))))
+    equations = model.equations(selection.fits[-1].state, curves)
+    projected = project_out(equations, selection.hypotheses)
+    before, setting = projected.of_model()
+    results = []
+    for j, (covariate, _) in enumerate(tests):
+        count = projected.count(j, setting)
+        factor = projected.correction(j, setting, count, equations.scatter) if count else 0.0
+        gain = factor * max(2.0 * (projected.with_candidate(j)[0] - before), 0.0)
+        delta, p = gain - count * float(np.log(len(equations.residual))), scipy.special.chdtrc(max(count, 1), gain)
+        results.append((covariate, delta, float(p)))
+    return [{"covariate": name, "p_value": p} for name, (_, p) in significant(results).items()]
 
 
 def _suspects(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
-    """Return the effects that these recordings cannot distinguish, and that could be what the residual holds.
+    """Return the effects that are not observable, but could be a cause of the residual, the likeliest first.
 
-    Such an effect shows in the equations, and at its limits it brings at least the share ``WORTH`` of the mean square
-    that is left; or it goes with the temperature, which was not recorded or did not change enough.
+    The effect shows in the equations, and at its limits explains at least the share ``WORTH`` of the residual's mean
+    square; or it depends on the temperature, which was not recorded or did not change enough.
     """
     first, n = selection.first, len(selection.fits[0].residual)
 
-    def could(name: str) -> bool:
+    def possible(name: str) -> bool:
         if "temperature" in catalogue()[name].needs:
             return bool(np.isnan(selection.model.rests.temperature).any()) or name in first.scores
         return name in first.scores and first.visible[name] >= first.spare[name] * n * float(np.log1p(WORTH))
 
-    def brings(name: str) -> float:
+    def unlikely(name: str) -> float:
         return -first.scores[name].delta_bic if name in first.scores else float("inf")
 
-    return sorted((name for name in hidden if could(name)), key=brings)
+    return sorted((name for name in hidden if possible(name)), key=unlikely)
 
 
-def _of_scatter(names: Sequence[str], over_noise: float) -> str:
-    """Return what to record where the rests scatter more than the noise, and nothing that can be seen explains it."""
-    many = f"the rests scatter {over_noise:.2g} times the noise"
-    if not names:
-        return f"set the unit down firmly for each rest: {many} and follow nothing that is recorded"
-    alike = listed([plain(name) for name in names[:MOST_NAMED]], "or")
-    warm = any("temperature" in catalogue()[name].needs for name in names)
+def _of_scatter(suspects: Sequence[str], over_noise: float) -> str:
+    """Return what to record if the rests scatter more than the noise and no observable effect explains it."""
+    scatter = f"the rests scatter {over_noise:.2g} times the noise"
+    if not suspects:
+        return f"set the unit down firmly for each rest: {scatter} and follow nothing that is recorded"
+    names = listed([plain(name) for name in suspects[:MOST_NAMED]], "or")
+    warm = any("temperature" in catalogue()[name].needs for name in suspects)
     temperature = ", with the temperature of the sensor" if warm else ""
-    return f"{MORE}{temperature}: {many}, and they cannot distinguish an unsteady hand from {alike}"
+    return f"{MORE}{temperature}: {scatter}, and they cannot distinguish an unsteady hand from {names}"

@@ -1,18 +1,18 @@
-"""Which effects the recordings cannot show, and why.
+"""Find the effects that the recordings cannot show, with the reasons.
 
-An effect is not observable where it needs what the recordings do not hold, where base and configured effects add up to
-all that it would add (less than 1e-3 of its columns is left), or where it would hide in the noise even with all its
-parameters at the sensor's limits: the mean gain in 2 log L stays below the gate ``k log N + 10``,
+An effect is not observable if it needs a quantity that the recordings lack, if base and configured effects explain its
+signal (less than 1e-3 of its columns remains), or if it would be below the noise even with all its parameters at the
+sensor's limits. Then the mean gain in 2 log L is below the gate ``k log N + 10``:
 
-    turns on a table    lambda = sum_j limit_j^2 H_jj,  H the whitened products of its columns
-    rests and moves     f n log(1 + lambda / n),  f the factor of the gain, n the equations
+    turns on a table    lambda = sum_j limit_j^2 H_jj,  with the whitened products H of its columns
+    rests and moves     f n log(1 + lambda / n),  with the factor f of the gain and n equations
 
-In turns it is the largest lambda under those hypotheses about the noise that have weight where the effect is in the
-model: where it is not, a random walk is likelier, which would hide it.
+For turns this is the largest lambda under those noise hypotheses that are likely if the effect is in the model. Without
+the effect a random walk is likelier, and would hide it.
 
-lambda of a drift of the bias grows as the square of the time between the first rest and the last, so that the time
-that shows it is known. (With 20 rests of an MPU-6050 in 110 s lambda is 12, of 167 that the gate asks for. Of simulated
-drifts of half the limit, 0 of 4 are found in 4 minutes, 14 of 16 in 8, and 16 of 16 in 11.)
+lambda of a bias drift grows as the square of the time between the first and the last rest. So the necessary time is
+known. (With 20 rests of an MPU-6050 in 110 s lambda is 12; the gate is 167. Of simulated drifts of half the limit, 0 of
+4 are found in 4 minutes, 14 of 16 in 8, and 16 of 16 in 11.)
 """
 
 from __future__ import annotations
@@ -35,34 +35,30 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
 
 LEAST_SPAN_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
-OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that tells the heading"}
+OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that shows the heading"}
 DRIFT = "bias_drift"
-LEAST_WEIGHT = float(np.log(0.01))  # of a hypothesis about the noise, over that of the likeliest: log
-FEWEST = 3  # equations beyond bias and matrix, from which on an effect of one coefficient can be judged
-ENOUGH = 40  # rests that leave room for what the catalogue holds
+LEAST_WEIGHT = float(np.log(0.01))  # log of the likelihood of a noise hypothesis over that of the likeliest
+FEWEST = 3  # equations beyond bias and matrix, to judge an effect with one coefficient
+ENOUGH = 40  # rests for the effects of the catalogue
 MORE = f"record {ENOUGH} rests or more, each in another orientation, all three axes inclined in most of them"
 
 
 def at_its_limit(this: Effect, sensor: str, limit: float) -> str:
-    """Return the beginning of the reason why an effect is too small to be seen."""
+    """Return the first words of the reason why an effect is too small to be seen."""
     unit = this.parameters(sensor)[0].unit
     return f"even at its limit of {limit:.2g}{'' if unit == '1' else ' ' + unit} it would"
 
 
-def _steady(span: float) -> str:
-    return f"the temperature changes by no more than {span:.2g} degC"
+def _hidden(sensor: str, modelled: Collection[str], reason: Callable[[Effect], str]) -> dict[str, str]:
+    """Return the reason for each effect of a sensor that is not observable, without those in the model.
 
-
-def _hidden(sensor: str, held: Collection[str], reason: Callable[[Effect], str]) -> dict[str, str]:
-    """Return the effects of a sensor that have a reason not to be seen, but for those that the model holds.
-
-    Checks of the recordings look for effects of single turns (``Effect.of_turns``).
+    Effects of single turns (``Effect.of_turns``) are left to the checks of the recordings.
     """
     found = {}
     for name, this in catalogue().items():
-        if sensor not in this.sensors or name in held or this.of_turns:
+        if sensor not in this.sensors or name in modelled or this.of_turns:
             continue
-        within = next((other for other in held if name in effect(other).contains), None)
+        within = next((other for other in modelled if name in effect(other).contains), None)
         text = f"{within}, which is in the model, contains it" if within else reason(this)
         if text:
             found[name] = text
@@ -70,18 +66,18 @@ def _hidden(sensor: str, held: Collection[str], reason: Callable[[Effect], str])
 
 
 def never_shown(hidden: Collection[str], selected: Collection[str]) -> list[str]:
-    """Return the effects that the recordings cannot show, whatever is selected."""
+    """Return the effects that are not observable for another reason than a selected effect that contains them."""
     return [name for name in hidden if not any(name in effect(other).contains for other in selected)]
 
 
 def one_way(observations: Observations) -> bool:
-    """Return whether the table turns, about no axis in both directions."""
-    ways: dict[int, set[float]] = {}
+    """Return whether the table turns, but about no axis in both directions."""
+    signs: dict[int, set[float]] = {}
     for part in observations.parts:
         if part.motion.axis is not None and part.motion.rate is not None:
-            seen = np.unique(np.sign(part.motion.rate[~part.motion.still]))
-            ways.setdefault(part.motion.axis, set()).update(seen[seen != 0.0].tolist())
-    return _moving(observations) and not any(len(w) == 2 for w in ways.values())
+            rates = part.motion.rate[~part.motion.still]
+            signs.setdefault(part.motion.axis, set()).update(np.unique(np.sign(rates[rates != 0.0])).tolist())
+    return _moving(observations) and not any(len(found) == 2 for found in signs.values())
 
 
 def _moving(observations: Observations) -> bool:
@@ -89,7 +85,7 @@ def _moving(observations: Observations) -> bool:
 
 
 def not_observable(selection: Selection, configured: Sequence[str]) -> dict[str, str]:
-    """Return the effects not in the model that turns cannot show, with the reason and what would show them."""
+    """Return the reason for each effect that turns cannot show, and what would show it, without those in the model."""
     observations = selection.observations
 
     def reason(this: Effect) -> str:
@@ -101,7 +97,7 @@ def not_observable(selection: Selection, configured: Sequence[str]) -> dict[str,
 
 
 def alike_with_zeros(selection: Selection) -> dict[str, str]:
-    """Return the effects that differ from a selected one by a zero of the angle alone, where zeros are estimated."""
+    """Return the effects that differ from a selected one only by a zero of the angle, if zeros are in the model."""
     of_angle = next((t.effect.name for t in selection.base.terms if t.effect.name in (MOUNTING, ZERO)), None)
     if of_angle is None:
         return {}
@@ -114,7 +110,8 @@ def alike_with_zeros(selection: Selection) -> dict[str, str]:
 
 
 def _reason(this: Effect, selection: Selection) -> str:
-    observations, places = selection.observations, selection.first.indices(this.name)
+    """Return why turns cannot show an effect; empty if they can."""
+    observations, excited = selection.observations, selection.first.indices(this.name)
     motions = [part.motion for part in observations.parts]
     lacking = [
         text
@@ -125,44 +122,48 @@ def _reason(this: Effect, selection: Selection) -> str:
     warmth = [motion.temperature for motion in motions]
     known = [t for t in warmth if t is not None]
     span = float(np.ptp(np.concatenate(known))) if known else 0.0
-    moving = _moving(observations)
     in_one = "every turn goes in one direction, in which it looks exactly like a part of bias and matrix"
     checks = [
         (observations.sensor in this.unseen, this.unseen.get(observations.sensor, "")),
         (warm and len(known) < len(warmth), "the recordings hold no temperature"),
         (this.needs_clock and not observations.clock_shared, "the time between the recordings is not known"),
         (bool(lacking), f"the recordings hold {' and '.join(lacking)}"),
-        (not places and this.needs_motion and not moving, "the table never moved while it was sampled"),
-        (warm and (not places or span < LEAST_SPAN_DEGC), _steady(span)),
-        (not places and this.needs_both_directions and one_way(observations), in_one),
-        (not places, "bias and matrix explain all that it would add in this motion"),
+        (not excited and this.needs_motion and not _moving(observations), "the table never moved while it was sampled"),
+        (warm and (not excited or span < LEAST_SPAN_DEGC), _steady(span)),
+        (not excited and this.needs_both_directions and one_way(observations), in_one),
+        (not excited, "bias and matrix explain all that it would add in this motion"),
     ]
     return next((reason for applies, reason in checks if applies), "") or _faint(this, selection)
 
 
 def _faint(this: Effect, selection: Selection) -> str:
-    """Return why an effect that did not show would not have; empty where it would."""
+    """Return why turns would not show an effect at its limits; empty if they would, or if it was seen."""
     limits, score = selection.limits.get(this.name), selection.alone.get(this.name)
     if limits is None or not np.all(np.isfinite(limits)) or score is None or score.delta_bic > GATE_BIC:
         return ""
-    ranking, held = selection.ranking, selection.chosen()
+    ranking, chosen = selection.ranking, selection.chosen()
     gate = score.parameters * float(np.log(ranking.samples)) + GATE_BIC
     for j in ranking.indices(this.name):
         seen = ranking.visibility(j, limits)[1:] >= gate
         if seen.any():
-            likely = ranking.log_likelihoods([*held, j])[1:]
+            likely = ranking.log_likelihoods([*chosen, j])[1:]
             if likely[seen].max() > likely.max() + LEAST_WEIGHT:
                 return ""
     return f"{at_its_limit(this, selection.observations.sensor, limits[0])} be below the noise"
 
 
 def not_observable_by_hand(selection: by_hand.Selection, configured: Sequence[str]) -> dict[str, str]:
-    """Return the effects not in the model that rests and moves cannot show, each with the reason."""
-    held = [*configured, *selection.names]
-    return _hidden(selection.model.sensor, held, lambda this: _reason_by_hand(this, selection))
+    """Return the reason for each effect that rests and moves cannot show, without those in the model."""
+    modelled = [*configured, *selection.names]
+    return _hidden(selection.model.sensor, modelled, lambda this: _reason_by_hand(this, selection))
+
+
+def _steady(span: float) -> str:
+    return f"the temperature changes by no more than {span:.2g} degC"
 
 
 def _reason_by_hand(this: Effect, selection: by_hand.Selection) -> str:
+    """Return why rests and moves cannot show an effect; empty if they can."""
     model, base = selection.model, selection.fits[0]
     refused = refusal(this, model.sensor, model.rests)
     if refused:
@@ -183,7 +184,7 @@ def _reason_by_hand(this: Effect, selection: by_hand.Selection) -> str:
 
 
 def _faint_by_hand(this: Effect, score: Score, selection: by_hand.Selection) -> str:
-    """Return why an effect that did not show would not have; empty where it would."""
+    """Return why rests and moves would not show an effect at its limits; empty if they would."""
     n, rests = len(selection.fits[0].residual), selection.model.rests
     gate = score.parameters * float(np.log(n)) + GATE_BIC
     scored = selection.last if this.name in selection.last.visible else selection.first

@@ -1,55 +1,64 @@
-"""On which covariates the residual still depends, given base, configured and selected effects.
+"""Test on which covariates the residual depends, given base, configured and selected effects.
 
     temperature, time, |omega| : Chebyshev polynomials of degree 1 to d over their span, d = 2 to 5
     angle                      : cos and sin of n periods a turn, n = 3 to 8, one n and all of them
     specific_force             : Chebyshev polynomials of degree 3 to 5 of one component, and of all
 
-are tried; where effects were selected or the residual is above white noise, a step at one of 16 places of the span of
-temperature, time and |omega|, sharp or soft, and for a gyroscope n = 2 to 8 periods in proportion to the rate. A
-covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests, and has it too
-where the noise is not constrained by a static recording. A flexible curve would win against physics in the first round
-of a selection, so the curves never take part in it.
+If effects were selected or the residual exceeds white noise, further tests are a step at one of 16 places of the span
+of temperature, time and |omega|, sharp or soft, and for a gyroscope n = 2 to 8 periods in proportion to the rate. The
+residual depends on a covariate if one of its tests has delta BIC > 10 and m p < 1e-3, with m the number of all tests,
+also without the constraint of the noise by a static recording. The curves take no part in a selection, since a flexible
+curve would win against physics in its first round.
+
+Goodness of fit is the share of simulations from the fitted model that fit worse than the readings by
+
+    T = min over the smooth curves above of p(2 log L' - 2 log L)
+
+The whitened linear model is fitted to the residual and to draws from the noise of the fit, under every noise setting.
+So the share allows for the number of tests and for the noise estimate of each fit (a parametric bootstrap: Davison and
+Hinkley, Bootstrap Methods and their Application, 1997, section 4.2).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
 from numpy.polynomial.chebyshev import chebvander
 
-from pipeline.diagnosis.functional_forms import Span, signals_of
-from pipeline.diagnosis.residual_regression import Curves, ProjectedCurves, Scan
-from pipeline.estimation.gauss_markov import selection_grid
+from pipeline.diagnosis.functional_forms import Span, available_signals, signals_of
+from pipeline.diagnosis.residual_regression import Curves, ProjectedCurves, Scan, each_explains
+from pipeline.estimation.gauss_markov import GaussMarkov, selection_grid
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from pipeline.estimation.selection import Selection
     from pipeline.records import Index, Motion, Values
 
-    Block = tuple[Sequence[int], int]
-    Basis = tuple[str, Curves, list[Block]]
-    Tests = tuple[list[str], Values, Index]
+    Block = tuple[Sequence[int], int]  # curves that are tried together: the first so many of them, and each further one
+    Basis = tuple[str, Callable[[Motion], Values], list[Block]]  # covariate, its curves by motion: (n, q), and blocks
+    Tests = tuple[list[str], Values, Index]  # covariate, delta BIC and number of parameters of each test
 
-GATE_P = 1e-3  # probability of naming a covariate of a complete model, over all tests (Bonferroni)
+GATE_P = 1e-3  # probability of a false dependence of a complete model, over all tests (Bonferroni)
 DEGREE = 5  # up to four turning points over the span; faster changes are steps
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
-LEAST_RIPPLE = 2  # one is an effect of the catalogue
-PLACES = 16  # of a test for a step: the nearest one is within 1/32 of the span
-EQUATION = 0.05  # of what effects of time or temperature gain: less may be due to a smoothed temperature where it turns
-ABOVE = 1.1  # times the white noise: a residual that may hold something sudden
-SIGNALS = {"temperature": "temperature", "time": "time", "rate": "speed"}  # of covariates in which steps are tried
+LEAST_RIPPLE = 2  # periods a turn; the catalogue contains one
+PLACES = 16  # of steps: the nearest one is within 1/32 of the span
+EQUATION = 0.05  # of the gain by effects of time or temperature: less may be the error of a smoothed temperature
+ABOVE = 1.1  # times the white noise: a larger residual may contain a step
+SIGNALS = {"time": "time", "temperature": "temperature", "rate": "speed"}  # of covariates, for steps and polynomials
+SIMULATIONS = 199  # standard error of the share: 3.5 % at most
 
 
-def dependences(selection: Selection, explained: Curves | None = None) -> list[tuple[str, float, float]]:
-    """Return the covariates on which the residual depends, with p-value and delta BIC, the likeliest first.
+def dependences(selection: Selection, explained: Curves | None = None) -> list[dict[str, Any]]:
+    """Return the covariates on which the residual depends, the clearest first: ``covariate, p_value, delta_bic``.
 
-    Curves ``explained`` (motion to (n, m) values) count as explained.
+    ``explained``: curves that are projected out too.
     """
     found = _significant(selection, explained)
     if any(effect(name).uses_time_or_temperature for name in selection.names):
@@ -58,56 +67,62 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[t
     if found and any(setting.prior for setting in selection.settings):
         least = min(setting.prior for setting in selection.settings)
         free = [replace(setting, prior=least) for setting in selection_grid(None)]
-        freely = _significant(replace(selection, settings=[*selection.settings, *free]), explained)
-        found = {name: values for name, values in freely.items() if name in found}
-    return [(name, p, delta) for name, (delta, p) in sorted(found.items(), key=lambda item: -item[1][0])]
+        unconstrained = _significant(replace(selection, settings=[*selection.settings, *free]), explained)
+        found = {name: values for name, values in unconstrained.items() if name in found}
+    return [{"covariate": name, "p_value": p, "delta_bic": delta} for name, (delta, p) in found.items()]
+
+
+def significant(tests: Iterable[tuple[str, float, float]]) -> dict[str, tuple[float, float]]:
+    """Return delta BIC and p-value of the best test in each covariate that passes the gate, the clearest first.
+
+    ``tests``: covariate, delta BIC and p-value of each.
+    """
+    tests = sorted(tests, key=lambda test: -test[1])
+    best: dict[str, tuple[float, float]] = {}
+    for covariate, delta, p in tests:
+        if delta > GATE_BIC and p * len(tests) < GATE_P:
+            best.setdefault(covariate, (delta, p))
+    return best
 
 
 def _significant(selection: Selection, explained: Curves | None) -> dict[str, tuple[float, float]]:
-    """Return delta BIC and p-value of the best test in each covariate that passes the gate."""
-    scan = Scan(selection, explained)
-    tests = [_smooth_tests(selection, scan)]
+    """Return the significant covariates of a selection; see ``significant``."""
+    scan, bases = Scan(selection, explained), _bases_of(selection)
+    tests = [_tests_of_curves(bases, scan)]
     if selection.names or selection.fit.residual_rms > ABOVE * float(np.sqrt(np.mean(selection.start.scale**2))):
-        tests.append(_step_tests(selection, scan))
-    count = sum(len(names) for names, _, _ in tests)
-    found: dict[str, tuple[float, float]] = {}
-    for names, delta, parameters in tests:
-        p = scipy.special.chdtrc(parameters, np.maximum(delta + parameters * np.log(scan.samples), 0.0))
-        for k in np.argsort(delta):
-            if delta[k] > GATE_BIC and p[k] * count < GATE_P and delta[k] > found.get(names[k], (0.0, 0.0))[0]:
-                found[names[k]] = (float(delta[k]), float(p[k]))
-    return found
+        tests.append(_tests_of_steps(selection, [covariate for covariate, _, _ in bases], scan))
+    names = [name for of_kind, _, _ in tests for name in of_kind]
+    delta, parameters = (np.concatenate([test[k] for test in tests]) for k in (1, 2))
+    p = scipy.special.chdtrc(parameters, np.maximum(delta + parameters * np.log(scan.samples), 0.0))
+    return significant(zip(names, delta.tolist(), p.tolist(), strict=True))
 
 
-def _smooth_tests(selection: Selection, scan: Scan) -> Tests:
-    """Return covariate, delta BIC and number of parameters of each test with smooth curves."""
-    bases = bases_of(selection)
-    projected = ProjectedCurves(scan, curves_of(bases))
+def _tests_of_curves(bases: Sequence[Basis], scan: Scan) -> Tests:
+    projected = ProjectedCurves(scan, _curves_of(bases))
     names: list[str] = []
     counts: list[int] = []
     drops = [np.zeros((*scan.left.shape, 0))]
-    for covariate, kept, least in smooth_tests(bases, projected):
-        drops.append(projected.drop(kept)[:, :, least - 1 :])
-        counts += range(least, len(kept) + 1)
-        names += [covariate] * (len(kept) + 1 - least)
+    for covariate, independent, least in _independent(bases, projected):
+        drops.append(projected.drop(independent)[:, :, least - 1 :])
+        counts += range(least, len(independent) + 1)
+        names += [covariate] * (len(independent) + 1 - least)
     parameters = 3 * np.array(counts, int)
     return names, scan.gains(np.concatenate(drops, axis=2), parameters), parameters
 
 
-def _step_tests(selection: Selection, scan: Scan) -> Tests:
-    """Return the same of the tests with steps and ripples."""
+def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan) -> Tests:
+    """Return the tests with steps and with periods in proportion to the rate."""
     observations = selection.observations
-    held = [name for name, _, _ in bases_of(selection)]
     names: list[str] = []
     scanned: list[tuple[str, Values]] = []
     for covariate, signal in SIGNALS.items():
-        if covariate in held:
+        if covariate in covariates:
             places = Span.of(observations, signal).places()
             every = max(1, len(places) // PLACES)
             scanned.append((signal, places[every // 2 :: every]))
             names += [covariate] * 2 * len(scanned[-1][1])
     steps = len(names)
-    ripples = (MOST - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in held else 0
+    ripples = (MOST - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in covariates else 0
 
     def curves(motion: Motion) -> Values:
         signals, columns = signals_of(motion), []
@@ -117,61 +132,95 @@ def _step_tests(selection: Selection, scan: Scan) -> Tests:
         if ripples:
             rate = np.zeros(len(motion.time)) if motion.rate is None else motion.rate
             columns.append(rate[:, None] * _harmonics(motion, LEAST_RIPPLE))
-        return np.concatenate(columns, axis=1)
+        return np.concatenate(columns, axis=1)[:, None]
 
-    values = scan.values(curves)[:, 0]
-    pairs = values[:, steps:].reshape(len(values), 2, ripples).swapaxes(1, 2)  # cosine and sine of each
+    values = scan.values(curves)
+    pairs = values[:, :, steps:].reshape(len(values), 1, 2, ripples).swapaxes(2, 3)  # cosine and sine of each
     of_pairs = scan.drops(pairs)
     of_pairs = of_pairs[:, :, np.any(of_pairs, axis=(0, 1))]
-    drops = np.concatenate([scan.drops(values[:, :steps, None]), of_pairs], axis=2)
+    drops = np.concatenate([scan.drops(values[:, :, :steps, None]), of_pairs], axis=2)
     parameters = np.repeat([4, 6], [steps, of_pairs.shape[2]])
     return names + ["angle"] * of_pairs.shape[2], scan.gains(drops, parameters), parameters
 
 
-def curves_of(bases: Sequence[Basis]) -> Curves:
-    """Return what evaluates the curves of all covariates, those of each after those of the one before."""
-    return lambda motion: np.concatenate([curves(motion) for _, curves, _ in bases], axis=1)
+def goodness_of_fit(selection: Selection) -> dict[str, Any]:
+    """Return ``share_worse``, the share of simulations that fit worse, and ``simulations``, their number."""
+    bases, observations, scan = _bases_of(selection), selection.observations.weakened, Scan(selection)
+    fitted = ProjectedCurves(scan, _curves_of(bases))
+    within = np.append(scan.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
+    left, cross = np.zeros((len(scan.left), 1 + SIMULATIONS)), []  # of the readings and each simulation
+    for c, drawn in enumerate(_draws(selection)):
+        draws = scan.whitened(scan.scale[c] * drawn)
+        left[:, 0] += scan.left[:, c]
+        left[:, 1:] += np.einsum("tss->ts", scan.without_model(c, draws, draws))[1:]
+        of_draws = scan.without_model(c, fitted.columns[0], draws)[1:]
+        cross.append(np.concatenate([fitted.cross[:, c, :, None], of_draws], axis=2))
+
+    def likelihood(rss: Values) -> Values:
+        return np.asarray(scan.log_likelihood(rss, within).max(axis=0))
+
+    before, smallest_p = likelihood(left), np.ones(1 + SIMULATIONS)
+    for _, index, least in _independent(bases, fitted):
+        drop = np.zeros((len(left), len(index), 1 + SIMULATIONS))
+        for c, products in enumerate(cross):
+            inner, error = fitted.inner[:, c, index][:, :, index], fitted.error[:, c, index]
+            drop += np.cumsum(each_explains(inner, products[:, index], error)[0], axis=1)
+        gain = np.maximum(2.0 * (likelihood(left[:, None] - drop) - before), 0.0)
+        p = scipy.special.chdtrc(3 * np.arange(1, len(index) + 1)[:, None], gain)
+        smallest_p = np.minimum(smallest_p, p[least - 1 :].min(axis=0))
+    return {"share_worse": float(np.mean(smallest_p[1:] <= smallest_p[0])), "simulations": SIMULATIONS}
 
 
-def smooth_tests(bases: Sequence[Basis], projected: ProjectedCurves) -> Iterator[tuple[str, list[int], int]]:
-    """Yield covariate, independent curves and ``least`` of each block in which as many as that are independent.
+def _draws(selection: Selection) -> Values:
+    """Return draws from the noise of the fit, in units of the white noise of one sample: (3, n, s) array."""
+    observations, rng = selection.observations.weakened, np.random.default_rng(0)
+    blocks, weight = observations.blocks, observations.weight
+    label, noise = blocks.label(len(weight)), GaussMarkov(blocks, [selection.fit.setting])
+    found = []
+    for _ in range(3):
+        white = rng.standard_normal((len(weight), SIMULATIONS)) / np.sqrt(weight)[:, None]
+        mean = blocks.sums(weight[:, None] * white) / blocks.weight[:, None]
+        found.append(white + (noise.draw(rng, SIMULATIONS) - mean)[label])
+    return np.stack(found)
 
-    ``projected`` holds ``curves_of(bases)``.
+
+def _curves_of(bases: Sequence[Basis]) -> Curves:
+    """Return the curves of all covariates together."""
+    return lambda motion: np.concatenate([curves(motion) for _, curves, _ in bases], axis=1)[:, None]
+
+
+def _independent(bases: Sequence[Basis], projected: ProjectedCurves) -> Iterator[tuple[str, list[int], int]]:
+    """Yield covariate, independent curves and least number of each block with at least as many independent curves.
+
+    ``projected`` holds ``_curves_of(bases)``.
     """
-    at = 0
+    first = 0
     for covariate, _, blocks in bases:
         for block, least in blocks:
-            kept = projected.independent(at + np.asarray(block))
-            if len(kept) >= least:
-                yield covariate, kept, least
-        at += 1 + max(max(block) for block, _ in blocks)
+            independent = projected.independent(first + np.asarray(block))
+            if len(independent) >= least:
+                yield covariate, independent, least
+        first += 1 + max(max(block) for block, _ in blocks)
 
 
-def bases_of(selection: Selection) -> list[Basis]:
-    """Return covariates that the recordings hold, the curves of each, and which of these are tried together.
-
-    A block is tried with its first ``least`` curves, and with each further one.
-    """
+def _bases_of(selection: Selection) -> list[Basis]:
+    """Return the covariates that the recordings hold, with the curves and blocks of each."""
     observations = selection.observations
-    motions = [part.motion for part in observations.parts]
-    degrees: list[Block] = [(range(DEGREE), 2)]
     components: list[Block] = [(range(3 * i, 3 * i + 3), 3) for i in range(3)]
     bases: list[Basis] = [("specific_force", _force, [*components, (range(9), 9)])]
-    if observations.clock_shared:
-        bases.append(("time", _chebyshev(Span.of(observations, "time")), degrees))
-    if all(m.temperature is not None for m in motions):
-        bases.append(("temperature", _chebyshev(Span.of(observations, "temperature")), degrees))
-    if any(np.any(~m.still) for m in motions):
-        bases.append(("rate", _chebyshev(Span.of(observations, "speed")), degrees))
-    if any(m.axis is not None for m in motions):
+    available = available_signals(observations)
+    for covariate, signal in SIGNALS.items():
+        if signal in available:
+            bases.append((covariate, _chebyshev(Span.of(observations, signal)), [(range(DEGREE), 2)]))
+    if any(part.motion.axis is not None for part in observations.parts):
         count = MOST - FEWEST + 1
         single: list[Block] = [((j, count + j), 2) for j in range(count)]
         bases.append(("angle", _harmonics, [*single, (range(2 * count), 2 * count)]))
     return bases
 
 
-def _chebyshev(span: Span) -> Curves:
-    """Return what evaluates Chebyshev polynomials of degree 1 to 5 of a signal over its span."""
+def _chebyshev(span: Span) -> Callable[[Motion], Values]:
+    """Return the function from motion to Chebyshev polynomials of degree 1 to 5 of a signal over its span."""
 
     def curves(motion: Motion) -> Values:
         x = 2.0 * (np.asarray(signals_of(motion)[span.signal]) - span.low) / span.size - 1.0

@@ -1,4 +1,4 @@
-"""What further columns explain of the residual that base, configured and selected effects leave.
+"""Compute how much further columns explain of the residual, given base, configured and selected effects.
 
     y_c = X_c beta_c + Z gamma_c + noise,    drop(Z, c) = b^T G^-1 b
     b = Z^T M C^-1 y_c,    G = Z^T M C^-1 Z,    M = 1 - C^-1 X_c (X_c^T C^-1 X_c)^-1 X_c^T
@@ -6,12 +6,12 @@
     X_c  : columns of the model on axis c: 1, what K acts on, and every parameter of every effect
     Z    : (n, r) further columns, such as curves in a covariate or the columns of a functional form
     C    : white noise plus bias wander, ``pipeline.estimation.gauss_markov``
-    drop : by how much they lower the whitened sum of squares
+    drop : reduction of the whitened sum of squares by them
 
-The coefficients of effects that the axes share are left free on each axis: that decouples the axes, and never lets a
-form explain more than it does. Rounding errors of products are at most ``u sqrt(n) |a| |a'|`` (Higham and Mary 2019,
-doi:10.1137/18M1226312), so a column z from which others are taken with coefficients x leaves a sum of squares that is
-known to ``e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2``; a column that leaves less explains nothing.
+The coefficients of effects that the axes share are free on each axis: then the axes are separate problems, and no form
+explains more than it does. Rounding errors of products are at most ``u sqrt(n) |a| |a'|`` (Higham and Mary 2019,
+doi:10.1137/18M1226312). So the remaining sum of squares of a column z, after columns a_k are subtracted with
+coefficients x_k, is uncertain by ``e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2``. Below e^2 a column explains nothing.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.records import Index, Mask, Motion, Values
 
-Curves: TypeAlias = "Callable[[Motion], Values]"
+Curves: TypeAlias = "Callable[[Motion], Values]"  # to (n, 1, q), or (n, 3, q) if they differ between the axes
 
-NEW = 1e-3  # share of a column's norm that base and effects leave, below which it is theirs (EXCITED of the ranking)
+NEW = 1e-3  # least remaining share of a new column's norm, without base and effects (EXCITED of the ranking)
 ROUNDING = float(np.finfo(np.float64).eps) / 2.0  # u
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What a functional form explains."""
+    """The improvement of the fit by a functional form."""
 
     delta_bic: float
     p_value: float
-    axes: tuple[int, ...]  # on which it acts
+    axes: tuple[int, ...]  # that it improves
     setting: int  # index of its best noise setting
 
 
 class Whitened(NamedTuple):
-    """Columns about the means of their blocks, (n, q), and these means under each noise, (t, q, m)."""
+    """Whitened columns: deviations from the means of their blocks, (n, q), and these means by noise, (t, q, m)."""
 
     inside: Values
     means: Values
@@ -61,9 +61,9 @@ class Whitened(NamedTuple):
 
 
 class Scan:
-    """The residual of a selection's fit under every noise setting, and what further columns explain of it.
+    """The residual of a selection's fit under every noise setting, and its reduction by further columns.
 
-    ``explained``: motion to curves that count as explained, (n, q), or (n, 3, q) where each axis has its own.
+    ``explained``: curves that are projected out too.
     """
 
     def __init__(self, selection: Selection, explained: Curves | None = None) -> None:
@@ -103,18 +103,17 @@ class Scan:
         self.before = float(self.log_likelihood(self.left.sum(axis=1)).max())
 
     def values(self, curves: Curves) -> Values:
-        """Return the values of curves at all rows: (n, 3, q) array, or (n, 1, q) where the axes have the same."""
-        values = np.concatenate([curves(motion) for motion in self._motions])
-        return values[:, None] if values.ndim == 2 else values
+        """Return the values of curves in all rows: (n, 3, q) array, or (n, 1, q) if they are equal on all axes."""
+        return np.concatenate([curves(motion) for motion in self._motions])
 
     def whitened(self, columns: Values) -> Whitened:
-        """Return (n, q) columns, whitened."""
+        """Return (n, q) columns whitened."""
         means = self._blocks.sums(self._weight[:, None] * columns) / self._blocks.weight[:, None]
         inside = np.sqrt(self._weight)[:, None] * (columns - means[self._label])
         return Whitened(inside, self._noise.whitened(means))
 
-    def beside(self, c: int, one: Whitened, other: Whitened) -> Values:
-        """Return the products of columns on an axis after the model is projected out, white noise first: (t, q, p)."""
+    def without_model(self, c: int, one: Whitened, other: Whitened) -> Values:
+        """Return the products of columns on an axis without their part in the model, white noise first: (t, q, p)."""
         known, _, inverse = self._fitted[c]
         taken = one.times(self._every)[:, :, known] @ inverse @ self._every.times(other)[:, known]
         return np.asarray((one.times(other) - taken) / self.scale[c] ** 2)
@@ -122,7 +121,7 @@ class Scan:
     def log_likelihood(self, rss: Values, within: Values | None = None) -> Values:
         """Return the log likelihood under each noise setting, (t, ...), of whitened sums of squares.
 
-        ``within``: scatter within rows, of the shape of the last axes of ``rss``; without it that of the readings.
+        ``within``: scatter within rows, of the shape of the last axes of ``rss``; by default that of the readings.
         """
         total = np.maximum(rss + (self.within if within is None else within), 1e-300)
         penalty = self._penalty.reshape(-1, *[1] * (rss.ndim - 1))
@@ -130,17 +129,16 @@ class Scan:
         return found
 
     def gains(self, drops: Values, parameters: int | Index) -> Values:
-        """Return delta BIC of forms on all three axes, from their (t, 3, m) drops and numbers of parameters: (m,)."""
+        """Return delta BIC of forms on all three axes from their drops, (t, 3, m), and numbers of parameters: (m,)."""
         rss = self.left.sum(axis=1)[:, None] - drops.sum(axis=1)
         best = self.log_likelihood(rss).max(axis=0)
         found: Values = 2.0 * (best - self.before) - parameters * float(np.log(self.samples))
         return found
 
     def best_axes(self, drops: Values, columns: int | Index, scanned: int | Index = 0) -> list[Gain]:
-        """Return what each form explains, on the axes that it improves.
+        """Return the gain of each form on the axes that it improves.
 
-        Their (t, 3, m) ``drops`` are those of so many columns on each axis; ``scanned`` counts parameters such as a
-        place.
+        ``drops``: (t, 3, m). ``columns``: number of columns on each axis. ``scanned``: number of scanned constants.
         """
         order = np.argsort(-drops.max(axis=0), axis=0)
         together = np.cumsum(np.take_along_axis(drops, order[None], axis=1), axis=1)
@@ -155,23 +153,22 @@ class Scan:
         ]
 
     def drops(self, columns: Values) -> Values:
-        """Return what forms explain under each noise on each axis: (t, 3, m) array.
+        """Return the drops of forms under each noise on each axis: (t, 3, m) array.
 
-        ``columns``: (n, m, r) of m forms with r coefficients, or (n, 3, m, r) where each axis has its own.
+        ``columns``: (n, 3, m, r) of m forms with r coefficients, or (n, 1, m, r) if they are equal on all axes.
         """
-        n, *_, m, r = columns.shape
-        values = columns.reshape(n, 1 if columns.ndim == 3 else 3, m * r)
-        inner, cross, error = self.products([self.whitened(values[:, k]) for k in range(values.shape[1])], r)
+        n, axes, _, r = columns.shape
+        inner, cross, error = self.products([self.whitened(columns[:, k].reshape(n, -1)) for k in range(axes)], r)
         explained, new = each_explains(inner, cross[..., None], error)
         new &= new[0]
         return np.asarray(np.where(new.all(axis=3), explained[..., 0].sum(axis=3), 0.0)[1:])
 
     def products(self, versions: Sequence[Whitened], r: int) -> tuple[Values, Values, Values]:
-        """Return the products of forms of r columns each beside the model: inner, cross and the error e of each column.
+        """Return the products of m forms of r columns without their part in the model, white noise first.
 
-        (t, 3, m, r, r), (t, 3, m, r) and (t, 3, m, r) arrays, white noise first. Where white noise leaves less than
-        ``NEW`` of a column, or another noise nothing but rounding, the error is larger than what is left.
-        ``versions``: of each axis, or one for all.
+        (t, 3, m, r, r) products of a form's columns, (t, 3, m, r) with the residual, and (t, 3, m, r) the error e of
+        each column. e exceeds the remaining norm of a column that is less than ``NEW`` under white noise, or rounding
+        alone under another noise. ``versions``: the columns of each axis, or one for all.
         """
 
         def split(values: Values) -> Values:
@@ -197,9 +194,9 @@ class Scan:
 
 
 class ProjectedCurves:
-    """Products of q curves and the residual of a scan after model and explained curves are projected out of them.
+    """Products of q curves and the residual of a scan, after model and explained curves are projected out of them.
 
-    ``curves``: motion to (n, q), or to (n, 3, q) where each axis has its own. Of the products, white noise is left out.
+    The products are without white noise alone.
     """
 
     def __init__(self, scan: Scan, curves: Curves) -> None:
@@ -213,29 +210,27 @@ class ProjectedCurves:
 
     def independent(self, index: Iterable[int]) -> list[int]:
         """Return the curves of ``index`` that are independent of base, effects and the curves before them."""
-        rest, kept = self.white.copy(), []
+        rest, new = self.white.copy(), []
         for j in index:
             if rest[j, j] > (NEW * self.size[j]) ** 2:
-                kept.append(int(j))
+                new.append(int(j))
                 rest -= np.outer(rest[:, j], rest[j]) / rest[j, j]
-        return kept
+        return new
 
     def drop(self, index: Sequence[int]) -> Values:
-        """Return what several curves explain together, by the number of them from the first on: (t, 3, r) array."""
-        each, _ = self._each(index)
-        together: Values = np.cumsum(each, axis=2)
-        return together
+        """Return the drops of the first curve, the first two curves and so on: (t, 3, r) array."""
+        return np.asarray(np.cumsum(self._each(index)[0], axis=2))
 
     def _each(self, index: Sequence[int]) -> tuple[Values, Mask]:
-        """Return what each curve adds to those before it, and whether it is independent of them: (t, 3, r)."""
+        """Return the drop by each curve after those before it, and whether it is independent of them: (t, 3, r)."""
         inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index]
         explained, independent = each_explains(inner, cross[..., None], self.error[:, :, index])
         return explained[..., 0], independent
 
     def coefficients(self, index: Sequence[int], setting: int) -> Values:
-        """Return the estimates of some curves under one noise: (3, r) array, unit of the sensor.
+        """Return the coefficients of some curves under one noise: (3, r) array, unit of the sensor.
 
-        Those of a curve that is not independent of the others are 0.
+        The coefficient of a curve that depends on those before it is 0.
         """
         inner, cross = self.inner[setting][:, index][:, :, index], self.cross[setting][:, index]
         independent = self._each(index)[1][setting]
@@ -246,10 +241,10 @@ class ProjectedCurves:
 
 
 def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, Mask]:
-    """Return what each of r curves adds to those before it, (..., r, s), and whether it is independent of them.
+    """Return the drop by each of r curves after those before it, (..., r, s), and whether it is independent of them.
 
     ``inner``: (..., r, r), products of the curves. ``cross``: (..., r, s), their products with s residuals. ``error``:
-    (..., r), the rounding error e; a curve that leaves less explains nothing.
+    (..., r), the rounding error e of each curve.
     """
     explained, independent = np.zeros_like(cross), np.zeros(error.shape, bool)
     for j in range(inner.shape[-1]):

@@ -1,7 +1,7 @@
-"""What the selection finds in turns on a table.
+"""Select the effects that the model of a sensor lacks, from turns on a table.
 
-Held-out errors of the selection's own fits are the rms length of ``matrix (reading - model)`` where the attitude is
-logged, else the rms error of the magnitude, against the noise floor of ``pipeline.validation.heldout``.
+The held-out error of a fit is the rms length of ``matrix (reading - model)`` if the attitude is logged, else the rms
+error of the magnitude. It is compared with the noise floor of ``pipeline.validation.heldout``.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis.findings import Case, Findings
-from pipeline.diagnosis.formula_discovery import Discovery, dependent, discover, why_not_suggested
-from pipeline.diagnosis.influence import goodness_of_fit, influence
+from pipeline.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
+from pipeline.diagnosis.influence import influence
 from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import alike_with_zeros, never_shown, not_observable, one_way
+from pipeline.diagnosis.residual_dependence import dependences, goodness_of_fit
 from pipeline.diagnosis.residual_plots import plots
 from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
@@ -37,79 +38,77 @@ if TYPE_CHECKING:
 
 
 NEEDED = "record turns about all three axes on a table whose angle and rate are logged"
-CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
+CLOSE = 1.1  # mean square of a residual over that of noise below which effects cannot explain a part of the excess
 
 
 def findings(case: Case) -> Findings:
-    """Return what the selection finds in turns on a table.
+    """Return the findings of the selection in turns on a table.
 
     Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
     """
     observations = observe(case.sensor, case.recordings, case.settings["table"])
     known = case.noise, case.sensor_config, case.calibration
     selection = select(observations, case.configured, *known, accelerometer=case.accelerometer)
-    unknown = dependent(selection)
+    unknown = dependences(selection)
 
     def search() -> Findings | None:
-        found = discover(selection, unknown, case)
-        try:
-            return _offered(_described(found, case), found) if found.suggested else None
-        except ConvergenceError:  # a form that held-out readings cannot be corrected by is no effect of a sensor
+        discovery = discover(selection, unknown, case)
+        if not discovery.suggested:
             return None
+        try:
+            described = _described(discovery, case)
+        except ConvergenceError:  # the form cannot be subtracted from held-out readings, so it is no effect of a sensor
+            return None
+        reason = why_not_suggested(discovery, described.hidden)
+        if reason is None:
+            return described
+        formulas = [{**formula, "suggested": False} for formula in discovery.front]
+        more = {"suggested_effect": None, "not_suggested": reason, "formulas": formulas}
+        return replace(described, more={**described.more, **more})
 
-    plain = Discovery(selection, selection, unknown)
+    catalogue_alone = Discovery(selection, selection, unknown)
     try:
-        described = _described(plain, case)
-    except ConvergenceError:  # effects so large that held-out readings cannot be corrected: found, not judged there
+        described = _described(catalogue_alone, case)
+    except ConvergenceError:  # effects are too large to be subtracted from held-out readings: no held-out error
         fitted = [r for r in case.recordings if r.role != "validation"]
-        described = _described(plain, replace(case, recordings=fitted))
+        described = _described(catalogue_alone, replace(case, recordings=fitted))
     return replace(described, search=search)
 
 
-def _offered(described: Findings, found: Discovery) -> Findings:
-    """Return findings without the suggestion where the form is no firm one, and with the reason."""
-    reason = why_not_suggested(found, described.hidden)
-    if reason is None:
-        return described
-    formulas = [{**formula, "suggested": False} for formula in found.front]
-    more = {"suggested_effect": None, "not_suggested": reason, "formulas": formulas}
-    return replace(described, more={**described.more, **more})
-
-
 def _described(discovery: Discovery, case: Case) -> Findings:
-    """Return what was selected and discovered in common terms."""
+    """Return the findings of a selection and a discovery."""
     sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
     fits = _fits(reported)
-    held, floor = _held_out(reported, fits, case)
+    errors, floor = _held_out_errors(reported, fits, case)
     held_out = None
-    if held is not None and noise is not None:
-        held_out = {"error_before": held[0], "error_after": held[-1], "floor": floor}
+    if errors and noise is not None:
+        held_out = {"error_before": errors[0], "error_after": errors[-1], "floor": floor}
     hidden = not_observable(reported, case.configured)
-    left = [fit.residual_rms**2 for fit in fits]
+    squares = [fit.residual_rms**2 for fit in fits]
     reference = observations.weakened.expected_square
     noise_square = None if noise is None else float(np.mean(reference * noise.white**2 + noise.wander**2))
-    least = left[-1] if noise_square is None else noise_square
-    at_noise = not reported.names and left[0] < CLOSE * least
-    excess = left[0] if at_noise else max(left[0] - least, left[0] - left[-1])
+    least = squares[-1] if noise_square is None else noise_square
+    at_noise = not reported.names and squares[0] < CLOSE * least
+    excess = squares[0] if at_noise else squares[0] - min(least, squares[-1])
     motions = [part.motion for part in observations.parts]
     bent = any(effect(name).of_the_room(sensor) for name in selection.names)
-    others = free_curves(sensor, motions, bent=bent) if selection.names or unknown else []
-    answers = posterior(selection, never_shown(hidden, reported.names), others)
+    curves = free_curves(sensor, motions, bent=bent) if selection.names or unknown else []
+    answers = posterior(selection, never_shown(hidden, reported.names), curves)
     verdict = verdict_of_selection(
         reported.names,
         unknown,
-        float(np.clip((left[0] - left[-1]) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
+        float(np.clip((squares[0] - squares[-1]) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
         2.0 * (reported.fit.log_likelihood - reported.base.log_likelihood),
-        above_noise=noise_square is not None and left[-1] > FAR_ABOVE**2 * noise_square,
+        above_noise=noise_square is not None and squares[-1] > FAR_ABOVE**2 * noise_square,
         held_out=held_out,
-        beyond=max((answers.probability(this.name) for this in others), default=0.0),
+        beyond=max((answers.probability(curve.name) for curve in curves), default=0.0),
     )
     explained, white_square = reported.first.explained(), float(np.mean(reported.start.scale**2))
 
     def drop_alone(name: str) -> float:
-        most = max((explained[j] for j in reported.first.indices(name)), default=0.0)
-        return float(most) / reported.first.samples * white_square
+        largest = max((explained[j] for j in reported.first.indices(name)), default=0.0)
+        return float(largest) / reported.first.samples * white_square
 
     final, _ = fit_in_mean_frame(reported.fit)
 
@@ -118,14 +117,15 @@ def _described(discovery: Discovery, case: Case) -> Findings:
             return FAR_OFF
         if one_way(observations):
             return "make every turn in the other direction too: five effects are observable only in both directions"
-        shown = next((name for name, this in catalogue().items() if this.proposed and name in hidden), None)
-        return f"to make {plain(shown)} observable: record {catalogue()[shown].excitation}" if shown else ""
+        proposed = next((this for name, this in catalogue().items() if this.proposed and name in hidden), None)
+        return f"to make {plain(proposed.name)} observable: record {proposed.excitation}" if proposed else ""
 
     def calibrated(fit: Fit) -> SensorCalibration:
         return calibration_of(fit, selection.observations, None, case.settings)
 
+    suggested = [str(discovery.suggested["name"])] if discovery.suggested else []  # in the base of ``reported``
     scores = reported.ranking.log_likelihoods(reported.chosen())
-    hypotheses = list(zip(reported.ranking.settings, scores.tolist(), strict=True))[1:]  # the first is white noise
+    noises = list(zip(reported.ranking.settings, scores.tolist(), strict=True))[1:]  # the first is white noise
     return Findings(
         sensor=sensor,
         selected=reported.names,
@@ -137,15 +137,15 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         limits=reported.limits,
         answers=answers,
         shares=lambda name: _shares(reported, name),
-        left=left,
+        squares=squares,
         drop_alone=drop_alone,
         excess=excess,
-        held_out=held or [None] * len(fits),
+        held_out=errors or [None] * len(fits),
         hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
         over_noise=_over_noise(selection.base, case, reference),
         left_over_noise=_over_noise(selection.fit, case, reference),
-        noises=[(setting.ratio, setting.time, score) for setting, score in hypotheses],
+        noises=noises,
         white=float(np.sqrt(white_square)),
         expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
         advice=advice,
@@ -160,15 +160,10 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         },
         turns=turns_of(observations),
         deeper=lambda: {
-            "influence": influence(reported, [*_form(discovery), *reported.names]),
+            "influence": influence(reported, [*suggested, *reported.names]),
             "goodness_of_fit": goodness_of_fit(reported),
         },
     )
-
-
-def _form(discovery: Discovery) -> list[str]:
-    """Return the name of the suggested form, an effect of the reported selection's base."""
-    return [str(discovery.suggested["name"])] if discovery.suggested else []
 
 
 def _fits(selection: Selection) -> list[Fit]:
@@ -181,28 +176,25 @@ def _fits(selection: Selection) -> list[Fit]:
     return [*fits, selection.fit] if selection.names else fits
 
 
-def _held_out(selection: Selection, fits: Sequence[Fit], case: Case) -> tuple[list[float] | None, float]:
-    """Return the held-out errors of some fits, and the noise floor of the last; None where nothing is held out.
-
-    An error is the rms length of the vector's error where the attitude is known, else the rms error of the magnitude.
-    """
-    sensor, noise = case.sensor, case.noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
+def _held_out_errors(selection: Selection, fits: Sequence[Fit], case: Case) -> tuple[list[float], float]:
+    """Return the held-out error of each fit, and the noise floor of the last; no errors without held-out motion."""
+    noise = case.noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
     held = [r for r in case.recordings if r.role == "validation"] if selection.names else []
-    found = [samples_of_motion(sensor, r, noise, case.settings["table"], smoothed=True) for r in held]
+    found = [samples_of_motion(case.sensor, r, noise, case.settings["table"], smoothed=True) for r in held]
     samples = [s for s in found if s is not None and s.known.any()]
     if not samples:
-        return None, 0.0
+        return [], 0.0
     calibrations = [calibration_of(fit, selection.observations, None) for fit in fits]
     corrected = [[with_known_effects(calibration, each) for each in samples] for calibration in calibrations]
-    directed = all(true is not None for each in corrected for _, _, true in each)
+    directed = all(true is not None for of_fit in corrected for _, _, true in of_fit)
     errors: list[float] = []
-    for by_fit in corrected:
+    for of_fit in corrected:
         squares = []
-        for each, (vector, magnitude, true) in zip(samples, by_fit, strict=True):
-            off = np.linalg.norm(vector, axis=1) - magnitude
+        for each, (vector, magnitude, true) in zip(samples, of_fit, strict=True):
+            error = np.linalg.norm(vector, axis=1) - magnitude
             if directed and true is not None:
-                off = np.linalg.norm(vector - true, axis=1)
-            squares.append(off[each.known] ** 2)
+                error = np.linalg.norm(vector - true, axis=1)
+            squares.append(error[each.known] ** 2)
         errors.append(float(np.sqrt(np.nanmean(np.concatenate(squares)))))
     floor, vector_floor = noise_floors(calibrations[-1], samples)
     return errors, floor if vector_floor is None or not directed else vector_floor
@@ -211,8 +203,8 @@ def _held_out(selection: Selection, fits: Sequence[Fit], case: Case) -> tuple[li
 def _shares(selection: Selection, name: str) -> dict[str, float]:
     """Return the share of an effect's fitted signal that each other effect reproduces."""
     if name in selection.names:
-        held = selection.chosen()
-        return selection.ranking.shares(selection.ranking.indices(name)[0], held, selection.ranking.of_model(held)[1])
+        chosen, ranking = selection.chosen(), selection.ranking
+        return ranking.shares(ranking.indices(name)[0], chosen, ranking.of_model(chosen)[1])
     return selection.first.shares(selection.first.indices(name)[0], [], selection.alone[name].setting)
 
 

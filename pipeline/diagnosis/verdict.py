@@ -1,7 +1,7 @@
-"""The verdict on one sensor: what its selection found, against the error on held-out motion.
+"""Decide the verdict on one sensor, from the result of its selection and the error on held-out motion.
 
-The first of ``RULES`` that applies decides; where none does, it is the verdict of the selection. A held-out error is
-compared with its 99 % interval (``pipeline.validation.expected_error``); where that is not known, it decides nothing.
+The first rule of ``RULES`` that applies decides; if none applies, the verdict is that of the selection. A held-out
+error is compared with its 99 % interval (``pipeline.validation.expected_error``). Without an interval it has no effect.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from pipeline.model.effects.base import unit_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 to 1.14 in 140 sensors of null families
-MOSTLY = 0.5  # share of the residual's excess that selected effects must explain where something else is left
-BELIEVED = 3  # effects at once; more are what the catalogue makes of physics that it does not hold
-UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
-LIKELY = 0.5  # probability of something outside the catalogue, above which what was selected is no explanation
-SURE = 0.9  # the same where the held-out error is at the noise floor with what was selected (thermal_ramp, long-004)
-WORSE = 0.3  # of the noise's mean square, by which what was selected may raise the held-out error's at most
-HELPFUL = 0.1  # share of the held-out error's mean square that each effect worth a try takes away
+EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
+MOSTLY = 0.5  # least share of the residual's excess that selected effects explain if the residual has another cause too
+BELIEVED = 3  # most effects at once; a selection takes more only to imitate physics outside the catalogue
+UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by the selected effects: least delta BIC of a covariate that counts
+LIKELY = 0.5  # probability of physics outside the catalogue above which the selected effects are no explanation
+SURE = 0.9  # the same if the held-out error with the selected effects is at the noise floor (thermal_ramp, long-004)
+WORSE = 0.3  # of the noise's mean square: largest increase of the held-out mean square by the selected effects
+HELPFUL = 0.1  # least relative reduction of the held-out mean square by an effect that is offered
 LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms of 3 x 1000 samples
 DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null families was 0.006
-QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
+QUIET = 0.6  # times the noise: a smaller residual contradicts the noise of the rests
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 FREE = ("reference_least_squares", "nonlinear_least_squares", "rests_and_moves", "cholesky_lu")  # bias and matrix free
 SAME_SESSION = "record static in the session of the other recordings, without switching the unit off in between"
@@ -41,40 +41,40 @@ class HeldOut:
 
     @property
     def above(self) -> bool:
-        """Whether more is left than noise and stated uncertainties explain."""
+        """Whether the error is larger than noise and stated uncertainties explain."""
         return self.error > self.high
 
     @property
     def below(self) -> bool:
-        """Whether less is left than the noise would leave."""
+        """Whether the error is smaller than the noise estimate explains."""
         return self.error < self.low
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What decides the verdict on a sensor."""
+    """The evidence for the verdict on a sensor."""
 
     sensor: str
     found: str  # verdict of the selection alone
     selected: Sequence[str] = ()
-    over_noise: float | None = None  # residual of the fit over the noise, without what was selected
-    left_over_noise: float | None = None  # and with it
+    over_noise: float | None = None  # residual over the noise, of the fit without the selected effects
+    left_over_noise: float | None = None  # the same with them
     published: HeldOut | None = None  # of the unit's calibration
-    moves: tuple[float, float] | None = None  # rms error of held-out moves, and the largest that is expected, deg
+    moves: tuple[float, float] | None = None  # rms error of held-out moves and its largest expected value, deg
     free: HeldOut | None = None  # of a free fit of the same recordings; filtered ones against the filtered reference
     full: HeldOut | None = None  # of the free fit with the selected effects
     agreement: Mapping[str, Any] | None = None  # of matrix and held-out motion (``pipeline.validation.heldout``)
     static: HeldOut | None = None  # mean of the static recording, by the unit's calibration
-    doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
-    approximations: Sequence[str] = ()  # what the method's matrix and bias lack (``pipeline.diagnosis.method_errors``)
-    unknown: Sequence[str] = ()  # covariates on which the residual depends, given what was selected
-    beyond: Sequence[str] = ()  # covariates on which something outside the catalogue is likely to depend
-    implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, where that is not accepted
+    doubts: Sequence[str] = ()  # contradictions of the reference, from the checks of the recordings
+    approximations: Sequence[str] = ()  # errors of the method's bias and matrix (``pipeline.diagnosis.method_errors``)
+    unknown: Sequence[str] = ()  # covariates on which the residual with the selected effects depends
+    beyond: Sequence[str] = ()  # covariates of physics that is likely and outside the catalogue
+    implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, unless the settings accept that
     held_out: Mapping[str, float] | None = None  # ``error_before, error_after, floor`` of the selection's own fits
     method: str = ""
-    as_printed: bool = False  # whether the method takes the equations of the founding document as printed
+    as_printed: bool = False  # whether the method uses the equations of the thesis as printed
     filtered: bool = False
-    on_table: bool = True  # a few rests by hand may leave a small residual by chance
+    on_table: bool = True  # a few rests by hand may have a small residual by chance
 
     @property
     def above(self) -> bool:
@@ -83,12 +83,12 @@ class Evidence:
 
     @property
     def left(self) -> float | None:
-        """The residual of the fit over the noise, with what was selected."""
+        """The residual of the fit with the selected effects, over the noise."""
         return self.left_over_noise if self.selected else self.over_noise
 
     @property
     def at_noise(self) -> bool | None:
-        """Whether the fit leaves noise alone; None where that is not known."""
+        """Whether the residual of the fit is noise; None if that is unknown."""
         return None if self.left is None else self.left <= EXPLAINED
 
     @property
@@ -109,7 +109,7 @@ class Evidence:
 
     @property
     def made_worse(self) -> bool:
-        """Whether what was selected raises the held-out error."""
+        """Whether the selected effects raise the held-out error."""
         return _made_worse(self.held_out)
 
     @property
@@ -119,15 +119,14 @@ class Evidence:
 
     @property
     def too_quiet(self) -> bool:
-        """Whether the residual is below what the noise estimate makes possible."""
-        quiet = self.on_table and self.found == "nothing_missing" and self.over_noise is not None
-        return quiet and float(self.over_noise or 0.0) < QUIET
+        """Whether the residual is too small for the noise estimate."""
+        small = self.over_noise is not None and self.over_noise < QUIET
+        return small and self.on_table and self.found == "nothing_missing"
 
     @property
     def disagrees(self) -> bool:
-        """Whether held-out motion contradicts the matrix, and nothing else is found."""
-        known = self.agreement is not None and self.found == "nothing_missing"
-        return known and (self.agreement or {})["p_value"] < DISAGREES
+        """Whether held-out motion contradicts the matrix and the selection found nothing."""
+        return bool(self.agreement and self.found == "nothing_missing" and self.agreement["p_value"] < DISAGREES)
 
     @property
     def given(self) -> bool:
@@ -146,13 +145,13 @@ class Evidence:
 
     @property
     def static_differs(self) -> bool:
-        """Whether the static recording contradicts a fit that no missing effect or method makes wrong."""
+        """Whether the static recording contradicts a fit that neither a missing effect nor the method makes wrong."""
         explained = self.found in {"nothing_missing", "not_enough_data"} and self.of_free_method
         return explained and not self.approximations and self.static is not None and self.static.above
 
     @property
     def of_method(self) -> bool:
-        """Whether the method causes a held-out error above its interval: a free fit is within its own."""
+        """Whether the method causes a held-out error above its interval: a free fit is within its own interval."""
         same = self.method == "reference_least_squares" and not self.filtered  # the calibration is the free fit
         free = self.free or self.published
         within = not (same or (free and free.above))
@@ -169,13 +168,13 @@ def verdict_of_selection(
     held_out: Mapping[str, float] | None,
     beyond: float = 0.0,
 ) -> str:
-    """Return the verdict of a selection alone.
+    """Return the verdict by the selection alone.
 
-    What is selected must explain most of the excess, unless nothing else is left. A residual that still depends on
-    something beyond the catalogue is unexplained where that is worth naming; next to a much
-    larger effect it may be the small error of its linear equation. ``share`` of the residual's excess and ``gain`` in
-    2 log L are what the selected effects explain; ``above_noise``: the residual stays far above the noise with them;
-    ``beyond``: probability of physics outside the catalogue; it counts less where held-out motion shows noise alone.
+    If the residual has another cause too, selected effects must explain most of its excess. A dependence of the
+    residual (``unknown``) that is small next to a large effect may be the error of that effect's linear equation.
+    ``share`` of the excess and ``gain`` in 2 log L are those of the selected effects. ``above_noise``: whether the
+    residual with them is far above the noise. ``beyond``: probability of physics outside the catalogue; its threshold
+    is higher if held-out motion shows noise alone.
     """
     if _made_worse(held_out) or len(names) > BELIEVED:
         return "unexplained"
@@ -184,21 +183,20 @@ def verdict_of_selection(
         return "unexplained"
     if (unknown or above_noise) and (not names or share < MOSTLY):
         return "unexplained"
-    if unknown and max(float(found["delta_bic"]) for found in unknown) > UNKNOWN_SHARE * gain:
+    if unknown and max(float(entry["delta_bic"]) for entry in unknown) > UNKNOWN_SHARE * gain:
         return "unexplained"
     return "missing_effect" if names else "nothing_missing"
 
 
 def _made_worse(held_out: Mapping[str, float] | None) -> bool:
-    """Return whether what was selected raises the held-out error: then it is not what is missing."""
+    """Return whether the selected effects raise the held-out error: then they are not what is missing."""
     if held_out is None:
         return False
-    more = held_out["error_after"] ** 2 - held_out["error_before"] ** 2
-    return more > WORSE * held_out["floor"] ** 2
+    return held_out["error_after"] ** 2 - held_out["error_before"] ** 2 > WORSE * held_out["floor"] ** 2
 
 
-# Verdict, its reason (a macro of ``templates/reasons.txt``), and where it applies; ``e.above``: the held-out error of
-# the calibration is above its interval.
+# Verdict, its reason (a macro of ``templates/reasons.txt``), and the condition. ``e.above``: the held-out error of the
+# calibration is above its interval.
 RULES: tuple[tuple[str, str, Callable[[Evidence], object]], ...] = (
     ("reference_in_doubt", "doubts", lambda e: e.doubts),
     ("missing_effect", "beyond", lambda e: e.above and e.missing and not (e.full and e.full.above)),
@@ -218,7 +216,7 @@ RULES: tuple[tuple[str, str, Callable[[Evidence], object]], ...] = (
 
 
 def decide(e: Evidence) -> tuple[str, str]:
-    """Return the verdict and its reason as one or two sentences; empty where the selection is the reason."""
+    """Return the verdict and its reason in one or two sentences; without a reason if the selection decides."""
     for verdict, reason, applies in RULES:
         if applies(e):
             return verdict, " ".join(getattr(template("reasons.txt").module, reason)(e).split())
@@ -226,7 +224,7 @@ def decide(e: Evidence) -> tuple[str, str]:
 
 
 def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
-    """Return the diagnosis of a selection with the verdict by the evidence, its reason, and what to do next."""
+    """Return the document of a selection with the verdict by the evidence, its reason and the next experiment."""
     verdict, reason = decide(e)
     given, step = {"given": True} if e.given else {}, _next_step(verdict, document, e)
     if given and verdict == "missing_effect":
@@ -242,9 +240,9 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
 
 
 def may_be_unknown(verdict: str, e: Evidence) -> bool:
-    """Return whether physics outside the catalogue may be the cause: no check of the recordings names another.
+    """Return whether physics outside the catalogue may be the cause, as no check of the recordings names another one.
 
-    That includes selected effects with which the held-out error stays above the noise floor.
+    Also true if the held-out error with the selected effects is above the noise floor.
     """
     if verdict == "missing_effect" and e.held_out is not None:
         return e.held_out["error_after"] > LEFT_OVER * e.held_out["floor"]
@@ -252,10 +250,7 @@ def may_be_unknown(verdict: str, e: Evidence) -> bool:
 
 
 def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
-    """Return whether to offer the selected effects.
-
-    Where the verdict is ``unexplained``, only plausible effects are offered that each reduce the held-out error.
-    """
+    """Return whether to offer the selected effects: if ``unexplained``, each must be plausible and help on held-out."""
     if e.given:
         return False
     if verdict != "unexplained" or e.implausible or e.too_many:
@@ -266,20 +261,17 @@ def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
 
 
 def _next_step(verdict: str, document: Mapping[str, Any], e: Evidence) -> str:
-    """Return what to do next where that is not what the selection says; empty otherwise."""
+    """Return the next step if it differs from the one that the selection proposes; empty otherwise."""
+    experiment = of_unknown(document["unexplained"], on_table=e.on_table)
     if verdict == "unexplained" and e.implausible:
         step = "check that every recording is of this unit in one mounting, and check its range and units"
-        return (
-            f"{step}; then {of_unknown(document['unexplained'], on_table=e.on_table)}"
-            if document["unexplained"]
-            else step
-        )
+        return f"{step}; then {experiment}" if document["unexplained"] else step
     if verdict == "unexplained" != e.found:
-        return of_unknown(document["unexplained"], on_table=e.on_table)
+        return experiment
     if verdict == "reference_in_doubt":
-        what = "the table's log and the mounting" if e.on_table else "the rests and turns"
-        again = f"check {what} as said above, and record the recordings concerned again"
-        return SAME_SESSION if e.static_differs and not e.doubts else again
+        suspect = "the table's log and the mounting" if e.on_table else "the rests and turns"
+        check = f"check {suspect} as said above, and record the recordings concerned again"
+        return SAME_SESSION if e.static_differs and not e.doubts else check
     if verdict == "floor_in_doubt":
         return "record static again: ten minutes or more at rest, on a base that does not shake"
     if verdict != "left_by_method":

@@ -1,4 +1,4 @@
-"""A diagnosis in plain words (``templates/diagnosis.txt``), and what to record next."""
+"""Write a diagnosis in sentences (``templates/diagnosis.txt``), and propose the next experiment."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.findings import Findings
 
-MOST_ANSWERS = 4  # of an answer set in a sentence
+MOST_ANSWERS = 4  # answers of an answer set that a sentence lists
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
-UNCHANGED = 0.005  # of an rms error: half a unit of its third digit, or less
+UNCHANGED = 0.005  # relative change of an rms error: at most half a unit of its third digit
 UNKNOWN = {
     "temperature": "repeat the sequence at two steady temperatures, and while it heats and cools",
     "time": "return to the first pose at the end, and repeat the sequence once the unit is warm",
@@ -64,9 +64,9 @@ def template(name: str) -> Template:
 
 
 def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | None = None) -> list[str]:
-    """Return a sensor's part of ``diagnoses/<unit>.json``, None where it was not calibrated, as sentences.
+    """Return a sensor's part of ``diagnoses/<unit>.json`` as sentences; ``part`` is None if it was not calibrated.
 
-    Effects with more than ``most_values`` parameters are stated without their values, which the page lists in a table.
+    Effects with more than ``most_values`` parameters are stated without values, which the page lists in a table.
     """
     if part is None:
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
@@ -91,72 +91,68 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
 
 
 def plain(name: str) -> str:
-    """Return the name of an effect or covariate in words: ``bias temperature`` for ``bias_temperature``."""
+    """Return the name of an effect or covariate with blanks: ``bias temperature`` for ``bias_temperature``."""
     return name.replace("_", " ")
 
 
 def listed(words: Sequence[str], conjunction: str = "and") -> str:
-    """Return words as a list in a sentence: ``a, b and c``."""
+    """Return words joined as in a sentence: ``a, b and c``."""
     return f" {conjunction} ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
 
 
 def _said(answer: Mapping[str, Any]) -> str:
-    """Return one answer of an answer set with its probability."""
-    return f"{_answer(answer['effects'])} ({answer['probability']:.2g})"
-
-
-def _answer(effects: Sequence[str]) -> str:
-    """Return one answer in words."""
+    """Return an answer of an answer set in words, with its probability."""
     names = [
         f"something else that follows the {name.removeprefix(OTHER)}" if name.startswith(OTHER) else plain(name)
-        for name in effects
+        for name in answer["effects"]
     ]
-    return " + ".join(names) or "nothing"
+    return f"{' + '.join(names) or 'nothing'} ({answer['probability']:.2g})"
 
 
 def to_distinguish(sets: Sequence[Mapping[str, Any]], sensor: str, *, on_table: bool) -> str:
-    """Return the two most probable answers, and the experiment that distinguishes them; empty where there is one."""
+    """Return the two most probable answers and the experiment that distinguishes them; empty if there is one only."""
     if len(sets) < 2:
         return ""
     first, second = (each["effects"] for each in sets[:2])
     answers = " from ".join(map(_said, sets[:2]))
     different = [name for name in first if name not in second] or [name for name in second if name not in first]
     if different[0].startswith(OTHER):
-        own = "specific_force" if sensor == "accelerometer" else "rate"
-        return f"{answers}: {UNKNOWN[different[0].removeprefix(OTHER).replace('input', own)]}"
+        measured = "specific_force" if sensor == "accelerometer" else "rate"
+        return f"{answers}: {UNKNOWN[different[0].removeprefix(OTHER).replace('input', measured)]}"
     return f"{answers}: {_experiment(different[0], on_table=on_table)}"
 
 
 def _experiment(name: str, *, on_table: bool) -> str:
-    """Return what separates an effect from its look-alikes."""
+    """Return the experiment that separates an effect from its look-alikes."""
     this = catalogue()[name]
     return this.experiment if on_table else this.experiment_by_hand or this.experiment
 
 
-def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: Findings) -> str:
-    """Return the experiment that would show most, as one sentence."""
+def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], findings: Findings) -> str:
+    """Return the most informative next experiment as one sentence."""
+    on_table = findings.on_table
     if verdict == "unexplained":
-        return of_unknown(found.unknown, on_table=found.on_table) if found.unknown else found.advice(verdict)
-    if not found.selected:
-        if verdict == "nothing_missing" and found.answers.sets[0][0]:
-            pair = found.answers.sets[0], ((), dict(found.answers.sets).get((), 0.0))
+        return of_unknown(findings.unknown, on_table=on_table) if findings.unknown else findings.advice(verdict)
+    if not findings.selected:
+        if verdict == "nothing_missing" and findings.answers.sets[0][0]:
+            pair = findings.answers.sets[0], ((), dict(findings.answers.sets).get((), 0.0))
             sets = [{"effects": names, "probability": min(p, CERTAIN)} for names, p in pair]
-            return f"to distinguish {to_distinguish(sets, found.sensor, on_table=found.on_table)}"
-        return found.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
+            return f"to distinguish {to_distinguish(sets, findings.sensor, on_table=on_table)}"
+        return findings.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
     entries = {entry["effect"]: entry for entry in ranking}
 
     def alike(name: str) -> list[str]:
         others = [a["effect"] for a in entries[name]["look_alikes"]]
         return [n for n in others if name not in getattr(catalogue().get(n), "contains", ())]
 
-    name = next((n for n in found.selected if alike(n)), found.selected[0])
-    experiment = _experiment(name, on_table=found.on_table)
+    name = next((n for n in findings.selected if alike(n)), findings.selected[0])
+    experiment = _experiment(name, on_table=on_table)
     others = listed([plain(other) for other in alike(name)[:2]], "or")
     return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
 
 
 def of_unknown(unknown: Sequence[Mapping[str, Any]], *, on_table: bool) -> str:
-    """Return the experiment that would show on which quantity the residual depends, from entries ``unexplained``."""
+    """Return the experiment that shows on which quantity the residual depends, from the entries ``unexplained``."""
     if not unknown:
         return FAR_OFF if on_table else UNSTEADY
     covariate = str(unknown[0]["covariate"])

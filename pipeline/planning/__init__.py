@@ -1,1 +1,1 @@
-"""What a procedure could find before it is recorded: simulated without effects, then asked of the diagnosis."""
+"""Predict which effects a procedure could find, and propose what to record next."""

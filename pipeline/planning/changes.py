@@ -1,10 +1,10 @@
-"""What to record: the README of a new campaign, and what could be recorded in addition to a procedure.
+"""Propose additional recordings for a procedure, and write the README of a new campaign.
 
-Each change is a further course of the same unit, and is planned like the procedure itself. Those with options can be
-planned and simulated by them; the others are further recordings, to be named in the procedure's configuration.
+Each proposed change is planned like the procedure itself. Changes with options can be planned and simulated by these
+options. The others are further recordings, to be named in the procedure's configuration.
 
-The README states how a bench is recorded: mounting, recordings, lengths, what they determine. The recordings and their
-lengths are those of the simulated procedure; what they determine is that of its plan (``pipeline.planning.plan``).
+The README states how to mount and record a unit, the lengths of the recordings, and what they determine. It takes the
+recordings and lengths from the simulated procedure, and what they determine from its plan (``pipeline.planning.plan``).
 """
 
 from __future__ import annotations
@@ -26,32 +26,32 @@ from pipeline.simulation.procedures import TABLE_PROCEDURES, Course, plan
 from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
 
-FASTER_DPS = (100.0, 200.0)  # rates that are proposed, within a low-cost range of 250 deg/s
-CLEARLY_FASTER = 1.3  # than the procedure's fastest rate, for a rate to be proposed
-WITHIN = 0.9  # of the gyroscope's full scale: its bias needs the rest
-MOTION_S, MOTION_DPS = 120.0, 100.0  # of the random motion that is proposed
+FASTER_DPS = (100.0, 200.0)  # proposed rates, within a low-cost range of 250 deg/s
+CLEARLY_FASTER = 1.3  # least proposed rate over the procedure's fastest rate
+WITHIN = 0.9  # of the gyroscope's full scale: its bias needs the remainder
+MOTION_S, MOTION_DPS = 120.0, 100.0  # of the proposed random motion
 UPRIGHT_DPS = 60.0  # one turn about an upright z in 6 s
 LONG_REST_S = 600.0  # six correlation times of a typical wander (configs/sensor)
-POSITIONS = 2  # times as many rests
+POSITIONS = 2  # proposed number of rests over that of the procedure
 CLEARLY_SMALLER = 99.5  # per cent
 TOP = 3  # changes that are printed
 
 
 @dataclass(frozen=True)
 class Change:
-    """One thing to record more."""
+    """A change of the procedure or an additional recording."""
 
     what: str  # as advice to the reader
-    options: str  # of the command line that do it; empty where none does
+    options: str  # of the command line, empty if no option has this effect
     unit: UnitDescription
     extra: tuple[Planned, ...] = ()
 
 
 def changes(unit: UnitDescription) -> list[Change]:
-    """Return what could be recorded in addition to the procedure of a unit."""
+    """Return the proposed changes of a unit's procedure."""
     course = course_of(unit)
     fixed = replace(unit, samples=None, course=asdict(course))
     found = list((_on_a_table if unit.procedure in TABLE_PROCEDURES else _by_hand)(fixed, course))
@@ -91,10 +91,10 @@ def _on_a_table(unit: UnitDescription, course: Course) -> Iterator[Change]:
 
 
 def _further(unit: UnitDescription, course: Course, full: float) -> Iterator[Change]:
-    """Return recordings for which the procedure has no option."""
-    again = plan(unit.procedure, replace(course, validation_s=0.0, static_s=0.0), np.random.default_rng(0))
-    named = tuple(replace(p, name=f"{p.name}_again") for p in again)
-    yield Change("run the whole procedure a second time, once the unit is warm", "", unit, named)
+    """Yield recordings for which the procedure has no option."""
+    planned = plan(unit.procedure, replace(course, validation_s=0.0, static_s=0.0), np.random.default_rng(0))
+    repeated = tuple(replace(p, name=f"{p.name}_again") for p in planned)
+    yield Change("run the whole procedure a second time, once the unit is warm", "", unit, repeated)
     if unit.table == "single_axis":
         return
     rate = min(MOTION_DPS, WITHIN * full)
@@ -119,60 +119,51 @@ def _by_hand(unit: UnitDescription, course: Course) -> Iterator[Change]:
 
 @dataclass(frozen=True)
 class Gain:
-    """What a change would bring."""
+    """The improvement of a plan by a change."""
 
     change: Change
-    minutes: float  # more at the table
+    minutes: float  # additional time
     shown: tuple[str, ...]  # ``sensor.effect`` that become observable; of the table only if neither sensor showed it
-    distinguished: tuple[str, ...]  # those that would no longer be taken for a look-alike
-    factor: float  # geometric mean of the new smallest sizes over the old ones, of effects observable in both
+    distinguished: tuple[str, ...]  # those that are no longer taken for a look-alike
+    factor: float  # geometric mean of new over old smallest size, of effects that are observable in both
 
 
 def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
-    """Return what each change would bring, the most helpful first.
+    """Return the gain of each change, the most helpful first; ``before`` is the plan of the unit's procedure.
 
-    First goes the change that shows most effects for each minute that it takes (at least one: nothing is set up in
-    less); of those that show nothing new, the one that lowers the smallest sizes most, as a logarithm a minute.
-
-    ``before`` is the plan of the unit's procedure.
+    The order is by the number of effects that become observable for each additional minute (at least one, to set up),
+    then by the reduction of the smallest sizes for each minute, as a logarithm.
     """
     if all(before[sensor]["reason"] for sensor in SENSORS):
         return []
     gains = [_gain(change, before, plan_of(change.unit, change.extra, half_only=True)) for change in changes(unit)]
 
-    def worth(gain: Gain) -> tuple[float, float]:
+    def order(gain: Gain) -> tuple[float, float]:
         minutes = max(gain.minutes, 1.0)
         return -len(gain.shown) / minutes, float(np.log(gain.factor)) / minutes
 
-    return sorted(gains, key=worth)
+    return sorted(gains, key=order)
 
 
 def _gain(change: Change, before: Document, after: Document) -> Gain:
-    old, new = _entries(before), _entries(after)
-    both = old.keys() & new.keys()
-    ratios = [np.log(new[key]["smallest"] / old[key]["smallest"]) for key in sorted(both)]
+    old, new = (  # observable effects by ``sensor.effect``
+        {f"{s}.{entry['effect']}": entry for s in SENSORS for entry in document[s]["effects"]}
+        for document in (before, after)
+    )
+    of_table = {entry["effect"] for entry in old.values() if effect(entry["effect"]).owner == Owner.TABLE}
+    both = [key for key in new if key in old]
+    ratios = [np.log(new[key]["smallest"] / old[key]["smallest"]) for key in both]
     return Gain(
         change,
         after["minutes"] - before["minutes"],
-        tuple(key for key in new if key not in old and not _shared(key, old)),
-        tuple(key for key in new if key in both and old[key]["taken_for"] and not new[key]["taken_for"]),
+        tuple(key for key, entry in new.items() if key not in old and entry["effect"] not in of_table),
+        tuple(key for key in both if old[key]["taken_for"] and not new[key]["taken_for"]),
         float(np.exp(np.mean(ratios))) if ratios else 1.0,
     )
 
 
-def _shared(key: str, old: Mapping[str, Any]) -> bool:
-    """Return whether an effect is the table's and the other sensor shows it already."""
-    name = key.partition(".")[2]
-    return effect(name).owner == Owner.TABLE and any(other.partition(".")[2] == name for other in old)
-
-
-def _entries(document: Mapping[str, Any]) -> dict[str, Document]:
-    """Return the observable effects by ``sensor.effect``."""
-    return {f"{s}.{entry['effect']}": entry for s in SENSORS for entry in document[s]["effects"]}
-
-
 def helps_most(gains: Sequence[Gain]) -> list[str]:
-    """Return the changes that help most as lines, in the given order."""
+    """Return the first changes that help as lines."""
     useful = [gain for gain in gains if gain.shown or gain.distinguished or 100.0 * gain.factor < CLEARLY_SMALLER]
     if not useful:
         return ["additional recordings: none of those examined shows more"] if gains else []
@@ -180,19 +171,13 @@ def helps_most(gains: Sequence[Gain]) -> list[str]:
     for number, gain in enumerate(useful[:TOP], start=1):
         options = f" ({gain.change.options})" if gain.change.options else ""
         lines.append(f"  {number}. {gain.change.what}{options}: {gain.minutes:+.1f} min")
-        lines.append(f"     {_brought(gain)}")
+        parts = [f"shows {_listed(gain.shown)}"] if gain.shown else []
+        parts += [f"distinguishes {_listed(gain.distinguished)} from similar effects"] if gain.distinguished else []
+        percent = 100.0 * gain.factor
+        size = f"at {percent:.0f} % of the size" if percent < CLEARLY_SMALLER else "at the same size"
+        parts.append(f"finds {'the others' if parts else 'effects'} {size}")
+        lines.append(f"     {'; '.join(parts)}")
     return lines
-
-
-def _brought(gain: Gain) -> str:
-    """Return the effect of a change on what can be found; the factor is a mean over effects and sensors."""
-    parts = [f"shows {_listed(gain.shown)}"] if gain.shown else []
-    parts += [f"distinguishes {_listed(gain.distinguished)} from similar effects"] if gain.distinguished else []
-    percent = 100.0 * gain.factor
-    whose = "the others" if parts else "effects"
-    smaller = percent < CLEARLY_SMALLER
-    parts.append(f"finds {whose} " + (f"at {percent:.0f} % of the size" if smaller else "at the same size"))
-    return "; ".join(parts)
 
 
 def _listed(keys: Sequence[str]) -> str:
@@ -201,7 +186,7 @@ def _listed(keys: Sequence[str]) -> str:
 
 
 def readme(unit: UnitDescription, name: str) -> str:
-    """Return the README of a campaign whose first unit is recorded so."""
+    """Return the README of a campaign with the description of its first unit."""
     procedure, course = read_config("procedure", unit.procedure), course_of(unit)
     ups = LEVEL_AT_ZERO[:, 2]  # the vertical in the body frame at table angle 0, for turns about each axis
     text: str = template("campaign_readme.md").render(

@@ -1,25 +1,25 @@
-"""Detection limits: the smallest size of each effect that a selection would find, without recording anything.
+"""Compute detection limits: the smallest size of each effect that a selection would find, without a recording.
 
-The parameters of an effect are in proportion to their limits, with random signs; every probability is the mean over the
-signs. An effect is found where the gain in 2 log L that it brings passes the gate of the selection, and named where no
-look-alike i, which leaves a part of its signal, has the better BIC. N readings, k parameters, m candidates:
+The parameters of an effect are in proportion to their limits, with random signs. Every probability is the mean over the
+signs. An effect is found if its gain in 2 log L passes the gate of the selection. It is named if no look-alike i, which
+explains a part of its signal, has the better BIC. With N readings, k parameters and m candidates:
 
-Turns on a table (``TurntableLimits``), whose readings are many. With the whitened sum of squares ``a^2 lambda_t`` of a
-signal of size a, given the base, and that of noise alone, ``T_t = s^-2 tr(C_t^-1 C)``, under the noise setting t,
+Turns on a table (``TurntableLimits``), with many readings. Given the base, under the noise setting t, let ``a^2
+lambda_t`` be the whitened sum of squares of a signal of size a, and ``T_t = s^-2 tr(C_t^-1 C)`` that of noise alone:
 
     log L_t(a) = -N/2 log [(T_t + a^2 lambda_t) / N] - penalty_t,    g(a) = 2 [max_t log L_t(0) - max_t log L_t(a)]
     P(found) = P(chi^2_k(g) > max(k log N + 10, quantile of chi^2_k at 1 - 0.01/m))
 
-so that a wander which can explain the effect takes it (C: covariance of the noise by the sensor file, C_t that of
-setting t, s the white noise). The difference of two BICs is normal with mean ``g_i - (k - k_i) (log N - 1)`` and
-variance ``4 g_i``, g_i the gain over the look-alike.
+with the covariance C of the noise by the sensor file, C_t of setting t and white noise s. So a wander that can explain
+the effect takes it up. The difference of two BICs is normal with mean ``g_i - (k - k_i) (log N - 1)`` and variance ``4
+g_i``, where g_i is the gain over the look-alike.
 
-Rests and moves (``RestLimits``), whose equations are few and whose noise is not known beforehand. Draws of
+Rests and moves (``RestLimits``), with few equations and unknown noise. The likelihoods of the selection are computed
+for draws of
 
-    r = a Z d + C^1/2 w,    w standard normal, C the covariance by the sensor file, and a unit that rests firmly
+    r = a Z d + C^1/2 w,    w standard normal, C the covariance by the sensor file for a unit that rests firmly
 
-go with signs d through the likelihoods of the selection, at any size a without a new simulation, as all sums of squares
-are polynomials in a.
+with signs d. All sums of squares are polynomials in a, so no size a needs a new simulation.
 """
 
 from __future__ import annotations
@@ -38,71 +38,73 @@ from pipeline.estimation.ranking import RIDGE
 from pipeline.estimation.selection import ALIKE, DELAYS, GATE_BIC, GATE_P, Selection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.records import Mask, Noise, Values
 
-    Squares = tuple[Values, Values, Values]  # of draws, of draws with signals, of signals
-
 STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %
 LEAST, LARGEST = 1e-8, 1e3  # share of the limits
 ALMOST_SURE = 0.95  # share of the cases in which the size ``sure`` is found
-PARTLY = 0.3  # share of a signal below which an effect cannot be preferred for having fewer parameters
+PARTLY = 0.3  # least share of a signal that a look-alike reproduces to be preferred for having fewer parameters
 MOST_SIGNS = 32  # patterns of signs; the mean over them is then within 0.1 of that over all (standard error of a share)
 DRAWS = 64  # of the noise of rests: the standard error of a share of one half is 0.06
-ROUNDING = 1e-6  # share of a signal below which what is left of it is rounding
-TIED = 1e-3  # deviation of a difference in 2 log L below which two effects are the same to the selection
+ROUNDING = 1e-6  # share of a signal: a smaller remainder of it is rounding
+TIED = 1e-3  # deviation of a difference in 2 log L: with a smaller one two effects are equal to the selection
 
 
 @dataclass(frozen=True)
 class Detection:
-    """What a procedure would find of one effect; sizes as shares of its limits."""
+    """The detection limits of one effect; sizes are shares of its limits."""
 
     effect: str
     unit_sizes: Values  # (p,), size of each parameter at share 1; 0 for time constants, which are fixed
-    found: float  # where half of the cases pass the gate; infinite where none does
-    sure: float  # where 95 % do
-    named: float  # where half of the cases pass it and no look-alike is preferred
+    found: float  # where half of the cases pass the gate; infinite if that is never so
+    sure: float  # where 95 % pass
+    named: float  # where half of the cases pass and no look-alike is preferred
     taken_for: str | None  # the look-alike that is preferred at the size ``found``
-    look_alikes: dict[str, float]  # effect to the share of the signal that it reproduces, largest first
+    look_alikes: dict[str, float]  # share of the signal that each reproduces, largest first
 
 
 @dataclass(frozen=True)
 class _Signal:
-    """One effect with s patterns of signs, and r rivals that reproduce a part of it."""
+    """The signal of an effect with s patterns of signs, and its r rivals; both functions are of the share of limits."""
 
-    found: Callable[[float], Values]  # share of the limits to the probability that it passes the gate: (s,) array
-    ahead: Callable[[float], Values]  # and to the probability that its BIC is better than a rival's: (r, s) array
-    rivals: dict[int, float]  # candidate to the share of the signal that it reproduces
+    found: Callable[[float], Values]  # probability that it passes the gate: (s,) array
+    ahead: Callable[[float], Values]  # probability that its BIC is better than that of a rival: (r, s) array
+    rivals: dict[int, float]  # share of the signal that each candidate reproduces
 
 
 class DetectionLimits(abc.ABC):
-    """What a selection is expected to find of its candidates; one effect may be there at several time constants."""
+    """The detection limits of a selection's candidates; one effect may have candidates with several time constants."""
 
     def __init__(self, sensor: str, candidates: Sequence[Term], limits: Mapping[str, Values]) -> None:
         self.sensor, self.candidates = sensor, candidates
-        self.names = list(dict.fromkeys(term.effect.name for term in candidates))
-        none = {t.effect.name: np.full(len(t.values), np.inf) for t in candidates}
-        self.limits: dict[str, Values] = {name: limits.get(name, none[name]) for name in self.names}
+        unlimited = {t.effect.name: np.full(len(t.values), np.inf) for t in candidates}
+        self.limits: dict[str, Values] = {name: limits.get(name, none) for name, none in unlimited.items()}
+        self.names = list(self.limits)
 
     @abc.abstractmethod
     def _directions(self, j: int) -> int:
-        """Return how many directions of a candidate the recordings show."""
+        """Return the number of directions of a candidate that the recordings show."""
 
     @abc.abstractmethod
     def _signal(self, j: int, sizes: Values) -> _Signal:
-        """Return what a candidate of some sizes adds, with random signs."""
+        """Return the signal of a candidate with parameters of some sizes and random signs."""
 
-    def detection(self, name: str, *, half_only: bool = False) -> Detection | None:
-        """Return what would be found of an effect; None where the recordings do not show it.
+    def detection(self, name: str, *, half_only: bool = False) -> Detection:
+        """Return the detection limits of an effect that the recordings show.
 
-        With ``half_only``, ``sure`` and ``named`` are left out, and infinite.
+        With ``half_only``, ``sure`` and ``named`` are not computed, and are infinite.
         """
-        places = [j for j, t in enumerate(self.candidates) if t.effect.name == name and self._directions(j)]
-        if not places:
-            return None
-        j = min(places, key=self._far_from_typical)
+
+        def far_from_typical(j: int) -> float:
+            """Return the distance of time constants from half their limits, as a logarithm."""
+            fixed = self._fixed(j)
+            return float(np.sum(np.abs(np.log(self.candidates[j].values[fixed] / (0.5 * self.limits[name][fixed])))))
+
+        candidates = [j for j, t in enumerate(self.candidates) if t.effect.name == name and self._directions(j)]
+        j = min(candidates, key=far_from_typical)
         limits = np.where(np.isfinite(self.limits[name]), self.limits[name], 1.0)
         sizes = np.where(self._fixed(j), 0.0, limits)
         signal = self._signal(j, sizes)
@@ -113,6 +115,7 @@ class DetectionLimits(abc.ABC):
         half = _smallest(signal.found, 0.5)
         ahead = np.mean(signal.ahead(half), axis=1) if np.isfinite(half) else np.ones(len(signal.rivals))
         rivals = [self.candidates[i].effect.name for i in signal.rivals]
+        largest = {rival: share for share, rival in sorted(zip(signal.rivals.values(), rivals, strict=True))}
         return Detection(
             name,
             sizes,
@@ -120,7 +123,7 @@ class DetectionLimits(abc.ABC):
             np.inf if half_only else _smallest(signal.found, ALMOST_SURE),
             np.inf if half_only else _smallest(named, 0.5),
             rivals[int(np.argmin(ahead))] if np.any(ahead < 0.5) else None,
-            _alike(rivals, signal.rivals.values()),
+            {r: share for r, share in sorted(largest.items(), key=lambda item: -item[1]) if share > ALIKE},
         )
 
     def _fixed(self, j: int) -> Mask:
@@ -128,30 +131,18 @@ class DetectionLimits(abc.ABC):
         this = self.candidates[j].effect
         return np.array([p.name in this.nonlinear and not this.moves for p in this.parameters(self.sensor)])
 
-    def _far_from_typical(self, j: int) -> float:
-        """Return how far a candidate's time constants are from half their limits, as a logarithm."""
-        fixed, term = self._fixed(j), self.candidates[j]
-        return float(np.sum(np.abs(np.log(term.values[fixed] / (0.5 * self.limits[term.effect.name][fixed])))))
-
     def _parameters(self, j: int) -> int:
-        """Return the parameters that the BIC counts; 0 where the recordings do not show the candidate."""
-        shown = self._directions(j)
-        return shown + int(self._fixed(j).sum()) if shown else 0
+        """Return the number of parameters in the BIC of a candidate that the recordings show."""
+        return self._directions(j) + int(self._fixed(j).sum())
 
     def _rivals(self, j: int) -> list[int]:
-        """Return the candidates that are another effect and that the recordings show."""
+        """Return the candidates of other effects that the recordings show."""
         name = self.candidates[j].effect.name
         return [i for i, t in enumerate(self.candidates) if t.effect.name != name and self._directions(i)]
 
 
-def _alike(names: Sequence[str], shares: Iterable[float]) -> dict[str, float]:
-    """Return the largest share of each look-alike, largest first."""
-    largest = {name: share for share, name in sorted(zip(shares, names, strict=True)) if share > ALIKE}
-    return dict(sorted(largest.items(), key=lambda item: -item[1]))
-
-
 def _smallest(probability: Callable[[float], Values], wanted: float) -> float:
-    """Return the smallest share at which a probability, averaged over the signs, is reached; infinite if none."""
+    """Return the smallest share at which the mean probability over the signs is reached; infinite if none."""
     low, high = np.log(LEAST), np.log(LARGEST)
     if np.mean(probability(LARGEST)) < wanted:
         return float("inf")
@@ -162,7 +153,7 @@ def _smallest(probability: Callable[[float], Values], wanted: float) -> float:
 
 
 class TurntableLimits(DetectionLimits):
-    """What is expected of a selection before its first round, for readings of some noise."""
+    """The detection limits of the first round of a selection, for readings of some noise."""
 
     def __init__(self, selection: Selection, noise: Noise) -> None:
         self.ranking = selection.ranking
@@ -171,9 +162,9 @@ class TurntableLimits(DetectionLimits):
         blocks, samples = selection.observations.blocks, selection.observations.samples
         self.noise_sum = 3.0 * noise_sums(blocks, samples, self.ranking.settings, true)
         self._solved: dict[int, Values] = {}
-        at_rest = self._log_likelihood(np.zeros(len(self.noise_sum)))
-        self.setting = int(np.argmax(at_rest[1:])) + 1
-        self.before = float(at_rest[self.setting])
+        without_effects = self._log_likelihood(np.zeros(len(self.noise_sum)))
+        self.setting = int(np.argmax(without_effects[1:])) + 1
+        self.before = float(without_effects[self.setting])
 
     def _directions(self, j: int) -> int:
         return len(self.ranking.places[j])
@@ -195,24 +186,27 @@ class TurntableLimits(DetectionLimits):
         place = self.ranking.places[j]
         signal = np.einsum("sk,tkl,sl->ts", q, self.ranking.products[:, place[:, None], place], q)
         whole, k = float(np.sum(signal[self.setting])), self._parameters(j)
-        shares, lefts = {}, [np.zeros((len(signal), 0, signal.shape[1]))]
+        shares, remainders = {}, [np.zeros((len(signal), 0, signal.shape[1]))]
         for i in self._rivals(j):
             explained = self._explained(i, j, q)
             if explained[self.setting].sum() > PARTLY * whole:
-                left = signal - explained
-                lefts.append(np.where(left > ROUNDING * signal, left, 0.0)[:, None])
-                shares[i] = 1.0 - float(np.sum(lefts[-1][self.setting])) / whole
-        left_of = np.concatenate(lefts, axis=1)
+                remainder = signal - explained
+                remainders.append(np.where(remainder > ROUNDING * signal, remainder, 0.0)[:, None])
+                shares[i] = 1.0 - float(np.sum(remainders[-1][self.setting])) / whole
+        remaining = np.concatenate(remainders, axis=1)
         more = k - np.array([self._parameters(i) for i in shares], float)[:, None]
         order = sorted(self.names, key=lambda name: (name in DELAYS[1:], self.names.index(name)))
         rank = {i: order.index(self.candidates[i].effect.name) for i in (j, *shares)}
         tie = np.array([0.0 if rank[i] < rank[j] else 1.0 for i in shares])[:, None]  # the first of equals is selected
+        gate = max(
+            GATE_BIC + k * float(np.log(self.ranking.samples)), float(scipy.special.chdtri(k, GATE_P / len(self.names)))
+        )
 
         def found(share: float) -> Values:
-            return self._passes(self._gain(share**2 * signal), k)
+            return np.asarray(1.0 - scipy.special.chndtr(gate, k, self._gain(share**2 * signal)))
 
         def ahead(share: float) -> Values:
-            over = self._gain(share**2 * left_of)
+            over = self._gain(share**2 * remaining)
             mean = over - more * (float(np.log(self.ranking.samples)) - 1.0)
             deviation = np.sqrt(4.0 * over + 2.0 * np.abs(more))
             return np.asarray(np.where(deviation < TIED, tie, scipy.special.ndtr(mean / np.maximum(deviation, TIED))))
@@ -220,7 +214,7 @@ class TurntableLimits(DetectionLimits):
         return _Signal(found, ahead, shares)
 
     def _patterns(self, j: int, sizes: Values) -> Values:
-        """Return patterns of signs in the candidate's own reduced columns, which are orthonormal under white noise."""
+        """Return patterns of signs in a candidate's reduced columns, which are orthonormal under white noise."""
         block = self.ranking.spans[j]
         count = block.stop - block.start
         if 2 ** (count - 1) <= MOST_SIGNS:  # up to a common sign
@@ -231,26 +225,20 @@ class TurntableLimits(DetectionLimits):
         return np.asarray(signs * sizes[:count] @ self.ranking.beside[0, block, block] @ self.ranking.blocks[j])
 
     def _explained(self, i: int, j: int, q: Values) -> Values:
-        """Return what candidate i explains of the signals of candidate j: (t, s) array."""
-        at, place, products = self.ranking.places[i], self.ranking.places[j], self.ranking.products
+        """Return the part of the signals of candidate j that candidate i explains: (t, s) array."""
+        rival, place, products = self.ranking.places[i], self.ranking.places[j], self.ranking.products
         if i not in self._solved:
-            own = products[:, at[:, None], at]
-            own = own + RIDGE * np.einsum("tii->ti", own)[:, :, None] * np.eye(len(at))
-            self._solved[i] = np.linalg.solve(own, products[:, at, :])
-        cross = products[:, at[:, None], place] @ q.T
+            inner = products[:, rival[:, None], rival]
+            inner = inner + RIDGE * np.einsum("tii->ti", inner)[:, :, None] * np.eye(len(rival))
+            self._solved[i] = np.linalg.solve(inner, products[:, rival, :])
+        cross = products[:, rival[:, None], place] @ q.T
         return np.asarray(np.sum(cross * (self._solved[i][:, :, place] @ q.T), axis=1))
-
-    def _passes(self, gain: Values, k: int) -> Values:
-        """Return the probability that a gain passes the gate."""
-        bic = GATE_BIC + k * float(np.log(self.ranking.samples))
-        gate = max(bic, float(scipy.special.chdtri(k, GATE_P / len(self.names))))
-        return np.asarray(1.0 - scipy.special.chndtr(gate, k, gain))
 
 
 def noise_sums(blocks: Blocks, samples: float, settings: Sequence[Setting], true: Setting) -> Values:
-    """Return ``tr(C_t^-1 C) s^2`` of one channel of so many samples, C that of ``true``: (t,) array.
+    """Return ``tr(C_t^-1 C) s^2`` of one channel, with C of the setting ``true``: (t,) array.
 
-    It is that of the block means, and one for each sample beyond.
+    It is the sum over the block means, and 1 for each further sample.
     """
     C = np.diag(1.0 / blocks.weight) + true.ratio**2 * blocks.covariance(true.time)
     traces = np.trace(GaussMarkov(blocks, settings).solve(C), axis1=1, axis2=2)
@@ -258,7 +246,7 @@ def noise_sums(blocks: Blocks, samples: float, settings: Sequence[Setting], true
 
 
 class RestLimits(DetectionLimits):
-    """What a selection by hand, of a simulated recording, is expected to see in readings of some noise."""
+    """The detection limits of a selection by hand in a simulated recording, for readings of some noise."""
 
     def __init__(self, selection: by_hand.Selection, noise: Noise) -> None:
         model = selection.model
@@ -271,18 +259,19 @@ class RestLimits(DetectionLimits):
         together = replace(equations, candidates=[*equations.candidates, drawn])
         self.projected = project_out(together, selection.hypotheses)
         self.drawn, self.equations = self.projected.raw[-1], len(C)
-        at_rest = self._scores(np.sum(self.drawn**2, axis=1))
-        self.at = int(np.argmax(np.mean(at_rest, axis=1)))
-        shown = [self.projected.count(j, self.at) for j in range(len(terms))]
-        more = [int(self._fixed(j).sum()) for j in range(len(terms))]
-        self.factors = [
-            self.projected.correction(j, self.at, v + m, equations.scatter) if v else 0.0
-            for j, (v, m) in enumerate(zip(shown, more, strict=True))
-        ]
+        without_effects = self._scores(np.sum(self.drawn**2, axis=1))
+        self.hypothesis = int(np.argmax(np.mean(without_effects, axis=1)))
+        self.factors = []  # on the gain of each candidate
+        for j in range(len(terms)):
+            shown, constants = self.projected.count(j, self.hypothesis), int(self._fixed(j).sum())
+            factor = (
+                self.projected.correction(j, self.hypothesis, shown + constants, equations.scatter) if shown else 0.0
+            )
+            self.factors.append(factor)
         self._of_draws = [self._along(j, self.drawn) for j in range(len(terms))]
 
     def _directions(self, j: int) -> int:
-        return self.projected.count(j, self.at) if self.factors[j] > 0.0 else 0
+        return self.projected.count(j, self.hypothesis) if self.factors[j] > 0.0 else 0
 
     def _scores(self, rss: Values) -> Values:
         return log_likelihood(rss, self.drawn.shape[1], self.projected.log_determinant[:, None])
@@ -290,38 +279,35 @@ class RestLimits(DetectionLimits):
     def _signal(self, j: int, sizes: Values) -> _Signal:
         signs = np.random.default_rng(1).choice([-1.0, 1.0], (DRAWS, len(sizes)))
         signal = self.projected.raw[j] @ (signs * sizes).T
-        total = np.sum(self.drawn**2, axis=1), np.sum(self.drawn * signal, axis=1), np.sum(signal**2, axis=1)
-        taken = {i: self._squares(i, signal) for i in (j, *self._rivals(j))}
-        power = float(np.sum(total[2][self.at]))
-        shares = {i: min(float(np.sum(taken[i][2][self.at])) / power, 1.0) for i in taken if i != j}
-        shares = {i: share for i, share in shares.items() if share > PARTLY}
+        total = _squares(self.drawn, signal)
+        explained = {i: _squares(self._of_draws[i], self._along(i, signal)) for i in (j, *self._rivals(j))}
+        power = float(np.sum(total[2][self.hypothesis]))
+        shares = {i: float(np.sum(squares[2][self.hypothesis])) / power for i, squares in explained.items() if i != j}
+        shares = {i: min(share, 1.0) for i, share in shares.items() if share > PARTLY}
+        k, log_n = self._parameters(j), float(np.log(self.equations))
 
         def bic(share: float, i: int) -> Values:
-            rss, drop = (a + 2.0 * share * b + share**2 * c for a, b, c in (total, taken[i]))
+            rss, drop = (a + 2.0 * share * b + share**2 * c for a, b, c in (total, explained[i]))
             gain = self._scores(rss - drop).max(axis=0) - self._scores(rss).max(axis=0)
-            return np.asarray(2.0 * self.factors[i] * gain - self._parameters(i) * float(np.log(self.equations)))
+            return np.asarray(2.0 * self.factors[i] * gain - self._parameters(i) * log_n)
 
         def found(share: float) -> Values:
-            return self._passes(bic(share, j), self._parameters(j))
+            delta = bic(share, j)
+            p = scipy.special.chdtrc(k, np.maximum(delta + k * log_n, 0.0))
+            return np.asarray((delta > GATE_BIC) & (p * len(self.names) < GATE_P), float)
 
         def ahead(share: float) -> Values:
-            mine = bic(share, j)
-            return np.array([mine >= bic(share, i) for i in shares], float).reshape(-1, DRAWS)
+            delta = bic(share, j)
+            return np.array([delta >= bic(share, i) for i in shares], float).reshape(-1, DRAWS)
 
         return _Signal(found, ahead, shares)
 
-    def _along(self, i: int, what: Values) -> Values:
+    def _along(self, i: int, columns: Values) -> Values:
         """Return draws or signals, (t, n, s), along the directions of candidate i: (t, p, s) array."""
         projected = self.projected
-        return np.asarray(projected.orthonormal[i].transpose(0, 2, 1) @ (projected.raw[i].transpose(0, 2, 1) @ what))
+        return np.asarray(projected.orthonormal[i].transpose(0, 2, 1) @ (projected.raw[i].transpose(0, 2, 1) @ columns))
 
-    def _squares(self, i: int, signal: Values) -> Squares:
-        """Return what candidate i takes of draws and signals: squares, products and squares, each (t, s)."""
-        of_draws, of_signal = self._of_draws[i], self._along(i, signal)
-        return np.sum(of_draws**2, axis=1), np.sum(of_draws * of_signal, axis=1), np.sum(of_signal**2, axis=1)
 
-    def _passes(self, bic: Values, k: int) -> Values:
-        """Return 1 where a delta BIC passes the gate, else 0."""
-        gain = bic + k * float(np.log(self.equations))
-        significant = scipy.special.chdtrc(k, np.maximum(gain, 0.0)) * len(self.names) < GATE_P
-        return np.asarray((bic > GATE_BIC) & significant, float)
+def _squares(draws: Values, signal: Values) -> tuple[Values, Values, Values]:
+    """Return the squares of draws, their products with signals, and the squares of signals: each (t, s)."""
+    return np.sum(draws**2, axis=1), np.sum(draws * signal, axis=1), np.sum(signal**2, axis=1)

@@ -1,36 +1,34 @@
-"""What a recording by hand still lacks: the next rest for the accelerometer, the next face or turn for the gyroscope.
+"""Propose the next rest of a recording by hand for the accelerometer, and the next face or turn for the gyroscope.
 
-The next rest is that by which the calibration of the accelerometer gains most:
+The next rest is the one that improves the calibration of the accelerometer most:
 
     F = P + sum_i J_i^T J_i / s_i^2,    U_p = k_p sqrt(g_p (F^-1)_pp)
 
 where
 
     J_i : (9,) derivative of the length of gravity at rest i (``derivative_of``)
-    s_i : g; standard deviation of that length: white noise of the mean, and the scatter between rests
-    P   : precision by the sensor file's limits, of a misalignment as in the fit, of the others taken for two standard
-          deviations; F is regular by it from the start. While the fit knows a misalignment by its limit alone, F is the
-          inverse of the fit's covariance
-    g_p : variance of the fit over ``(F^-1)_pp``: bias wander, and a scatter that a few rests show only roughly; 1
-          before there is a fit
+    s_i : g; standard deviation of that length, by white noise of the mean and the scatter between rests
+    P   : precision by the sensor file's limits, which are two standard deviations, for a misalignment as in the fit;
+          it makes F regular from the start. If the fit determines a misalignment by its limit alone, F is the inverse
+          of the fit's covariance
+    g_p : variance of the fit over ``(F^-1)_pp``, for bias wander and an uncertain scatter; 1 without a fit
     k_p : coverage factor, with one more degree of freedom for each further rest
 
-The rests that are still needed are planned together, since the best set of n rests does not contain the best set of
-n - 1: rests are added one by one, and each planned rest is exchanged for a better attitude while the largest U falls
-(Fedorov, Theory of Optimal Experiments, 1972). Next goes the planned rest with the largest gain in log det F,
-``log(1 + J F^-1 J^T / s^2)``. The attitudes are the 26 in which a face, an edge or a corner of the case points up,
-since a person finds them by a few words.
+The remaining rests are planned together, since the best set of n rests does not contain the best set of n - 1: rests
+are added one by one, and each planned rest is exchanged for a better attitude as long as the largest U decreases
+(Fedorov, Theory of Optimal Experiments, 1972). The next rest is the planned one with the largest gain in log det F,
+``log(1 + J F^-1 J^T / s^2)``. A face, an edge or a corner of the case points up in each of the 26 attitudes, so that a
+few words describe it.
 
-The goal, where none is given, is what the 24 orientations of ``orientations_24`` reach by the sensor file:
+The default goal is the uncertainty of the 24 orientations of ``orientations_24`` by the sensor file:
 
     F = J^T (s^2 I + sum_c q^2 (n_c n_c^T) * R)^-1 J,    R_ij = exp(-|t_i - t_j| / tau)
 
-with white noise s of the mean of a rest, bias wander q and tau, rests one after the other, and the vertical n_i in the
-body.
+with white noise s of the mean of a rest, bias wander q and tau, consecutive rests, and the vertical n_i in the body.
 
 Faces and turns (procedure ``ferraris``): each of the six faces needs a rest, and each body axis a turn by the stated
-angle from rest to rest; where turns are held out, one that is. They are recognised as in the fit; a
-recording that is stated as a turn about an axis may begin and end without a rest.
+angle from rest to rest, a held-out one if turns are held out. They are recognised as in the fit. A recording that is
+stated as a turn about an axis may begin and end without a rest.
 
 Rests and moves: of turns by A about a level body axis a, from the vertical u, the one with the largest gain
 
@@ -46,7 +44,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from itertools import product
+from itertools import permutations, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,24 +65,24 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 
-SHARPNESS = 8  # of the norm that stands for the largest U: within 32 % of it for nine parameters, smooth
-SWEEPS = 10  # of the exchange; it ends by itself after two or three
-MOST = 60  # rests that are planned ahead: some 7 min
-FEWEST = 9  # rests of the fit, one a parameter
-SAME = 0.08  # of two components of the vertical: 5 deg from the edge between their sides, so that its name stays
-LEVEL_DEG = 3.0  # a tilt that is not worth a word: units are set down by hand to about 1 deg
+SHARPNESS = 8  # exponent of a smooth norm for the largest U, within 32 % of it for nine parameters
+SWEEPS = 10  # of the exchange, which usually ends after two or three
+MOST = 60  # planned rests: some 7 min
+FEWEST = 9  # rests of the fit, one for each parameter
+SAME = 0.08  # difference of components of the vertical, 5 deg from an edge: within it, the name does not change
+LEVEL_DEG = 3.0  # largest tilt that is not mentioned: units are set down by hand to about 1 deg
 BETWEEN_SIDES = np.tan(np.radians(22.5))  # ratio of two components above which a corner is raised, not a side
 
 
 @cache
 def attitudes() -> Values:
-    """Return the attitudes that are proposed, faces first, as the body's direction of the vertical: (26, 3) array."""
+    """Return the proposed attitudes as directions of the vertical in the body, faces first: (26, 3) array."""
     up = np.array(sorted(filter(any, product((1, 0, -1), repeat=3)), key=lambda p: sum(map(abs, p))), float)
     return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
 
 
 def in_words(up: Sequence[float] | Values) -> str:
-    """Return an attitude in plain words: the axis that points up, then the side or corner that is raised from there.
+    """Return an attitude in words: the axis that points up, then the side or corner that is raised.
 
     >>> in_words([0.0, 0.0, 1.0])
     '+z up'
@@ -109,7 +107,7 @@ def _axis(n: Values, i: int) -> str:
 
 @dataclass(frozen=True)
 class Progress:
-    """What the rests recorded so far tell."""
+    """The state of the accelerometer's calibration by the rests so far."""
 
     rests: tuple[tuple[Recording, Rest], ...]  # in order of time in each recording
     held_out: tuple[bool, ...]  # of each
@@ -118,11 +116,11 @@ class Progress:
     next_is_held_out: bool
     information: Values  # (9, 9); F
     values: Values  # (9,); bias and the lower triangle of the matrix
-    error: float  # g; s of a rest to come
-    inflation: Values  # (9,); g
+    error: float  # g; s of a future rest
+    inflation: Values  # (9,); g_p
     freedom: Values  # (9,); degrees of freedom
-    expanded: float  # g; largest U of the fit, infinite before there is one
-    reason: str  # why there is none
+    expanded: float  # g; largest U of the fit, infinite without one
+    reason: str  # why there is no fit
 
     @property
     def used(self) -> int:
@@ -130,7 +128,7 @@ class Progress:
         return self.held_out.count(False)
 
     def near(self, up: Values) -> list[int]:
-        """Return the rests to which no other attitude that is proposed is nearer than ``up``."""
+        """Return the rests whose nearest proposed attitude is that of ``up``."""
         nearest = np.argmax(self.up @ attitudes().T, axis=1)
         return [int(i) for i in np.flatnonzero(nearest == int(np.argmax(attitudes() @ up)))]
 
@@ -142,34 +140,36 @@ class Progress:
 
 @dataclass(frozen=True)
 class Proposal:
-    """What to record next."""
+    """The next rest."""
 
     up: Values  # (3,)
-    further: int  # rests of the fit that are still needed; 0: the goal is reached
-    expected: float  # g; largest U then
+    further: int  # number of rests of the fit up to the goal; 0: the goal is reached
+    expected: float  # g; largest U with these rests
 
 
 def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dwell: float) -> Progress:
-    """Return what the rests so far determine.
+    """Return the state of the accelerometer's calibration.
 
-    ``settings``: sections ``sensor``, ``table`` and ``procedure``. ``dwell``: s, of a rest to come. Raises
+    ``settings``: sections ``sensor``, ``table`` and ``procedure``. ``dwell``: s, of a future rest. Raises
     ``CannotCalibrateError`` if no recording holds readings of the accelerometer.
     """
     orientations = orientations_of(recordings, settings)
     fitted: SensorCalibration | None = None
-    reason, values, scatter = "", IDEAL, 0.0
+    values, scatter = IDEAL, 0.0
     try:
         fitted = nonlinear_least_squares.fit(recordings, None, settings)
     except (NotObservableError, CannotCalibrateError) as lack:
         reason = lack.message
-    if fitted is not None:
+    else:
         values = np.concatenate([fitted.bias, fitted.matrix.ravel()])[PLACE]
-        reason = _open(fitted)
+        reason = _undetermined(fitted)
         scatter = float(fitted.stages[-1].details["scatter_between_rests"])
     sensor_config, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
     rests, white = orientations.rests, _white_of_rest(orientations, sensor_config, dwell)
     error = float(np.hypot(white, scatter))
-    F = _precision(sensor_config, gravity)
+    u = {True: 0.5 * float(sensor_config["scale_factor"]), False: limit_of_misalignment(sensor_config)}
+    of_matrix = [u[bool(i == j)] for i, j in zip(ROWS, COLUMNS, strict=True)]
+    F = np.diag(1.0 / np.square([0.5 * float(sensor_config["bias"]) / gravity] * 3 + of_matrix))  # P
     if len(rests.time):
         J = derivative_of(rests.reading, values)
         F = F + (J / (np.mean(orientations.white**2) * rests.share + scatter**2)[:, None]).T @ J
@@ -204,7 +204,7 @@ def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dw
 
 
 def default_goal(sensor_config: Mapping[str, Any], gravity: float, dwell: float) -> float:
-    """Return the largest U that ``orientations_24`` reaches by the noise of the sensor file, g, to two digits."""
+    """Return the largest U of ``orientations_24`` by the noise of the sensor file, g, to two digits."""
     angle = np.radians(np.arange(0.0, 360.0, 45.0))
     turn = gravity * np.column_stack([np.zeros(8), np.cos(angle), np.sin(angle)])
     up = np.concatenate([np.roll(turn, axis, axis=1) for axis in range(3)])
@@ -228,29 +228,22 @@ def derivative_of(y: Values, values: Values) -> Values:
     return np.concatenate([-n @ L, n[:, ROWS] * centred[:, COLUMNS]], axis=1)
 
 
-def _open(fitted: SensorCalibration) -> str:
-    """Return what the rests do not determine yet; empty where they determine everything."""
-    open_ = fitted.stages[-1].details[KNOWN_BY_LIMIT]
+def _undetermined(fitted: SensorCalibration) -> str:
+    """Return what the rests do not determine; empty if they determine everything."""
+    by_limit = fitted.stages[-1].details[KNOWN_BY_LIMIT]
     count = fitted.stages[-1].details["orientations_used"]
-    if open_:
-        return f"{count} orientations leave {', '.join(open_)} open"
+    if by_limit:
+        return f"{count} orientations leave {', '.join(by_limit)} open"
     return f"{count} orientations determine nine parameters without a check" if count <= FEWEST else ""
 
 
 def _white_of_rest(orientations: Orientations, sensor_config: Mapping[str, Any], dwell: float) -> float:
-    """Return the standard deviation by white noise of the mean of a rest to come, an axis, g."""
+    """Return the standard deviation by white noise of the mean of a future rest on an axis, g."""
     white = float(np.sqrt(np.mean(orientations.white**2)))
     if white > 0.0:
         (recording, _), *_ = orientations.used
         return white / float(np.sqrt(max((dwell - WINDOW_S) / recording.interval, 1.0)))
     return float(sensor_config["noise_density"]) / float(np.sqrt(2.0 * dwell))
-
-
-def _precision(sensor_config: Mapping[str, Any], gravity: float) -> Values:
-    """Return P: (9, 9) array."""
-    u = {True: 0.5 * float(sensor_config["scale_factor"]), False: limit_of_misalignment(sensor_config)}
-    matrix = [u[bool(i == j)] for i, j in zip(ROWS, COLUMNS, strict=True)]
-    return np.diag(1.0 / np.square([0.5 * float(sensor_config["bias"]) / gravity] * 3 + matrix))
 
 
 def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Values:
@@ -262,13 +255,13 @@ def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Valu
 
 
 def propose(progress: Progress, goal: float) -> Proposal:
-    """Return the next rest, and how many rests of the fit are expected to reach the goal, g; at most ``MOST``."""
+    """Return the next rest, with the number of rests up to the goal, g; at most ``MOST``."""
     up = attitudes()
     readings = progress.values[:3] + up @ np.linalg.inv(triangle(progress.values)).T
     X = derivative_of(readings, progress.values) / progress.error
     planned, F = _planned(progress, X, goal)
     expected = progress.largest(F, len(planned))
-    if progress.next_is_held_out:  # as far as it can be from all rests, so that it judges the fit between them
+    if progress.next_is_held_out:  # as far as possible from all rests, to judge the fit between them
         free = np.setdiff1d(np.arange(len(up)), planned) if len(set(planned)) < len(up) else np.arange(len(up))
         near = np.max(up[free] @ progress.up.T, axis=1, initial=-1.0)
         return Proposal(up[free[int(np.argmin(near))]], len(planned), expected)
@@ -284,26 +277,24 @@ def _planned(progress: Progress, X: Values, goal: float) -> tuple[list[int], Val
     if progress.expanded <= goal:
         return planned, F
 
-    def best(information: Values) -> tuple[int, Values]:
-        """Return the attitude to add, and the score with each: the smaller the better."""
+    def scores(information: Values) -> Values:
+        """Return the score with each attitude added: the smaller the better."""
         inverse = np.linalg.inv(information)
         V = X @ inverse
-        left = np.diag(inverse) - V**2 / (1.0 + np.sum(V * X, axis=1))[:, None]
-        U = progress.inflation * left
-        score = np.sum((U / U.max()) ** SHARPNESS, axis=1)
-        return int(np.argmin(score)), score
+        variance = progress.inflation * (np.diag(inverse) - V**2 / (1.0 + np.sum(V * X, axis=1))[:, None])
+        return np.asarray(np.sum((variance / variance.max()) ** SHARPNESS, axis=1))
 
     while len(planned) < MOST:
-        at, _ = best(F)
-        planned.append(at)
-        F = F + np.outer(X[at], X[at])
+        planned.append(int(np.argmin(scores(F))))
+        F = F + np.outer(X[planned[-1]], X[planned[-1]])
         for _ in range(SWEEPS):
             before = list(planned)
             for i, old in enumerate(before):
                 without = F - np.outer(X[old], X[old])
-                at, score = best(without)
-                if score[at] < score[old] * (1.0 - 1e-9):
-                    planned[i], F = at, without + np.outer(X[at], X[at])
+                score = scores(without)
+                new = int(np.argmin(score))
+                if score[new] < score[old] * (1.0 - 1e-9):
+                    planned[i], F = new, without + np.outer(X[new], X[new])
             if planned == before:
                 break
         if progress.used + len(planned) > FEWEST and progress.largest(F, len(planned)) <= goal:
@@ -311,7 +302,7 @@ def _planned(progress: Progress, X: Values, goal: float) -> tuple[list[int], Val
     return planned, F
 
 
-TURNS_DEG = (90.0, 180.0, 270.0, 360.0)  # that a person sees without a scale
+TURNS_DEG = (90.0, 180.0, 270.0, 360.0)  # angles that need no scale
 STEP = 1e-5  # relative, of a difference quotient: its error is 1e-10
 
 
@@ -324,7 +315,7 @@ class Turn:
     angle: float  # deg
 
     def in_words(self, dwell: float) -> str:
-        """Return what to do."""
+        """Return the instruction."""
         turn = f"turn it by {self.angle:g} deg about its {AXES[self.axis]} axis, which stays level"
         return f"+{AXES[self.up]} up; rest it for {dwell:g} s, {turn}, rest it for {dwell:g} s again"
 
@@ -340,40 +331,40 @@ class Turn:
 
 
 def most_informative_turn(gyroscope: SensorCalibration, direction: float) -> Turn:
-    """Return the turn that tells most of the gyroscope's matrix.
+    """Return the turn that improves the gyroscope's matrix most.
 
-    ``gyroscope``: its calibration so far, with a covariance. ``direction``: rad, s.
+    ``gyroscope``: its calibration so far, with a covariance. ``direction``: s, rad.
     """
     assert gyroscope.covariance is not None  # noqa: S101
     S = gyroscope.covariance
 
     def gain(turn: Turn) -> float:
-        own = 3 + 3 * np.arange(3) + turn.axis
+        column = 3 + 3 * np.arange(3) + turn.axis
         H = turn.sensitivity() / direction
-        return float(np.linalg.slogdet(np.eye(3) + H @ S[np.ix_(own, own)] @ H.T)[1])
+        return float(np.linalg.slogdet(np.eye(3) + H @ S[np.ix_(column, column)] @ H.T)[1])
 
-    turns = [Turn(a, b, angle) for a in range(3) for b in range(3) if a != b for angle in TURNS_DEG]
+    turns = (Turn(axis, up, angle) for axis, up in permutations(range(3), 2) for angle in TURNS_DEG)
     return max(turns, key=gain)
 
 
 def next_face_or_turn(
     recordings: Sequence[Recording], procedure: Mapping[str, Any], dwell: float
 ) -> tuple[bool, list[str]]:
-    """Return whether all faces and turns are there, and lines that say what is there and what comes next.
+    """Return whether all faces and turns are recorded, and lines that state what is recorded and what comes next.
 
-    ``dwell``: s, of a rest to come.
+    ``dwell``: s, of a future rest.
     """
     stated = procedure["turns"]
     if any(entry.get("windows") for entry in procedure["recordings"].values()):
-        stated = {**stated, "holdout_every": 0}  # the windows say what is held out
+        stated = {**stated, "holdout_every": 0}  # the windows state what is held out
     faces, angle = dict.fromkeys(FACES, 0), float(stated["angle_deg"])
     turns: dict[str, list[bool]] = {axis: [] for axis in AXES}  # whether each is held out
-    found = [(r, [rest for rest in find_rests(r) if rest.accepted]) for r in recordings if r.role == ROLE]
-    at_rest = [r.gyroscope[rest.start : rest.stop] for r, rests in found for rest in rests if r.gyroscope is not None]
-    for recording, rests in found:
-        for on in face_of(rest_means(recording, rests)[0])[0].tolist():
-            if on >= 0:
-                faces[FACES[on]] += 1
+    pairs = [(r, [rest for rest in find_rests(r) if rest.accepted]) for r in recordings if r.role == ROLE]
+    at_rest = [r.gyroscope[rest.start : rest.stop] for r, rests in pairs for rest in rests if r.gyroscope is not None]
+    for recording, rests in pairs:
+        for face in face_of(rest_means(recording, rests)[0])[0].tolist():
+            if face >= 0:
+                faces[FACES[face]] += 1
         for turn in turns_by_hand(recording, rests, stated):
             turns[AXES[turn.axis]].append(turn.held_out)
         if recording.axis and len(rests) < 2 and at_rest and sound_span(recording, slice(0, recording.samples)):
@@ -386,9 +377,9 @@ def next_face_or_turn(
         "faces: " + ", ".join(f"{name} {count}" for name, count in faces.items()) + " rests",
         f"turns by {angle:g} deg: " + ", ".join(counts),
     ]
-    face = next((name for name, count in faces.items() if not count), None)
-    if face is not None:
-        return False, [*lines, f"next: {face} up; rest it for {dwell:g} s"]
+    lacking = next((name for name, count in faces.items() if not count), None)
+    if lacking is not None:
+        return False, [*lines, f"next: {lacking} up; rest it for {dwell:g} s"]
     about = next((axis for axis, held in turns.items() if not (any(held) if judged else held)), None)
     if about is None:
         return True, [*lines, "enough: all faces and turns are there"]

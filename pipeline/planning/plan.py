@@ -1,4 +1,4 @@
-"""The plan of a procedure as a document and as text: what it would find of each effect.
+"""Plan a procedure: simulate it without effects, and state which size of each effect it would find.
 
     {"sensor", "table", "procedure", "course": {how it is run}, "at_a_table", "minutes", "samples", "warnings": [text],
      "accelerometer": {"noise": {"white", "wander"}, "unit",
@@ -7,7 +7,7 @@
         "not_observable": [{"effect", "reason"}], "reason": null | why nothing can be planned},
      "gyroscope": {...}}
 
-Sizes are those that half of the units would show. An effect that would pass only beyond its limit is not observable.
+Sizes are those that half of the units would show. An effect that needs a size above its limit is not observable.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
     from pipeline.simulation.trajectory import Planned
 
-CLEARLY_LARGER = 1.2  # times the smallest size, from which on the size at which an effect is named is printed
-SEED = 0  # of the simulated noise: a plan is the same each time
-# The middle of what is drawn at random for a simulated unit: it warms up by some degrees in a room that changes little.
+CLEARLY_LARGER = 1.2  # times the smallest size: least size of a named effect that is printed
+SEED = 0  # of the simulated noise, so that a plan is reproducible
+# The middle of the random values of a simulated unit, which warms up by some degrees in a room that changes little.
 ROOM: dict[str, Any] = {
     "ambient": 25.0, "warm_up": 4.5, "warm_up_time": 300.0, "drift": 0.3,
     "periods": np.array([3000.0, 5000.0]), "phases": np.zeros(2),
@@ -53,8 +53,8 @@ Document = dict[str, Any]
 def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: bool = False) -> Document:
     """Return the plan of a unit's procedure with further recordings.
 
-    With ``half_only``, ``almost_sure`` and ``named`` are left out. Raises ``ConfigurationError`` if a name is not known
-    or the course cannot be run.
+    With ``half_only``, ``almost_sure`` and ``named`` are None. Raises ``ConfigurationError`` if a name is unknown or
+    the course is impossible.
     """
     simulated = simulate_procedure(unit, extra)
     return {
@@ -80,36 +80,34 @@ def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = F
         "not_observable": [],
         "reason": None,
     }
+    limits: DetectionLimits
     try:
-        limits, hidden = _limits(sensor, simulated)
+        if is_multi_position(sensor, simulated.recordings):
+            by_rests = select_by_hand(sensor, simulated)
+            limits, hidden = RestLimits(by_rests, noise), not_observable_by_hand(by_rests, [])
+        else:
+            observations = observe(sensor, simulated.recordings, simulated.table)
+            selection = select(observations, [], noise, simulated.sensor_configs[sensor], search=False)
+            limits, hidden = TurntableLimits(selection, noise), not_observable(selection, [])
     except NotObservableError as error:
         return {**document, "reason": error.message}
     for name in sorted(set(limits.names) - set(hidden)):
-        found = limits.detection(name, half_only=half_only)
-        assert found is not None  # noqa: S101  (what the motion does not excite is hidden)
+        detection = limits.detection(name, half_only=half_only)
         limited = bool(np.isfinite(limits.limits[name]).any())
-        if limited and found.found > 1.0:
-            hidden[name] = _faint(sensor, found)
+        if limited and detection.found > 1.0:
+            this, times = effect(name), f", {detection.found:.2g} times that would show"
+            faint = at_its_limit(this, sensor, detection.unit_sizes[0]) + " be below the noise"
+            hidden[name] = f"{faint}{times if np.isfinite(detection.found) else ''}; it needs {this.excitation}"
         else:
-            document["effects"].append(_entry(sensor, found, limited=limited))
+            document["effects"].append(_entry(sensor, detection, limited=limited))
     document["not_observable"] = [{"effect": n, "reason": hidden[n]} for n in sorted(hidden)]
     return document
 
 
-def _limits(sensor: str, simulated: SimulatedProcedure) -> tuple[DetectionLimits, dict[str, str]]:
-    """Return what a selection is expected to find, and the effects that it cannot find, each with the reason."""
-    noise, sensor_config = simulated.noise[sensor], simulated.sensor_configs[sensor]
-    if is_multi_position(sensor, simulated.recordings):
-        selected = select_by_hand(sensor, simulated)
-        return RestLimits(selected, noise), not_observable_by_hand(selected, [])
-    selection = select(observe(sensor, simulated.recordings, simulated.table), [], noise, sensor_config, search=False)
-    return TurntableLimits(selection, noise), not_observable(selection, [])
-
-
 def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Selection:
-    """Return what the selection makes of a simulated procedure by hand.
+    """Return the selection in a simulated procedure by hand.
 
-    Raises ``NotObservableError`` if bias and matrix cannot be determined, or there are no rests.
+    Raises ``NotObservableError`` if bias and matrix cannot be determined, or if there are no rests.
     """
     sections = {"sensor": simulated.sensor_configs, "table": simulated.table, "procedure": simulated.procedure}
     settings: dict[str, Any] = {**sections, "effects": {"accelerometer": [], "gyroscope": []}}
@@ -121,36 +119,30 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Select
     return by_hand.Selection(model, start, [], simulated.noise[sensor], simulated.sensor_configs[sensor])
 
 
-def _entry(sensor: str, found: Detection, *, limited: bool) -> Document:
-    parameters = effect(found.effect).parameters(sensor)
-    sizes = {p.name: found.found * float(u) for p, u in zip(parameters, found.unit_sizes, strict=True) if u}
-    first = float(found.unit_sizes[0])
+def _entry(sensor: str, detection: Detection, *, limited: bool) -> Document:
+    parameters = effect(detection.effect).parameters(sensor)
+    first = float(detection.unit_sizes[0])
+    almost_sure, named = (
+        share * first if np.isfinite(share * first) else None for share in (detection.sure, detection.named)
+    )
     return {
-        "effect": found.effect,
-        "smallest": found.found * first,
+        "effect": detection.effect,
+        "smallest": detection.found * first,
         "unit": parameters[0].unit,
-        "share_of_limit": found.found if limited else None,
-        "almost_sure": _finite(found.sure * first),
-        "named": _finite(found.named * first),
-        "sizes": sizes,
-        "taken_for": found.taken_for,
-        "look_alikes": [{"effect": n, "share": s} for n, s in found.look_alikes.items()],
+        "share_of_limit": detection.found if limited else None,
+        "almost_sure": almost_sure,
+        "named": named,
+        "sizes": {
+            p.name: detection.found * float(u) for p, u in zip(parameters, detection.unit_sizes, strict=True) if u
+        },
+        "taken_for": detection.taken_for,
+        "look_alikes": [{"effect": name, "share": share} for name, share in detection.look_alikes.items()],
     }
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _faint(sensor: str, found: Detection) -> str:
-    this = effect(found.effect)
-    times = f", {found.found:.2g} times that would show" if np.isfinite(found.found) else ""
-    return f"{at_its_limit(this, sensor, found.unit_sizes[0])} be below the noise{times}; it needs {this.excitation}"
 
 
 @dataclass(frozen=True)
 class SimulatedProcedure:
-    """What a procedure would record with a faultless sensor and table, the configurations, and their noise."""
+    """The recordings of a procedure with a faultless sensor and table, and the configurations and noise of both."""
 
     recordings: list[Recording]
     sensor_configs: Mapping[str, Any]
@@ -161,9 +153,9 @@ class SimulatedProcedure:
 
 
 def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> SimulatedProcedure:
-    """Simulate a procedure and further recordings in memory, without the unit's effects and the table's imperfections.
+    """Simulate a procedure and further recordings without the unit's effects and the table's imperfections.
 
-    Raises ``ConfigurationError`` if sensor, table or procedure are not known, or the course cannot be run.
+    Raises ``ConfigurationError`` if sensor, table or procedure are unknown, or the course is impossible.
     """
     faultless = replace(
         unit, effects={}, imperfections=FAULTLESS, held_out={}, temperature={**ROOM, **unit.temperature}
@@ -171,9 +163,7 @@ def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> 
     recordings, _ = simulate_unit(faultless, SEED, 0, extra)
     sensor_configs, table = read_config("sensor", unit.sensor), read_config("table", unit.table)
     long_rest = any(recording.role == "static" for recording in recordings)
-    noise = {
-        s: stated_noise(sensor_configs[s], unit.interval_s, long_rest=long_rest) for s in ("accelerometer", "gyroscope")
-    }
+    noise = {s: stated_noise(sensor_configs[s], unit.interval_s, long_rest=long_rest) for s in SENSORS}
     minutes = max(float(r.time[-1]) for r in recordings) / 60.0
     return SimulatedProcedure(
         recordings, sensor_configs, table, read_config("procedure", unit.procedure), noise, minutes
@@ -185,21 +175,17 @@ def stated_noise(sensor_config: Mapping[str, Any], interval: float, *, long_rest
 
         white^2 = noise_density^2 / (2 dt) + (1 / counts_per_unit)^2 / 12
 
-    with the sampling interval dt in s, the one-sided density in unit/sqrt(Hz), and the quantisation. ``long_rest``: the
-    noise will be estimated from a long rest.
+    with the sampling interval dt in s, the one-sided density in unit/sqrt(Hz), and the quantisation. ``long_rest``:
+    whether a long rest will determine the noise.
     """
-    variance = sensor_config["noise_density"] ** 2 * 0.5 / interval + 1.0 / (
-        12.0 * sensor_config["counts_per_unit"] ** 2
-    )
-    wander = float(sensor_config.get("bias_wander") or 0.0)
-    source = "static" if long_rest else "rests"
-    return Noise(
-        np.full(3, np.sqrt(variance)), np.full(3, wander), float(sensor_config.get("wander_time_s") or 100.0), source
-    )
+    quantisation = 1.0 / (12.0 * sensor_config["counts_per_unit"] ** 2)
+    white = np.sqrt(sensor_config["noise_density"] ** 2 * 0.5 / interval + quantisation)
+    wander, time = float(sensor_config.get("bias_wander") or 0.0), float(sensor_config.get("wander_time_s") or 100.0)
+    return Noise(np.full(3, white), np.full(3, wander), time, "static" if long_rest else "rests")
 
 
 def _warnings(simulated: SimulatedProcedure, sensor: str) -> list[str]:
-    """Return what sensor or table cannot do of the procedure, and figures that are assumed, as sentences."""
+    """Return the limitations of sensor and table in the procedure, and the assumed figures, as sentences."""
     full = float(simulated.sensor_configs["gyroscope"]["full_scale"])
     rates = [float(np.abs(r.table_rate).max()) for r in simulated.recordings if r.table_rate is not None]
     fastest, assumed = max(rates, default=0.0), assumed_figures(sensor, simulated.sensor_configs)
@@ -229,24 +215,22 @@ def plan_text(document: Document, second: Document | None = None) -> list[str]:
 
 
 def _rows(part: Mapping[str, Any]) -> list[list[str]]:
-    """Return what is planned of a sensor as a table; nothing where no effect is observable."""
-    head = ["effect", "smallest size", "of limit", "similar signal", "note"]
-    return [head, *(_row(entry) for entry in part["effects"])] if part["effects"] else []
-
-
-def _row(entry: Mapping[str, Any]) -> list[str]:
-    alike = ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2])
-    return [
-        entry["effect"],
-        size_text(entry["smallest"], entry["unit"]),
-        share_text(entry["share_of_limit"]),
-        alike,
-        _note(entry),
+    """Return the plan of a sensor as a table; empty if no effect is observable."""
+    rows = [
+        [
+            entry["effect"],
+            size_text(entry["smallest"], entry["unit"]),
+            share_text(entry["share_of_limit"]),
+            ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2]),
+            _note(entry),
+        ]
+        for entry in part["effects"]
     ]
+    return [["effect", "smallest size", "of limit", "similar signal", "note"], *rows] if rows else []
 
 
 def _note(entry: Mapping[str, Any]) -> str:
-    """Return up to which size another effect would be named instead of this one."""
+    """Return the size below which another effect would be named."""
     named, smallest, taken = entry["named"], entry["smallest"], entry["taken_for"]
     limit = None if entry["share_of_limit"] is None else smallest / entry["share_of_limit"]
     never = named is None or (limit is not None and named > limit)
@@ -270,15 +254,14 @@ def share_text(value: float | None) -> str:
 
 
 def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[list[str]]:
-    """Return what two plans say of a sensor as a table; nothing where no effect is known."""
+    """Return two plans of a sensor as a table; empty without effects."""
     a, b = ({entry["effect"]: entry for entry in part["effects"]} for part in (first, second))
     rows = []
     hidden = {e["effect"] for part in (first, second) for e in part["not_observable"]}
     for name in sorted(a.keys() | b.keys() | hidden):
         cells = [name]
-        for found in (a.get(name), b.get(name)):
-            known = [size_text(found["smallest"], found["unit"]), share_text(found["share_of_limit"])] if found else []
-            cells += known or ["-", ""]
+        for e in (a.get(name), b.get(name)):
+            cells += [size_text(e["smallest"], e["unit"]), share_text(e["share_of_limit"])] if e else ["-", ""]
         both = name in a and name in b
         rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
     return [["effect", "smallest in A", "of limit", "smallest in B", "of limit", "B / A"], *rows] if rows else []

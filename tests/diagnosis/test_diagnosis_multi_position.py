@@ -154,7 +154,7 @@ def test_six_positions_are_not_enough_and_the_advice_says_what_is() -> None:
     assert judged["reason"].endswith("through its 6 rests exactly, so that their error does not test it: record more")
     assert all(step["rms_error"] is None for step in judged["steps"])
     unit.settings["procedure"]["faces"] = {"accuracy_deg": 1.0}
-    assert "beside those on the six faces" in unit.diagnosed("accelerometer")["next_experiment"]
+    assert "in addition to those on the six faces" in unit.diagnosed("accelerometer")["next_experiment"]
 
 
 def test_twenty_four_orientations_select_nothing_where_nothing_is_hidden() -> None:

@@ -17,13 +17,13 @@ from pipeline.diagnosis import turntable
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.formula_discovery import (
     Discovery,
-    dependent,
     discover,
     effect_file,
     suggested_effect,
     why_not_suggested,
 )
 from pipeline.diagnosis.functional_forms import Factor, Form, Span, columns_of, harmonic, power, step
+from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.design import Term
@@ -230,10 +230,10 @@ def test_a_coefficient_has_the_unit_that_makes_the_term_one_of_the_sensor(
 def test_a_scan_of_single_forms_finds_what_the_products_of_all_curves_say() -> None:
     selection = selection_of("gyroscope", with_extra("gyroscope", gear(5e-4)))
     tried = [[*harmonic(5).texts], ["fx * speed", "u * speed"], ["wx", "wy"]]
-    scan, motions = Scan(selection), [part.motion for part in selection.observations.parts]
+    scan = Scan(selection)
     for texts in tried:
         columns = columns_of(texts, "gyroscope")
-        values = np.concatenate([columns(motion) for motion in motions])
+        values = scan.values(columns)
         expected = ProjectedCurves(scan, columns).drop([0, 1])[:, :, -1:]
         found = scan.drops(np.stack([values, 2.0 * values + 1.0], axis=-2))[:, :, :1]
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
@@ -272,7 +272,7 @@ def test_a_power_that_the_base_holds_already_says_nothing_new() -> None:
     scan = Scan(selection)
     curves = columns_of(["fx", "fx ** 2", "2 * fx ** 2 + 3 * fy", "cos(radians(angle))"], "accelerometer")
     assert ProjectedCurves(scan, curves).independent([0, 1, 2]) == [1]
-    drops = scan.drops(scan.values(curves)[:, 0, :, None])
+    drops = scan.drops(scan.values(curves)[..., None])
     assert drops[:, :, 0].max() == 0.0
     assert drops[:, :, 1].max() > 0.0
 
@@ -305,7 +305,7 @@ def test_nothing_is_guessed_in_sixty_units_without_anything_unknown(sensor: str,
         session = Session(
             9000 + seed, courses[seed % 3], wander=wander, static=bool(seed % 2), ramp=15.0 * (seed % 5 == 0)
         )
-        assert dependent(selection_of(sensor, record(session))) == [], seed
+        assert dependences(selection_of(sensor, record(session))) == [], seed
 
 
 @pytest.mark.parametrize(

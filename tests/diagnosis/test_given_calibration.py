@@ -66,7 +66,7 @@ def test_a_method_that_fits_is_not_compared() -> None:
 def test_the_given_calibration_is_blamed_where_a_fit_of_the_recordings_leaves_noise_alone() -> None:
     verdict, reason = decide(GIVEN)
     assert verdict == "left_by_method"
-    assert reason.endswith("the given calibration causes it.")
+    assert reason.endswith("the given calibration causes the error.")
     assert decide(replace(GIVEN, method="rests_and_moves"))[0] == "reference_in_doubt"
     assert decide(replace(GIVEN, over_noise=4.0))[0] == "unexplained"
     inside = replace(GIVEN, published=HeldOut(0.05, 0.01, 0.1))

@@ -10,7 +10,8 @@ import pytest
 import yaml
 from bench_session import STOP_AND_GO, Session, record
 
-from pipeline.diagnosis.influence import goodness_of_fit, influence
+from pipeline.diagnosis.influence import influence
+from pipeline.diagnosis.residual_dependence import goodness_of_fit
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
