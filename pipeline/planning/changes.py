@@ -52,42 +52,41 @@ class Change:
 
 def changes(unit: UnitDescription) -> list[Change]:
     """Return the proposed changes of a unit's procedure."""
-    course = course_of(unit)
-    fixed = replace(unit, samples=None, course=asdict(course))
-    found = list((_on_a_table if unit.procedure in TABLE_PROCEDURES else _by_hand)(fixed, course))
-    if course.static_s < LONG_REST_S:
-        what = f"a long rest of {LONG_REST_S / 60.0:g} min, to determine the noise"
-        found.append(_with(fixed, what, f"--static {LONG_REST_S:g}", static_s=LONG_REST_S))
-    return found
-
-
-def _with(unit: UnitDescription, what: str, options: str, **course: Any) -> Change:  # noqa: ANN401  (any attribute)
-    return Change(what, options, replace(unit, course={**unit.course, **course}))
-
-
-def _longer(unit: UnitDescription, course: Course) -> Change:
-    dwell = 2.0 * course.dwell_s
-    return _with(unit, "rest twice as long at each stop", f"--dwell {dwell:g}", dwell_s=dwell)
-
-
-def _on_a_table(unit: UnitDescription, course: Course) -> Iterator[Change]:
-    if not course.both_directions:
-        what = "make every turn in the other direction too"
-        yield _with(unit, what, "--both-directions", both_directions=True)
+    course, on_table = course_of(unit), unit.procedure in TABLE_PROCEDURES
     full = float(read_config("sensor", unit.sensor)["gyroscope"]["full_scale"])
+    fixed = replace(unit, samples=None, course=asdict(course))
+    found: list[Change] = []
+
+    def propose(what: str, options: str, **values: Any) -> None:  # noqa: ANN401  (any attribute of the course)
+        found.append(Change(what, options, replace(fixed, course={**fixed.course, **values})))
+
+    if on_table and not course.both_directions:
+        propose("make every turn in the other direction too", "--both-directions", both_directions=True)
     faster = [r for r in FASTER_DPS if CLEARLY_FASTER * max(course.rates_dps) < r <= WITHIN * full]
-    if faster:
+    if on_table and faster:
         rates = (*course.rates_dps, *faster)
-        options = "--rate " + " ".join(f"{r:g}" for r in rates)
         what = f"turn at {' and '.join(f'{r:g}' for r in faster)} deg/s too, both sensors recorded"
-        yield _with(unit, what, options, rates_dps=rates)
-    yield _with(unit, "make twice as many turns", f"--turns {2 * course.turns}", turns=2 * course.turns)
-    if not course.accelerometer_rates_dps:
-        yield _longer(unit, course)
+        propose(what, "--rate " + " ".join(f"{r:g}" for r in rates), rates_dps=rates)
+    if on_table:
+        propose("make twice as many turns", f"--turns {2 * course.turns}", turns=2 * course.turns)
+    if not (on_table and course.accelerometer_rates_dps):
+        dwell = 2.0 * course.dwell_s
+        propose("rest twice as long at each stop", f"--dwell {dwell:g}", dwell_s=dwell)
     if unit.procedure == "three_axis_turns":
         what = f"heat and cool the unit by {course.thermal_ramp_degc:g} degC meanwhile, in a thermal chamber"
-        yield Change(what, "--procedure thermal_ramp", replace(unit, procedure="thermal_ramp"))
-    yield from _further(unit, course, full)
+        found.append(Change(what, "--procedure thermal_ramp", replace(fixed, procedure="thermal_ramp")))
+    if on_table:
+        found += _further(fixed, course, full)
+    elif unit.procedure == "multi_position":
+        more = POSITIONS * course.positions
+        propose(f"rest in {more} positions", f"--positions {more}", positions=more)
+    else:
+        what = f"instead of these, rest in {course.positions} positions, each with another inclination"
+        found.append(Change(what, "--procedure multi_position", replace(fixed, procedure="multi_position")))
+    if course.static_s < LONG_REST_S:
+        what = f"a long rest of {LONG_REST_S / 60.0:g} min, to determine the noise"
+        propose(what, f"--static {LONG_REST_S:g}", static_s=LONG_REST_S)
+    return found
 
 
 def _further(unit: UnitDescription, course: Course, full: float) -> Iterator[Change]:
@@ -105,16 +104,6 @@ def _further(unit: UnitDescription, course: Course, full: float) -> Iterator[Cha
     turn = Gimbals(np.array([0.0, 0.0, UPRIGHT_DPS]), still, still, still, 360.0 / UPRIGHT_DPS)
     what = "turn about z with z upright, attitude logged, in the fit"
     yield Change(what, "", unit, (Planned("upright_z", "gyroscope", None, turn),))
-
-
-def _by_hand(unit: UnitDescription, course: Course) -> Iterator[Change]:
-    yield _longer(unit, course)
-    if unit.procedure == "multi_position":
-        more = POSITIONS * course.positions
-        yield _with(unit, f"rest in {more} positions", f"--positions {more}", positions=more)
-    else:
-        what = f"instead of these, rest in {course.positions} positions, each with another inclination"
-        yield Change(what, "--procedure multi_position", replace(unit, procedure="multi_position"))
 
 
 @dataclass(frozen=True)
