@@ -221,8 +221,7 @@ def _held_out_errors(selection: Selection) -> list[float | None]:
     errors: list[float | None] = []
     for each in selection.fits:
         folds = [
-            (part, held, fit(part, each.state, selection.hypotheses, selection.bounds))
-            for part, held in _folds(model)
+            (part, held, fit(part, each.state, selection.hypotheses, selection.bounds)) for part, held in _folds(model)
         ]
         judged = all(len(fitted.residual) >= fitted.rank + SPARE for _, _, fitted in folds)
         square = sum(_squared(part, fitted.state) * held for part, held, fitted in folds) / len(model.rests.time)
