@@ -129,7 +129,7 @@ def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: f
     k = max(round(ROW_S / interval), 1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], valid, [False]]).astype(int)))
     gaps = np.flatnonzero(np.diff(time) > GAP * interval) + 1
-    found: dict[str, list[Values]] = {}
+    rows: dict[str, list[Values]] = {}
     for first, last in edges.reshape(-1, 2):
         inner = gaps[(gaps > first) & (gaps < last)]
         for start, stop in zip([first, *inner], [*inner, last], strict=True):
@@ -145,8 +145,8 @@ def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: f
                 row["turn"] = omega[:, :, None] * omega[:, None, :]
             for name, values in row.items():
                 cut = values[EDGE : EDGE + n * k]
-                found.setdefault(name, []).append(cut.reshape(n, k, *cut.shape[1:]).mean(axis=1))
-    return {name: np.concatenate(parts) for name, parts in found.items()} or {"time": np.zeros(0)}
+                rows.setdefault(name, []).append(cut.reshape(n, k, *cut.shape[1:]).mean(axis=1))
+    return {name: np.concatenate(parts) for name, parts in rows.items()} or {"time": np.zeros(0)}
 
 
 def clear_of(a: Signals, b: Signals, R: Values) -> Signals:
@@ -154,15 +154,15 @@ def clear_of(a: Signals, b: Signals, R: Values) -> Signals:
 
     For the specific force the deviation from its mean is used, because a bias cannot be distinguished from the mean.
     """
-    found = {}
+    clear = {}
     for name in set(a) & {*SENSORS, *(f"{s}'" for s in SENSORS)}:
         difference = b[name] @ R - a[name]
         noise = MEDIAN_SIZE * np.median(np.abs(difference - np.median(difference, axis=0)), axis=0)
         centre = a[name].mean(axis=0) * (name == "accelerometer")
-        found[name] = (np.abs(a[name] - centre) > CLEAR * noise).astype(float)
-    if "gyroscope" in found:
-        found["turn"] = found["gyroscope"][:, :, None] * found["gyroscope"][:, None, :]
-    return found
+        clear[name] = (np.abs(a[name] - centre) > CLEAR * noise).astype(float)
+    if "gyroscope" in clear:
+        clear["turn"] = clear["gyroscope"][:, :, None] * clear["gyroscope"][:, None, :]
+    return clear
 
 
 def lever(turn: Values, alpha: Values) -> Values:
@@ -185,9 +185,9 @@ def columns_of(sensor: str, x: Signals) -> list[tuple[str, Values]]:
 
 def turned(x: Signals, R: Values, clear: Mapping[str, Values]) -> Signals:
     """Return the signals of a chip in axes that R turns into the chip's axes, where they are clear of noise."""
-    found = {k: R.T @ v @ R if k == "turn" else v @ R if v.ndim == 2 else v for k, v in x.items()}
-    level = {k: found[k].mean(axis=0) if k == "accelerometer" else 0.0 for k in clear}
-    return {k: level[k] + (v - level[k]) * clear[k] if k in clear else v for k, v in found.items()}
+    signals = {k: R.T @ v @ R if k == "turn" else v @ R if v.ndim == 2 else v for k, v in x.items()}
+    level = {k: signals[k].mean(axis=0) if k == "accelerometer" else 0.0 for k in clear}
+    return {k: level[k] + (v - level[k]) * clear[k] if k in clear else v for k, v in signals.items()}
 
 
 @dataclass(frozen=True)

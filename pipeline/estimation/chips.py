@@ -87,12 +87,12 @@ def chip_document(reference: Chip, other: Chip) -> dict[str, Any]:
     sensors = [s for s in SENSORS if all(chip.calibrations.get(s) is not None for chip in chips)]
     if not sensors:
         raise NotObservableError("no sensor is calibrated in both chips")
-    found = fit_chips(*chips, sensors)
+    fitted = fit_chips(*chips, sensors)
     on_table = any(r.table_angle is not None or r.table_attitude is not None for r in reference.recordings)
-    estimate = _combined(found.fits, _errors(found, chips), on_table=on_table)
-    R = found.R @ turn_by_vector(estimate.values[:3])
-    document = _estimated(R, estimate, chips) | _checks(found, R, estimate)
-    return document | {"duration_s": round(len(found.moving) * ROW_S, 3)}
+    estimate = _combined(fitted.fits, _errors(fitted, chips), on_table=on_table)
+    R = fitted.R @ turn_by_vector(estimate.values[:3])
+    document = _estimated(R, estimate, chips) | _checks(fitted, R, estimate)
+    return document | {"duration_s": round(len(fitted.moving) * ROW_S, 3)}
 
 
 def vector_of(R: Values) -> Values:
@@ -104,9 +104,9 @@ def _rms(values: Values) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _errors(found: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
+def _errors(fitted: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
     """Return the sources of error of the fits' parameters, one after the other, without the biases."""
-    fits, R, moving = found.fits, found.R, found.moving
+    fits, R, moving = fitted.fits, fitted.R, fitted.moving
     kept = [np.flatnonzero(np.array(fit.names) != "bias") for fit in fits]
     sizes = [len(k) for k in kept]
     places = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
@@ -114,8 +114,8 @@ def _errors(found: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
     for fit, k, place in zip(fits, kept, places, strict=True):
         priors = [chip.prior(fit.sensor) for chip in chips]
         prior = Prior(float(np.linalg.norm([p.wander for p in priors])), max(p.time for p in priors))
-        design = np.column_stack([np.ones(len(fit.residual)), found.rows[0][fit.sensor]])
-        covariance, freedom = assess_noise(fit.residual, design, found.blocks, prior).posterior(fit.map).averaged()
+        design = np.column_stack([np.ones(len(fit.residual)), fitted.rows[0][fit.sensor]])
+        covariance, freedom = assess_noise(fit.residual, design, fitted.blocks, prior).posterior(fit.map).averaged()
         # Motion alone determines all but the accelerometers' rotation; its noise may be larger than that at rest.
         by_motion = (np.array(fit.names)[k] != "rotation") | (fit.sensor == "gyroscope")
         in_motion = _rms(fit.residual[moving]) if moving.any() else 0.0
@@ -142,7 +142,7 @@ def _errors(found: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
                 sources.append((f"stated accuracies of the bench, {of}s", "B", np.inf, of_bench, both))
         for source, kind, degrees, covariance, pairs in sources:
             of_fits = [
-                np.concatenate([fit.map.of(_change(found, fit, of, *E))[k] for fit, k in zip(fits, kept, strict=True)])
+                np.concatenate([fit.map.of(_change(fitted, fit, of, *E))[k] for fit, k in zip(fits, kept, strict=True)])
                 for E in pairs
             ]
             of_axes = np.zeros((3, 9))
@@ -152,14 +152,14 @@ def _errors(found: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
     return errors
 
 
-def _change(found: Fits, fit: Fit, of: str, E_a: Values, E_b: Values) -> Values:
+def _change(fitted: Fits, fit: Fit, of: str, E_a: Values, E_b: Values) -> Values:
     """Return the change of a fit's readings, (n, 3), where the truths of a sensor are sheared."""
-    a, b = found.rows
+    a, b = fitted.rows
     change = np.zeros_like(fit.residual)
     if of == fit.sensor:
-        change += b[of] @ found.R @ E_b.T - a[of] @ E_a.T
+        change += b[of] @ fitted.R @ E_b.T - a[of] @ E_a.T
     if of == "gyroscope" and fit.sensor == "accelerometer":
-        x, r = turned(a, np.eye(3), found.clear), fit.step[np.array(fit.names) == "lever_arm"]
+        x, r = turned(a, np.eye(3), fitted.clear), fit.step[np.array(fit.names) == "lever_arm"]
         change -= lever(E_a @ x["turn"] + x["turn"] @ E_a.T, x["gyroscope'"] @ E_a.T) @ r
     return change
 
@@ -221,15 +221,15 @@ def _combined(fits: Sequence[Fit], errors: Sequence[Error], *, on_table: bool) -
     return Estimate(names, T @ x, [replace(e, of_fits=T @ e.of_fits) for e in errors], agreement)
 
 
-def _checks(found: Fits, R: Values, estimate: Estimate) -> dict[str, Any]:
+def _checks(fitted: Fits, R: Values, estimate: Estimate) -> dict[str, Any]:
     """Return the residuals of the fits, and doubts about them."""
-    doubts, residual, held_out, agree, moving = [], {}, {}, estimate.agreement, found.moving
+    doubts, residual, held_out, agree, moving = [], {}, {}, estimate.agreement, fitted.moving
     if agree and agree["p_value"] < DOUBTFUL:
         doubts.append(
             f"accelerometers and gyroscopes state rotations that differ by {agree['angle_deg']:.2g} deg (p = "
             f"{agree['p_value']:.1g}): one of the calibrations is wrong in its axes; see the chips' diagnoses"
         )
-    for fit in found.fits:
+    for fit in fitted.fits:
         unit = SENSOR_UNITS[fit.sensor]
         parts = [fit.residual[moving], fit.residual[~moving]]
         in_motion, at_rest = (_rms(part) if len(part) else None for part in parts)
@@ -239,8 +239,8 @@ def _checks(found: Fits, R: Values, estimate: Estimate) -> dict[str, Any]:
                 f"in motion the {fit.sensor}s differ by {in_motion:.2g} {unit}, at rest by {at_rest:.2g} {unit}: the "
                 "board bends, the chips' filters differ, or an effect is missing in a calibration"
             )
-        if found.held_out is not None:
-            a, b = found.held_out
+        if fitted.held_out is not None:
+            a, b = fitted.held_out
             columns = dict(columns_of(fit.sensor, turned(a, np.eye(3), clear_of(a, b, R))))
             y = b[fit.sensor] @ R - a[fit.sensor]
             held_out[fit.sensor] = {"unit": unit, "rows": len(y), "without_lever_arm": _rms(y - y.mean(axis=0))}

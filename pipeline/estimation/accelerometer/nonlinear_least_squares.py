@@ -158,12 +158,12 @@ def _fit_triangular(
     while refused := _outlier(rows, solved):
         rows = _without(rows, refused)
         solved = _fit_determined(rows, gravity_g, prior, limit)
-    found, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
-    correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
+    fitted, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
+    correction = {"steps": [{"subtract": fitted.state.bias.tolist()}, {"matrix": fitted.state.matrix.tolist()}]}
     if not rows.by_hand and solved.spare > 1:
         return _on_table(rows, solved, before, correction, prior, settings)
-    covariance = PLACED @ found.covariance @ PLACED.T
-    freedom = float(found.degrees_of_freedom.min())
+    covariance = PLACED @ fitted.covariance @ PLACED.T
+    freedom = float(fitted.degrees_of_freedom.min())
     details, parameters = _details(rows, solved, freedom), _parameters(solved, covariance)
     gain = (ScaledColumns.of(solved.columns).weights() * solved.share)[:, solved.rows]
     return after_stage(
@@ -171,7 +171,7 @@ def _fit_triangular(
         NAME,
         details,
         solved.model,
-        found,
+        fitted,
         settings,
         correction,
         parameters=parameters,
@@ -244,10 +244,10 @@ def _fitted(rows: Orientations, gravity_g: float, prior: Prior, by_limit: Mask, 
         white = float(np.median(equations.error[: model.rests_equations]))
         noises = [NoiseHypothesis(WHITE, (prior.wander / white,))]
     noises = [replace(noise, known=True) for noise in noises]  # by the scatter within the rests
-    found = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
-    equations = model.equations(found.state)
-    variance = np.diag(equations.covariance(found.noise)) if rows.by_hand else equations.variance(found.noise)
-    return _Solved(model, found, equations.base / np.sqrt(variance)[:, None], 1.0 / np.sqrt(variance))
+    fitted = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
+    equations = model.equations(fitted.state)
+    variance = np.diag(equations.covariance(fitted.noise)) if rows.by_hand else equations.variance(fitted.noise)
+    return _Solved(model, fitted, equations.base / np.sqrt(variance)[:, None], 1.0 / np.sqrt(variance))
 
 
 def _start(y: Values, gravity_g: float, *, tilted: bool) -> Values:

@@ -67,39 +67,39 @@ def fit(
         )
     prior = prior_of("gyroscope", recordings, settings)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
-    fitted = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
-    model, found, outlying = fit_robustly(model, fitted, recordings)
+    fit_model = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
+    model, fitted, outlying = fit_robustly(model, fit_model, recordings)
     moved, faces = np.zeros(12), settings["procedure"].get("faces")
     for _ in range(MOVED_TIMES if faces and model.moves else 0):
-        moved = model.accelerometer_errors(found)
+        moved = model.accelerometer_errors(fitted)
         model = model_of(recordings, None, noise, settings, moved=moved)
         assert model is not None  # noqa: S101
-        model, found, outlying = fit_robustly(model, partial(fitted, start=found.state), recordings)
-    moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(found.covariance))[3:]
+        model, fitted, outlying = fit_robustly(model, partial(fit_model, start=fitted.state), recordings)
+    moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(fitted.covariance))[3:]
     if np.any(u > UNKNOWN):
         weak = [name for name, one in zip(BASE_NAMES[3:], u, strict=True) if one > UNKNOWN]
         raise NotObservableError(
             f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u.max()):.2g} "
             f"(standard uncertainty), as if all were about one axis: {advice}"
         )
-    apart = found.residual[model.of_moves] * found.error[model.of_moves]
+    apart = fitted.residual[model.of_moves] * fitted.error[model.of_moves]
     details: dict[str, Any] = {
         "rests": len(model.rests.time),
         "moves": moves,
         "direction_error_rms_deg": float(np.sqrt(np.mean(apart**2))) if moves else None,
-        "scatter_of_rests": found.noise.scatter[0],
-        "scatter_of_moves": found.noise.scatter[1] if moves else None,
-        "scatter_of_directions": found.noise.direction,
+        "scatter_of_rests": fitted.noise.scatter[0],
+        "scatter_of_moves": fitted.noise.scatter[1] if moves else None,
+        "scatter_of_directions": fitted.noise.direction,
         "moves_weighted_down": len(outlying),
         "moves_outlying": outlying,
-        "condition": found.condition,
-        "degrees_of_freedom": float(found.degrees_of_freedom.min()),
+        "condition": fitted.condition,
+        "degrees_of_freedom": float(fitted.degrees_of_freedom.min()),
     }
     if faces:
         details[MOVED] = moved.tolist()
     if model.turns is not None:
-        details["turns"] = model.turns.described(found.state)
-        details["departures"] = model.turns.departures(found.state)
-    correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
+        details["turns"] = model.turns.described(fitted.state)
+        details["departures"] = model.turns.departures(fitted.state)
+    correction = {"steps": [{"subtract": fitted.state.bias.tolist()}, {"matrix": fitted.state.matrix.tolist()}]}
     before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
-    return after_stage(before, NAME, details, model, found, settings, correction)
+    return after_stage(before, NAME, details, model, fitted, settings, correction)

@@ -251,23 +251,23 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
     )
 
 
-def plausible(model: Model, found: Fit, limits: Limits) -> bool:
+def plausible(model: Model, fitted: Fit, limits: Limits) -> bool:
     """Return whether every effect is within its limits, or exceeds them by less than its uncertainty."""
-    uncertainty = np.sqrt(np.diag(found.covariance))
+    uncertainty = np.sqrt(np.diag(fitted.covariance))
     return all(
         bool(np.all(np.abs(term.values) - 2.0 * uncertainty[place] <= limits.get(name, np.inf)))
-        for name, (term, place) in placed(found.state.terms, model.directions.shape[1]).items()
+        for name, (term, place) in placed(fitted.state.terms, model.directions.shape[1]).items()
     )
 
 
-def require_observable(model: Model, found: Fit, limits: Limits) -> None:
+def require_observable(model: Model, fitted: Fit, limits: Limits) -> None:
     """Raise ``NotObservableError``, with the effects or parameters, if rests and moves do not determine them."""
-    equations = model.equations(found.state)
-    limited = _prior(model, found.state, limits)[0] > 0.0
-    names = parameter_names(model.sensor, [term.effect for term in found.state.terms])
+    equations = model.equations(fitted.state)
+    limited = _prior(model, fitted.state, limits)[0] > 0.0
+    names = parameter_names(model.sensor, [term.effect for term in fitted.state.terms])
     Q, _ = np.linalg.qr(equations.base)
     lost = []
-    for term, Z in zip(found.state.terms, equations.effects, strict=True):
+    for term, Z in zip(fitted.state.terms, equations.effects, strict=True):
         size, rest = np.linalg.norm(Z, axis=0), np.linalg.norm(Z - Q @ (Q.T @ Z), axis=0)
         if np.all(rest <= NEW * np.where(size > 0.0, size, 1.0)):
             lost.append(term.effect)
@@ -276,7 +276,7 @@ def require_observable(model: Model, found: Fit, limits: Limits) -> None:
     undetermined = np.abs(weak.eigenvectors[:, weak.eigenvalues < NONE])[-len(names) :]
     loose = [name for name, row in zip(names, undetermined, strict=True) if np.any(row > 0.2)]
     if lost or loose:
-        advice = "; ".join(f"{e.name} needs {e.excitation}" for e in lost or [t.effect for t in found.state.terms])
+        advice = "; ".join(f"{e.name} needs {e.excitation}" for e in lost or [t.effect for t in fitted.state.terms])
         raise NotObservableError(
             f"the rests of the {model.sensor} do not determine {', '.join([e.name for e in lost] or loose)}: {advice}; "
             f"or take it out of effects.{model.sensor}"
@@ -284,20 +284,20 @@ def require_observable(model: Model, found: Fit, limits: Limits) -> None:
 
 
 def fit_robustly(
-    model: GyroscopeModel, fitted: Callable[[GyroscopeModel], Fit], recordings: Sequence[Recording]
+    model: GyroscopeModel, fit_model: Callable[[GyroscopeModel], Fit], recordings: Sequence[Recording]
 ) -> tuple[GyroscopeModel, Fit, list[dict[str, Any]]]:
     """Fit rests and moves, with weights of Student's t if a move is an outlier.
 
-    ``fitted``: function that fits a model. Returns model and fit with the variance by the weights, and the outliers:
+    ``fit_model``: function that fits a model. Returns model and fit with the variance by the weights, and the outliers:
     ``recording, time_s, error_deg, over_noise, weight``.
     """
-    found, moves = fitted(model), model.moves
+    fitted, moves = fit_model(model), model.moves
     if moves is None:
-        return model, found, []
-    t, error = _over_noise(model, found)
+        return model, fitted, []
+    t, error = _over_noise(model, fitted)
     limit = np.sqrt(2.0 * np.log(len(t) / FALSE_ALARM))
     if not np.any(t > limit):
-        return model, found, []
+        return model, fitted, []
     weight = np.ones(len(t))
     for _ in range(ROBUST_ROUNDS):
         before, weight = weight, np.minimum(1.0, (FREEDOM + 2.0) / (FREEDOM + t**2))
@@ -305,8 +305,8 @@ def fit_robustly(
             break
         variance = np.where(t > 0.0, (error / np.maximum(t, 1e-12)) ** 2, 0.0)
         model = model.with_excess(variance * (1.0 / weight - 1.0))
-        found = fitted(model)
-        t, error = _over_noise(model, found)
+        fitted = fit_model(model)
+        t, error = _over_noise(model, fitted)
     outlying = [
         {
             "recording": recordings[int(model.every.recording[moves.after[k]])].name,
@@ -317,14 +317,14 @@ def fit_robustly(
         }
         for k in np.flatnonzero(t > limit)
     ]
-    return model, found, outlying
+    return model, fitted, outlying
 
 
-def _over_noise(model: GyroscopeModel, found: Fit) -> tuple[Values, Values]:
+def _over_noise(model: GyroscopeModel, fitted: Fit) -> tuple[Values, Values]:
     """Return t of each move, and its residual, deg."""
-    C = model.equations(found.state).covariance(found.noise)
-    error = found.error[model.of_moves].reshape(-1, 2)
-    r = found.residual[model.of_moves].reshape(-1, 2) * error
+    C = model.equations(fitted.state).covariance(fitted.noise)
+    error = fitted.error[model.of_moves].reshape(-1, 2)
+    r = fitted.residual[model.of_moves].reshape(-1, 2) * error
     variance = np.diag(C)[model.of_moves].reshape(-1, 2) * error**2 - model.excess[:, None]
     size = np.sqrt(np.sum(r**2 / variance, axis=1))
     scale = float(np.median(size)) / np.sqrt(2.0 * np.log(2.0))

@@ -251,12 +251,12 @@ class GyroscopeModel:
             shared=shared,
         )
 
-    def accelerometer_errors(self, found: Fit) -> Values:
+    def accelerometer_errors(self, fitted: Fit) -> Values:
         """Return the estimate of the accelerometer's errors of bias and matrix from the moves: (12,) array."""
-        equations = self.equations(found.state)
+        equations = self.equations(fitted.state)
         shared = np.zeros((len(equations.residual), 12))
-        shared[self.of_moves] = self._of_moves(found.state).shared
-        white, _ = equations.whitened(found.noise, np.column_stack([shared, equations.residual]))
+        shared[self.of_moves] = self._of_moves(fitted.state).shared
+        white, _ = equations.whitened(fitted.noise, np.column_stack([shared, equations.residual]))
         return np.asarray(-self.at_rests.root @ (white[:, :12].T @ white[:, 12]))
 
     def _turned(self, state: State) -> tuple[Motion, Values, Values]:

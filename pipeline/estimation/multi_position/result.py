@@ -99,33 +99,33 @@ def fit_effects_by_rests(
             raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
     hypotheses = selection_hypotheses(noise, model.kinds)
     limits = limits_of(sensor, sensor_config)
-    found = fit_configured(model, before, names, hypotheses)
-    if plausible(model, found, limits):
-        found = fit_configured(model, before, names, hypotheses, limits)
-    if len(found.residual) <= found.rank:
+    fitted = fit_configured(model, before, names, hypotheses)
+    if plausible(model, fitted, limits):
+        fitted = fit_configured(model, before, names, hypotheses, limits)
+    if len(fitted.residual) <= fitted.rank:
         raise NotObservableError(
             f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} in addition to bias and "
-            f"matrix: record at least {found.rank + 10} rests in as many orientations"
+            f"matrix: record at least {fitted.rank + 10} rests in as many orientations"
         )
-    require_observable(model, found, limits)
-    return calibration_of(model, found, before, settings)
+    require_observable(model, fitted, limits)
+    return calibration_of(model, fitted, before, settings)
 
 
 def calibration_of(
-    model: Model, found: Fit, before: SensorCalibration, settings: Mapping[str, Any]
+    model: Model, fitted: Fit, before: SensorCalibration, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Convert a fit to a calibration with the stage ``effects``."""
     details = {
         "samples": round(model.samples()),
         "rests": len(model.rests.time),
-        "equations": len(found.residual),
-        "rounds": found.rounds,
-        "condition": found.condition if np.isfinite(found.condition) else None,
-        "wander_ratio": float(found.noise.bias.ratio),
-        "wander_time_s": float(found.noise.bias.time),
-        "scatter_over_noise": list(found.noise.scatter),
+        "equations": len(fitted.residual),
+        "rounds": fitted.rounds,
+        "condition": fitted.condition if np.isfinite(fitted.condition) else None,
+        "wander_ratio": float(fitted.noise.bias.ratio),
+        "wander_time_s": float(fitted.noise.bias.time),
+        "scatter_over_noise": list(fitted.noise.scatter),
     }
-    return after_stage(before, "effects", details, model, found, settings)
+    return after_stage(before, "effects", details, model, fitted, settings)
 
 
 def with_stage(  # noqa: PLR0917  (what a fit by hand is)
@@ -133,21 +133,21 @@ def with_stage(  # noqa: PLR0917  (what a fit by hand is)
     name: str,
     details: dict[str, Any],
     model: Model,
-    found: Fit,
+    fitted: Fit,
     correction: dict[str, Any] | None,
     parameters: dict[str, dict[str, Any]],
 ) -> SensorCalibration:
     """Return a calibration after an additional stage, without its uncertainty."""
     at_rest = slice(0, model.rests_equations)
-    rms = float(np.sqrt(np.mean((found.residual[at_rest] * found.error[at_rest]) ** 2)))
-    rank = found.rank - len(model.known_by_limit)
+    rms = float(np.sqrt(np.mean((fitted.residual[at_rest] * fitted.error[at_rest]) ** 2)))
+    rank = fitted.rank - len(model.known_by_limit)
     return replace(
         before,
-        bias=found.state.bias,
-        matrix=found.state.matrix,
+        bias=fitted.state.bias,
+        matrix=fitted.state.matrix,
         stages=(*before.stages, StageResult(name, parameters, rms, correction, details)),
-        converged=found.converged,
-        convergence=certified(found.cosine, found.condition, rank, len(found.covariance)),
+        converged=fitted.converged,
+        convergence=certified(fitted.cosine, fitted.condition, rank, len(fitted.covariance)),
     )
 
 
@@ -156,7 +156,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     name: str,
     details: dict[str, Any],
     model: Model,
-    found: Fit,
+    fitted: Fit,
     settings: Mapping[str, Any],
     correction: dict[str, Any] | None = None,
     *,
@@ -170,14 +170,14 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     ``parameters``: of the stage, where they are not bias and matrix. ``white``: (12,), variance by white noise, where
     the budget states it separately.
     """
-    sensor, table, place = model.sensor, settings["table"], _places(model, found)
-    covariance = place @ found.covariance @ place.T
-    freedom = np.min(np.where(place != 0.0, found.degrees_of_freedom, np.inf), axis=1)
-    effects, of_effects = effect_parameters(sensor, found.state.terms, covariance)
+    sensor, table, place = model.sensor, settings["table"], _places(model, fitted)
+    covariance = place @ fitted.covariance @ place.T
+    freedom = np.min(np.where(place != 0.0, fitted.degrees_of_freedom, np.inf), axis=1)
+    effects, of_effects = effect_parameters(sensor, fitted.state.terms, covariance)
     parameters = parameters or of_effects
-    parameters = parameters or base_parameters(sensor, found.state.bias, found.state.matrix, covariance)
-    calibration = replace(with_stage(before, name, details, model, found, correction, parameters), effects=effects)
-    limit, of_limit = limits_contribution(model, found)
+    parameters = parameters or base_parameters(sensor, fitted.state.bias, fitted.state.matrix, covariance)
+    calibration = replace(with_stage(before, name, details, model, fitted, correction, parameters), effects=effects)
+    limit, of_limit = limits_contribution(model, fitted)
     variance, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
     if white is not None:
         white = np.minimum(white, variance)
@@ -194,45 +194,47 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
             lines.append(clock_contribution(calibration, float(table["clock_accuracy_ppm"])))
         missing["Earth's rotation"] = "not in the model: by hand nobody knows the heading; up to 0.0042 deg/s of bias"
     complete, trials = combined(calibration, [*lines, *limit], missing), trials_of(settings)
-    return _with_monte_carlo(complete, model, found, trials, lines[1:]) if trials else complete
+    return _with_monte_carlo(complete, model, fitted, trials, lines[1:]) if trials else complete
 
 
-def _places(model: Model, found: Fit) -> Values:
+def _places(model: Model, fitted: Fit) -> Values:
     """Return the map from base and effect parameters to bias, matrix and effect parameters: (12 + p, b + p) array."""
     base = model.directions
-    return np.asarray(scipy.linalg.block_diag(base, np.eye(len(found.covariance) - base.shape[1])))
+    return np.asarray(scipy.linalg.block_diag(base, np.eye(len(fitted.covariance) - base.shape[1])))
 
 
-def limits_contribution(model: Model, found: Fit) -> tuple[list[Contribution], Values]:
+def limits_contribution(model: Model, fitted: Fit) -> tuple[list[Contribution], Values]:
     """Return the line of the misalignments known by the sensor file's limit, if any, and its first-order covariance."""
-    place = _places(model, found)
+    place = _places(model, fitted)
     if not model.known_by_limit:
         return [], np.zeros((len(place), len(place)))
-    equations = model.equations(found.state)
+    equations = model.equations(fitted.state)
     X = equations.columns
-    inverse = np.linalg.inv(equations.covariance(found.noise))
+    inverse = np.linalg.inv(equations.covariance(fitted.noise))
     gain = scaled_inverse(X.T @ inverse @ X) @ X.T @ inverse
-    line, first = limit_contribution(gain, list(model.known_by_limit), curvature(model, found), found.covariance, place)
+    line, first = limit_contribution(
+        gain, list(model.known_by_limit), curvature(model, fitted), fitted.covariance, place
+    )
     return [line], first
 
 
 def _with_monte_carlo(
-    calibration: SensorCalibration, model: Model, found: Fit, trials: int, direct: Sequence[Contribution]
+    calibration: SensorCalibration, model: Model, fitted: Fit, trials: int, direct: Sequence[Contribution]
 ) -> SensorCalibration:
     """Return a calibration whose budget also has a Monte Carlo run; ``direct``: its sources of type B."""
-    equations = model.equations(found.state)
+    equations = model.equations(fitted.state)
     n, p = equations.columns.shape
-    prior = np.diag(np.sqrt(found.precision))[found.precision > 0.0]
+    prior = np.diag(np.sqrt(fitted.precision))[fitted.precision > 0.0]
     X, H = np.concatenate([equations.columns, prior]), np.zeros((n + len(prior), p, p))
-    H[:n] = curvature(model, found)
+    H[:n] = curvature(model, fitted)
     covariances = [
         scipy.linalg.block_diag(scale * equations.covariance(noise), np.eye(len(prior)))
-        for noise, _, scale in found.hypotheses
+        for noise, _, scale in fitted.hypotheses
     ]
     solvers = [quadratic_results(X, H, np.asarray(np.linalg.pinv(c, hermitian=True), float)) for c in covariances]
-    weight, place = np.array([w for _, w, _ in found.hypotheses]), _places(model, found)
-    effects = [value for term in found.state.terms for value in term.values]
-    estimate = np.concatenate([found.state.bias, found.state.matrix.ravel(), effects])
+    weight, place = np.array([w for _, w, _ in fitted.hypotheses]), _places(model, fitted)
+    effects = [value for term in fitted.state.terms for value in term.values]
+    estimate = np.concatenate([fitted.state.bias, fitted.state.matrix.ravel(), effects])
 
     def draw(rng: np.random.Generator, count: int) -> Values:
         chosen, steps = rng.choice(len(weight), count, p=weight), np.empty((count, p))
@@ -244,11 +246,11 @@ def _with_monte_carlo(
     return beside_trials(calibration, draw, trials, direct)
 
 
-def curvature(model: Model, found: Fit) -> Values:
+def curvature(model: Model, fitted: Fit) -> Values:
     """Return the derivative of the columns with respect to the parameters: (n, p, p) array, symmetric."""
     slopes = []
-    for j, step in enumerate(np.diag(STEP * np.sqrt(np.diag(found.covariance)))):
-        (up, more), (down, less) = (stepped(model, found.state, sign * step) for sign in (1.0, -1.0))
+    for j, step in enumerate(np.diag(STEP * np.sqrt(np.diag(fitted.covariance)))):
+        (up, more), (down, less) = (stepped(model, fitted.state, sign * step) for sign in (1.0, -1.0))
         change = model.equations(up).columns - model.equations(down).columns
         slopes.append(change / (more[j] - less[j]) if step[j] > 0.0 else np.zeros_like(change))
     H = np.stack(slopes, axis=2)
@@ -275,8 +277,8 @@ def fit_faces(
     assert model.faces is not None  # noqa: S101
     prior = prior_of("accelerometer", recordings, settings)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
-    found = fit(model, State(before.bias, before.matrix), noises, {})
-    force, _ = model.specific_force(found.state, model.rests)
+    fitted = fit(model, State(before.bias, before.matrix), noises, {})
+    force, _ = model.specific_force(fitted.state, model.rests)
     across = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
     off = dict(zip(FACES, np.linalg.norm(across, axis=1).tolist(), strict=True))
     accuracy = float(settings["procedure"]["faces"]["accuracy_deg"])
@@ -289,8 +291,8 @@ def fit_faces(
         ],
         "rests_on_faces": {name: int(np.count_nonzero(model.faces.face == i)) for i, name in enumerate(FACES)},
         "face_off_deg": off,
-        "scatter_of_rests": found.noise.scatter[0],
-        "condition": found.condition,
-        "degrees_of_freedom": float(found.degrees_of_freedom.min()),
+        "scatter_of_rests": fitted.noise.scatter[0],
+        "condition": fitted.condition,
+        "degrees_of_freedom": float(fitted.degrees_of_freedom.min()),
     }
-    return after_stage(before, NAME, details, model, found, settings)
+    return after_stage(before, NAME, details, model, fitted, settings)

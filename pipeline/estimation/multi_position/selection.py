@@ -77,7 +77,7 @@ def fit_configured(
     for terms in starts_of(configured, model.sensor, start):
         state = State(start.bias, start.matrix, tuple(Term(t.effect, np.array(t.values, float)) for t in terms))
         fits.append(fit(model, state, hypotheses, limits or {}))
-    return max(fits, key=lambda found: found.log_likelihood)
+    return max(fits, key=lambda fitted: fitted.log_likelihood)
 
 
 class Selection:
@@ -131,11 +131,11 @@ class Selection:
     def _score_all(self, names: Sequence[str]) -> Scored:
         fitted = {term.effect.name: term.values for term in self.fit.state.terms}
         terms = []
-        for this in self.candidates:
-            if this.name in fitted and this.name not in names:
-                terms.append(Term(this, np.where(_nonlinear(this, self.model.sensor), fitted[this.name], 0.0)))
-            elif this.name not in names:
-                terms += [Term(this, values) for values in this.starts(self.model.sensor)]
+        for candidate in (c for c in self.candidates if c.name not in names):
+            values = candidate.starts(self.model.sensor)
+            if candidate.name in fitted:
+                values = [np.where(_nonlinear(candidate, self.model.sensor), fitted[candidate.name], 0.0)]
+            terms += [Term(candidate, v) for v in values]
         equations = self.model.equations(self._state(names), terms)
         projected = project_out(equations, self.hypotheses)
         before, at = projected.of_model()
@@ -186,13 +186,13 @@ class Selection:
             curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > GATE_BIC)
             if not curved or score.delta_bic < max(COMPETES * top, 0.0):
                 continue
-            found = self._fitted(self._state(names), Term(effect(score.name), score.values))
-            gain = max(2.0 * (found.log_likelihood - before), 0.0) * scored.spare[score.name]
+            refit = self._fitted(self._state(names), Term(effect(score.name), score.values))
+            gain = max(2.0 * (refit.log_likelihood - before), 0.0) * scored.spare[score.name]
             scored.scores[score.name] = replace(
                 score,
-                delta_bic=gain - score.parameters * float(np.log(len(found.residual))),
+                delta_bic=gain - score.parameters * float(np.log(len(refit.residual))),
                 p_value=float(scipy.special.chdtrc(score.parameters, gain)),
-                values=found.state.terms[-1].values,
+                values=refit.state.terms[-1].values,
             )
 
     def _state(self, names: Collection[str]) -> State:
@@ -257,22 +257,22 @@ class Selection:
         return False
 
 
-def _nonlinear(this: Effect, sensor: str) -> Mask:
+def _nonlinear(candidate: Effect, sensor: str) -> Mask:
     """Return which parameters of an effect are not linear: (p,) array."""
-    return np.array([p.name in this.nonlinear for p in this.parameters(sensor)])
+    return np.array([p.name in candidate.nonlinear for p in candidate.parameters(sensor)])
 
 
-def refusal(this: Effect, sensor: str, rests: Rests) -> str:
+def refusal(candidate: Effect, sensor: str, rests: Rests) -> str:
     """Return why an effect cannot be in a model without a table; empty if it can."""
-    unknown = [need for need in this.needs if need != "temperature"]
+    unknown = [need for need in candidate.needs if need != "temperature"]
     checks = [
-        (sensor not in this.sensors, f"{this.name} is no effect of the {sensor}"),
-        (sensor in this.unseen, this.unseen.get(sensor, "")),
-        (this.owner == Owner.TABLE or this.moves, "there is no table"),
-        (this.owner == Owner.MOUNTING, "by hand nobody knows the unit's heading, nor about which point it turns"),
-        ("temperature" in this.needs and np.isnan(rests.temperature).any(), "the recordings hold no temperature"),
+        (sensor not in candidate.sensors, f"{candidate.name} is no effect of the {sensor}"),
+        (sensor in candidate.unseen, candidate.unseen.get(sensor, "")),
+        (candidate.owner == Owner.TABLE or candidate.moves, "there is no table"),
+        (candidate.owner == Owner.MOUNTING, "by hand nobody knows the unit's heading, nor about which point it turns"),
+        ("temperature" in candidate.needs and np.isnan(rests.temperature).any(), "the recordings hold no temperature"),
         (bool(unknown), f"without a table nobody knows the {' and '.join(unknown)}"),
-        (this.needs_clock and not rests.clock_shared, "the time between the recordings is not known"),
+        (candidate.needs_clock and not rests.clock_shared, "the time between the recordings is not known"),
     ]
     return next((reason for applies, reason in checks if applies), "")
 
@@ -290,8 +290,8 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     fitted = {term.effect.name: term for term in state.terms[configured:]}
     listed = [
         (name, term, weight)
-        for name, this in effects.items()
-        for term, weight in time_constants(this, model.sensor, fitted.get(name))
+        for name, candidate in effects.items()
+        for term, weight in time_constants(candidate, model.sensor, fitted.get(name))
     ]
     equations = model.equations(state, [term for _, term, _ in listed])
     base = np.concatenate([equations.base, *equations.effects[:configured]], axis=1)
