@@ -78,6 +78,22 @@ def test_a_gyroscope_is_doubted_where_gravity_shows_that_its_turn_axes_lean(adde
     assert float(told.split()[0]) == pytest.approx(0.06, abs=0.01)
 
 
+@pytest.mark.parametrize(("of_uncertainty", "verdict"), [(0.5, "nothing_missing"), (2.0, "reference_in_doubt")])
+def test_a_lean_within_the_uncertainty_of_the_gyroscopes_matrix_is_no_doubt(
+    of_uncertainty: float, verdict: str
+) -> None:
+    recordings, settings = simulated()
+    checked = check_recordings(recordings, settings)
+    noise = noise_of("gyroscope", checked, settings)
+    fit = fit_stage("gyroscope", "reference_least_squares", checked, None, settings | {"noise": {"gyroscope": noise}})
+    assert fit.covariance is not None
+    U = np.degrees(2.0 * np.sqrt(np.max(np.diag(fit.covariance)[3:12])))  # deg; 1e-3 of a matrix are 0.057 deg
+    lean = {"effect": "table_axis_nonorthogonality", "parameters": {"x_y": {"value": of_uncertainty * U}}}
+    gravity = {"verdict": "missing_effect", "selected": [lean["effect"]], "ranking": [lean]}
+    found = diagnose(fit, checked, noise, settings, gravity=gravity)
+    assert found["verdict"] == verdict, found["reason"]
+
+
 def test_a_zero_in_the_accelerometers_model_leaves_the_gyroscope_its_diagnosis() -> None:
     recordings, settings = simulated(zero_deg={"accel_y": 1.5})
     found = judged(recordings, {**settings, "effects": {"accelerometer": ["encoder_zero"], "gyroscope": []}})

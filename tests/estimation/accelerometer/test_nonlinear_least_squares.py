@@ -2,11 +2,14 @@ from __future__ import annotations
 
 import json
 import time as clock
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
+from scipy.stats import t as student
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit, triangle
@@ -239,6 +242,37 @@ def test_a_rest_that_contradicts_the_others_is_left_out_with_its_reason() -> Non
     assert [round(rest["time_s"] / 6.5) for rest in left_out] == [10]
     assert "mg off the length by the other rests" in left_out[0]["reason"]
     assert _vector(calibration) == pytest.approx(TRUTH, abs=5e-4)
+
+
+def test_a_rest_is_left_out_only_beyond_what_the_largest_of_all_reaches_by_chance() -> None:
+    """The deviation from which on it is left out, by Student's t against a fit of scipy to the others."""
+    up, own = _spread(24), 10
+    sound = _by_hand(up, np.random.default_rng(9), noise=5e-4, between=3e-4)
+    assert sound.accelerometer is not None
+
+    def stretched(factor: float) -> Recording:
+        reading = np.array(sound.accelerometer)
+        reading[325 * own : 325 * own + 250] *= factor
+        return replace(sound, accelerometer=reading)
+
+    low, high = 1.0, 1.02
+    for _ in range(9):
+        middle = 0.5 * (low + high)
+        gone = fit([stretched(middle)], None, _settings()).stages[-1].details["rests_left_out"]
+        low, high = (low, middle) if gone else (middle, high)
+    force = stretched(high).accelerometer
+    assert force is not None
+    means = force.reshape(24, 325, 3)[:, 30:220].mean(axis=1)
+    others = np.delete(means, own, axis=0)
+
+    def errors(p: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.linalg.norm((y - p[:3]) @ triangle(p).T, axis=1) - 1.0
+
+    best = least_squares(errors, [0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0], x_scale="jac", args=(others,))
+    slope = derivative_of(means[[own]], best.x)[0]
+    spread = np.sqrt(2.0 * best.cost / 14.0 * (1.0 + slope @ np.linalg.solve(best.jac.T @ best.jac, slope)))
+    limit = float(student.isf(0.5 * 1e-3 / 24.0, 14))  # 5.8; of one rest alone 4.1
+    assert errors(best.x, means[[own]])[0] / spread == pytest.approx(limit, rel=0.1)
 
 
 def test_a_rest_that_turned_is_left_out_with_its_reason() -> None:
