@@ -54,12 +54,6 @@ class Comparison:
         for channel in channels:
             finite = np.isfinite(channel.low)
             self.known &= finite if channel.of_intervals else finite[1:] & finite[:-1]
-        # Size, starts, and the sums of each channel.
-        self.stretches: list[tuple[int, Index, dict[str, tuple[Values, Values, Values, Values]]]] = []
-        n = len(self.dt)
-        for size in sorted({SHORT, max(n // LONG, SHORT)}):
-            starts = np.arange(0, max(n - size // 2, 1), size)
-            self.stretches.append((size, starts, {c.name: self._sums(c, starts) for c in channels}))
 
     def find(self, claim: Channel) -> tuple[bool, Note] | None:
         """Return whether no effect of the catalogue explains a contradiction, and the note on it; None without one."""
@@ -121,12 +115,13 @@ class Comparison:
 
     def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Found | None:
         limits, n = self.limits, len(self.dt)
-        for size, starts, known in self.stretches:
-            turned, total, bends, _ = known[claim.name]
+        for size in sorted({SHORT, max(n // LONG, SHORT)}):
+            starts = np.arange(0, max(n - size // 2, 1), size)
+            turned, total, bends, _ = self._sums(claim, starts)
             length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
             excess, sums = [], []
             for other in others:
-                shown, shown_total, shown_bends, swing = known[other.name]
+                shown, shown_total, shown_bends, swing = self._sums(other, starts)
                 most = np.maximum(total, shown_total)
                 allowed = limits.rate * most + BENDS * np.sqrt(bends + shown_bends) + RESOLVED_DEG
                 if claim.of_intervals or other.of_intervals:
