@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from pipeline.records import Values
 
 JSON = dict[str, Any]
 TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding
@@ -173,11 +172,14 @@ def _explained(calibration: SensorCalibration, imported: ImportedCalibration) ->
     sensor, effects = calibration.sensor, sensor_effects(calibration)
     compensation = Compensation(imported.sensors.get("accelerometer"), imported.sensors.get("gyroscope"), imported.unit)
     truth = getattr(compensation.apply(**SAMPLE, smoothing=0.0), sensor)
-    centred = SAMPLE[sensor] - calibration.bias
+    centred, expanded = SAMPLE[sensor] - calibration.bias, None  # expanded uncertainties (95 %); None: unknown
+    if calibration.covariance is not None:
+        standard = np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None))
+        expanded = coverage_factor(calibration.effective_freedom()) * standard
     return {
         "unit": SENSOR_UNITS[sensor],
         "calibration": calibration,
-        "expanded": _expanded_uncertainty(calibration),
+        "expanded": expanded,
         "effects": [
             {
                 "name": e.name,
@@ -192,15 +194,6 @@ def _explained(calibration: SensorCalibration, imported: ImportedCalibration) ->
         "truth": truth,
         "other": "gyroscope" if sensor == "accelerometer" else "accelerometer",
     }
-
-
-def _expanded_uncertainty(calibration: SensorCalibration) -> Values | None:
-    """Return the expanded uncertainties (95 %) of all parameters; None if they are unknown."""
-    if calibration.covariance is None:
-        return None
-    freedom = calibration.freedom if calibration.freedom is not None else np.array(calibration.degrees_of_freedom)
-    k = coverage_factor(np.broadcast_to(freedom, len(calibration.covariance)))
-    return np.asarray(k * np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None)))
 
 
 def _plain(expression: str) -> str:

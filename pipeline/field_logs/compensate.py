@@ -172,14 +172,25 @@ def compensate_log(
     bytes. Raises ``InputError``, without an output, if the log is damaged, contradicts the profile, has no rest in the
     interval ``rest``, or would be overwritten.
     """
-    files, profile = [source, *joined], profile or LogProfile()
+    files, profile, suffix = [source, *joined], profile or LogProfile(), source.suffix.lower()
     for file in files:
         require_apart(file, target)
-    smoothed = 0.0 if source.suffix.lower() == ".mcap" else smoothing  # of MCAP, ``Temperatures`` smooths
+    smoothed = 0.0 if suffix == ".mcap" else smoothing  # of MCAP, ``Temperatures`` smooths
 
     def write(stream: LogStream, file: Path) -> Result:
         with replacing(file) as out:
-            return _write_log(files, out, profile, stream, topic, smoothing, block_bytes)
+            if suffix == ".mcap":
+                from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (only for this format)
+
+                return McapLog(source, out, profile, stream, topic, smoothing).compensate()
+            from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
+
+            wanted = 1 if suffix in MESSAGE_FORMATS else len(sensor_parts(profile.ingest))
+            if len(files) != wanted:
+                raise InputError(f"the profile reads a recording from {wanted} files; got {len(files)}", str(source))
+            if len(files) > 1 or suffix in MESSAGE_FORMATS:
+                return compensate_whole(files, out, profile, stream)
+            return CsvLog(source, out, profile, stream).compensate(block_bytes)
 
     notes = []
     if rest is not None:
@@ -194,31 +205,6 @@ def compensate_log(
     result = write(LogStream(compensation, smoothed, progress), target)
     result.notes = notes + result.notes
     return result
-
-
-def _write_log(  # noqa: PLR0917  (the arguments of ``compensate_log``)
-    files: Sequence[Path],
-    out: Output,
-    profile: LogProfile,
-    stream: LogStream,
-    topic: str | None,
-    smoothing: float,
-    block_bytes: int,
-) -> Result:
-    """Write a log of any format, compensated, to ``out``."""
-    source, suffix = files[0], files[0].suffix.lower()
-    if suffix == ".mcap":
-        from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (only for this format)
-
-        return McapLog(source, out, profile, stream, topic, smoothing).compensate()
-    from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
-
-    wanted = 1 if suffix in MESSAGE_FORMATS else len(sensor_parts(profile.ingest))
-    if len(files) != wanted:
-        raise InputError(f"the profile reads a recording from {wanted} files; got {len(files)}", str(source))
-    if len(files) > 1 or suffix in MESSAGE_FORMATS:
-        return compensate_whole(files, out, profile, stream)
-    return CsvLog(source, out, profile, stream).compensate(block_bytes)
 
 
 class LogStream:

@@ -111,9 +111,13 @@ def _filter_of(recording: Recording, settings: dict[str, Any]) -> tuple[Values, 
     zero_phase, interval = bool(settings["zero_phase"]), recording.interval
     if settings["name"] == "rc_low_pass":
         time_constant = _time_constant(settings, interval)
-        k = interval / (interval + time_constant)
-        sections = np.array([[k, 0.0, 0.0, 1.0, k - 1.0, 0.0]])
-        return sections, partial(_rc_filtered, recording.time, time_constant, zero_phase)
+        k, time = interval / (interval + time_constant), recording.time
+
+        def run(reading: Values) -> Values:
+            forward = _rc_low_pass(time, reading, time_constant)
+            return _rc_low_pass(-time[::-1], forward[::-1], time_constant)[::-1] if zero_phase else forward
+
+        return np.array([[k, 0.0, 0.0, 1.0, k - 1.0, 0.0]]), run
     sections = _butterworth_sections(settings, interval)
     return sections, partial(_section_filtered, sections, stretch_starts(recording), zero_phase)
 
@@ -167,11 +171,6 @@ def _rc_low_pass(time: Values, reading: Values, time_constant: float) -> Values:
         out[start:stop] = P * (last + np.cumsum(k[start:stop, None] * reading[start:stop] / P, axis=0))
         last, start = out[stop - 1], stop
     return out
-
-
-def _rc_filtered(time: Values, time_constant: float, zero_phase: bool, reading: Values) -> Values:  # noqa: FBT001
-    forward = _rc_low_pass(time, reading, time_constant)
-    return _rc_low_pass(-time[::-1], forward[::-1], time_constant)[::-1] if zero_phase else forward
 
 
 def _group_delay(settings: dict[str, Any], sections: Values, interval: float) -> float:
