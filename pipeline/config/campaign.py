@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 
     from pipeline.config.layers import Layers
 
+    Rows = Mapping[str, Mapping[str, str]]  # unit to its cells by column
+
 JSON = dict[str, Any]
 SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: a job takes some seconds, as its start does; a minute, to fill cores
 
@@ -259,11 +261,11 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
         value that identifies its device) or None; ``x`` (``label``; ``values`` by unit, None for the table time;
         ``named``: whether points are labelled with their names) or None.
     """
-    columns = _Columns({n: unit.row | {g: unit.config[g]["name"] for g in GROUPS} for n, unit in units.items()})
+    rows = {name: unit.row | {g: unit.config[g]["name"] for g in GROUPS} for name, unit in units.items()}
     comparisons, problems = [], []
     for number, entry in enumerate(entries, 1):
         try:
-            comparisons.append(_comparison(entry, number, columns))
+            comparisons.append(_comparison(entry, number, rows))
         except Problem as problem:
             title = entry.get("title") if isinstance(entry, dict) else None
             problems.append(f"compare, {f'{title!r}' if title else f'entry {number}'}: {problem}")
@@ -272,40 +274,34 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
     return comparisons
 
 
-class _Columns:
-    """The columns of each unit."""
-
-    def __init__(self, of_unit: Mapping[str, Mapping[str, str]]) -> None:
-        self.of_unit = of_unit
-        self.known = sorted({column for row in of_unit.values() for column in row})
-
-    def cell(self, unit: str, column: str) -> str:
-        if column not in self.known:
-            raise Problem(f"units have no column {column!r}{nearest(column, self.known)}")
-        return str(self.of_unit[unit].get(column, ""))
-
-    def select(self, wanted: Any, among: Sequence[str]) -> list[str]:  # noqa: ANN401  (the user's)
-        """Return the units of a list of names, or those whose columns have the values of a mapping."""
-        if isinstance(wanted, dict):
-            values = {str(c): _names(v) for c, v in wanted.items()}
-            return [u for u in among if all(self.cell(u, column) in valid for column, valid in values.items())]
-        if not isinstance(wanted, list):
-            form = "columns and their values, for example {method: staged}"
-            raise Problem(f"a list of units is expected, or {form}, got {wanted!r}")
-        for name in map(str, wanted):
-            if name not in self.of_unit:
-                raise Problem(f"no unit {name!r} in units.csv{nearest(name, self.of_unit)}")
-        return [str(n) for n in wanted]
+def _cell(rows: Rows, unit: str, column: str) -> str:
+    if column not in rows[unit]:
+        raise Problem(f"units have no column {column!r}{nearest(column, rows[unit])}")
+    return str(rows[unit][column])
 
 
-def _comparison(entry: Any, number: int, columns: _Columns) -> JSON:  # noqa: ANN401  (the user's)
+def _select(rows: Rows, wanted: Any, among: Sequence[str]) -> list[str]:  # noqa: ANN401  (the user's)
+    """Return the units of a list of names, or those whose columns have the values of a mapping."""
+    if isinstance(wanted, dict):
+        values = {str(c): _names(v) for c, v in wanted.items()}
+        return [u for u in among if all(_cell(rows, u, column) in valid for column, valid in values.items())]
+    if not isinstance(wanted, list):
+        form = "columns and their values, for example {method: staged}"
+        raise Problem(f"a list of units is expected, or {form}, got {wanted!r}")
+    for name in map(str, wanted):
+        if name not in rows:
+            raise Problem(f"no unit {name!r} in units.csv{nearest(name, rows)}")
+    return [str(n) for n in wanted]
+
+
+def _comparison(entry: Any, number: int, rows: Rows) -> JSON:  # noqa: ANN401  (the user's)
     entry = {"units": entry} if isinstance(entry, list) else entry
     if not isinstance(entry, dict):
         raise Problem(f"{FORM} is expected, got {entry!r}")
     unknown = [str(k) for k in entry if k not in KEYS]
     if unknown:
         raise Problem(f"{unknown[0]}: unknown key{nearest(unknown[0], KEYS)}")
-    groups = _groups(entry, columns)
+    groups = _groups(entry, rows)
     names, members = [g["name"] for g in groups], [u for g in groups for u in g["units"]]
     against = str(entry.get("against", names[0]))
     if against not in names:
@@ -318,25 +314,25 @@ def _comparison(entry: Any, number: int, columns: _Columns) -> JSON:  # noqa: AN
         "groups": groups,
         "sensors": sensors,
         "against": against,
-        "pairs": {u: ", ".join(columns.cell(u, c) for c in _names(pairs)) for u in members} if pairs else None,
-        "x": _x(str(entry["x"]), members, _names(entry.get("by", [])), columns) if "x" in entry else None,
+        "pairs": {u: ", ".join(_cell(rows, u, c) for c in _names(pairs)) for u in members} if pairs else None,
+        "x": _x(str(entry["x"]), members, _names(entry.get("by", [])), rows) if "x" in entry else None,
     }
 
 
-def _groups(entry: JSON, columns: _Columns) -> list[JSON]:
+def _groups(entry: JSON, rows: Rows) -> list[JSON]:
     """Return the groups of an entry: at least two, none empty, without common units."""
     keys = [k for k in ("units", "groups", "by") if k in entry]
     if len(keys) != 1:
         raise Problem(f"{FORM} is expected, got {' and '.join(keys) or 'none of them'}")
-    among, content = columns.select(entry.get("where") or {}, list(columns.of_unit)), entry[keys[0]]
+    among, content = _select(rows, entry.get("where") or {}, list(rows)), entry[keys[0]]
     if keys[0] == "by":
-        groups = _by(_names(content), str(entry.get("x", "")), among, columns)
+        groups = _by(_names(content), str(entry.get("x", "")), among, rows)
     else:
         if keys[0] == "units":
-            content = {unit: [unit] for unit in columns.select(content, among)}
+            content = {unit: [unit] for unit in _select(rows, content, among)}
         if not isinstance(content, dict):
             raise Problem(f"groups: a mapping of names to units or columns is expected, got {content!r}")
-        units_of = {str(name): columns.select(wanted, among) for name, wanted in content.items()}
+        units_of = {str(name): _select(rows, wanted, among) for name, wanted in content.items()}
         groups = [{"name": name, "series": "", "label": name, "units": units} for name, units in units_of.items()]
     group_of: dict[str, str] = {}
     for group in groups:
@@ -351,12 +347,12 @@ def _groups(entry: JSON, columns: _Columns) -> list[JSON]:
     return groups
 
 
-def _by(names: list[str], x: str, among: list[str], columns: _Columns) -> list[JSON]:
+def _by(names: list[str], x: str, among: list[str], rows: Rows) -> list[JSON]:
     """Return a group for each combination of values, in the order of the units table."""
     along = names.index(x) if x in names else len(names) - 1
     units_with: dict[tuple[str, ...], list[str]] = {}
     for unit in among:
-        values = tuple(columns.cell(unit, name) for name in names)
+        values = tuple(_cell(rows, unit, name) for name in names)
         if all(values):
             units_with.setdefault(values, []).append(unit)
     return [
@@ -365,12 +361,12 @@ def _by(names: list[str], x: str, among: list[str], columns: _Columns) -> list[J
     ]
 
 
-def _x(column: str, members: list[str], by: list[str], columns: _Columns) -> JSON:
+def _x(column: str, members: list[str], by: list[str], rows: Rows) -> JSON:
     if column == TABLE_TIME:
         return {"label": "table time, s", "values": None, "named": True}
     values = {}
     for unit in members:
-        text = columns.cell(unit, column)
+        text = _cell(rows, unit, column)
         try:
             values[unit] = float(text)
         except ValueError:

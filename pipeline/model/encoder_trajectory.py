@@ -63,7 +63,10 @@ class EncoderTrajectory:
         gentle = np.convolve(miss > GENTLE_DEG, np.ones(3), "same") < 0.5
         gentle &= np.abs(excess) > EXACT_DEG
         self.explained: Mask = np.logical_and(even | bent, np.logical_not(gentle))
-        self.acceleration = self._at_samples(slope)
+        # At the samples from an adjacent explained interval, else from the nearest rates.
+        known = np.append(self.explained, 0.0) + np.append(0.0, self.explained)
+        total = np.append(self._before * self.explained, 0.0) + np.append(0.0, self._after * self.explained)
+        self.acceleration: Values = np.where(known > 0.0, total / np.maximum(known, 1.0), slope)
         self.valid: Mask = self.explained | self._smooth(miss)
         self.valid_samples = self._filter_settled()
 
@@ -100,16 +103,6 @@ class EncoderTrajectory:
             bent &= checked
         whole = ~bent
         return np.where(whole, step, s), np.where(whole, mean, a), np.where(whole, mean, b), bent
-
-    def _at_samples(self, slope: Values) -> Values:
-        """Return the acceleration at the samples: from an adjacent explained interval, else from the nearest rates."""
-        known = np.zeros((2, len(self.time)))
-        weight = np.zeros((2, len(self.time)))
-        known[0, :-1], weight[0, :-1] = self._before, self.explained
-        known[1, 1:], weight[1, 1:] = self._after, self.explained
-        total = weight.sum(0)
-        mean = (known * weight).sum(0) / np.where(total > 0, total, 1.0)
-        return np.where(total > 0, mean, slope)
 
     def _smooth(self, miss: Values) -> Mask:
         moving = np.abs(self._mean) + np.abs(self.rate[1:]) + np.abs(self.rate[:-1]) > MOVING_DPS
