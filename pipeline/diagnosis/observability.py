@@ -121,7 +121,7 @@ def _reason(this: Effect, selection: Selection) -> str:
     warm = "temperature" in this.needs
     warmth = [motion.temperature for motion in motions]
     known = [t for t in warmth if t is not None]
-    span = float(np.ptp(np.concatenate(known))) if known else 0.0
+    span = float(np.ptp(np.concatenate(known))) if warm and known else 0.0
     in_one = "every turn goes in one direction, in which it looks exactly like a part of bias and matrix"
     checks = [
         (observations.sensor in this.unseen, this.unseen.get(observations.sensor, "")),

@@ -66,7 +66,7 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[d
         found = {k: v for k, v in found.items() if v[0] > least or k not in ("temperature", "time")}
     if found and any(setting.prior for setting in selection.settings):
         least = min(setting.prior for setting in selection.settings)
-        free = [replace(setting, prior=least) for setting in selection_grid(None)]
+        free = [setting._replace(prior=least) for setting in selection_grid(None)]
         unconstrained = _significant(replace(selection, settings=[*selection.settings, *free]), explained)
         found = {name: values for name, values in unconstrained.items() if name in found}
     return [{"covariate": name, "p_value": p, "delta_bic": delta} for name, (delta, p) in found.items()]

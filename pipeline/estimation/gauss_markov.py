@@ -25,9 +25,10 @@ Thompson, Biometrika 58, 1971 (restricted likelihood).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy
@@ -54,8 +55,7 @@ SLOW = 0.3  # share of white noise's spectrum, see ``steady_s``: right answers a
 FAST_S = 25.0  # correlation time below which ``information`` replaces the model, because its blocks last seconds
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """One noise hypothesis: ratio of bias to white noise, correlation time in s, and prior log weight."""
 
     ratio: float
@@ -93,11 +93,12 @@ class Prior:
         belief = np.tile((self.stated or self).log_belief(wander), (len(TIME_FACTORS), 1))
         if self.seen is not None:
             belief += [np.interp(wander, self.seen[0], row) for row in self.seen[1]]
+        weights = (belief + np.log(TIME_PRIOR)[:, None]).tolist()
         return [
-            Setting(float(ratio), factor * self.time, float(log + np.log(share)))
-            for factor, share, logs in zip(TIME_FACTORS, TIME_PRIOR, belief, strict=True)
-            for ratio, log in zip(RATIOS, logs, strict=True)
-            if np.isfinite(log)
+            Setting(ratio, factor * self.time, weight)
+            for factor, row in zip(TIME_FACTORS, weights, strict=True)
+            for ratio, weight in zip(RATIOS.tolist(), row, strict=True)
+            if math.isfinite(weight)
         ]
 
 
@@ -245,20 +246,22 @@ class GaussMarkov:
         self._order = order = blocks.order
         v = (1.0 / blocks.weight if variance is None else variance)[order]
         start, length, clock = blocks.start[order], blocks.length[order], blocks.clock[order]
-        tau = np.array([s.time for s in settings])[:, None]
         q = np.array([s.ratio for s in settings])[:, None] ** 2
-        self._half = h = _half_average(length, tau)
+        times, at = np.unique([s.time for s in settings], return_inverse=True)  # a grid repeats each time
+        tau = times[:, None]
+        of_time = _half_average(length, tau)
         same, step = clock[1:] == clock[:-1], np.maximum(np.diff(start), length[:-1])
-        near = np.where(same, np.exp(-(step - length[:-1]) / tau), 0.0)
-        self._phi = phi = np.where(same, np.exp(-step / tau), 0.0)
-        own = (v + q * variance_of_average(length, tau)) / h**2
+        near = np.where(same, np.exp(-(step - length[:-1]) / tau), 0.0)[at]
+        self._phi = phi = np.where(same, np.exp(-step / tau), 0.0)[at]
+        self._half = h = of_time[at]
+        own = (v + q * variance_of_average(length, tau)[at]) / h**2
         diagonal = own.copy()
         diagonal[:, 1:] += phi * (phi * own[:, :-1] - 2.0 * q * near)
         neighbour = np.zeros_like(own)
         neighbour[:, :-1] = q * near - phi * own[:, :-1]
         self._d, self._e, info = scipy.linalg.lapack.dpttrf(diagonal.ravel(), neighbour.ravel()[:-1])
         assert info == 0  # noqa: S101  (T is a covariance)
-        self.log_determinant: Values = np.sum(np.log(self._d.reshape(h.shape)) + 2.0 * np.log(h), axis=1)
+        self.log_determinant: Values = np.sum(np.log(self._d.reshape(h.shape)) + 2.0 * np.log(of_time)[at], axis=1)
 
     def products(self, columns: Values) -> Values:
         """Return ``A^T C^-1 A`` of (m, p) columns: (g, p, p) array."""

@@ -359,7 +359,10 @@ def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
         new = _evaluated(spectrum, now.axis, now.kinds, now.columns, stepped)
         gain = now.deviance - new.deviance
         better = gain > 0
-        now.replace(better, new.rows(better))
+        if better.all():
+            now = new
+        else:
+            now.replace(better, new.rows(better))
         damping *= np.where(better, 0.2, 8.0)
         predicted = -np.sum(gradient * step, axis=1)
         slow = better & (gain < PRECISION) & (damping < 1.0)

@@ -206,7 +206,9 @@ def median(values: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
     """Return the median along an axis, 2 (a thousand values) to 5 (matrices) times as fast as ``numpy.median``."""
     ordered, half = np.sort(values, axis), values.shape[axis] // 2
     one, two, last = (ordered.take(k, axis) for k in (half, half - 1 + values.shape[axis] % 2, -1))
-    middle = np.where(np.isnan(last), last, 0.5 * (one + two))  # NaN is sorted last
+    middle = np.asarray(0.5 * (one + two))
+    if (unknown := np.isnan(last)).any():  # NaN is sorted last
+        middle = np.where(unknown, last, middle)
     return np.expand_dims(middle, axis) if keepdims else middle
 
 

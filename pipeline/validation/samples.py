@@ -25,6 +25,7 @@ with the eigenvalues l_i of S and the components t_i of t along its eigenvectors
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -81,12 +82,12 @@ class Samples:
         """
         return self.white_variance + self.wander_variance
 
-    @property
+    @cached_property
     def known(self) -> Mask:
         """Whether a sample has reading and reference: (n,) array."""
         return np.asarray(np.isfinite(self.reading).all(axis=1) & np.isfinite(self.magnitude))
 
-    @property
+    @cached_property
     def representative(self) -> Index:
         """Indices of known samples that represent the recording."""
         known = np.flatnonzero(self.known)
