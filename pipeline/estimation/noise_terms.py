@@ -320,17 +320,21 @@ def _evaluated(spectrum: Spectrum, axis: Integers, kinds: Integers, columns: Mas
         index, n = np.append(0, used + 1), len(used)
         products = spectrum.products[:, :, index[:, None], index].reshape(*spectrum.products.shape[:2], -1)[axis]
         sums = (weight[:, None, :] @ products).reshape(g, n + 1, n + 1)
-        unused = ~columns[:, used]
-        absent = unused[:, :, None] * np.eye(n)
-        inner = np.where(unused[:, :, None] | unused[:, None, :], absent, sums[:, 1:, 1:])
-        inverse, determinant = np.linalg.inv(inner) - absent, np.linalg.slogdet(inner)[1]
-        signed = np.concatenate([np.ones((g, 1)), -np.einsum("gij,gj->gi", inverse, sums[:, 1:, 0])], axis=1)
+        inner, unused = sums[:, 1:, 1:], ~columns[:, used]
+        if unused.any():  # 1 on the diagonal for a column that is not fitted
+            absent = unused[:, :, None] * np.eye(n)
+            inner = np.where(unused[:, :, None] | unused[:, None, :], absent, inner)
+        inverse, determinant = np.linalg.inv(inner), np.linalg.slogdet(inner)[1]
+        if unused.any():
+            inverse -= absent
+        signed = np.ones((g, n + 1))
+        signed[:, 1:] = -(inverse @ sums[:, 1:, :1])[:, :, 0]
         outer = signed[:, :, None] * signed[:, None, :]
         power = np.maximum(products @ outer.reshape(g, -1, 1), 0.0)[:, :, 0]
         outer[:, 1:, 1:] += inverse
         restricted = (products @ outer.reshape(g, -1, 1))[:, :, 0]
         beta[:, used], covariance[:, used[:, None], used] = -signed[:, 1:], inverse
-    unrestricted = np.log(total) @ spectrum.count + np.sum(power * weight, axis=1)
+    unrestricted = np.log(total) @ spectrum.count + (power * weight).sum(axis=1)
     return Fits(
         axis, kinds, columns, parameters, unrestricted + determinant, unrestricted, total, restricted, slopes, beta,
         covariance,
@@ -346,7 +350,7 @@ def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
     now = best = _evaluated(spectrum, axis, kinds, columns, start)
     damping, running = np.full(len(trials), 1e-2), np.arange(len(trials))  # of the fits in ``now``
     for _ in range(ITERATIONS):
-        gradient = 0.5 * np.sum(now.slopes * (spectrum.count - now.power / now.total)[:, None, :], axis=2)
+        gradient = 0.5 * (now.slopes @ (spectrum.count - now.power / now.total)[:, :, None])[:, :, 0]
         at_bound = np.where(gradient > 0.0, now.parameters <= bounds[0], now.parameters >= bounds[1])
         moving = free & ~at_bound
         information = 0.5 * (now.slopes * spectrum.count) @ now.slopes.transpose(0, 2, 1)
@@ -354,8 +358,10 @@ def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
         diagonal = np.einsum("gpp->gp", information)  # a view
         diagonal += np.where(moving, damping[:, None] * diagonal + 1e-9, 1.0)
         gradient = np.where(moving, gradient, 0.0)
-        step = np.clip(-np.linalg.solve(information, gradient[:, :, None])[:, :, 0], *STEP_LIMITS)
-        stepped = np.where(moving, np.clip(now.parameters + step, *bounds), now.parameters)
+        step = -np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+        step = np.minimum(np.maximum(step, STEP_LIMITS[0]), STEP_LIMITS[1])
+        inside = np.minimum(np.maximum(now.parameters + step, bounds[0]), bounds[1])
+        stepped = np.where(moving, inside, now.parameters)
         new = _evaluated(spectrum, now.axis, now.kinds, now.columns, stepped)
         gain = now.deviance - new.deviance
         better = gain > 0
