@@ -91,7 +91,8 @@ class Samples:
     def representative(self) -> Index:
         """Indices of known samples that represent the recording."""
         known = np.flatnonzero(self.known)
-        return np.asarray(known[np.unique(np.linspace(0, len(known) - 1, REPRESENTATIVE_SAMPLES).astype(int))])
+        places = np.linspace(0, len(known) - 1, REPRESENTATIVE_SAMPLES).astype(int)
+        return np.asarray(known[np.flatnonzero(np.bincount(places))])  # each place once
 
 
 @dataclass(frozen=True)
