@@ -132,7 +132,7 @@ class HeldOutCase:
 
     def at_rests(self, rests: Mapping[str, Sequence[Rest]]) -> list[Samples]:
         """Return the mean readings of given rests, by the name of their recording."""
-        found = (self._at_rests(r, rests[r.name]) for r in self.recordings if rests.get(r.name))
+        found = (self._means(r, rests[r.name]) for r in self.recordings if rests.get(r.name))
         return [samples for samples in found if samples is not None]
 
     def _at_rests_of(self, role: str) -> list[Samples]:
@@ -150,7 +150,7 @@ class HeldOutCase:
         ]
         return [s for s in found if s is not None and np.isfinite(s.reading).all(axis=1).any()]
 
-    def _at_rests(self, recording: Recording, rests: Sequence[Rest]) -> Samples | None:
+    def _means(self, recording: Recording, rests: Sequence[Rest]) -> Samples | None:
         """Return the mean readings of the rests of a recording, or None without any.
 
         The rate at which the unit creeps, as far as the accelerometer shows it, is subtracted from the means of a
