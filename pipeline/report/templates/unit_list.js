@@ -1,6 +1,6 @@
 "use strict";
 // The list of all units: sorting and filter. A browser lays out long tables slowly: of many rows only those in view are in the page, and
-// the margins of the table stand for the others. Rows beyond the first are HTML in #others until they come into view.
+// the margins of the table take the space of the others. Rows beyond the first are HTML in #others until they come into view.
 const ENTITIES = { "&amp;": "&", "&lt;": "<", "&gt;": ">", "&#34;": '"', "&#39;": "'" };
 const maker = document.createElement("template");
 class Row {
