@@ -147,13 +147,13 @@ def record(
             motion = plain if altered is scene else altered.motion(time, temperature)
             white = sensor.white(unit.interval_s) * rng[s].standard_normal((len(time), 3))
             reading = sensor.exact(motion) + white + sensor.sensor_config["bias_wander"] * wander[s][k]
-            readings[s] = _rounded(sensor.quantised(reading), decimals_of(sensor.sensor_config))
+            readings[s] = np.round(sensor.quantised(reading), decimals_of(sensor.sensor_config))
         whole = Recording(
             plan.name,
             plan.role,
             None if plan.axis is None else AXES[plan.axis],
             times[k],
-            temperature=_rounded(environment.reading(time, rng["temperature"]), TEMPERATURE_DECIMALS),
+            temperature=np.round(environment.reading(time, rng["temperature"]), TEMPERATURE_DECIMALS),
             **readings,
             **_log(plan, bench, time - time[0]),
         )
@@ -200,11 +200,11 @@ def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:
         angle, rate = trajectory.program.at(time)[:2]
         sense = bench.imperfections.get("sense", 1)
         angle, rate = sense * angle + bench.imperfections.get("zero_deg", {}).get(plan.name, 0.0), sense * rate
-        return {"table_angle": _rounded(angle, ANGLE_DECIMALS), "table_rate": _rounded(rate, ANGLE_DECIMALS)}
+        return {"table_angle": np.round(angle, ANGLE_DECIMALS), "table_rate": np.round(rate, ANGLE_DECIMALS)}
     if isinstance(trajectory, Gimbals):
         rate = np.linalg.norm(trajectory.pose(time).omega, axis=1)
-        attitude = _rounded(trajectory.quaternion(time), QUATERNION_DECIMALS)
-        return {"table_attitude": attitude, "table_rate": _rounded(rate, ANGLE_DECIMALS)}
+        attitude = np.round(trajectory.quaternion(time), QUATERNION_DECIMALS)
+        return {"table_attitude": attitude, "table_rate": np.round(rate, ANGLE_DECIMALS)}
     assert isinstance(trajectory, Moves)  # noqa: S101
     return {"table_rate": np.zeros(len(time))} if plan.role == "static" else {}
 
@@ -214,12 +214,6 @@ def received(count: int, lost: float, rng: np.random.Generator) -> NDArray[np.bo
     kept = rng.random(count) >= lost
     kept[[0, -1]] = True
     return kept
-
-
-def _rounded(values: Values, decimals: int) -> Values:
-    """Round values as their printed form is read."""
-    rounded: Values = np.rint(values * 10.0**decimals) / 10.0**decimals
-    return rounded
 
 
 MARGIN_S = 2.0  # by which a separate log begins earlier and ends later than the recording
