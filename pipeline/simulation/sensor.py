@@ -332,9 +332,11 @@ def _values(
     sign = np.where(positive, 1.0, rng.choice([-1.0, 1.0], len(parameters)))
     typical = kind.typical_share * parameter_limits(kind, sensor, limits)
     drawn = sign * rng.uniform(0.7, 1.3, len(parameters)) * typical
-    given = np.array([]) if value is None else np.atleast_1d(np.asarray(value, float))
+    given = np.ravel([] if value is None else value)
+    if given.dtype.kind not in "iuf":
+        raise ConfigurationError(f"{sensor}.{name}: a size, or the list of the parameters' values, is expected")
     if len(given) == len(parameters):
-        return given
+        return given.astype(float)
     if len(given) == 1:
         return np.where(positive, typical, sign * given[0])
     if value is not None:

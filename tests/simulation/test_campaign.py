@@ -220,6 +220,7 @@ def test_a_fleet_is_drawn_from_the_data_sheet() -> None:
         ({"effects": {"accelerometer.lever": 0.1}}, "no effect is called 'lever'"),
         ({"effects": {"mounting": 1.0}}, "has parameters for each recording; give imperfections mounting_deg"),
         ({"effects": {"lever_arm": [1.0, 2.0]}}, "takes one size or 3 values (r_x, r_y, r_z), not 2"),
+        ({"effects": {"lever_arm": ["long", 0.1, 0.1]}}, "lever_arm: a size, or the list of the parameters' values"),
         ({"sensor": "mpu9"}, "no sensor is called 'mpu9'; known: adis16448, adis16470"),
         ({"procedure": "dance"}, "no procedure is called 'dance'"),
         ({"samples": 100}, "cannot be recorded in 100 samples"),
