@@ -248,7 +248,7 @@ def discover(selection: Selection, unknown: list[dict[str, Any]], case: Case) ->
     noise = case.noise
     floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
     best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + CLEARLY
-    alone = replace(selection, names=[], fit=selection.base)
+    alone = replace(selection, steps={}, fit=selection.base)
     for context in [selection, alone] if selection.names else [selection]:
         terms, ranked = search(context)
         if not terms:

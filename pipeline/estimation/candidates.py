@@ -1,8 +1,8 @@
-"""Select the effects that a fit can include: possible, plausible and available; and the start of their parameters."""
+"""List the effects that a fit can include, with the starts, the priors and the limits of their parameters."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
     from pipeline.records import Motion, Recording, SensorCalibration, Values
 
-AUTO = "auto"  # instead of a list of effects: what the diagnosis selects
+AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
 TILTS = ("d_x", "d_y")  # parameters of ``table_tilt``
-HELD_DEG = 1e-4  # standard deviation of a tilt that is held at 0: a hundredth of a good encoder's accuracy
+HELD_DEG = 1e-4  # standard deviation of a tilt that is fixed at 0: a hundredth of a good encoder's accuracy
 HELD = (
     "The part of the tilt about the shaft is the same as a common zero of the turns: the recordings do not determine "
     "it beside the mountings or zeros, table.levelling_deg does not state it, and it is held at 0."
 )
-ONE_SHAFT = 0.999  # cosine between shafts; mountings of 2 deg turn the level frame by as much
-SEAT_DEG = 5.0  # where mountings are fitted and the table's config states no size: the default tolerance of ingest
+ONE_SHAFT = 0.999  # cosine between shafts that count as one: mountings of 2 deg turn the level frame by as much
+SEAT_DEG = 5.0  # of mountings if the table's config states none: the default tolerance of ingest
 SECOND_SHARE = 0.1  # of the likelier one's prior probability, by assumption
 SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
@@ -48,11 +48,11 @@ def configured_effects(sensor: str, settings: Mapping[str, Any], recordings: Seq
 
 
 def bench_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
-    """Return the effects of the bench: errors that the table's config states, and found zeros of the angle."""
+    """Return the effects of the bench: errors that the table's config states, and estimated zeros of the angle."""
     table = settings["table"]
     stated = stated_priors(table) if table.get("motion") != "none" else {}
-    own_clocks = not all(recording.clock_shared for recording in recordings)
-    names = [name for name in stated if not (effect(name).needs_clock and own_clocks)]
+    one_clock = all(recording.clock_shared for recording in recordings)
+    names = [name for name in stated if one_clock or not effect(name).needs_clock]
     found = any(note.code == "N-FOUND" for recording in recordings for note in recording.notes)
     return [*names, ZERO] if found and sensor == "accelerometer" and MOUNTING not in names else names
 
@@ -65,7 +65,7 @@ def starts_of(
 ) -> list[list[Term]]:
     """Return the terms from which a fit starts, every combination of the effects' starts.
 
-    ``observed``: the sensor alone for recordings by hand. ``known``: its fitted effects start where they are.
+    ``observed``: for recordings by hand only the sensor. ``known``: a calibration, at whose effects a fit starts.
     ``accelerometer``, for the gyroscope: its mountings. Raises ``ConfigurationError`` if an effect is unknown, named
     twice, contained in another, or not one of this sensor.
     """
@@ -80,7 +80,7 @@ def starts_of(
                 f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them"
             )
     fitted = {} if known is None else {e.name: e.values for e in known.effects}
-    combinations: list[list[Term]] = [[]]
+    choices: list[list[Term]] = []
     for name in names:
         this = effect(name).of_recordings(recordings)
         if sensor not in this.sensors:
@@ -89,14 +89,14 @@ def starts_of(
             )
         prior = None if isinstance(observed, str) else prior_of(this, observed, accelerometer, names)
         starts = this.starts(sensor) if prior is None or this.nonlinear else [prior.mean]
-        values = [fitted[name]] if name in fitted else starts
-        values = [v for v in values if len(v) == len(this.parameters(sensor))] or this.starts(sensor)
-        combinations = [[*before, Term(this, v, prior=prior)] for before in combinations for v in values]
-    return combinations
+        if name in fitted and len(fitted[name]) == len(this.parameters(sensor)):
+            starts = [fitted[name]]
+        choices.append([Term(this, values, prior=prior) for values in starts])
+    return [list(terms) for terms in product(*choices)]
 
 
 def turns_of(observations: Observations) -> dict[str, str]:
-    """Return the names of the recordings of turns, and the setup of each."""
+    """Return the setup of each recording of turns, by its name."""
     return {part.name: part.motion.setup for part in observations.parts if part.motion.axis is not None}
 
 
@@ -105,9 +105,9 @@ def prior_of(
 ) -> NormalPrior | None:
     """Return the prior of an effect of the bench; None for other effects.
 
-    Each parameter is ``N(0, s^2)``, s as the table's config states it. For the rotations of the unit, where the
-    accelerometer was fitted with them, its estimate: both sensors share the frame of the mean of the mountings. For the
-    tilt of the table beside mountings or zeros: see ``tilt_like_zeros``.
+    Each parameter has the prior ``N(0, s^2)``, s by the table's config. If the accelerometer was fitted with mountings,
+    its estimate is the prior of the gyroscope's: both sensors share the frame of the mean of the mountings. For a tilt
+    of the table see ``tilt_like_zeros``.
 
     ``accelerometer``: for the gyroscope. ``beside``: the effects of the fit.
     """
@@ -119,23 +119,18 @@ def prior_of(
         stated = observed.bench.get(this.name)
         return None if stated is None else NormalPrior(np.zeros(1), np.full((1, 1), stated**-2))
     assert this.definition is not None  # noqa: S101
-    mine, seat_deg = this.definition["recordings"], observed.bench.get(MOUNTING, SEAT_DEG)
-    size = 3 * len(mine)
-    mean = np.zeros(size)
+    own, seat_deg = this.definition["recordings"], observed.bench.get(MOUNTING, SEAT_DEG)
+    mean, covariance = np.zeros(3 * len(own)), seat_deg**2 * np.eye(3 * len(own))
     found = None if accelerometer is None else next((e for e in accelerometer.effects if e.name == MOUNTING), None)
-    if accelerometer is None or accelerometer.covariance is None or found is None or found.definition is None:
-        return NormalPrior(mean, np.eye(size) / seat_deg**2)
-    theirs, names = found.definition["recordings"], accelerometer.parameter_names()
-    first = names.index(f"{MOUNTING}.{next(iter(found.parameters))}")
-    shared = [(k, theirs.index(name)) for k, name in enumerate(mine) if name in theirs]
-    if not shared:
-        return NormalPrior(mean, np.eye(size) / seat_deg**2)
-    here = np.concatenate([np.arange(3 * k, 3 * k + 3) for k, _ in shared])
-    there = np.concatenate([np.arange(3 * k, 3 * k + 3) for _, k in shared])
-    mean[here] = found.values[there]
-    covariance = seat_deg**2 * np.eye(size)
-    covariance[np.ix_(here, here)] = accelerometer.covariance[np.ix_(first + there, first + there)]
-    covariance += np.kron(np.full((len(mine),) * 2, np.diag(covariance)[here].mean()), np.eye(3))
+    if accelerometer is not None and accelerometer.covariance is not None and found and found.definition:
+        others = found.definition["recordings"]
+        shared = [(k, others.index(name)) for k, name in enumerate(own) if name in others]
+        if shared:
+            here, there = (np.add.outer(np.multiply(3, k), np.arange(3)).ravel() for k in zip(*shared, strict=True))
+            mean[here] = found.values[there]
+            first = accelerometer.parameter_names().index(f"{MOUNTING}.{next(iter(found.parameters))}")
+            covariance[np.ix_(here, here)] = accelerometer.covariance[np.ix_(first + there, first + there)]
+            covariance += np.kron(np.full((len(own),) * 2, np.diag(covariance)[here].mean()), np.eye(3))
     return NormalPrior(mean, np.asarray(np.linalg.inv(covariance), np.float64))
 
 
@@ -143,8 +138,8 @@ def tilt_like_zeros(motions: Sequence[Motion], beside: Sequence[str]) -> Values 
     """Return the direction of (d_x, d_y) in which a tilt is equivalent to a rotation of the unit in every turn.
 
     It is the direction of the shaft, if one level shaft makes all turns and each has a separate mounting or zero. The
-    readings do not determine this part of the tilt: its prior is the table's levelling, or it is fixed at 0. None:
-    readings determine both parts.
+    readings do not determine this component of the tilt: its prior is the table's levelling, or it is fixed at 0. None
+    if the readings determine both components.
     """
     owner = next((effect(name) for name in (MOUNTING, ZERO) if name in beside), None)
     if owner is None or any(m.axis is None or m.level is None for m in motions):
@@ -164,42 +159,42 @@ def is_held(name: str, parameter: Mapping[str, Any]) -> bool:
 
 
 def limits_of(sensor: str, sensor_config: Mapping[str, Any]) -> dict[str, Values]:
-    """Return the limits of plausibility of every effect's parameters, absolute values; infinite where there is none.
+    """Return the limits of plausibility of every effect's parameters, absolute values; infinite if none is stated.
 
     ``sensor_config``: ``effects`` of the sensor file: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
     one or, without the axis, for some of them.
     """
-    given = sensor_config.get("effects") or {}
-    found = {n: parameter_limits(this, sensor, given) for n, this in catalogue().items() if sensor in this.sensors}
-    return {name: limits for name, limits in found.items() if len(limits)}
+    stated = sensor_config.get("effects") or {}
+    limits = {n: parameter_limits(this, sensor, stated) for n, this in catalogue().items() if sensor in this.sensors}
+    return {name: values for name, values in limits.items() if len(values)}
 
 
 def candidates_for(observations: Observations, configured: Sequence[str]) -> list[Effect]:
     """Return the effects that could be missing in the model and that the recordings can show."""
-    found = []
-    recordings = turns_of(observations)
+    sensor, motions = observations.sensor, [part.motion for part in observations.parts]
+    turns, without_temperature = turns_of(observations), any(motion.temperature is None for motion in motions)
+    candidates = []
     for name, listed in catalogue().items():
-        this = listed.of_recordings(recordings)
-        if this.of_turns and not observations.mounting_in_doubt:
-            continue
-        if name in configured or observations.sensor not in this.sensors or observations.sensor in this.unseen:
-            continue
-        if name == "earth_rotation" and observations.earth:
-            continue
-        if this.needs_clock and not observations.clock_shared:
-            continue
-        complete = all(part.motion.temperature is not None for part in observations.parts)
-        if "temperature" in this.needs and not complete:
-            continue
-        if any(this.available(part.motion) for part in observations.parts):
-            found.append(this)
-    second = SECOND[observations.sensor]
-    return sorted(found, key=lambda e: (e.name in second, e.name))
+        this = listed.of_recordings(turns)
+        impossible = (
+            name in configured
+            or sensor not in this.sensors
+            or sensor in this.unseen
+            or (this.of_turns and not observations.mounting_in_doubt)
+            or (name == "earth_rotation" and observations.earth)
+            or (this.needs_clock and not observations.clock_shared)
+            or ("temperature" in this.needs and without_temperature)
+        )
+        if not impossible and any(this.available(motion) for motion in motions):
+            candidates.append(this)
+    second = SECOND[sensor]
+    return sorted(candidates, key=lambda e: (e.name in second, e.name))
 
 
 def require_available(observations: Observations, names: Sequence[str]) -> None:
     """Raise ``NotObservableError``, with advice, for an effect that needs signals which the recordings lack."""
-    setups = {part.motion.setup for part in observations.parts}
+    parts = observations.parts
+    setups = {part.motion.setup for part in parts}
     for own in OWN:
         if setups <= {name.partition("@")[2] for name in names if name.startswith(f"{own}@")}:
             base = "matrix" if own == "mounting" else "bias"
@@ -209,8 +204,8 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
             )
     for name in names:
         this = effect(name)
-        lacking = [need for need in this.needs if all(getattr(p.motion, need) is None for p in observations.parts)]
-        without = [p.name for p in observations.parts for need in this.needs if getattr(p.motion, need) is None]
+        lacking = [need for need in this.needs if all(getattr(part.motion, need) is None for part in parts)]
+        without = [part.name for part in parts for need in this.needs if getattr(part.motion, need) is None]
         if lacking or ("temperature" in this.needs and without):
             raise NotObservableError(
                 f"{name} needs {', '.join(lacking or ['temperature'])}, which "
@@ -229,8 +224,8 @@ def time_constants(
 ) -> list[tuple[Term, float]]:
     """Return an effect at several time constants or widths, with log weights of their prior; the fitted one first.
 
-    ``between``: whether there is one between each two of the effect's starts, in equal ratios.
-    ``width``: standard uncertainty of the fitted value's logarithm; None: as wide as the steps between the others.
+    ``between``: whether to add the geometric mean of each two successive starts of the effect. ``width``: standard
+    uncertainty of the fitted value's logarithm; None: that of the steps between the others.
     """
     starts = this.starts(sensor)
     if isinstance(this, Bend):
@@ -242,9 +237,9 @@ def time_constants(
         middle = [np.sqrt(one * other) for one, other in pairwise(starts)]
         starts = sorted([*starts, *middle], key=lambda values: float(values[-1]))
     share = 1.0 / len(starts)
-    grid = [(Term(this, values), float(np.log(share))) for values in starts]
+    terms = [(Term(this, values), float(np.log(share))) for values in starts]
     if fitted is None:
-        return grid
+        return terms
     if width is not None:
         share = min(share, float(np.sqrt(2.0 * np.pi) * width / np.log(starts[-1][-1] / starts[0][-1])))
-    return [(fitted, float(np.log(share))), *grid]
+    return [(fitted, float(np.log(share))), *terms]

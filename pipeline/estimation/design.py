@@ -3,7 +3,7 @@
     y_c = b_c + K_c . u + sum over effects z_c(p) + noise,    c = x, y, z
 
 where b is the bias, K_c row c of the inverse of the calibration matrix, u the truth by the table. The layout of an
-effect (``Layout``) states which columns are for one axis and which all axes share; each column is built once:
+effect (``Layout``) states which columns are for one axis and which all axes share. Each column is built once:
 
     A = [1, u, every-axis regressors | y_x, its columns and shared ones | y_y, ... | y_z, ...]
 
@@ -18,8 +18,9 @@ with the prior ``N(0, u^2)``. With their columns T, scaled by u, they are elimin
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -32,15 +33,16 @@ from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.model.effects.base import Effect, Layout, truth
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.estimation.observations import Observations, Part
     from pipeline.records import Index, Motion, Noise, Values
 
-BASE = 12  # bias and matrix
-REMEMBERED = 4  # motions of a part after effects of timing: base and as many terms without themselves
-WEAKEST_DIRECTION, PART_OF_IT = 1e-3, 0.1  # share of unit columns that counts as determined; of such a direction
+BASE = 12  # parameters: bias and matrix
+REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
+WEAKEST_DIRECTION, PART_OF_IT = 1e-3, 0.1  # singular value of unit columns that is determined; share of its vector
 BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,8 @@ class Term:
     """The columns of an effect at given values of its parameters."""
 
     effect: Effect
-    values: Values  # (p,); where its derivative is taken
-    full: bool = False  # whether the columns of its nonlinear parameters are among them
+    values: Values  # (p,); at which its derivatives are taken
+    full: bool = False  # whether the nonlinear parameters have columns, too
     prior: NormalPrior | None = None  # of the parameters; None: flat
 
     def layout(self) -> Layout:
@@ -88,23 +90,20 @@ def stepped(terms: Sequence[Term], step: Values) -> tuple[list[Term], Values]:
 
 
 def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion:
-    """Return the true motion of the sensor at the time stamps, with all effects of timing except ``but``."""
+    """Return the true motion of the sensor at the timestamps, with all effects of timing except ``but``."""
     movers = [term for term in terms if term.effect.moves and term.effect is not but and np.any(term.values)]
     if not movers:
         return part.motion
     key = tuple((term.effect.name, term.values.tobytes()) for term in movers)
     if key not in part.moved:
-        motion = part.motion
-        for term in movers:
-            motion = term.effect.moved(motion, term.values)
         while len(part.moved) >= REMEMBERED:
             part.moved.pop(next(iter(part.moved)))
-        part.moved[key] = motion
+        part.moved[key] = reduce(lambda motion, term: term.effect.moved(motion, term.values), movers, part.motion)
     return part.moved[key]
 
 
 def without_unknown_motion(observations: Observations, terms: Sequence[Term]) -> Observations:
-    """Remove the rows that effects of timing move to times with unknown motion; return the same object if none are."""
+    """Remove the rows that effects of timing shift to times of unknown motion; without any, return the same object."""
     known = [true_motion(part, terms).reference_valid for part in observations.parts]
     if all(mask is None or mask.all() for mask in known):
         return observations
@@ -115,11 +114,8 @@ def without_unknown_motion(observations: Observations, terms: Sequence[Term]) ->
 def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
     """Return the motion on which each term acts, and last the motion of the base."""
     everything = true_motion(part, terms)
-    moves = [term.effect.moves and bool(np.any(term.values)) for term in terms]
-    acted = [
-        true_motion(part, terms, term.effect) if move else everything for term, move in zip(terms, moves, strict=True)
-    ]
-    return [*acted, everything]
+    acting = [term.effect if term.effect.moves and np.any(term.values) else None for term in terms]
+    return [*(everything if own is None else true_motion(part, terms, own) for own in acting), everything]
 
 
 @dataclass(frozen=True)
@@ -165,8 +161,9 @@ def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
 class Design:
     """Products of base, terms and readings under noise settings.
 
-    ``scale``: (3,). ``target``: (n, 3), values to explain; None: the readings. ``project``: project the base out of the
-    other columns first, so that products lose no digits. ``base``: (n, 3), regressors of K instead of the truth.
+    ``scale``: (3,), white noise of each axis. ``target``: (n, 3), values to explain; None: the readings. ``base``: (n,
+    3), regressors of K; None: the truth. ``project``: project the base out of the other columns first, so that products
+    lose no digits.
     """
 
     def __init__(
@@ -182,15 +179,13 @@ class Design:
     ) -> None:
         self.scale = scale
         self._place(observations.sensor, terms)
-        self._priors = [(at, t) for at, t in zip(self.slices, terms, strict=True) if t.prior]
+        self._priors = [(at, t, t.prior) for at, t in zip(self.slices, terms, strict=True) if t.prior]
         weight = observations.weight
-        A = np.zeros((len(weight), self._width))
+        A = np.ones((len(weight), self._width))
         A[:, self._readings] = observations.reading if target is None else target
-        row = 0
-        for part in observations.parts:
-            rows = slice(row, row + len(part.weight))
-            self._fill(A[rows], observations.sensor, part, terms, K)
-            row = rows.stop
+        edges = np.cumsum([0, *(len(part.weight) for part in observations.parts)]).tolist()
+        for part, edge in zip(observations.parts, pairwise(edges), strict=True):
+            self._fill(A[slice(*edge)], observations.sensor, part, terms, K)
         if base is not None:
             A[:, 1:4] = base
         self.size = np.sqrt(np.einsum("i,ij,ij->j", weight, A, A))
@@ -210,13 +205,13 @@ class Design:
     def _add_stops(self, observations: Observations, terms: Sequence[Term], K: Values) -> None:
         """Add the errors of the angle, as parameters after the readings, with separate columns for each axis."""
         motions = [true_motion(part, terms) for part in observations.parts]
-        before, after, group, last = errors_of_stops(observations.sensor, motions, K)
+        before, after, stop, last = errors_of_stops(observations.sensor, motions, K)
         self.stops = last + 1
-        A, rows, blocks = self.columns.columns, np.arange(len(group)), observations.blocks
+        A, rows, blocks = self.columns.columns, np.arange(len(stop)), observations.blocks
         for c in range(3):
             T = np.zeros((len(rows), self.stops))
-            T[rows, group] = observations.angle_deg * before[:, c]
-            T[rows, group + 1] = observations.angle_deg * after[:, c]
+            T[rows, stop] = observations.angle_deg * before[:, c]
+            T[rows, stop + 1] = observations.angle_deg * after[:, c]
             self._own[c] = Products(blocks, observations.weight, np.hstack([A[:, self._local[c]], T]))
             self._total[c] = np.append(self._total[c], self.count + 1 + np.arange(self.stops))
             self._at[c] = np.arange(len(self._total[c]))
@@ -230,15 +225,14 @@ class Design:
         width, parameters = 4, BASE
         for term in terms:
             layout = term.layout()
-            count = len(term.effect.parameters(sensor))
-            if layout != Layout.SHARED:
-                count -= len(term.effect.nonlinear)
-            each = count if layout == Layout.SHARED else count // 3
+            shared, count = layout == Layout.SHARED, len(term.effect.parameters(sensor))
+            count -= 0 if shared else len(term.effect.nonlinear)
+            each = count if shared else count // 3
             places = []
             for c in range(3):
                 places.append(slice(width, width + each))
                 local[c] += range(width, width + each)
-                offset = parameters if layout == Layout.SHARED else parameters + c * each
+                offset = parameters if shared else parameters + c * each
                 total[c] += range(offset, offset + each)
                 if layout != Layout.EVERY_AXIS or c == 2:
                     width += each
@@ -246,25 +240,18 @@ class Design:
             self.slices.append(slice(parameters, parameters + count))
             parameters += count
         self._readings = [width, width + 1, width + 2]
-        for c in range(3):
-            local[c].append(width + c)
-            total[c].append(parameters)
-        self.count = parameters
-        self._width = width + 3
-        self._local = [np.array(index) for index in local]
-        self._total = [np.array(index) for index in total]
+        self._local = [np.array([*index, width + c]) for c, index in enumerate(local)]
+        self._total = [np.array([*index, parameters]) for index in total]
+        self.count, self._width = parameters, width + 3
 
     def _fill(self, A: Values, sensor: str, part: Part, terms: Sequence[Term], K: Values) -> None:
+        """Write the columns of base and terms into the rows of one recording; the first column is 1 already."""
         *motions, everything = motions_of(part, terms)
-        A[:, 0] = 1.0
         A[:, 1:4] = truth(sensor, everything)
         for term, motion, places in zip(terms, motions, self._columns, strict=True):
             regressors = term.regressors(sensor, motion, K, everything)
-            if term.layout() == Layout.EVERY_AXIS:
-                A[:, places[0]] = regressors
-            else:
-                for c in range(3):
-                    A[:, places[c]] = regressors[:, c]
+            for c, place in enumerate(places):
+                A[:, place] = regressors if term.layout() == Layout.EVERY_AXIS else regressors[:, c]
 
     def of_axis(self, c: int) -> Values:
         """Return the columns of one axis, the readings last: (n, q + 1) array."""
@@ -277,30 +264,25 @@ class Design:
     def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return all products of parameters' columns and, last, the readings, (g, p + 1, p + 1); and log det C, (g,).
 
-        The priors are added, and errors of the angle are eliminated. The determinant has an unknown constant factor.
+        The priors are added, and errors of the angle are eliminated. ``log det C`` lacks a constant.
         """
         whole, logarithms = self._with_stops(settings)
         if not self.stops:
             return whole, logarithms
         p = self.count + 1
         cross, inner = whole[:, p:, :p], whole[:, p:, p:]
-        left = whole[:, :p, :p] - cross.transpose(0, 2, 1) @ np.linalg.solve(inner, cross)
-        return left, logarithms + np.linalg.slogdet(inner)[1]
+        rest = whole[:, :p, :p] - cross.transpose(0, 2, 1) @ np.linalg.solve(inner, cross)
+        return rest, logarithms + np.linalg.slogdet(inner)[1]
 
     def _with_stops(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return ``products`` with the errors of the angle as the last parameters."""
-        count = self.count + 1 + self.stops
+        last, count = self.count, self.count + 1 + self.stops
         total = np.zeros((len(settings), count**2))
-        distinct = {id(own): own for own in self._own}  # without stops, one for all axes
-        of_settings = {key: own.products(settings) for key, own in distinct.items()}
-        for c, own in enumerate(self._own):
-            flat = of_settings[id(own)][0].reshape(len(settings), -1)
-            total[:, self._to[c]] += flat[:, self._from[c]] / self.scale[c] ** 2
+        of_axes = self._of_axes(lambda own: own.products(settings))
+        for c, (products, _) in enumerate(of_axes):
+            total[:, self._to[c]] += products.reshape(len(settings), -1)[:, self._from[c]] / self.scale[c] ** 2
         square = total.reshape(-1, count, count)
-        last = self.count
-        for at, term in self._priors:  # as readings of the parameters themselves
-            prior = term.prior
-            assert prior is not None  # noqa: S101
+        for at, term, prior in self._priors:  # as readings of the parameters themselves
             rest = prior.mean - term.values
             square[:, at, at] += prior.precision
             square[:, at, last] += prior.precision @ rest
@@ -308,23 +290,28 @@ class Design:
             square[:, last, last] += rest @ prior.precision @ rest
         of_stops = np.arange(last + 1, count)
         square[:, of_stops, of_stops] += 1.0
-        return square, np.sum([of_settings[id(own)][1] for own in self._own], axis=0)
+        return square, np.sum([logarithm for _, logarithm in of_axes], axis=0)
+
+    def _of_axes(self, compute: Callable[[Products], Result]) -> list[Result]:
+        """Return what is computed from the columns of each axis; without stops, all axes have the same columns."""
+        if not self.stops:
+            return [compute(self.columns)] * 3
+        return [compute(own) for own in self._own]
 
     def linear_map(self, setting: Setting) -> LinearMap:
         """Return the linear map from small changes of the readings to the parameters, under a noise setting."""
-        inverse, distinct = self._inverse(setting), {id(own): own for own in self._own}
-        influence = {key: own.influence(setting) for key, own in distinct.items()}
-        weights, back = [], []
-        for own, at, total, scale in zip(self._own, self._at, self._total, self.scale, strict=True):
+        inverse, weights, derivative = self._inverse(setting), [], []
+        of_axes = self._of_axes(lambda own: own.influence(setting))
+        for influence, at, total, scale in zip(of_axes, self._at, self._total, self.scale, strict=True):
             free = total != self.count  # the readings lie between parameters and stops
-            weights.append(influence[id(own)][at[free]])
-            back.append(inverse[: self.count, (total - (total > self.count))[free]] / scale**2)
-        return LinearMap((weights[0], weights[1], weights[2]), (back[0], back[1], back[2]))
+            weights.append(influence[at[free]])
+            derivative.append(inverse[: self.count, (total - (total > self.count))[free]] / scale**2)
+        return LinearMap(tuple(weights), tuple(derivative))
 
     def prior_covariances(self, setting: Setting) -> dict[str, Values]:
         """Return the contribution of each effect's prior to the covariance of the parameters: (p, p) arrays."""
         inverse = self._inverse(setting)[: self.count, : self.count]
-        return {t.effect.name: inverse[:, at] @ t.prior.precision @ inverse[at] for at, t in self._priors if t.prior}
+        return {t.effect.name: inverse[:, at] @ prior.precision @ inverse[at] for at, t, prior in self._priors}
 
     def _inverse(self, setting: Setting) -> Values:
         """Return the inverse of the products of the columns of parameters and stops: (q, q) array."""

@@ -1,4 +1,4 @@
-"""Fit base and effects together, the last stage of a fit for both sensors; the effects are configured or selected."""
+"""Fit bias, matrix and effects together: the last stage of a fit, for both sensors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def fit(
     sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Fit the effects of ``settings["effects"][sensor]`` together with bias and matrix, whatever the method was.
+    """Fit the effects of ``settings["effects"][sensor]`` together with bias and matrix, after every method.
 
     Returns ``previous`` unchanged if there are no effects to add.
     """
@@ -51,9 +51,9 @@ def fit(
 def mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
     """Fit the accelerometer with the mountings of its turns; None if the recordings do not determine them.
 
-    Effects that are selected in addition to the listed ones are fitted together with the mountings, which would be
-    biased otherwise. Errors of the table's angle are fitted only if they are listed, because a wrongly selected one
-    would bias the mountings.
+    Effects that are missing in the list are selected and fitted, too: without them the mountings would be biased.
+    Errors of the table's angle are fitted only if they are listed, because a wrongly selected one would bias the
+    mountings.
     """
     listed = settings["effects"]["accelerometer"]
     within = (MOUNTING, *effect(MOUNTING).contains)
@@ -63,8 +63,8 @@ def mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str,
     observations = observe("accelerometer", recordings, settings["table"])
     noise = noise_of("accelerometer", recordings, settings)
     try:
-        seen = select(observations, names, noise, settings["sensor"]["accelerometer"]).names
-        names += [name for name in seen if not of_the_angle(name)]
+        selected = select(observations, names, noise, settings["sensor"]["accelerometer"]).names
+        names += [name for name in selected if not of_the_angle(name)]
         return fit_joint("accelerometer", recordings, names, noise, settings)
     except NotObservableError:
         return None

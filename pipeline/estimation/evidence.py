@@ -30,9 +30,9 @@ Set: TypeAlias = frozenset[str]
 # The prior was chosen on 738 simulated sensors: docs/blind_study.md.
 SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the sensor file's limits
 SCALE_PRIOR = np.log([0.2375, 0.2375, 0.2375, 0.2375, 0.03, 0.02])
-NEGLIGIBLE = 1e-4  # weight of a hypothesis or of a part of a mixture that is left out
+NEGLIGIBLE = 1e-4  # weight below which a hypothesis or a component of a mixture is not used
 READINGS, ZEROS = -2, -1  # columns of the padded products
-WIDE = 8  # columns of an effect from which on LAPACK's factorisation costs less than an elimination of all side by side
+WIDE = 8  # columns of an effect above which LAPACK's factorisation costs less than a vectorised elimination
 RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
 
 
@@ -48,22 +48,22 @@ class Version:
 class Problem:
     """Candidates in addition to a base, which is projected out, under t hypotheses about the noise."""
 
-    products: Values  # (t, p + 1, p + 1); of columns over the limits of their parameters, and last the readings
+    products: Values  # (t, p + 1, p + 1); of columns per limit of their parameters, and last the readings
     prior: Values  # (t,); log pi(theta) - 1/2 log|C| - 1/2 log|X^T C^-1 X|
     within: float  # sum of squares that no column changes
     free: float  # nu
     versions: Mapping[str, Sequence[Version]]
     limits: Mapping[str, Values]  # (k,), of the parameters of each effect; the unit of its columns
     excluded: Mapping[str, Set] = field(default_factory=dict)  # effects that are never in a set with this one
-    least: float = 0.0  # of sigma^2
+    least: float = 0.0  # lower bound of sigma^2
 
     @cached_property
     def padded(self) -> Values:
-        """The products with a further column of zeros, the last, which fills up sets of fewer columns."""
+        """The products with a last column of zeros, which stands for the missing columns of smaller sets."""
         return np.pad(self.products, ((0, 0), (0, 1), (0, 1)))
 
     def rss(self, squares: Values) -> Values:
-        """Return -nu/2 log RSS of sums of squares; where sigma has a lower bound, log L at its likeliest value."""
+        """Return -nu/2 log RSS of sums of squares; if sigma has a lower bound, log L at its likeliest value."""
         total = np.maximum(squares + self.within, 1e-300)
         if not self.least:
             return np.asarray(-0.5 * self.free * np.log(total))
@@ -80,7 +80,7 @@ class Problem:
 
 
 def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
-    """Return the linear map of columns to columns per limit of the parameters, in the directions that are excited.
+    """Return the linear map from columns to columns per limit of the parameters, in the excited directions.
 
     ``products``: (k, k), with the base projected out. ``size``: (k,), norm of the columns before the projection.
     ``least``: smallest share of that norm after the projection.
@@ -107,10 +107,11 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
     """Return the problem of candidates at a fit.
 
     ``columns``: effect, log weight and place of the columns of each version, the fitted one first. ``products``: (t, p
-    + 1, p + 1), of columns and the fit's residual without the base, white noise first. ``size``: (p + 1,), norm of the
-    columns with the base. ``known``: values of fitted effects, whose columns times them are added to the residual; and
-    limits by the data sheet. Where there is none, the unit is the parameter that adds as much as the noise of all
-    ``samples``. ``new``: share of a column's norm below which the base explains it. Others: of ``Problem``.
+    + 1, p + 1), of columns and the fit's residual, with the base projected out; white noise first. ``size``: (p + 1,),
+    norm of the columns before this projection. ``known``: values of the fitted effects, whose signal is added to the
+    residual; and limits by the sensor file. An effect without a limit has as unit the parameter whose signal is as
+    large as the noise of all ``samples``. ``new``: share of a column's norm below which the base explains it. Others:
+    of ``Problem``.
     """
     (fitted, stated), values = known, np.zeros(products.shape[1])
     versions: dict[str, list[Version]] = {}
@@ -121,7 +122,7 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
         versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
     products[:, :, -1] += products @ values
     products[:, -1] += values @ products
-    changed = products.copy()
+    scaled = products.copy()
     for name, _, at in columns:
         inner = products[0, at, at]
         if name not in limits:
@@ -129,9 +130,9 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
             limit = stated.get(name, noise)[: len(noise)]
             limits[name] = np.where(np.isfinite(limit), limit, noise)
         change = excited(inner, size[at], limits[name], new)
-        changed[:, :, at] = changed[:, :, at] @ change
-        changed[:, at] = change.T @ changed[:, at]
-    return Problem(changed, prior, within, free, versions, limits, excluded, least)
+        scaled[:, :, at] = scaled[:, :, at] @ change
+        scaled[:, at] = change.T @ scaled[:, at]
+    return Problem(scaled, prior, within, free, versions, limits, excluded, least)
 
 
 class Given:
@@ -139,18 +140,17 @@ class Given:
 
     def __init__(self, problem: Problem, sets: Sequence[Mapping[str, Pick]]) -> None:
         self.problem, products = problem, problem.padded
-        held = [[problem.versions[name][v].columns for name, (v, _) in picks.items()] for picks in sets]
-        shape = len(sets), max(sum(map(len, columns)) for columns in held)
+        columns = [[problem.versions[name][v].columns for name, (v, _) in picks.items()] for picks in sets]
+        shape = len(sets), max(sum(map(len, each)) for each in columns)
         at, scale = np.full(shape, ZEROS), np.ones(shape)
-        for row, (picks, columns) in enumerate(zip(sets, held, strict=True)):
-            if columns:
-                own = slice(sum(map(len, columns)))
-                at[row, own] = np.concatenate(columns)
-                scale[row, own] = np.repeat([SCALES[s] for _, s in picks.values()], [len(c) for c in columns])
-        L = np.linalg.cholesky(
-            products[:, at[:, :, None], at[:, None, :]] + scale[:, :, None] ** -2.0 * np.eye(shape[1])
-        )
-        self._half = np.linalg.inv(L) @ products[:, at]  # what the sets take
+        for row, (picks, each) in enumerate(zip(sets, columns, strict=True)):
+            if each:
+                used = slice(sum(map(len, each)))
+                at[row, used] = np.concatenate(each)
+                scale[row, used] = np.repeat([SCALES[s] for _, s in picks.values()], [len(c) for c in each])
+        inner = products[:, at[:, :, None], at[:, None, :]] + scale[:, :, None] ** -2.0 * np.eye(shape[1])
+        L = np.linalg.cholesky(inner)
+        self._half = np.linalg.inv(L) @ products[:, at]  # its squares are what each column shares with the sets
         self.squares = problem.products[:, None, -1, -1] - np.sum(self._half[..., READINGS] ** 2, axis=2)
         logarithm = 2.0 * np.sum(np.log(np.einsum("tskk->tsk", L)), axis=2) + 2.0 * np.sum(np.log(scale), axis=1)
         chosen = [sum(SCALE_PRIOR[s] + problem.versions[n][v].log_weight for n, (v, s) in p.items()) for p in sets]
@@ -162,56 +162,54 @@ class Given:
 
     def conditionals(self, names: Sequence[str]) -> list[dict[str, Values]]:
         """Return log E of each set with each of some effects, without prior odds: its (versions, scales) array."""
-        found: list[dict[str, Values]] = [{} for _ in self.level.T]
+        of_sets: list[dict[str, Values]] = [{} for _ in self.level.T]
         for block in self.blocks(names):
-            each = np.logaddexp.reduce(block.score, axis=1).transpose(1, 2, 0)
-            for k, own in enumerate(each):
-                found[k] |= zip(block.names, np.split(own, block.starts[1:]), strict=True)
-        return found
+            evidence = np.logaddexp.reduce(block.score, axis=1).transpose(1, 2, 0)
+            for of_set, each in zip(of_sets, evidence, strict=True):
+                of_set.update(zip(block.names, np.split(each, block.starts[1:]), strict=True))
+        return of_sets
 
     def mixtures(self, names: Sequence[str]) -> dict[str, tuple[Values, Values, Values]]:
-        """Return log weight, (m,), mean and standard deviation, (m, k), of parameters over their limits.
+        """Return the distribution of each effect's parameters over their limits, given the first set: a mixture.
 
-        They are for each effect, given the first set.
+        Log weight, (m,), mean and standard deviation, (m, k), of its normal components.
         """
-        found = {}
+        mixtures = {}
         for block in self.blocks(names):
             score, inner, cross, squares = block.score[:, :, 0], block.inner[:, 0], block.cross[:, 0], block.squares
-            ends = [*block.starts[1:], score.shape[2]]
             top = np.maximum.reduceat(np.max(score, axis=(0, 1)), block.starts)
-            owner = np.repeat(np.arange(len(ends)), np.diff([*block.starts, ends[-1]]))
+            owner = np.repeat(np.arange(len(block.names)), np.diff([*block.starts, score.shape[2]]))
             kept = score > top[owner] + np.log(NEGLIGIBLE)
             s, t, m = np.nonzero(kept)
-            k = inner.shape[-1]
-            inverse = np.linalg.inv(inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(k))
+            inverse = np.linalg.inv(inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
             mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
-            spread = np.einsum("nkk->nk", inverse) * self.problem.variance(squares[:, :, 0][kept])[:, None]
-            deviation = np.sqrt(np.maximum(spread, 0.0))
-            for place, name in enumerate(block.names):
-                own = owner[m] == place
-                found[name] = weight[own], mean[own], deviation[own]
-        return found
+            variance = np.einsum("nkk->nk", inverse) * self.problem.variance(squares[:, :, 0][kept])[:, None]
+            deviation = np.sqrt(np.maximum(variance, 0.0))
+            for j, name in enumerate(block.names):
+                of_effect = owner[m] == j
+                mixtures[name] = weight[of_effect], mean[of_effect], deviation[of_effect]
+        return mixtures
 
     def blocks(self, names: Sequence[str]) -> list[Block]:
         """Return further effects, grouped by their number of columns."""
-        sizes: dict[int, list[str]] = {}
+        by_size: dict[int, list[str]] = {}
         for name in names:
-            sizes.setdefault(len(self.problem.versions[name][0].columns), []).append(name)
-        out, products = [], self.problem.padded
-        for alike in sizes.values():
-            each = [self.problem.versions[name] for name in alike]
+            by_size.setdefault(len(self.problem.versions[name][0].columns), []).append(name)
+        blocks, products = [], self.problem.padded
+        for members in by_size.values():
+            each = [self.problem.versions[name] for name in members]
             at = np.array([version.columns for versions in each for version in versions])
             half = self._half[..., at].transpose(0, 1, 3, 4, 2)
             inner = products[:, None, at[:, :, None], at[:, None, :]] - half @ half.swapaxes(3, 4)
             cross = products[:, None, at, READINGS] - (half @ self._half[:, :, None, :, READINGS, None])[..., 0]
             flat = inner.reshape(-1, *inner.shape[2:]), cross.reshape(-1, *cross.shape[2:]), self.squares.ravel()
-            gain, log_det = (found.reshape(-1, *inner.shape[:3]) for found in _explained(*flat))
+            gain, log_det = (values.reshape(-1, *inner.shape[:3]) for values in _explained(*flat))
             squares = self.squares[:, :, None] - gain
             weight = SCALE_PRIOR[:, None, None, None] + [v.log_weight for versions in each for v in versions]
             score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, :, None] + weight
             starts = np.cumsum([0, *(len(versions) for versions in each[:-1])])
-            out.append(Block(alike, starts, inner, cross, score, squares + self.problem.within))
-        return out
+            blocks.append(Block(members, starts, inner, cross, score, squares + self.problem.within))
+        return blocks
 
 
 @dataclass(frozen=True)
@@ -223,15 +221,15 @@ class Block:
     inner: Values  # (t, s, m, k, k), products of columns
     cross: Values  # (t, s, m, k), with the readings
     score: Values  # (scales, t, s, m), log E
-    squares: Values  # (scales, t, s, m), sum of squares that is left
+    squares: Values  # (scales, t, s, m), RSS
 
 
 def _explained(inner: Values, cross: Values, squares: Values) -> tuple[Values, Values]:
     """Return ``c^T A^-1 c`` and ``log|A D^2|``, with ``A = G + D^-2``: (scales, t, m) arrays.
 
-    ``inner``: (t, m, k, k), G. ``cross``: (t, m, k), c. ``squares``: (t,), of the readings. Wide effects by Cholesky's
-    factor of A with c as a further row, others by elimination of all side by side; the pivots of A are not below
-    ``D^-2``.
+    ``inner``: (t, m, k, k), G. ``cross``: (t, m, k), c. ``squares``: (t,), of the readings. Effects of many columns are
+    computed by the Cholesky factor of A with c as a further row, others by a vectorised elimination; the pivots of A
+    are at least ``D^-2``.
     """
     k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
     log_det = np.broadcast_to(-k * np.log(least), (len(SCALES), *inner.shape[:2])).copy()
@@ -243,13 +241,13 @@ def _explained(inner: Values, cross: Values, squares: Values) -> tuple[Values, V
         factor = np.linalg.cholesky(joined)
         log_det += 2.0 * np.sum(np.log(np.einsum("...kk->...k", factor)[..., :k]), axis=-1)
         return np.sum(factor[..., k, :k] ** 2, axis=-1), log_det
-    left = np.concatenate([inner, cross[..., None]], axis=3).transpose(2, 3, 0, 1)[:, :, None]
-    left = left + np.eye(k, k + 1)[:, :, None, None, None] * least
+    matrix = np.concatenate([inner, cross[..., None]], axis=3).transpose(2, 3, 0, 1)[:, :, None]
+    matrix = matrix + np.eye(k, k + 1)[:, :, None, None, None] * least
     gain = np.zeros(log_det.shape)
     for j in range(k):
-        pivot, row = np.maximum(left[j, j], least), left[j, j + 1 :]
-        over = row / pivot
-        gain += row[-1] * over[-1]
+        pivot, row = np.maximum(matrix[j, j], least), matrix[j, j + 1 :]
+        ratio = row / pivot
+        gain += row[-1] * ratio[-1]
         log_det += np.log(pivot)
-        left[j + 1 :, j + 1 :] -= row[:-1, None] * over
+        matrix[j + 1 :, j + 1 :] -= row[:-1, None] * ratio
     return gain, log_det

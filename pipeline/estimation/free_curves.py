@@ -1,17 +1,17 @@
-"""Free curves, with which the posterior represents physics that is not in the catalogue.
+"""Free curves, which represent physics outside the catalogue in the posterior.
 
     other_temperature : sum over n = 1 to 5 of c_n P_n(x), x the temperature over its span
     other_rate        : the same of |omega|, and d_x omega_x^2 + d_y omega_y^2, which differ with the axis of the turn
     other_input       : sum over n = 2 to 5 of c_n P_n(x), x the axis' own input over its largest value
     other_angle       : sum over n = 1 to 8 of a_n cos(n A) + b_n sin(n A), A the table's angle
 
-with Legendre polynomials P_n and coefficients for each axis. A curve has no limit by the sensor file: its coefficients
-have the size of the noise, times the scales of ``pipeline.estimation.evidence``. The many coefficients lower the
-evidence, so that a curve is more probable than an effect only if the residual of that effect is larger than noise.
+with Legendre polynomials P_n and coefficients for each axis. A curve has no limit by the sensor file: the unit of its
+coefficients is the size of the noise, times the scales of ``pipeline.estimation.evidence``. The many coefficients lower
+the evidence, so that a curve is more probable than an effect only if the residual of that effect is larger than noise.
 
-An effect that depends on time has a similar signal to a bend in the dependence on temperature. So, where slow effects
-are in question, ``other_temperature`` has a second form with one coefficient for each axis, ``c exp(-x / w)`` or
-``c (1 - tanh(x / w))``, x the share of the span from one of its ends.
+The signal of an effect that depends on time is similar to that of a bend in the dependence on temperature. If an effect
+of time or temperature is selected, ``other_temperature`` therefore has a second form with one coefficient for each
+axis, ``c exp(-x / w)`` or ``c (1 - tanh(x / w))``, x the share of the span from one of its ends.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion, Values
 
-OTHER = "other_"  # how the names of free curves begin
-BEND = ":bend"  # how the name of their second form ends, which answers state under the name of the first
-WIDTHS = tuple(np.geomspace(0.1, 0.5, 12))  # of a bend, shares of the span: sharper ones are steps, wider parabolas
+OTHER = "other_"  # prefix of the names of free curves
+BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first
+WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
 # Prior probability of a bend over that of an effect. With it, a bend was an answer in all 54 simulated units (seed 61)
 # that hid one and selected a slow effect, and below 0.5 in all 34 (seed 62) that hid the slow effect.
 BEND_SHARE = 0.5
@@ -58,7 +58,7 @@ class FreeCurve(Effect):
         )
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the curves; zeros in a recording without the covariate."""
+        """Return the curves; zeros for a recording without the covariate."""
         del K, values
         if self.covariate == "input":
             return np.asarray(legvander(truth(sensor, motion) / self.half, DEGREE)[..., 2:])
@@ -82,7 +82,7 @@ class Bend(Effect):
     meaning, excitation, experiment, source = "Physics outside the catalogue.", "", "", ""
 
     def __init__(self, forms: Sequence[tuple[float, float, bool]], form: int = 0) -> None:
-        self.forms = forms  # the end of the span and the width, degC, and whether it is soft
+        self.forms = forms  # end of the span, degC, signed width, degC, and whether the form is that of tanh
         self.end, self.width, self.soft = forms[form]
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
@@ -92,7 +92,7 @@ class Bend(Effect):
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the bend."""
         del sensor, K, values
-        assert motion.temperature is not None  # noqa: S101  (it needs it)
+        assert motion.temperature is not None  # noqa: S101  (by ``needs``)
         x = (motion.temperature - self.end) / self.width
         return np.asarray((1.0 - np.tanh(x) if self.soft else np.exp(-x))[:, None])
 
@@ -104,16 +104,15 @@ def free_curves(sensor: str, motions: Sequence[Motion], *, bent: bool) -> list[E
         "rate": [length(m.angular_rate) for m in motions],
         "angle": [m.angle for m in motions],
     }
-    found: list[Effect] = []
+    curves: list[Effect] = []
     for covariate, values in spans.items():
         known = [v for v in values if v is not None and len(v)]
         low, high = (min(v.min() for v in known), max(v.max() for v in known)) if known else (0.0, 0.0)
         if high > low and (covariate != "temperature" or len(known) == len(values)):
-            found.append(FreeCurve(covariate, float(low), float(high)))
+            curves.append(FreeCurve(covariate, float(low), float(high)))
             if bent and covariate == "temperature":
-                ends, widths = ((float(low), 1.0), (float(high), -1.0)), np.multiply(WIDTHS, high - low)
-                found.append(
-                    Bend([(end, sign * w, soft) for (end, sign), soft, w in product(ends, (False, True), widths)])
-                )
+                ends = (float(low), 1.0), (float(high), -1.0)
+                forms = product(ends, (False, True), WIDTHS * (high - low))
+                curves.append(Bend([(end, sign * width, soft) for (end, sign), soft, width in forms]))
     largest = max(float(np.abs(truth(sensor, m)).max()) for m in motions)
-    return [*found, *([FreeCurve("input", -largest, largest)] if largest > 0.0 else [])]
+    return [*curves, *([FreeCurve("input", -largest, largest)] if largest > 0.0 else [])]

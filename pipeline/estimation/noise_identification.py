@@ -8,7 +8,7 @@ The section states for each axis
 - the quality of the fit of the most probable set.
 
 The readings are from the static recording before any filter, else from the rests. A ramp, sinusoids and a changing
-temperature are regressed out (``noise_regression``).
+temperature are regressed out.
 
 A fit is in doubt if the power of the spectrum in bins of frequency differs from the model: the cube root of a
 chi-square variable over its degrees of freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty,
@@ -22,17 +22,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from pipeline.estimation.noise_regression import Regression, Stretch
-from pipeline.estimation.noise_search import QUANTILE, Search, best_of, limits, ranked
+from pipeline.estimation.noise_search import (
+    ONE_SIDED,
+    QUANTILE,
+    Regression,
+    Search,
+    Stretch,
+    best_of,
+    limits,
+)
 from pipeline.estimation.noise_terms import (
     MARKOV,
     SINGLE,
     STOCHASTIC,
     WHITE,
+    Trial,
     allan_deviation,
     allan_variance,
     at_once,
     each_term,
+    evaluate,
     solved,
     spectrum_of,
     unit_of,
@@ -60,10 +69,15 @@ LEAST_FIT_PROBABILITY = 1e-4  # probability of the bins under the fit, below whi
 COARSE_COUNTS = 0.4  # standard deviation in counts, below which rounding is not white noise (Widrow & Kollar 2008)
 LONGEST_AVERAGE_SHARE = 0.25  # longest averaging time that the Allan deviation determines, in lengths of the recording
 AVERAGES_PER_DECADE = 8
+MOST_PUBLISHED = 12  # compositions
 DERIVATIVE_STEP = 1.01  # of a correlation time, for a derivative
 SLOW = ("bias_instability", "random_walk", "gauss_markov", "ramp", "temperature")
 STILL = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
 OF_RESTS = "no static recording: what is slower than a rest is not seen, and in rests by hand the unit moves"
+NOT_FITTED = {
+    "ramp": "only a static recording shows it",
+    "temperature": "the temperature did not change, or only as a ramp",
+}
 
 
 def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
@@ -196,6 +210,9 @@ def _axis(
         doubts.append(f"no composition fits the spectrum (p = {p_value:.1g}): a filter, vibration or a disturbance")
     if regression.scale < COARSE_COUNTS * regression.count:
         doubts.append(f"the readings are rounded to {regression.count:.3g} {unit}, which is coarser than their noise")
+    candidates = sorted(search.found.values(), key=lambda c: c.bic)
+    weight = np.exp(-0.5 * (np.array([c.bic for c in candidates]) - best.bic))
+    probability = (weight / weight.sum()).tolist()
     present = _present(best, bounds[0], regression)
     terms: JSON = {}
     for kind in SINGLE:
@@ -210,13 +227,13 @@ def _axis(
             }  # fmt: skip
     processes = [term for term in present if "correlation_time_s" in term]
     terms[STOCHASTIC[MARKOV]] = sorted(processes, key=lambda term: float(term["correlation_time_s"]["value"]))
-    deterministic = regression.terms(best, spectrum)
+    deterministic = _deterministic(regression, best, spectrum)
     return {
         "terms": terms | deterministic,
         "reason": None,
         "ranking": [
-            {"terms": regression.names(c), "delta_bic": c.bic - best.bic, "probability": probability}
-            for c, probability in ranked(search)
+            {"terms": regression.names(c), "delta_bic": c.bic - best.bic, "probability": p}
+            for c, p in list(zip(candidates, probability, strict=True))[:MOST_PUBLISHED]
         ],
         "p_value": p_value,
         "allan": _allan(*measured, best, present, deterministic, spectrum),
@@ -283,3 +300,43 @@ def _reason(kind: int, names: Sequence[str], spectrum: Spectrum) -> str:
         f"the recording is too short: over its {spectrum.length:.3g} s the Allan deviation falls like that of white "
         f"noise up to averaging times of {LONGEST_AVERAGE_SHARE * spectrum.length:.3g} s"
     )
+
+
+def _deterministic(regression: Regression, best: Candidate, spectrum: Spectrum) -> JSON:
+    """Return ramp, temperature and sinusoids, as published."""
+    ramp_unit, temperature_unit = unit_of("ramp", regression.unit), f"{regression.unit}/degC"
+    beta, covariance = best.fit.beta[0], best.fit.beta_covariance[0]
+    sinusoids = []
+    for j, line in zip(range(len(regression.optional), len(beta), 3), regression.lines, strict=False):
+        size = float(np.hypot(line.a, line.b))
+        direction = np.array([line.a, line.b]) / size
+        spread = float(np.sqrt(direction @ covariance[j : j + 2, j : j + 2] @ direction))
+        amplitude = _with_interval(regression.scale * float(np.hypot(*beta[j : j + 2])), regression.scale * spread)
+        of_frequency = float(np.sqrt(covariance[j + 2, j + 2])) / (regression.span * size)
+        frequency = _with_interval(line.frequency, of_frequency)
+        sinusoids.append(amplitude | {"unit": regression.unit, "frequency_hz": frequency})
+    return {
+        "ramp": {"unit": ramp_unit} | _slope(regression, best, spectrum, "ramp", regression.span),
+        "temperature": {"unit": temperature_unit} | _slope(regression, best, spectrum, "temperature", 1.0),
+        "sinusoid": sinusoids,
+    }
+
+
+def _slope(regression: Regression, best: Candidate, spectrum: Spectrum, name: str, per: float) -> JSON:
+    """Return the coefficient of a column as published; the column is ``per`` times its unit."""
+    absent = {"value": None, "interval": None, "upper_limit": None}
+    if name not in regression.optional:
+        return absent | {"reason": NOT_FITTED[name]}
+    column = 1 + regression.optional.index(name)
+    columns = tuple(sorted({*best.columns, column}))
+    fit = evaluate(spectrum, [Trial(int(best.fit.axis[0]), best.kinds, columns, best.parameters)])
+    value = regression.scale / per * float(fit.beta[0, column - 1])
+    spread = regression.scale / per * float(np.sqrt(fit.beta_covariance[0, column - 1, column - 1]))
+    if column in best.columns:
+        return _with_interval(value, spread)
+    return absent | {"reason": "not seen", "upper_limit": abs(value) + ONE_SIDED * spread}
+
+
+def _with_interval(value: float, spread: float) -> JSON:
+    """Return a value with its 95 % interval as published."""
+    return {"value": value, "interval": [value - QUANTILE * spread, value + QUANTILE * spread]}

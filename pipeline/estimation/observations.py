@@ -1,11 +1,11 @@
 """Select the samples of every recording of a unit for a fit against a table's motion.
 
-If readings and log are valid, these are used:
+Of the samples whose readings and log are valid, a fit uses
 
-* settled rests, as means over at most 1 s. The motion does not change in a rest, so that only white noise is averaged;
-  its sum of squares is stored.
-* samples at which the log describes the motion. Where the log is too coarse for a ramp or a step, its angular
-  acceleration is wrong, which would bias a lever arm or a delay; such samples are not used.
+* those of settled rests, as means over at most 1 s. The motion does not change in a rest, so that only white noise is
+  averaged; its sum of squares is stored.
+* those at which the log describes the motion. Where the log is too coarse for a ramp or a step, its angular
+  acceleration is wrong, which would bias a lever arm or a delay.
 
 If the readings were filtered, the motion is filtered, too. If the log has no rate, samples of a gyroscope are not used
 while the output of the filter depends on unknown rates.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,13 +38,13 @@ if TYPE_CHECKING:
 ROLES = ("accelerometer", "gyroscope", "static")
 BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
 SHORTEST_BLOCK_S = 4.0  # a fraction of the shortest correlation time of the grid
-MOST_BLOCKS = 600  # where the bias changes within longer ones: as many as give the right answers (docs/blind_study.md)
-FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # share of the largest rate that a filter may still hold of a doubtful one
-LONGEST_RESPONSE = 400  # samples
-# Variance of the angle's errors at a stop over that of noise, below which they stay noise: a gain in 2 log L by chance
-# is then a tenth larger, of 10 and more that the gates of ``selection`` ask for.
+MOST_BLOCKS = 600  # if the bias changes within longer ones: as many as give the right answers (docs/blind_study.md)
+FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # error by unknown rates in the filter's output: share of the largest rate; deg/s
+LONGEST_RESPONSE = 400  # samples of a filter's impulse response on each side
+# Variance of the angle's errors at a stop over that of noise, below which they count as noise: gains in 2 log L by
+# chance are then a tenth larger, and the gates of ``selection`` require 10 and more.
 HIDDEN_ANGLE = 0.1
-LEFT_OUT = 1e-9  # weight of rows that are left out: their information vanishes, and no block is empty
+LEFT_OUT = 1e-9  # factor on the weight of rows that are not used: not 0, so that no block is empty
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,12 @@ class Part:
     name: str
     motion: Motion
     reading: Values  # (m, 3), g or deg/s
-    # (m,); samples of each row, minus what a filter's correlation takes from their information
-    weight: Values
+    weight: Values  # (m,); effective number of independent samples of each row
     scatter: Values  # (3,); sum of squares about the means, weighted
     clock_shared: bool
     interval: float  # s; between the recording's samples
-    rounding: Values | None = None  # (m,); variance of the rate by a coarse encoder, (deg/s)^2; None of a fine one
+    rounding: Values | None = None  # (m,); variance of the rate by a coarse encoder, (deg/s)^2; None: a fine one
+    # motion by names and values of effects of timing
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -67,15 +68,14 @@ class Observations:
     """The data of one sensor for a fit."""
 
     sensor: str
-    parts: tuple[Part, ...]  # in the order of time where the clock is shared
+    parts: tuple[Part, ...]  # in the order of time if the clock is shared
     earth: bool  # whether Earth's rotation is in the motion
-    # standard deviations of what the bench adds, by effect (``bench_priors``)
-    bench: Mapping[str, float] = field(default_factory=dict)
+    bench: Mapping[str, float] = field(default_factory=dict)  # standard deviations by effect (``bench_priors``)
     mounting_in_doubt: bool = False  # whether one mounting does not explain all turns (note ``N-SEATS``)
-    angle_deg: float = 0.0  # standard uncertainty of the angle at each stop; 0 where noise hides it
+    angle_deg: float = 0.0  # standard uncertainty of the angle at each stop; 0 if noise hides it
     levelling_deg: float = 0.0  # standard uncertainty of the table's level; 0: not stated
     white: float = 0.0  # standard deviation of a sample's white noise, mean of the axes; 0: not known
-    steady: float = float("inf")  # s; how long the bias may be taken as constant by its noise
+    steady: float = float("inf")  # s; time over which the bias is constant against white noise
 
     @cached_property
     def reading(self) -> Values:
@@ -89,7 +89,7 @@ class Observations:
 
     @cached_property
     def weakened(self) -> Observations:
-        """The same, with weights that allow for the errors of the angle, for sums in which these are noise."""
+        """The observations with weights reduced for errors of the angle, for sums in which these count as noise."""
         parts = []
         for part in self.parts if self.angle_deg > 0.0 else ():
             weight, rests = part.weight / (1.0 + _lost_at_stops(part, self)), part.motion.still
@@ -100,19 +100,16 @@ class Observations:
     @cached_property
     def scatter(self) -> Values:
         """Sum of squares within the rows: (3,) array."""
-        total = np.zeros(3)
-        for part in self.parts:
-            total += part.scatter
-        return total
+        return np.asarray(np.sum([np.zeros(3), *(part.scatter for part in self.parts)], axis=0))
 
     @cached_property
     def samples(self) -> float:
-        """Number of samples, as far as they are independent."""
+        """Effective number of independent samples."""
         return float(sum(part.weight.sum() for part in self.parts))
 
     @cached_property
     def expected_square(self) -> float:
-        """Mean square of the residual over that of white noise s: 1, and what a coarse encoder adds about one axis."""
+        """Mean square of the residual over that of white noise s: 1 plus the noise of a coarse encoder's rate."""
         if self.white <= 0.0:
             return 1.0
         added = [float(part.weight @ part.rounding) for part in self.parts if part.rounding is not None]
@@ -120,26 +117,20 @@ class Observations:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """Short stretches of time in which the bias is taken as constant."""
-        return self._blocks(max(self._span / MOST_BLOCKS, min(self.steady, self._length)))
+        """Short stretches of time in which the bias is assumed constant."""
+        return self._blocks(self.steady)
 
     @cached_property
     def long_blocks(self) -> Blocks:
         """Longer stretches, so few that all three axes can have one dense covariance."""
-        return self._blocks(self._length)
+        return self._blocks(float("inf"))
 
-    @property
-    def _span(self) -> float:
-        return sum(float(np.ptp(part.motion.time)) for part in self.parts)
-
-    @property
-    def _length(self) -> float:
-        return max(SHORTEST_BLOCK_S, self._span / BLOCKS)
-
-    def _blocks(self, length: float) -> Blocks:
-        apart = [not _follows(before, part) for before, part in zip([None, *self.parts], self.parts, strict=False)]
+    def _blocks(self, longest: float) -> Blocks:
+        span = sum(float(np.ptp(part.motion.time)) for part in self.parts)
+        length = min(longest, max(SHORTEST_BLOCK_S, span / BLOCKS))
+        apart = [not _follows(before, part) for before, part in pairwise(self.parts)]
         rows = [(part.motion.time, part.weight) for part in self.parts]
-        return Blocks.of_rows(rows, np.cumsum(apart).tolist(), length)
+        return Blocks.of_rows(rows, np.cumsum([0, *apart]).tolist(), max(length, span / MOST_BLOCKS))
 
     @property
     def clock_shared(self) -> bool:
@@ -147,13 +138,10 @@ class Observations:
         return all(part.clock_shared for part in self.parts) or len(self.parts) == 1
 
 
-def _follows(before: Part | None, part: Part) -> bool:
-    """Return whether the time from the recording before is known: one clock for all, or one session in order."""
-    if before is None:
-        return False
-    if before.clock_shared and part.clock_shared:
-        return True
-    return before.motion.setup == part.motion.setup != "" and bool(before.motion.time[-1] < part.motion.time[0])
+def _follows(before: Part, part: Part) -> bool:
+    """Return whether the time between two recordings is known: one clock for all, or one session in order."""
+    in_session = before.motion.setup == part.motion.setup != "" and before.motion.time[-1] < part.motion.time[0]
+    return (before.clock_shared and part.clock_shared) or bool(in_session)
 
 
 def without_rows(observations: Observations, left_out: Sequence[Mask]) -> Observations:
@@ -174,28 +162,28 @@ def without_each_recording(observations: Observations) -> Iterator[Observations]
 
 
 def weighted(observations: Observations, noise: Noise | None) -> Observations:
-    """Return observations with weights reduced for correlated noise.
+    """Return observations with weights reduced for correlated noise and for a coarse encoder.
 
-    Errors of the angle are not considered if they are small against the noise.
+    Errors of the angle are not modelled if they are small against the noise.
     """
     parts, white = [], 0.0 if noise is None else float(np.mean(noise.white))
     for part in observations.parts:
         share = information(noise, part.interval)
-        fewer = part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter)
-        if part.rounding is not None and white > 0.0:  # the noise r of the rate: 1 / (1 + r^2 / s^2) as much
-            fewer = replace(fewer, weight=fewer.weight / (1.0 + part.rounding / white**2))  # the scatter is of rests
-        parts.append(fewer)
+        weight = share * part.weight
+        if part.rounding is not None and white > 0.0:  # the scatter is of rests: their rate has no such noise
+            weight = weight / (1.0 + part.rounding / white**2)
+        parts.append(replace(part, weight=weight, scatter=share * part.scatter))
     steady = min((steady_s(noise, part.interval) for part in parts), default=float("inf"))
-    found = replace(observations, parts=tuple(parts), white=white, steady=steady)
-    lost = [_lost_at_stops(part, found).max(initial=0.0) for part in parts]
-    return found if max(lost, default=0.0) > HIDDEN_ANGLE else replace(found, angle_deg=0.0)
+    reduced = replace(observations, parts=tuple(parts), white=white, steady=steady)
+    lost = [_lost_at_stops(part, reduced).max(initial=0.0) for part in parts]
+    return reduced if max(lost, default=0.0) > HIDDEN_ANGLE else replace(reduced, angle_deg=0.0)
 
 
 def _lost_at_stops(part: Part, observations: Observations) -> Values:
-    """Return by how much errors of the angle exceed the noise of the stop of each row, as variances: (m,) array.
+    """Return the variance of the angle's error over that of the noise, ``W d^2 / s^2``, of each row's stop: (m,) array.
 
-    Rows at one stop, or in the turn from it to the next, share an error of the size d. Together they contain the
-    information of ``W / (1 + W d^2 / s^2)`` samples of white noise s. W is their weight.
+    Rows at one stop, or in the turn from it to the next, have a common error of the size d. With the total weight W,
+    they contain the information of ``W / (1 + W d^2 / s^2)`` samples of white noise s.
     """
     angle, white = observations.angle_deg, observations.white
     if angle == 0.0 or white <= 0.0:
@@ -212,32 +200,29 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
     ``recordings``: held-out ones are not used. ``table``: ``gravity_g``, ``latitude_deg``, ``azimuth_deg``, and the
     settings of ``bench_priors``.
     """
-    parts = []
-    for recording in recordings:
-        if recording.role in ROLES and recording.samples >= 6:
-            part = _part(sensor, recording, table)
-            if part is not None:
-                parts.append(part)
-    parts.sort(key=_in_time)
-    doubt = any(note.code == "N-SEATS" for recording in recordings for note in recording.notes)
-    bench = stated_priors(table)
-    angle = float(table.get("angle_accuracy_deg") or 0.0) if table.get("motion") == "logged" else 0.0
-    level = float(table.get("levelling_deg") or 0.0)
-    return Observations(sensor, tuple(parts), earth_of(table) is not None, bench, doubt, angle, level)
+    used = [r for r in recordings if r.role in ROLES and r.samples >= 6]
+    parts = [part for part in (_part(sensor, recording, table) for recording in used) if part is not None]
 
+    def in_time(part: Part) -> tuple[bool, str, float]:
+        """Order recordings in time, within the unit or else within their setup."""
+        setup = "" if part.clock_shared else part.motion.setup
+        return not part.clock_shared, setup, float(part.motion.time[0]) if part.clock_shared or setup else 0.0
 
-def _in_time(part: Part) -> tuple[bool, str, float]:
-    """Return a key that orders recordings in time, within the unit or else within their setup."""
-    setup = "" if part.clock_shared else part.motion.setup
-    return not part.clock_shared, setup, float(part.motion.time[0]) if part.clock_shared or setup else 0.0
+    return Observations(
+        sensor,
+        tuple(sorted(parts, key=in_time)),
+        earth=earth_of(table) is not None,
+        bench=stated_priors(table),
+        mounting_in_doubt=any(note.code == "N-SEATS" for recording in recordings for note in recording.notes),
+        angle_deg=float(table.get("angle_accuracy_deg") or 0.0) if table.get("motion") == "logged" else 0.0,
+        levelling_deg=float(table.get("levelling_deg") or 0.0),
+    )
 
 
 def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part | None:
     reading = recording.reading(sensor)
-    if reading is None:
-        return None
-    motion = table_motion(recording, table)
-    if motion is None:
+    motion = None if reading is None else table_motion(recording, table)
+    if reading is None or motion is None:
         return None
     motion = replace(motion, direction=turning_direction(motion))
     filtered = recording.filter["name"] != "none"
@@ -248,52 +233,48 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     rows = rows_of(motion, valid, together=not filtered).settled(reading)
     if len(rows.first) == 0:
         return None
-    seen = rows.motion(motion) if filtered else _shared(recording, motion, rows)
-    information = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)
+    independent = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)  # share of a filter's output
     means = rows.means(reading)
-    kept = reading[rows.kept]
-    squares = (kept - np.repeat(means, rows.count.astype(int), axis=0)) ** 2
+    squares = (reading[rows.kept] - np.repeat(means, rows.count.astype(int), axis=0)) ** 2
     by_angle = rate_by_angle(recording) if sensor == "gyroscope" and recording.axis is not None else None
-    rounding = None if by_angle is None or not by_angle.noise.any() else rows.means(by_angle.noise**2)
-    within = np.sum(squares, axis=0)
     return Part(
         recording.name,
-        seen,
+        rows.motion(motion) if filtered else _shared(recording, motion, rows),
         means,
-        rows.count * information,
-        within * information,
-        recording.clock_shared,
-        recording.interval,
-        rounding=rounding,
+        weight=rows.count * independent,
+        scatter=np.sum(squares, axis=0) * independent,
+        clock_shared=recording.clock_shared,
+        interval=recording.interval,
+        rounding=None if by_angle is None or not by_angle.noise.any() else rows.means(by_angle.noise**2),
     )
 
 
 def _shared(recording: Recording, motion: Motion, rows: Rows) -> Motion:
-    """Return the motion at the rows; both sensors of a recording mostly have the same."""
-    key = "rows", id(motion.specific_force), rows.kept.tobytes(), rows.first.tobytes()  # it is kept as well
+    """Return the motion at the rows, which is mostly the same for both sensors of a recording."""
+    key = "rows", id(motion.specific_force), rows.kept.tobytes(), rows.first.tobytes()  # the array is cached, too
     if key not in recording.cache:
         recording.cache[key] = rows.motion(motion)
-    found: Motion = recording.cache[key]
-    return found
+    at_rows: Motion = recording.cache[key]
+    return at_rows
 
 
 def filtered_motion(motion: Motion, recording: Recording) -> Motion:
     """Return the motion after the filter that the readings went through.
 
-    The filter is linear, so that filtered readings are the model of filtered truth; in effects that are not linear in
-    the truth the order matters, but only while the filter's output changes.
+    The filter is linear, so that the model of the filtered truth gives the filtered readings; for effects that are not
+    linear in the truth this holds only while the filter's output does not change.
     """
-    signals = ("specific_force", "angular_rate", "specific_force_rate", "angular_acceleration")
-    found: dict[str, Any] = {name: filtered(getattr(motion, name), recording) for name in signals}
+    names = ("specific_force", "angular_rate", "specific_force_rate", "angular_acceleration")
+    signals: dict[str, Any] = {name: filtered(getattr(motion, name), recording) for name in names}
 
     def at(trajectory: Callable[..., Motion | None], **to: Any) -> Motion:  # noqa: ANN401  (an offset or a lag)
-        there = trajectory(**to)
-        assert there is not None  # noqa: S101
-        return filtered_motion(there, recording)
+        moved = trajectory(**to)
+        assert moved is not None  # noqa: S101
+        return filtered_motion(moved, recording)
 
     return replace(
         motion,
-        **found,
+        **signals,
         at_offset=None if motion.at_offset is None else partial(at, motion.at_offset),
         at_lag=None if motion.at_lag is None else partial(at, motion.at_lag),
     )
@@ -313,7 +294,6 @@ def _filter_settled(motion: Motion, recording: Recording) -> Mask:
     bend = np.zeros(len(rate))
     bend[1:-1] = np.linalg.norm(rate[2:] - 2.0 * rate[1:-1] + rate[:-2], axis=1)
     wide = np.max([bend, np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])], axis=0)
-    answer = np.abs(impulse_response(recording, 2 * min(recording.samples, LONGEST_RESPONSE) + 1))
-    left = np.convolve(np.where(sure, 0.0, 0.5 * wide), answer)[len(answer) // 2 :][: len(rate)]
-    forgotten = left <= max(FORGOTTEN * float(np.abs(rate).max()), FORGOTTEN_DPS)
-    return np.logical_and(sure, forgotten)
+    response = np.abs(impulse_response(recording, 2 * min(recording.samples, LONGEST_RESPONSE) + 1))
+    error = np.convolve(np.where(sure, 0.0, 0.5 * wide), response)[len(response) // 2 :][: len(rate)]
+    return np.logical_and(sure, error <= max(FORGOTTEN * float(np.abs(rate).max()), FORGOTTEN_DPS))

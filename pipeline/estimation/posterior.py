@@ -4,10 +4,10 @@ Every effect is in a set with the prior probability ``INCLUSION``. ``pipeline.es
 of a set, which is averaged over its scales by the product of their conditionals at the best scales (Chib, JASA 90,
 1995). Sets are found by a beam search, then by exchange of each member.
 
-An upper limit is the ``BELOW`` quantile of a parameter's absolute value, given that its effect is present, over sets,
-scales and noises, whatever was selected. It is stated only for effects that were not selected. At the detection size
-these are two of three units (26 of 40 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones.
-Source: Hoeting et al., Statistical Science 14 (1999), 382-417; conjugate prior of Zellner.
+An upper limit is the ``BELOW`` quantile of a parameter's absolute value, given that its effect is present, averaged
+over sets, scales and noises. It is stated only for effects that were not selected. At the detection size these are two
+of three units (26 of 40 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones. Source:
+Hoeting et al., Statistical Science 14 (1999), 382-417; conjugate prior of Zellner.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 INCLUSION = 0.02  # prior probability of each effect
-FIRST = 0, 3  # version and scale from which those of a set are improved
+FIRST = 0, 3  # version and scale at which the search for the best ones of a set begins
 ODDS = float(np.log(INCLUSION / (1.0 - INCLUSION)))
 BEAM, MOST = 6, 5  # sets that are extended, and their largest size
-FAR = 12.0  # of log E below the best, beyond which a set that a beam found is not looked at any further
-NEAR = 7.0  # of log E below the best, within which a set is extended, and its scales are found
-MOST_NEAR, ROUNDS = 16, 3  # of these sets; of a search for the best scales, and of exchanges
-CERTAIN = 0.97  # what is said of more than that: of the inclusions with 1.000, 96.6 % were right in those sensors
-ENOUGH = 0.95  # of an answer set
+FAR = 12.0  # of log E below the best, beyond which a set of the beam is not examined further
+NEAR = 7.0  # of log E below the best, within which a set is extended, and its best scales are determined
+MOST_NEAR, ROUNDS = 16, 3  # number of these sets; iterations of the search for the best scales, and of exchanges
+CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in those sensors
+ENOUGH = 0.95  # probability of an answer set
 BELOW = 29.0 / 30.0  # of an upper limit, see above
-LIKELY = 0.05  # share of the best probability, above which a set counts for upper limits
-HALVINGS, EXACT = 40, 1e-9  # of the interval that holds a quantile; relative
+LIKELY = 0.05  # share of the best probability, above which a set is used for upper limits
+HALVINGS, EXACT = 40, 1e-9  # iterations for a quantile; their relative precision
 FARTHEST = 40.0  # standard deviations: beyond them the normal distribution is 0 or 1 in doubles
 
 
@@ -50,16 +50,16 @@ class Found:
 
     score: float
     picks: Mapping[str, Pick]
-    spread: float = 0.0  # log of what averaging over the scales brings above the best ones
+    spread: float = 0.0  # log of the evidence averaged over the scales, over that at the best ones
     final: bool = False  # whether ``picks`` are the best ones
 
 
 @dataclass(frozen=True)
 class Answers:
-    """The results of the posterior."""
+    """Probabilities of sets of effects, and upper limits of parameters."""
 
     sets: list[tuple[tuple[str, ...], float]]  # sets and their probability, the most probable first
-    upper_limit: dict[str, Values]  # (k,), of the parameters in which the reading is linear
+    upper_limit: dict[str, Values]  # (k,), of the linear parameters of each effect
 
     def probability(self, name: str) -> float:
         """Return the probability that an effect is present."""
@@ -99,14 +99,14 @@ class Search:
         return Given(self.problem, [{n: pick for n, pick in self.pool[names].picks.items() if n not in but}])
 
     def _prune(self, seeds: Sequence[Set]) -> None:
-        """Remove hypotheses without weight, given any of the sets ``seeds``."""
+        """Remove the noise hypotheses that have no weight given any of the sets ``seeds``."""
         kept = np.zeros(len(self.problem.prior), bool)
         for names in seeds:
-            found = Given(self.problem, [dict.fromkeys(sorted(names), FIRST)])
-            blocks = found.blocks(self._allowed(names))
+            given = Given(self.problem, [dict.fromkeys(sorted(names), FIRST)])
+            blocks = given.blocks(self._allowed(names))
             best = [np.maximum.reduceat(np.max(b.score[:, :, 0], axis=0), b.starts, axis=1) for b in blocks]
-            each = np.concatenate([found.alone(), *best], axis=1)
-            kept |= np.any(each > each.max(axis=0) + np.log(NEGLIGIBLE), axis=1)
+            scores = np.concatenate([given.alone(), *best], axis=1)
+            kept |= np.any(scores > scores.max(axis=0) + np.log(NEGLIGIBLE), axis=1)
         self.problem = self.problem.under(kept)
 
     def _allowed(self, names: Set) -> list[str]:
@@ -122,7 +122,7 @@ class Search:
             level = self._near(level, NEAR)
 
     def _near(self, level: list[Set], within: float) -> list[Set]:
-        """Return the sets that are not far below the best of all; single effects in any case."""
+        """Return the sets that are within a distance of the best of all, and all single effects."""
         least = self.pool[self.best()].score - within
         return [n for n in level if len(n) <= len(self.required) + 1 or self.pool[n].score > least]
 
@@ -150,32 +150,32 @@ class Search:
         for names in new:
             self._finish(names)
         given = Given(self.problem, [self.pool[names].picks for names in new]) if new else None
-        for names, found_of in zip(new, given.conditionals([*self.problem.versions]) if given else [], strict=True):
-            own = self.pool[names]
+        conditionals = given.conditionals([*self.problem.versions]) if given else []
+        for names, evidence in zip(new, conditionals, strict=True):
+            parent = self.pool[names]
             for name in self._allowed(names):
-                found, child = found_of[name], names | {name}
-                total = float(np.logaddexp.reduce(found, axis=None))
-                score, held = total + own.spread + ODDS * len(child), self.pool.get(child)
-                if held is None or (not held.final and held.score < score):
-                    best, at = _largest(found)
+                child, total = names | {name}, float(np.logaddexp.reduce(evidence[name], axis=None))
+                score, known = total + parent.spread + ODDS * len(child), self.pool.get(child)
+                if known is None or (not known.final and known.score < score):
+                    best, pick = _largest(evidence[name])
                     spread = total - best if len(child) == 1 else 0.0
-                    self.pool[child] = Found(score, {**own.picks, name: at}, spread, final=len(child) == 1)
+                    self.pool[child] = Found(score, {**parent.picks, name: pick}, spread, final=len(child) == 1)
         return list(dict.fromkeys(names | {name} for names in level for name in self._allowed(names)))
 
     def _finish(self, names: Set) -> None:
-        """Find the best versions and scales of a set, and average over all."""
-        held = self.pool.get(names)
-        if held is not None and held.final:
+        """Determine the best versions and scales of a set, and average over all."""
+        known = self.pool.get(names)
+        if known is not None and known.final:
             return
-        picks: dict[str, Pick] = dict(held.picks) if held else dict.fromkeys(sorted(names), FIRST)
+        picks: dict[str, Pick] = dict(known.picks) if known else dict.fromkeys(sorted(names), FIRST)
         spread = score = 0.0
         for _ in range(ROUNDS):
             before, spread = dict(picks), 0.0
             for name in picks:
                 others = {n: pick for n, pick in picks.items() if n != name}
-                each = Given(self.problem, [others]).conditionals([name])[0][name]
-                score, picks[name] = _largest(each)
-                spread += float(np.logaddexp.reduce(each, axis=None)) - score
+                evidence = Given(self.problem, [others]).conditionals([name])[0][name]
+                score, picks[name] = _largest(evidence)
+                spread += float(np.logaddexp.reduce(evidence, axis=None)) - score
             if picks == before:
                 break
         if not picks:
@@ -183,10 +183,10 @@ class Search:
         self.pool[names] = Found(score + spread + ODDS * len(names), picks, spread, final=True)
 
 
-def _largest(each: Values) -> tuple[float, Pick]:
-    """Return the largest of (versions, scales) values, and where it is."""
-    v, s = divmod(int(np.argmax(each)), each.shape[1])
-    return float(each[v, s]), (v, s)
+def _largest(evidence: Values) -> tuple[float, Pick]:
+    """Return the largest of (versions, scales) values, with its version and scale."""
+    v, s = divmod(int(np.argmax(evidence)), evidence.shape[1])
+    return float(evidence[v, s]), (v, s)
 
 
 def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], names: Iterable[str]) -> Answers:
@@ -207,31 +207,31 @@ def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], name
     weight /= weight.sum()
     order = np.argsort(-weight, kind="stable")
     keys = list(pool)
-    together: dict[tuple[str, ...], float] = {}
+    probability: dict[tuple[str, ...], float] = {}
     for i in order:
         stated = tuple(sorted(name.removesuffix(BEND) for name in keys[i]))
-        together[stated] = together.get(stated, 0.0) + float(weight[i])
-    sets = sorted(together.items(), key=lambda each: -each[1])
+        probability[stated] = probability.get(stated, 0.0) + float(weight[i])
+    sets = sorted(probability.items(), key=lambda each: -each[1])
     likely = [(pool[keys[i]][0], keys[i]) for i in order[:BEAM] if weight[i] > LIKELY * weight[order[0]]]
     return Answers(sets, _upper_limits([name for name in names if not name.endswith(BEND)], likely))
 
 
 def _upper_limits(names: Sequence[str], likely: Sequence[tuple[Search, Set]]) -> dict[str, Values]:
-    """Return the upper limits of effects' parameters, given that each is there beside likely sets: (k,) arrays."""
+    """Return the upper limits of effects' parameters, given that each is present in addition to likely sets."""
     parts: dict[str, list[tuple[Values, Values, Values]]] = {}
     seen = set()
     for search, members in likely:
-        asked: dict[Set, list[str]] = {}  # by the rest of the set, beside which they are
+        by_rest: dict[Set, list[str]] = {}  # effects by the other members of the set
         for name in (n for n in names if n in search.problem.versions):
             barred = search.problem.excluded.get(name, frozenset())
-            kept = members - ((barred | {name}) - (search.required - {name}))
-            if not search.required & barred and (id(search), kept, name) not in seen:
-                seen.add((id(search), kept, name))
-                asked.setdefault(kept, []).append(name)
-        for kept, own in asked.items():
-            for name, (weight, mean, deviation) in search.given(members, members - kept).mixtures(own).items():
+            rest = members - ((barred | {name}) - (search.required - {name}))
+            if not search.required & barred and (id(search), rest, name) not in seen:
+                seen.add((id(search), rest, name))
+                by_rest.setdefault(rest, []).append(name)
+        for rest, added in by_rest.items():
+            for name, (weight, mean, deviation) in search.given(members, members - rest).mixtures(added).items():
                 limit = search.problem.limits[name]
-                parts.setdefault(name, []).append((weight + ODDS * len(kept), mean * limit, deviation * limit))
+                parts.setdefault(name, []).append((weight + ODDS * len(rest), mean * limit, deviation * limit))
     mixtures = {}
     for name in (n for n in names if n in parts):
         weight, mean, deviation = (np.concatenate(each) for each in zip(*parts[name], strict=True))
@@ -250,7 +250,7 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
     if not mixtures:
         return []
     counts = [mean.shape[1] for _, mean, _ in mixtures]
-    sizes = np.repeat([len(weight) for weight, _, _ in mixtures], counts)  # all side by side, of every quantity
+    sizes = np.repeat([len(weight) for weight, _, _ in mixtures], counts)  # components of each of all quantities
     first, of = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
     weight = np.concatenate([np.tile(each[0], k) for each, k in zip(mixtures, counts, strict=True)])
     mean = np.abs(np.concatenate([each.T.ravel() for _, each, _ in mixtures]))
@@ -261,18 +261,17 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
 
     whole = np.add.reduceat(weight, first)
     low, high = np.zeros(len(sizes)), np.maximum.reduceat(mean + 5.0 * deviation, first)
-    found = np.minimum(2.0 * np.sqrt(total(mean**2 + deviation**2) / whole), high)
-    for _ in range(HALVINGS):  # of Newton, or halvings where a step of it leaves the interval
-        above, beneath = (np.clip((found[of] + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0))
-        off = total(scipy.special.ndtr(above) - scipy.special.ndtr(-beneath)) - BELOW * whole
-        density = total((np.exp(-0.5 * above**2) + np.exp(-0.5 * beneath**2)) / deviation) / np.sqrt(2.0 * np.pi)
-        low, high = np.where(off < 0.0, found, low), np.where(off < 0.0, high, found)
-        following = found - off / np.maximum(density, 1e-300)
-        following = np.where((following > low) & (following < high), following, 0.5 * (low + high))
-        if np.all(np.abs(following - found) <= EXACT * high):
+    x = np.minimum(2.0 * np.sqrt(total(mean**2 + deviation**2) / whole), high)
+    for _ in range(HALVINGS):  # a step of Newton's method, or a halving if the step leaves the interval
+        upper, lower = (np.clip((x[of] + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0))
+        excess = total(scipy.special.ndtr(upper) - scipy.special.ndtr(-lower)) - BELOW * whole
+        density = total((np.exp(-0.5 * upper**2) + np.exp(-0.5 * lower**2)) / deviation) / np.sqrt(2.0 * np.pi)
+        low, high = np.where(excess < 0.0, x, low), np.where(excess < 0.0, high, x)
+        before, x = x, x - excess / np.maximum(density, 1e-300)
+        x = np.where((x > low) & (x < high), x, 0.5 * (low + high))
+        if np.all(np.abs(x - before) <= EXACT * high):
             break
-        found = following
-    return np.split(following, np.cumsum(counts)[:-1])
+    return np.split(x, np.cumsum(counts)[:-1])
 
 
 @cache
@@ -283,9 +282,9 @@ def prior_limit() -> float:
 
 def excluded(effects: Sequence[Effect]) -> dict[str, Set]:
     """Return the effects that are never in a set with each: those that contain one another, and the two delays."""
-    found: dict[str, set[str]] = {this.name: set() for this in effects}
+    barred: dict[str, set[str]] = {this.name: set() for this in effects}
     for this in effects:
-        for other in {*this.contains, *(DELAYS if this.name in DELAYS else ())} & found.keys() - {this.name}:
-            found[this.name].add(other)
-            found[other].add(this.name)
-    return {name: frozenset(others) for name, others in found.items() if others}
+        for other in {*this.contains, *(DELAYS if this.name in DELAYS else ())} & barred.keys() - {this.name}:
+            barred[this.name].add(other)
+            barred[other].add(this.name)
+    return {name: frozenset(others) for name, others in barred.items() if others}

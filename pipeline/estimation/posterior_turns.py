@@ -1,8 +1,8 @@
-"""Posterior over effects in turns on a table: a linear problem at a fit, for each relevant set of timing effects.
+"""Compute the posterior over effects in turns on a table: a linear problem for each relevant set of timing effects.
 
 Columns are computed at the fit of the selected effects. The readings are linearised there: ``y = r + Z p`` with the
-residual r, the columns Z and the values p of the selected effects. An effect of timing moves the motion for all
-columns; if a set with other timing effects has weight, the fit is repeated with them.
+residual r, the columns Z and the values p of the selected effects. An effect of timing changes the motion and so all
+columns; if sets with other timing effects are probable, the fit is repeated with these effects.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 
-WORTH_A_FIT = 0.01  # share of the probability of sets with other effects of timing, from which on they are fitted
-MOST_FITS = 3  # of them
-LEAST_LAG_S = 1e-4  # below it a lag has the column of a time offset, and no sign of its own
+WORTH_A_FIT = 0.01  # probability of the sets with the same other timing effects, above which these are fitted
+MOST_FITS = 3  # of other timing effects
+LEAST_LAG_S = 1e-4  # a smaller lag has the column of a time offset, whose sign is free
 
 
 def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect] = ()) -> Answers:
@@ -43,15 +43,16 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
     shown = {*(candidates.keys() - set(hidden)), *selection.names}
     candidates = {name: term for name, term in sorted(candidates.items()) if name in shown}
     candidates |= {this.name: Term(this, np.zeros(len(this.parameters(sensor)))) for this in others}
-    own, moving = frozenset(selection.names), frozenset(n for n, term in candidates.items() if term.effect.moves)
-    first = Search(_problem(selection, selection.fit, candidates), seeds=[own])
+    selected, moving = frozenset(selection.names), frozenset(n for n, term in candidates.items() if term.effect.moves)
+    first = Search(_problem(selection, selection.fit, candidates), seeds=[selected])
     curves = {this.name for this in others}
-    best = first.best([key for key in first.pool if not key & curves])  # a fit holds no curves
-    if best != own and best & moving == own & moving and any(candidates[n].effect.nonlinear for n in best ^ own):
-        first = Search(_problem(selection, _fit(selection, best, candidates), candidates), seeds=[own, best])
+    best = first.best([key for key in first.pool if not key & curves])  # a fit has no free curves
+    changed = best ^ selected
+    if changed and not changed & moving and any(candidates[n].effect.nonlinear for n in changed):
+        first = Search(_problem(selection, _fit(selection, best, candidates), candidates), seeds=[selected, best])
     searches: list[Search | None] = [first]
-    fitted = [own & moving]
-    for movers in _worth_a_fit(first, moving, own & moving):
+    fitted = [selected & moving]
+    for movers in _worth_a_fit(first, moving, selected & moving):
         names = first.best([key for key in first.pool if key & moving == movers]) - curves
         fit = _fit(selection, names, candidates)
         fitted.append(movers)
@@ -66,16 +67,16 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
     return answers(searches, owner, candidates)
 
 
-def _worth_a_fit(search: Search, moving: frozenset[str], own: frozenset[str]) -> list[frozenset[str]]:
-    """Return the sets of timing effects, other than those of the fit, with significant weight; the likeliest first."""
+def _worth_a_fit(search: Search, moving: frozenset[str], fitted: frozenset[str]) -> list[frozenset[str]]:
+    """Return the probable sets of timing effects other than the fitted one, the most probable first."""
     pool = search.pool
     total = float(np.logaddexp.reduce([found.score for found in pool.values()]))
-    shares: dict[frozenset[str], float] = {}
+    probability: dict[frozenset[str], float] = {}
     for names, found in pool.items():
         key = names & moving
-        shares[key] = shares.get(key, 0.0) + float(np.exp(found.score - total))
-    other = [key for key, share in shares.items() if key and key != own and share > WORTH_A_FIT]
-    return sorted(other, key=lambda key: -shares[key])[:MOST_FITS]
+        probability[key] = probability.get(key, 0.0) + float(np.exp(found.score - total))
+    other = [key for key, share in probability.items() if key and key != fitted and share > WORTH_A_FIT]
+    return sorted(other, key=lambda key: -probability[key])[:MOST_FITS]
 
 
 def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, Term]) -> Fit:
@@ -94,22 +95,23 @@ def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, 
 
 def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
     """Return the terms of an effect and their prior log weights."""
-    held, width = next((t for t in fit.terms if t.effect.name == term.effect.name), None), None
-    if held is not None and term.effect.nonlinear:
-        last = placed(fit.terms)[term.effect.name][1].stop - 1
-        width = float(np.sqrt(fit.covariance[last, last]) / max(abs(held.values[-1]), 1e-300))
-    found = time_constants(term.effect, sensor, held, width, between=bool(fit.terms))
+    fitted, place = placed(fit.terms).get(term.effect.name, (None, slice(0)))
+    width = None
+    if fitted is not None and term.effect.nonlinear:
+        last = place.stop - 1
+        width = float(np.sqrt(fit.covariance[last, last]) / max(abs(fitted.values[-1]), 1e-300))
+    terms = time_constants(term.effect, sensor, fitted, width, between=bool(fit.terms))
     second = float(np.log(SECOND_SHARE)) if term.effect.name in SECOND[sensor] else 0.0
-    return [(replace(each, full=False, prior=term.prior), weight + second) for each, weight in found]
+    return [(replace(each, full=False, prior=term.prior), weight + second) for each, weight in terms]
 
 
 def _products(
     selection: Selection, fit: Fit, listed: Sequence[tuple[str, Term, float]], known: int
 ) -> tuple[Design, Values, Values, Values, list[slice]]:
-    """Return a design at a fit, products of its base, those of the rest beside it, log determinants, and places.
+    """Return a design at a fit, the products of its base, those of the other columns, log determinants, and places.
 
-    The places are those of the listed terms. Where nothing is fitted beside the base, the products are those of the
-    selection's ranking. ``known``: columns of the base.
+    The base is projected out of the other columns. The places are those of the listed terms. If the fit has no effects,
+    the products are those of the selection's ranking. ``known``: number of columns of the base.
     """
     ranking, walks = selection.ranking, [*random_walks(selection.settings).values()]
     places = {
@@ -118,12 +120,11 @@ def _products(
     }
     keys = [(name, term.values.tobytes()) for name, term, _ in listed]
     if fit.terms or any(key not in places for key in keys):
-        design = design_at(
-            selection.observations, fit, [*fit.terms[: len(selection.base.terms)], *(t for _, t, _ in listed)]
-        )
+        configured = fit.terms[: len(selection.base.terms)]
+        design = design_at(selection.observations, fit, [*configured, *(term for _, term, _ in listed)])
         stacked, logarithms = design.products([WHITE, *selection.settings, *walks])
         beside = without(stacked, np.arange(known))[:, known:, known:]
-        return design, stacked[:, :known, :known], beside, logarithms, design.slices[len(selection.base.terms) :]
+        return design, stacked[:, :known, :known], beside, logarithms, design.slices[len(configured) :]
     stacked, logarithms = ranking.design.products(walks)
     beside = without(stacked, np.arange(known))[:, known:, known:]
     base = np.concatenate([ranking.stacked[:, :known, :known], stacked[:, :known, :known]])
@@ -148,10 +149,10 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
     base = base / np.outer(size[:known], size[:known])
     prior = np.array([s.prior for s in settings]) - 0.5 * (logarithms + np.linalg.slogdet(base)[1])
     pairs = zip(listed, places, strict=True)
-    own = [(name, weight, slice(at.start - known, at.stop - known)) for (name, _, weight), at in pairs]
+    columns = [(name, weight, slice(at.start - known, at.stop - known)) for (name, _, weight), at in pairs]
     samples = 3.0 * observations.samples
     return linear_problem(
-        own,
+        columns,
         products,
         size[known:],
         prior,

@@ -5,15 +5,16 @@ In each round every candidate is scored at its best noise setting. The best cand
     delta BIC > 10   and   m p < 0.01
 
 where p is the p-value of the likelihood ratio and m the number of candidates (Bonferroni). A bias that depends on time
-or temperature needs a delta BIC of 16, because wander of another kind than the model's has a similar signal. The
+or temperature needs a delta BIC of 16, because wander that the noise model does not describe has a similar signal. The
 equations of selected effects are of first order: a further effect must gain 1/5000 of their gain, or 30. While the
 residual exceeds twice the noise, an effect must also explain 5 % of the excess, because any small effect slightly
 improves a model that lacks a large one.
 
-After an effect of timing or with a time constant, the model is fitted and all columns are computed again. A selected
-effect whose delta BIC has become negative is dropped. A selected effect that another one replaces with delta BIC > 10
-is exchanged. If no candidate passes although the wander seems three times that of a static recording or of the sensor
-file, two effects may mask each other: then all pairs are tried once.
+After each acceptance the model is fitted, and if the columns have changed, all are computed again. A set with a time
+constant is refused if the recordings do not determine it: the constant may grow until bias and drift have the same
+signal. A selected effect is dropped if its delta BIC has become negative, and exchanged if another one is better by a
+delta BIC of more than 10. If no candidate passes although the wander seems three times that of a static recording or
+of the sensor file, two effects may mask each other: then all pairs are scored once.
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
+from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
 from pipeline.estimation.design import Start, Term, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gauss_markov import Setting, selection_grid
-from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms
+from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms, require_observable
 from pipeline.estimation.observations import Observations, weighted
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.model.effects import effect
@@ -46,15 +48,15 @@ GATE_P = 0.01  # of a false selection, over all candidates (Bonferroni)
 MOST = 5  # effects that one selection adds
 INFLATED = 3.0  # times the expected wander, see above
 EVIDENCE = 5.0  # difference in log L: a Bayes factor of 150, "very strong" (Kass and Raftery, JASA 90, 1995)
-ALIKE = 0.8  # share of an effect's signal that another reproduces, from which on it is a look-alike
-MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of timing is fitted to its own optimum
+ALIKE = 0.8  # share of an effect's signal that another reproduces, above which it is a look-alike
+MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of timing is fitted to its optimum
 CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start is near its optimum
-DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless the second is clearly better
+DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is selected unless the second is clearly better
 CLEARLY = 6.0  # delta BIC: "strong" evidence (Raftery 1995)
 TIE = 0.5  # delta BIC below which the catalogue's order decides
-SECOND_ORDER = 2e-4  # of the gain in 2 log L by what is selected: what equations of first order may leave of it
-HIGHEST_GATE = 30.0  # of the gate beside large effects, see above
-FAR_ABOVE = 2.0  # times the noise: the residual of a model that misses more than the catalogue holds
+SECOND_ORDER = 2e-4  # of the gain in 2 log L of the selected effects: the error of their equations of first order
+HIGHEST_GATE = 30.0  # largest delta BIC that is required after large effects, see above
+FAR_ABOVE = 2.0  # times the noise: the residual of a model that lacks more than one effect of the catalogue
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
 
@@ -71,9 +73,9 @@ def select(
 ) -> Selection:
     """Select effects.
 
-    ``configured``: effects that are in the model already. ``sensor_config``: the sensor's section of the configuration.
-    ``known``: its effects are starts for the configured ones. ``accelerometer``, for the gyroscope: its mountings.
-    ``search``: without it, no effect is scored: base and the candidates' products alone.
+    ``configured``: effects of the model. ``sensor_config``: the sensor's section of the configuration. ``known``: a
+    calibration whose effects are starts for the configured ones. ``accelerometer``, for the gyroscope: its fit with the
+    mountings. ``search``: False computes the base and the products of the candidates only, without scores.
     """
     observations, grid = weighted(observations, noise), selection_grid(noise)
 
@@ -87,16 +89,16 @@ def select(
             candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
         ranking = Ranking(observations, base, base, candidates, grid)
         limits = limits_of(observations.sensor, sensor_config)
-        found = Selection(
+        selection = Selection(
             observations, noise, sensor_config, start, grid, limits, candidates, base, base, ranking, ranking
         )
         if search:
-            found.run()
-        return found
+            selection.run()
+        return selection
 
-    found = searched(observations)
-    remaining = without_unknown_motion(observations, found.fit.terms)
-    return found if remaining is observations else searched(remaining)
+    selection = searched(observations)
+    remaining = without_unknown_motion(observations, selection.fit.terms)
+    return selection if remaining is observations else searched(remaining)
 
 
 @dataclass
@@ -109,15 +111,20 @@ class Selection:
     start: Start
     settings: list[Setting]
     limits: dict[str, Values]
-    candidates: dict[str, Term]  # where nothing is known of them but their priors
+    candidates: dict[str, Term]  # before any fit, with their priors
     base: Fit  # base and configured effects
     fit: Fit  # base, configured and selected effects
     first: Ranking  # the linear problem of the base
     ranking: Ranking  # the linear problem with the selected effects at their values
-    names: list[str] = field(default_factory=list)  # selected effects, in order
-    steps: dict[str, Score] = field(default_factory=dict)  # of each selected effect when it was accepted
+    steps: dict[str, Score] = field(default_factory=dict)  # of each selected effect, in order, when it was accepted
     alone: dict[str, Score] = field(default_factory=dict)  # of each candidate against the base
     fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)  # of base, configured and further effects
+    refused: set[frozenset[str]] = field(default_factory=set)  # sets with a time constant that is not determined
+
+    @property
+    def names(self) -> list[str]:
+        """The selected effects, in order."""
+        return list(self.steps)
 
     def chosen(self) -> list[int]:
         """Return the indices of the selected effects among the ranking's candidates."""
@@ -144,32 +151,43 @@ class Selection:
                 if not self._exchange():
                     return
                 continue
-            self.names.append(best.name)
-            self.steps[best.name] = best
-            K = self.fit.K
-            self._fit_selected()
-            moved = effect(best.name).nonlinear or effect(best.name).moves or np.abs(self.fit.K - K).max() > ANOTHER_K
-            if moved:  # the candidates' columns depend on what has changed
+            this, K = effect(best.name), self.fit.K
+            if not self._accept({**self.steps, best.name: best}):
+                continue
+            if this.nonlinear or this.moves or np.abs(self.fit.K - K).max() > ANOTHER_K:  # other columns
                 self._refit()
             self._drop()
-            self._drop_refuted()
+            self._drop_insignificant()
             self._merge()
 
-    def _beside(self, names: Sequence[str]) -> dict[str, Score]:
+    def _accept(self, steps: dict[str, Score]) -> bool:
+        """Fit the effects of ``steps`` and select them, unless a time constant is at a value that is not determined."""
+        before = self.steps, self.fit
+        self.steps = steps
+        self._fit_selected()
+        if any(effect(name).nonlinear and not effect(name).moves for name in steps):
+            try:
+                require_observable(self.observations, self.fit)
+            except NotObservableError:
+                self.refused.add(frozenset(steps))
+                self.steps, self.fit = before
+                return False
+        return True
+
+    def _given(self, names: Sequence[str]) -> dict[str, Score]:
         """Return the score of each candidate given some of the selected effects, best first."""
         return {s.name: s for s in self.ranking.scores(self.ranking.of_effects(names), self.limits)}
 
     def _scores(self) -> list[Score]:
         """Score all candidates; fit competing ones of timing or with a time constant to their optimum."""
-        scores = self._beside(self.names).values()
+        scores = list(self._given(self.names).values())
         top = max((s.delta_bic for s in scores if s.admissible), default=0.0)
-        found = []
-        for score in scores:
+        for i, score in enumerate(scores):
             this = effect(score.name)
             share = MOVER_SHARE if this.moves else CONSTANT_SHARE
-            competes = bool(this.nonlinear) and score.delta_bic > max(GATE_BIC, share * top)
-            found.append(self._refined(score) if competes else score)
-        return found
+            if this.nonlinear and score.delta_bic > max(GATE_BIC, share * top):
+                scores[i] = self._refined(score)
+        return scores
 
     def _refined(self, score: Score) -> Score:
         """Return the score of a nonlinear candidate at its own optimum."""
@@ -195,44 +213,44 @@ class Selection:
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
-        worth = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in scores if self._passes(s)}
-        if not worth:
+        values = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in scores if self._passes(s)}
+        if not values:
             return None
-        best = max(worth, key=lambda name: worth[name])
-        if best == DELAYS[1] and worth.get(DELAYS[0], 0.0) > worth[best] - CLEARLY:
+        best = max(values, key=lambda name: values[name])
+        if best == DELAYS[1] and values.get(DELAYS[0], 0.0) > values[best] - CLEARLY:
             best = DELAYS[0]
-        tied = [name for name in self.candidates if worth.get(name, 0.0) > worth[best] - TIE]
+        tied = [name for name in self.candidates if values.get(name, 0.0) > values[best] - TIE]
         name = best if best in DELAYS else tied[0]
         return next(s for s in scores if s.name == name)
 
-    def _passes(self, score: Score, beside: Sequence[int] = ()) -> bool:
-        """Return whether a candidate passes the gate; a lag cannot be negative, nor be told beside a delay.
+    def _passes(self, score: Score, partners: Sequence[int] = ()) -> bool:
+        """Return whether a candidate passes the gate; a lag cannot be negative, nor be distinguished from a delay.
 
-        ``beside`` holds the indices of candidates that the score was made with, beside what is selected.
+        ``partners``: indices of candidates that were in the model of the score in addition to the selected effects.
         """
         second_delay = score.name in DELAYS and any(name in DELAYS for name in self.names)
-        if second_delay or self._overlaps(score.name, self.names):
+        negative_lag = score.name == DELAYS[1] and score.values[0] <= 0
+        if second_delay or negative_lag or not self._possible(score.name, self.names):
             return False
-        real = score.name != DELAYS[1] or score.values[0] > 0
-        significant = score.delta_bic > self._gate(score.name) and score.p_value * len(self.candidates) < GATE_P
-        return bool(score.admissible and significant and real and self._matters(score, beside))
+        # after large effects, the gate exceeds the error of their equations of first order
+        of_first_order = SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
+        slow = effect(score.name).of_the_room(self.observations.sensor)
+        gate = float(np.clip(of_first_order, SLOW_GATE_BIC if slow else GATE_BIC, HIGHEST_GATE))
+        significant = score.delta_bic > gate and score.p_value * len(self.candidates) < GATE_P
+        return bool(score.admissible and significant and self._matters(score, partners))
 
-    def _overlaps(self, name: str, selected: Sequence[str]) -> bool:
-        """Return whether an effect contains, or is contained in, one that is configured or selected."""
-        held = [*selected, *(term.effect.name for term in self.base.terms)]
-        return any(name in effect(other).contains or other in effect(name).contains for other in held)
+    def _possible(self, name: str, selected: Sequence[str]) -> bool:
+        """Return whether an effect can be added: it contains no effect of the model, nor is contained in one."""
+        if frozenset([*selected, name]) in self.refused:
+            return False
+        others = [*selected, *(term.effect.name for term in self.base.terms)]
+        return not any(name in effect(other).contains or other in effect(name).contains for other in others)
 
-    def _gate(self, name: str) -> float:
-        """Return the delta BIC to pass; after large effects, it exceeds the residual of their first-order equations."""
-        left = SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
-        slow = effect(name).of_the_room(self.observations.sensor)
-        return float(np.clip(left, SLOW_GATE_BIC if slow else GATE_BIC, HIGHEST_GATE))
-
-    def _matters(self, score: Score, beside: Sequence[int] = ()) -> bool:
+    def _matters(self, score: Score, partners: Sequence[int]) -> bool:
         """Return whether an effect explains a significant part of a residual that is far above the noise."""
         if self.noise is None:
             return True
-        selected = [*self.ranking.of_effects(self.names), *beside]
+        selected = [*self.ranking.of_effects(self.names), *partners]
         floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
         residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
         drop = score.drop / self.ranking.samples
@@ -252,36 +270,38 @@ class Selection:
 
     def _terms(self) -> list[Term]:
         """Return the selected effects at their fitted values, or at those of the step that accepted them."""
-        held = {term.effect.name: term for term in self.fit.terms}
-        return [held.get(n) or replace(self.candidates[n], values=self.steps[n].values) for n in self.names]
+        fitted = {term.effect.name: term for term in self.fit.terms}
+        return [fitted.get(n) or replace(self.candidates[n], values=self.steps[n].values) for n in self.names]
 
-    def _forget(self, gone: Sequence[str]) -> None:
+    def _remove(self, names: Sequence[str]) -> None:
         """Remove effects from the selected and fitted ones."""
-        self.names = [name for name in self.names if name not in gone]
-        for name in gone:
-            del self.steps[name]
-        self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in gone))
+        self.steps = {name: step for name, step in self.steps.items() if name not in names}
+        self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in names))
+
+    def _replaced(self, old: str, new: Score, without: str = "") -> dict[str, Score]:
+        """Return the steps with another effect in the place of one."""
+        return {new.name if n == old else n: new if n == old else s for n, s in self.steps.items() if n != without}
 
     def _drop(self) -> None:
         for name in [n for n in self.names if not effect(n).moves]:
-            own = self._beside([n for n in self.names if n != name]).get(name)
-            if own is None or own.delta_bic < 0.0:
-                self._forget([name])
+            score = self._given([n for n in self.names if n != name]).get(name)
+            if score is None or score.delta_bic < 0.0:
+                self._remove([name])
                 if effect(name).nonlinear:
                     self._refit()
 
-    def _drop_refuted(self) -> None:
-        """Drop effects that the full fit does not need; the last ranking had columns of an earlier matrix."""
-        refuted = []
+    def _drop_insignificant(self) -> None:
+        """Drop effects that are not significant in the full fit: the ranking had columns of an earlier matrix."""
+        dropped = []
         for name, (term, block) in placed(self.fit.terms).items():
             if name not in self.names or term.effect.moves:
                 continue
             covariance = self.fit.covariance[block, block]
             wald = float(term.values @ scaled_inverse(covariance) @ term.values)
             if wald < np.count_nonzero(np.diag(covariance) > 0.0) * float(np.log(self.ranking.samples)):
-                refuted.append(name)
-        self._forget(refuted)
-        if refuted:
+                dropped.append(name)
+        self._remove(dropped)
+        if dropped:
             self._refit()
 
     def _merge(self) -> None:
@@ -291,34 +311,30 @@ class Selection:
             if part is None or general in self.names or not self.ranking.indices(general):
                 continue
             for other in [n for n in self.names if n != part and not effect(n).moves]:
-                kept = [n for n in self.names if n not in (part, other)]
-                if self._criterion([*kept, general]) > self._criterion(self.names) - GATE_BIC:
-                    self.steps[general] = self._beside(kept)[general]
-                    self.names[self.names.index(part)] = general
-                    self._forget([part, other])
+                rest = [n for n in self.names if n not in (part, other)]
+                if self._criterion([*rest, general]) > self._criterion(self.names) - GATE_BIC:
+                    self.steps = self._replaced(part, self._given(rest)[general], other)
                     self._refit()
                     return
 
     def _criterion(self, names: Sequence[str]) -> float:
         """Return ``2 log L - k log N`` of base and some candidates, at the values of the ranking."""
-        found, _ = self.ranking.of_model(self.ranking.of_effects(names))
+        log_likelihood, _ = self.ranking.of_model(self.ranking.of_effects(names))
         count = sum(len(self.candidates[n].values) for n in names)
-        return 2.0 * found - count * float(np.log(self.ranking.samples))
+        return 2.0 * log_likelihood - count * float(np.log(self.ranking.samples))
 
     def _exchange(self) -> bool:
-        """Replace a selected effect by another one that explains significantly more."""
+        """Try to replace a selected effect by another one that explains significantly more; return whether one does."""
         for name in [n for n in self.names if not effect(n).moves]:
             others = [n for n in self.names if n != name]
-            scores = self._beside(others)
-            own = scores.pop(name).delta_bic if name in scores else float("-inf")
+            scores = self._given(others)
+            delta_bic = scores.pop(name).delta_bic if name in scores else float("-inf")
             able = (s for s in scores.values() if s.admissible and not effect(s.name).moves)
-            rival = next((s for s in able if not self._overlaps(s.name, others)), None)
-            if rival is not None and rival.delta_bic > own + GATE_BIC:
-                self.names[self.names.index(name)] = rival.name
-                self.steps[rival.name] = rival
-                self._forget([name])
-                self._refit()
-                self._drop_refuted()
+            rival = next((s for s in able if self._possible(s.name, others)), None)
+            if rival is not None and rival.delta_bic > delta_bic + GATE_BIC:
+                if self._accept(self._replaced(name, rival)):
+                    self._refit()
+                    self._drop_insignificant()
                 return True
         return False
 
@@ -336,16 +352,11 @@ class Selection:
         gain = 2.0 * (fit.log_likelihood - self.fit.log_likelihood)
         if gain <= (CLEARLY if other == DELAYS[1] else 0.0):
             return False
-        step = self.steps.pop(name)
-        found, at = placed(fit.terms)[other]
-        self.names[place] = other
-        self.steps[other] = replace(
-            step,
-            name=other,
-            delta_bic=step.delta_bic + gain,
-            values=found.values,
-            uncertainty=np.sqrt(np.diag(fit.covariance)[at]),
-        )
+        term, at = placed(fit.terms)[other]
+        score = replace(self.steps[name], name=other, values=term.values)
+        uncertainty = np.sqrt(np.diag(fit.covariance)[at])
+        score = replace(score, delta_bic=score.delta_bic + gain, uncertainty=uncertainty)
+        self.steps = self._replaced(name, score)
         self.fits[tuple(self.names)] = fit
         self._refit()
         self._drop()
@@ -353,33 +364,32 @@ class Selection:
 
     def _inflated(self) -> bool:
         """Return whether the residual's wander is far above that of a static recording or of the sensor file."""
-        _, at = self.ranking.of_model([])
+        _, setting = self.ranking.of_model([])
         white = float(np.sqrt(np.mean(self.start.scale**2)))
         expected = float(self.sensor_config.get("bias_wander") or 0.0)
         if self.noise is not None and self.noise.source == "static":
             expected = float(np.sqrt(np.mean(self.noise.wander**2)))
-        return expected > 0 and self.ranking.settings[at].ratio * white > INFLATED * expected
+        return expected > 0 and self.ranking.settings[setting].ratio * white > INFLATED * expected
 
     def _pairs(self) -> None:
-        """Score all pairs once and accept the best if each of the two is needed."""
-        before, _ = self.ranking.of_model([])
-        able = [j for j, place in enumerate(self.ranking.places) if len(place)]
-        logarithm = float(np.log(self.ranking.samples))
+        """Score all pairs once and accept the best if both effects are significant."""
+        ranking = self.ranking
+        before, _ = ranking.of_model([])
+        able = [j for j, place in enumerate(ranking.places) if len(place)]
         best: tuple[float, int, int] = (2.0 * GATE_BIC, -1, -1)
         for j, k in combinations(able, 2):
-            if self.ranking.candidates[j].effect.name == self.ranking.candidates[k].effect.name:
-                continue
-            found, _ = self.ranking.of_model([j, k])
-            count = len(self.ranking.places[j]) + len(self.ranking.places[k])
-            best = max(best, (2.0 * (found - before) - count * logarithm, j, k))
-        if best[1] < 0:
+            if ranking.candidates[j].effect.name != ranking.candidates[k].effect.name:
+                gain = 2.0 * (ranking.of_model([j, k])[0] - before)
+                count = len(ranking.places[j]) + len(ranking.places[k])
+                best = max(best, (gain - count * float(np.log(ranking.samples)), j, k))
+        _, j, k = best
+        if j < 0:
             return
-        names = [self.ranking.candidates[j].effect.name for j in best[1:]]
+        number = len(able) * (len(able) - 1) / 2
         steps = {}
-        for name, partner in zip(names, best[:0:-1], strict=True):
-            scores = self.ranking.scores([partner], self.limits)
-            steps[name] = next(s for s in scores if s.name == name)
-        tried = len(able) * (len(able) - 1) / 2
-        pairs = zip(steps.values(), best[:0:-1], strict=True)
-        if all(self._passes(s, [partner]) and s.p_value * tried < GATE_P for s, partner in pairs):
-            self.names, self.steps = names, steps
+        for member, partner in ((j, k), (k, j)):
+            name = ranking.candidates[member].effect.name
+            steps[name] = next(s for s in ranking.scores([partner], self.limits) if s.name == name)
+            if not self._passes(steps[name], [partner]) or steps[name].p_value * number >= GATE_P:
+                return
+        self._accept(steps)

@@ -1,27 +1,26 @@
-"""Find and run the function of a fit's stage, and apply the correction of readings by the stages.
+"""Run the stages of a fit, and apply the correction of readings by the stages.
 
 A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``: a new
 stage needs only such a module and its name in a method's list. The stages of the staged method are functions of one
-module for each sensor, and some stages are the same for both sensors: they take the name or the sensor first. Of all
-stages,
+module for each sensor, and take their name first. Stages that are the same for both sensors take the sensor first.
 
-    recordings : all of a unit; a fit takes those of the roles that it names
+    recordings : all of a unit; a stage uses those of its roles
     previous   : the result of the stage before, whose stages the new result continues; None for the first
-    settings   : sections of the configuration; ``noise`` by sensor, where an earlier stage of the run estimated it
+    settings   : sections of the configuration; ``noise`` by sensor if an earlier stage of the run estimated it
 
-and raise ``CannotCalibrateError`` where there is no recording for them, ``NotObservableError`` where the recordings do
-not determine their parameters, ``ConfigurationError`` where they cannot follow the stage before.
+A stage raises ``CannotCalibrateError`` if there is no recording for it, ``NotObservableError`` if the recordings do not
+determine its parameters, ``ConfigurationError`` if it cannot follow the stage before.
 
-The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effects of an existing calibration, for
-validation and diagnosis with the recordings. Its uncertainty is taken from its file. If the file states none, the
-covariance is zero, which the budget states; any held-out error beyond noise is then a departure of the calibration.
+The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effects from an existing calibration file,
+for validation and diagnosis with the recordings. The uncertainty is that of the file. If the file states none, the
+covariance is zero, which the budget states; any held-out error beyond noise is then an error of the calibration.
 
 The correction by the stages so far is ``{"steps": [...]}``; each step acts on the output of the step before, on row
 vectors v:
 
     {"subtract": b}                                          v - b
     {"matrix": M}                                            v M^T, that is M v as a column
-    {"two_sided": {"positive": p, "negative": n, "switch_at": s}}   p_i v_i where v_i > s_i, else n_i v_i
+    {"two_sided": {"positive": p, "negative": n, "switch_at": s}}   p_i v_i if v_i > s_i, else n_i v_i
 
 where b, p, n, s are (3,) and M is (3, 3).
 """
@@ -47,7 +46,7 @@ STAGED = {
 }
 OF_BOTH_SENSORS = ("reference_least_squares", "effects")
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
-NOT_WANTED = "not_wanted"  # the stage of a sensor whose method is null
+NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 KINDS = "subtract, matrix, two_sided"
 
 
@@ -67,22 +66,22 @@ def fit_stage(
     previous: SensorCalibration | None,
     settings: Mapping[str, Any],
 ) -> SensorCalibration:
-    """Run a stage on the result of the stage before; of a sensor whose method is null there is none."""
+    """Run a stage on the result of the stage before; raise ``CannotCalibrateError`` if the sensor's method is null."""
     if stage == NOT_WANTED:
         raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")
     if stage == GIVEN:
         return given_calibration(sensor, settings)
     fit = import_module(stage_module(sensor, stage)).fit
-    named = (stage,) if stage in STAGED[sensor] else (sensor,) if stage in OF_BOTH_SENSORS else ()
-    found: SensorCalibration = fit(*named, recordings, previous, settings)
-    return found
+    first = (stage,) if stage in STAGED[sensor] else (sensor,) if stage in OF_BOTH_SENSORS else ()
+    calibration: SensorCalibration = fit(*first, recordings, previous, settings)
+    return calibration
 
 
 def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibration:
     """Return the given calibration of a sensor from the configuration (``method.given``).
 
-    Effects of mounting, place, table and timing belong to the bench on which the file was made: they are not used, and
-    the stage names them. Raises ``CannotCalibrateError`` if the file has no calibration of the sensor.
+    Effects of mounting, place, table and timing belong to the bench of that calibration: they are not used, and the
+    stage lists them. Raises ``CannotCalibrateError`` if the file has no calibration of the sensor.
     """
     from pipeline.estimation.uncertainty_budget import base_parameters, combined  # noqa: PLC0415  (0.1 s of Snakemake)
 
@@ -93,21 +92,13 @@ def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibra
     found = SensorCalibration.from_json(sensor, part)
     bench = part["of_the_bench"]
     kept = [i for i, name in enumerate(found.parameter_names()) if name.partition(".")[0] not in bench]
-    assert found.covariance is not None  # noqa: S101  (JSON holds zeros where none is known)
+    assert found.covariance is not None  # noqa: S101  (JSON has zeros if none is known)
     covariance = found.covariance[np.ix_(kept, kept)]
-    calibration = SensorCalibration(
-        sensor,
-        found.bias,
-        found.matrix,
-        effects=tuple(e for e in found.effects if e.name not in bench),
-        stages=(
-            StageResult(
-                GIVEN,
-                base_parameters(sensor, found.bias, found.matrix, covariance[:12, :12]),
-                details={"source": source, "sha256": given["sha256"], "notes": given["notes"], "left_out": bench},
-            ),
-        ),
-    )
+    parameters = base_parameters(sensor, found.bias, found.matrix, covariance[:12, :12])
+    details = {"source": source, "sha256": given["sha256"], "notes": given["notes"], "left_out": bench}
+    stage = StageResult(GIVEN, parameters, details=details)
+    effects = tuple(e for e in found.effects if e.name not in bench)
+    calibration = SensorCalibration(sensor, found.bias, found.matrix, effects=effects, stages=(stage,))
     if not part["uncertain"]:
         return combined(
             calibration, [], {GIVEN_SOURCE: f"{source} states no uncertainty: none is known, and zeros stand for it"}
@@ -117,7 +108,7 @@ def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibra
     return combined(calibration, [line], {})
 
 
-def staged_result(  # noqa: PLR0917  (what a stage of the staged method tells)
+def staged_result(  # noqa: PLR0917  (the results of a stage)
     name: str,
     steps: Sequence[Mapping[str, Any]],
     parameters: dict[str, dict[str, Any]],
@@ -126,7 +117,7 @@ def staged_result(  # noqa: PLR0917  (what a stage of the staged method tells)
     noise: ResidualNoise,
     degrees_of_freedom: Values,
 ) -> StageResult:
-    """Return the result of a stage; ``error``: of the magnitude of each sample; ``samples``: used, and of all."""
+    """Return the result of a stage; ``error``: of the magnitude of each sample; ``samples``: those used, and all."""
     details = {
         "samples_used": samples[0],
         "samples_left_out": samples[1] - samples[0],

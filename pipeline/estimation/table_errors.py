@@ -4,8 +4,7 @@ The true motion is the logged motion plus an error, ``u + du``, which changes th
 the standard uncertainty of independent errors:
 
     angle          each stop of the table, and in a turn between two stops e_k + (e_k+1 - e_k) (A - A_k) / (A_k+1 - A_k)
-    rate           each turn axis, relative; for an accelerometer in continuous turns its integral, an error of the
-    angle
+    rate           each turn axis, relative; in continuous turns of an accelerometer its integral, an error of the angle
     orthogonality  lean of each turn axis toward both others (``table_axis_nonorthogonality``)
     wobble         once a turn, each axis about both others: cosine and sine of the table angle
     levelling      tilt of the table about level x and y (``table_tilt``)
@@ -21,6 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
-COUNTED_STOPS = 4  # rests of a recording from which on it stops and goes: its steps are counted, whatever their rate
+COUNTED_STOPS = 4  # stops of a recording above which its steps are counted, so that the rate adds no error
 TILTS = ("angle_accuracy_deg", "orthogonality_deg", "wobble_deg", "levelling_deg")
 
 TIME_BASE = "time base"
@@ -58,23 +58,22 @@ class Reference:
     """The motion at the rows of a fit, recording by recording, by a table with stated accuracies."""
 
     sensor: str
-    motions: Sequence[Motion]  # their samples, one after the other, are the columns of a fit's weights
+    motions: Sequence[Motion]  # their samples, one after the other, are the columns of ``LinearMap.weights``
     K: Values  # (3, 3)
     table: Mapping[str, Any]
 
     def summed(self, fit: LinearMap, change: Callable[[Motion], Values | None], inputs: int) -> Values:
         """Return the change of the parameters by inputs that change the truth: (p, inputs) array.
 
-        ``change``: motion to (n, 3, inputs), or None if they change nothing.
+        ``change``: motion to the derivative of the truth, (n, 3, inputs), or None if it does not change.
         """
-        total, row = np.zeros((fit.parameters, inputs)), 0
-        for motion in self.motions:
-            rows = slice(row, row + len(motion.time))
-            row = rows.stop
+        total = np.zeros((fit.parameters, inputs))
+        edges = np.cumsum([0, *(len(motion.time) for motion in self.motions)]).tolist()
+        for motion, edge in zip(self.motions, pairwise(edges), strict=True):
             du = change(motion)
             if du is not None:
-                here = fit.rows(rows)
-                total += np.stack([here.of(du[:, :, j] @ self.K.T) for j in range(inputs)], axis=1)
+                rows = fit.rows(slice(*edge))
+                total += np.stack([rows.of(du[:, :, j] @ self.K.T) for j in range(inputs)], axis=1)
         return total
 
 
@@ -95,21 +94,20 @@ def table_errors(
 
     ``estimated``: effects of the fit; an error that one of them estimates is not an input any more.
     """
-    found, missing = [], {}
+    lines, missing = [], {}
+    setups = {motion.setup for motion in reference.motions}
     for source, key, unit, sensors, replaced_by, inputs, change in ACCURACIES:
         if reference.sensor not in sensors:
             continue
         u = reference.table.get(key)
-        setups = {motion.setup for motion in reference.motions}
-        each = [n for n in replaced_by if all(f"{n}@{setup}" in estimated for setup in setups)]
-        fitted = [name for name in replaced_by if name in estimated or name in each]
+        fitted = [n for n in replaced_by if n in estimated or all(f"{n}@{setup}" in estimated for setup in setups)]
         reason = f"estimated by {fitted[0]}" if fitted else _without(source, key, reference)
         if reason:
             missing[source] = reason
         elif u:
-            does = reference.summed(fit, partial(change, reference), inputs) if change else _angle(reference, fit)
-            found.append(type_b(source, NORMAL, float(u), unit, does))
-    return found, missing
+            by_input = reference.summed(fit, partial(change, reference), inputs) if change else _angle(reference, fit)
+            lines.append(type_b(source, NORMAL, float(u), unit, by_input))
+    return lines, missing
 
 
 def disturbance(
@@ -126,8 +124,8 @@ def disturbance(
         return None
     sums = np.zeros((len(blocks.weight), len(residuals)))
     sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0 if weight is None else weight
-    errors, _ = table_errors(reference, LinearMap((sums, sums, sums), (sums, sums, sums)).first())
-    return np.sum([e.covariance for e in errors], axis=0) if errors else None
+    lines, _ = table_errors(reference, LinearMap((sums, sums, sums), ()).first())
+    return np.sum([line.covariance for line in lines], axis=0) if lines else None
 
 
 def noise_on_table(
@@ -152,7 +150,7 @@ def _largest(reference: Reference) -> float:
 
 
 def _without(source: str, key: str, reference: Reference) -> str:
-    """Return why a source is not included; empty if it is included, or its accuracy is stated as 0."""
+    """Return why a source is not included; empty if it is, or if its accuracy is stated as 0."""
     table, clocks = reference.table, {motion.timed_by for motion in reference.motions}
     placed = table.get("latitude_deg") is not None and table.get("azimuth_deg") is not None
     if source == "Earth's rotation" and not placed:
@@ -168,72 +166,63 @@ def _without(source: str, key: str, reference: Reference) -> str:
 
 def _angle(reference: Reference, fit: LinearMap) -> Values:
     """Return the change of the parameters by an error of each stop's angle: (p, stops) array."""
-    left, right, group, count = errors_of_stops(reference.sensor, reference.motions, reference.K)
-    at_stops = fit.of_groups(left, group, count + 1)
-    at_stops += fit.of_groups(right, group + 1, count + 1)
+    before, after, stop, count = errors_of_stops(reference.sensor, reference.motions, reference.K)
+    at_stops = fit.of_groups(before, stop, count + 1) + fit.of_groups(after, stop + 1, count + 1)
     attitudes = [m for m in reference.motions if m.axis is None and m.level is not None]
-    if not attitudes:
-        return at_stops
     return np.concatenate([at_stops, *(_turned(reference, fit, motion) for motion in attitudes)], axis=1)
 
 
 def errors_of_stops(sensor: str, motions: Sequence[Motion], K: Values) -> tuple[Values, Values, Index, int]:
     """Return the change of each reading by errors of the angle at the stop before and the stop after it, per deg.
 
-    Returns two (n, 3) arrays; the index of the stop before, (n,), where the stop after is the next; and the number of
+    Returns two (n, 3) arrays; the index of the stop before, (n,), which the stop after follows; and the number of
     stops.
     """
-    left, right, groups, count = [], [], [], 0
+    before, after, index, count = [], [], [], 0
     for motion in motions:
-        n = len(motion.time)
         if motion.axis is None or motion.angle is None or motion.rate is None:
-            left.append(np.zeros((n, 3)))
-            right.append(np.zeros((n, 3)))
-            groups.append(np.full(n, count))
-            count += 1
-            continue
-        stop, share, slope, stops = between_stops(motion.angle, motion.rate)
-        if sensor == "accelerometer":
-            turned = motion.specific_force @ (-np.radians(1.0) * K @ ABOUT[motion.axis]).T
-            left.append(turned * (1.0 - share)[:, None])
-            right.append(turned * share[:, None])
+            stop, stops = np.zeros(len(motion.time), int), 1
+            before.append(np.zeros((len(stop), 3)))
+            after.append(np.zeros((len(stop), 3)))
         else:
-            faster = (motion.rate * slope)[:, None] * K[:, motion.axis]
-            left.append(-faster)
-            right.append(faster)
-        groups.append(stop + count)
+            stop, share, slope, stops = between_stops(motion.angle, motion.rate)
+            if sensor == "accelerometer":
+                turned = motion.specific_force @ (-np.radians(1.0) * K @ ABOUT[motion.axis]).T
+                before.append(turned * (1.0 - share)[:, None])
+                after.append(turned * share[:, None])
+            else:
+                faster = (motion.rate * slope)[:, None] * K[:, motion.axis]
+                before.append(-faster)
+                after.append(faster)
+        index.append(stop + count)
         count += stops
-    return np.concatenate(left), np.concatenate(right), np.concatenate(groups), count
+    return np.concatenate(before), np.concatenate(after), np.concatenate(index), count
 
 
 def between_stops(angle: Values, rate: Values) -> tuple[Index, Values, Values, int]:
-    """Return the stop at or before each sample, the share of the way to the next, and its derivative, 1/deg.
+    """Return the stop at or before each sample, the share of the turn to the next, its derivative, 1/deg, and a count.
 
-    If a recording does not begin or end with a rest, its first or last sample is used as a stop.
+    The count is that of the stops. If a recording does not begin or end with a rest, its first or last sample is used
+    as a stop.
     """
     still = np.abs(rate) <= RATE_AT_REST_DPS
-    before = np.concatenate([[False], still[:-1]])
+    was_still = np.concatenate([[False], still[:-1]])
     jump = np.abs(np.diff(angle, prepend=angle[0])) > SAME_STOP_DEG
-    new = still & (~before | jump)
+    new = still & (~was_still | jump)
     new[0] = True
     stop = np.cumsum(new) - 1
-    at = np.append(angle[new], angle[-1])
-    way = at[stop + 1] - at[stop]
-    moving = ~still & (np.abs(way) > SAME_STOP_DEG)
-    safe = np.where(moving, way, 1.0)
-    return stop, np.where(moving, (angle - at[stop]) / safe, 0.0), np.where(moving, 1.0 / safe, 0.0), len(at)
+    stops = np.append(angle[new], angle[-1])
+    arc = stops[stop + 1] - stops[stop]
+    moving = ~still & (np.abs(arc) > SAME_STOP_DEG)
+    slope = np.where(moving, 1.0 / np.where(moving, arc, 1.0), 0.0)
+    return stop, (angle - stops[stop]) * slope, slope, len(stops)
 
 
 def _turned(reference: Reference, fit: LinearMap, motion: Motion) -> Values:
     """Return the change of the parameters by a rotation of one recording about each axis, per deg: (p, 3) array."""
-
-    def change(other: Motion) -> Values | None:
-        if other is not motion:
-            return None
-        u = truth(reference.sensor, motion)
-        return np.stack([-np.radians(u @ about.T) for about in ABOUT], axis=2)
-
-    return reference.summed(fit, change, 3)
+    u = truth(reference.sensor, motion)
+    du = np.stack([-np.radians(u @ about.T) for about in ABOUT], axis=2)
+    return reference.summed(fit, lambda other: du if other is motion else None, 3)
 
 
 def _rate(reference: Reference, motion: Motion) -> Values | None:
@@ -260,14 +249,13 @@ def _wobble(reference: Reference, motion: Motion) -> Values | None:
     if motion.axis is None or motion.angle is None or motion.rate is None:
         return None
     a, angle = motion.axis, np.radians(motion.angle)
-    du = np.zeros((len(angle), 3, 12))
+    u, du = truth(reference.sensor, motion), np.zeros((len(angle), 3, 12))
     for j, (wave, slope) in enumerate(((np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle)))):
         for k in (1, 2):
             about = np.radians(1.0) * np.eye(3)[(a + k) % 3]
-            turned = np.cross(truth(reference.sensor, motion), about) * wave[:, None]
+            du[:, :, 4 * a + 2 * j + k - 1] = np.cross(u, about) * wave[:, None]
             if reference.sensor == "gyroscope":
-                turned = turned + about * (slope * motion.rate)[:, None]
-            du[:, :, 4 * a + 2 * j + k - 1] = turned
+                du[:, :, 4 * a + 2 * j + k - 1] += about * (slope * motion.rate)[:, None]
     return du
 
 
@@ -298,7 +286,7 @@ def _clock(reference: Reference, motion: Motion) -> Values | None:
 
 
 # Source, setting of the table, unit, sensors whose readings it changes, effects that estimate it, number of inputs, and
-# the change of the truth by them, (n, 3, inputs); that of the angle at the stops is ``_angle``.
+# the change of the truth by them, (n, 3, inputs); for the angle at the stops see ``_angle``.
 ACCURACIES: tuple[
     tuple[str, str, str, Sequence[str], Sequence[str], int, Callable[[Reference, Motion], Values | None] | None], ...
 ] = (

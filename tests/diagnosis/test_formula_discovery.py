@@ -28,7 +28,7 @@ from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.design import Term
 from pipeline.estimation.gauss_markov import Setting
-from pipeline.estimation.generalized_least_squares import fit_terms
+from pipeline.estimation.generalized_least_squares import fit_joint, fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
@@ -112,6 +112,17 @@ def test_a_gear_that_pushes_five_times_a_turn_is_told_and_mended() -> None:
     assert all(other["explained_by"] == "angle" for other in part["unexplained"][1:])
     assert part["suggested_effect"]["owner"] == "table"
     require_mended("accelerometer", recordings, part)
+
+
+def test_only_effects_that_the_recordings_determine_together_are_selected() -> None:
+    """A time constant that grows to many recordings makes a warm-up the same as bias and drift."""
+    for seed, size in ((1, 0.05), (2, 0.25)):  # the set is proposed as a pair, and effect by effect
+        end = max(r.time[-1] for r in record(Session(seed, SHORT)))
+        extra = [0.0, 0.0, 0.0, size / end**3]
+        recordings = with_extra("gyroscope", lambda r, c=extra: np.polynomial.Polynomial(c)(r.time)[:, None], seed)
+        selection = selection_of("gyroscope", recordings)
+        settings = {"sensor": SHEET, "table": TABLE}
+        fit_joint("gyroscope", recordings, selection.names, selection.noise, settings)
 
 
 def test_a_step_of_the_bias_at_a_temperature_is_placed_although_effects_of_temperature_take_most_of_it() -> None:
