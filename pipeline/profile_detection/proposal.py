@@ -193,8 +193,16 @@ def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
         if proposal.topic is not None and columns.time is None:
             proposal.remarks.append("no field of the topic is a time, which each topic needs")
         proposal.remarks += columns.log.remarks + _labels(columns.log)
-    if force is None and rate is None:
-        _add_template(proposal)
+    if force is not None or rate is not None:
+        return proposal
+    proposal.remarks.append("no three columns have the names or values of an accelerometer or a gyroscope")
+    if proposal.topic is None and "table_rate" not in proposal.columns[0]:  # lines of both sensors to fill in
+        for name, triad in TRIADS.items():
+            proposal.columns[0] |= {c: {"column": UNKNOWN, "unit": UNKNOWN} for c in triad}
+            proposal.evidence[name] = (
+                f"the names of the {name}'s columns, and their unit: {', '.join(UNITS_OF[name])}, or counts with "
+                f'counts_per_unit: "{OF_SENSOR.format(name)}"; leave the three lines out if it is not in the log'
+            )
     return proposal
 
 
@@ -219,19 +227,6 @@ def _described(values: Values | None) -> str:
     kind = "whole numbers " if whole(values) else ""
     even = ", grows evenly with the rows" if even_steps(values) else ""
     return f"{kind}{low:.6g} to {high:.6g}{even}" if high > low else f"{low:.6g} throughout"
-
-
-def _add_template(proposal: Proposal) -> None:
-    """Add lines of both sensors to fill in, unless the log is of a table or has topics."""
-    proposal.remarks.append("no three columns have the names or values of an accelerometer or a gyroscope")
-    if proposal.topic is not None or "table_rate" in proposal.columns[0]:
-        return
-    for sensor, triad in TRIADS.items():
-        proposal.columns[0] |= {c: {"column": UNKNOWN, "unit": UNKNOWN} for c in triad}
-        proposal.evidence[sensor] = (
-            f"the names of the {sensor}'s columns, and their unit: {', '.join(UNITS_OF[sensor])}, or counts with "
-            f'counts_per_unit: "{OF_SENSOR.format(sensor)}"; leave the three lines out if it is not in the log'
-        )
 
 
 def _gyroscope(

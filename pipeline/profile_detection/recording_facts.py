@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import textwrap
 from itertools import islice
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +29,7 @@ from pipeline.signal.rests import rests_from_table, runs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from mcap.records import Channel, Schema
 
@@ -320,7 +320,14 @@ def topic_lines(path: Path, *, fields: bool) -> list[Line]:
                     first[rows.channel] = rows.payload(0)
     except (IngestError, OSError):
         return []
-    lines = [("container", _container(reader))]
+    size, proof = counted(reader.count, "message"), "integrity: not_verifiable, without checksums"
+    if isinstance(reader, McapReader):
+        library = f", written by {reader.header.library}" if reader.header and reader.header.library else ""
+        proof = "every checksum and count verified" if reader.verified else proof
+        container = f"{size} in {counted(len(reader.chunks), 'chunk')}{library}; {proof}"
+    else:
+        container = f"{MESSAGE_FORMATS[path.suffix.lower()].kind} with {size}; {proof}"
+    lines = [("container", container)]
     if len(reader.channels) > MOST_TOPICS:
         return [*lines, ("topics", ", ".join(f"{c.topic} ({reader.counts[n]})" for n, c in reader.channels.items()))]
     for number, channel in reader.channels.items():
@@ -331,16 +338,6 @@ def topic_lines(path: Path, *, fields: bool) -> list[Line]:
             text += _fields(channel, schema, first[number])
         lines.append(("topic", text))
     return lines
-
-
-def _container(reader: MessageReader) -> str:
-    """Return the size of a message log, and the result of the check of its integrity."""
-    size, proof = counted(reader.count, "message"), "integrity: not_verifiable, without checksums"
-    if not isinstance(reader, McapReader):
-        return f"{MESSAGE_FORMATS[Path(reader.path).suffix.lower()].kind} with {size}; {proof}"
-    library = f", written by {reader.header.library}" if reader.header and reader.header.library else ""
-    proof = "every checksum and count verified" if reader.verified else proof
-    return f"{size} in {counted(len(reader.chunks), 'chunk')}{library}; {proof}"
 
 
 def counted(number: int, what: str) -> str:
