@@ -126,3 +126,12 @@ def test_a_file_that_is_no_history_is_refused_by_name(tmp_path: Path, content: s
     (tmp_path / "history" / "0001.json").write_text(content)
     with pytest.raises(InputError, match=r"0001\.json: is no history of runs: remove it"):
         read_history(tmp_path)
+
+
+def test_the_unit_that_a_run_changed_most_is_told_first(tmp_path: Path) -> None:
+    results = tmp_path / "bench"
+    record(results, {f"U{i}": state([], 0.1) for i in range(3)}, SETTINGS)
+    record(results, {f"U{i}": state(["a"], error) for i, error in enumerate((0.08, 0.5, 0.04))}, SETTINGS)
+    (results / "summary.csv").write_text("unit,status\n" + "".join(f"U{i},ok\n" for i in range(3)))
+    told = [line for line in outcome(results, SETTINGS, of_this_run=True).splitlines() if "held-out error" in line]
+    assert [line.partition(",")[0] for line in told] == ["U1", "U2", "U0"]  # factors 5, 2.5 and 1.25

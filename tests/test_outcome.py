@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from snakemake.cli import parse_config
 
-from pipeline.outcome import _reasons, add_command, once_command, run_command
+from pipeline.outcome import _reasons, add_command, commands_of, once_command, run_command
 
 TEXT = st.text(
     st.characters(codec="utf-8", exclude_characters="\0\n\r\x85\u2028\u2029", exclude_categories=("Cc", "Cs"))
@@ -57,6 +57,24 @@ def test_effects_that_one_run_had_are_kept_by_the_command_that_adds_more() -> No
     assert parse_config(command[11:]) == {"unit_overrides": {"U2": ["filter.order=3"], "U1": ["filter.order=1"]}}
     once = words(once_command(settings, "U1", "effects.gyroscope=[a,b,c]"))
     assert parse_config(once[3:])["unit_overrides"]["U1"] == ["filter.order=1", "effects.gyroscope=[a,b,c]"]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "names", "verb"),
+    [
+        ("missing_effect", ["a"], "add it"),
+        ("missing_effect", ["a", "b"], "add them"),
+        ("unexplained", ["a"], "try it"),
+        ("unexplained", ["a", "b"], "try them"),
+    ],
+)
+def test_effects_that_do_not_explain_the_residual_are_offered_as_a_trial(
+    verdict: str, names: list[str], verb: str
+) -> None:
+    part = {"verdict": verdict, "selected": names, "override": f"effects.gyroscope=[{','.join(names)}]"}
+    offered = commands_of(part, "gyroscope", "U1", {"campaign": "c"})
+    assert offered["verb"] == verb
+    assert words(offered["add"])[2:] == ["add", "c", "U1", *(f"gyroscope.{name}" for name in names)]
 
 
 def test_the_closing_lines_name_a_sensor_that_has_no_calibration(tmp_path: Path) -> None:

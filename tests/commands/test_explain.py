@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.commands.explain import main
+from pipeline.commands.explain import find, main
 from pipeline.errors import InputError, MissingInputError
 
 OVERRIDE = "effects.gyroscope=[g_sensitivity]"
@@ -44,6 +44,16 @@ def results(tmp_path: Path) -> Path:
         document = {"unit": unit, "accelerometer": None, "gyroscope": part(selected)}
         (folder / f"{unit}.json").write_text(json.dumps(document))
     return tmp_path / "results"
+
+
+def test_units_are_told_in_the_order_of_the_campaign_without_those_that_failed(results: Path) -> None:
+    folder = results / "bench"
+    (folder / "diagnoses" / "U0.json").write_text((folder / "diagnoses" / "U1.json").read_text())
+    (folder / "summary.csv").write_text("unit,status\nU2,ok\nU0,failed\nU1,ok\n")
+    (folder / "failures.json").write_text(json.dumps([{"unit": "U0", "stage": "calibrate", "message": "no rests"}]))
+    _, diagnoses, failures = find("bench", [], results)
+    assert list(diagnoses) == ["U2", "U1"]
+    assert list(failures) == ["U0"]
 
 
 def test_a_parameter_beyond_the_data_sheet_is_told(results: Path, capsys: pytest.CaptureFixture[str]) -> None:

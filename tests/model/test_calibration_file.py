@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from scipy.signal import lfilter
 
 from pipeline.io.quality_flags import CLIPPED
-from pipeline.model.calibration_file import implausible, sentences
+from pipeline.model.calibration_file import implausible, sample_covariance, sentences
 from pipeline.records import FittedEffect, Recording, SensorCalibration
 from pipeline.stages.calibration import calibrated_range, judged
 
@@ -116,3 +117,27 @@ def test_the_calibrated_range_is_that_of_the_sound_samples_of_the_fits() -> None
     others = [recording("validation", 4.0, 900.0, 60.0), recording("static", 5.0, 800.0, 1.0)]
     found = calibrated_range([*fitted, *others])
     assert found == {"specific_force_g": 0.9, "angular_rate_dps": 180.0, "temperature_degc": [3.0, 40.0]}
+
+
+def test_the_covariance_of_a_sample_is_that_of_simulated_samples_without_slow_wander() -> None:
+    """Truth: an angle with rounding errors, white noise and two processes, written out sample by sample."""
+    rng = np.random.default_rng(8)
+    n, dt, white, rounding, fast, slow = 200_000, 0.01, 0.002, 1e-4, 0.015, 0.5
+    rounded = rounding * rng.normal(size=(n + 1, 3))
+    readings = white / np.sqrt(dt) * rng.normal(size=(n, 3)) + np.diff(rounded, axis=0) / dt
+    for size, time in ((fast, 0.03), (slow, 40_000.0)):
+        kept = np.exp(-dt / time)
+        steps = size * np.sqrt(1.0 - kept**2) * rng.normal(size=(n, 3))
+        readings += lfilter([1.0], [1.0, -kept], steps, axis=0)
+    M = np.array([[1.02, 0.01, 0.0], [0.2, 0.97, -0.03], [0.0, 0.3, 1.01]])
+    calibrated = readings @ M.T
+    apart = calibrated[100:] - calibrated[:-100]  # 1 s: the slow process hardly changes, the rest is independent
+    expected = apart.T @ apart / (2.0 * len(apart))
+    processes = [(fast, 0.03), (slow, 40_000.0)]
+    wander = [{"value": size, "correlation_time_s": {"value": time}} for size, time in processes]
+    terms = {"white": {"value": white}, "quantisation": {"value": rounding}, "gauss_markov": wander}
+    noise = {"sampling_interval_s": dt, "axes": {axis: {"terms": terms} for axis in "xyz"}}
+    covariance = sample_covariance({"noise": {"gyroscope": noise}, "gyroscope": {"matrix": M.tolist()}}, "gyroscope")
+    assert covariance is not None
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(covariance / np.outer(size, size), expected / np.outer(size, size), atol=0.04)

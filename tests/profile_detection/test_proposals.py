@@ -74,6 +74,14 @@ def test_scale_of_the_xsens_counts_is_found_as_its_certificate_says(reference: P
     assert gyroscope["counts_per_unit"] == pytest.approx(4767.0 * np.pi / 180, rel=0.02)
 
 
+@pytest.mark.parametrize("counts", [1300.0, 3200.0, 12500.0])
+def test_counts_far_from_every_usual_scale_keep_their_own(tmp_path: Path, counts: float) -> None:
+    logger = Logger("ax,ay,az,gx,gy,gz", (0.0, counts, 131.0), {}, whole=True)
+    entry = proposed(written(tmp_path, logger)).columns[0]["accel_x"]
+    assert entry["unit"] == "counts"
+    assert entry["counts_per_unit"] == pytest.approx(counts, rel=0.05)
+
+
 def test_files_of_one_shape_share_what_one_of_them_tells(reference: Path) -> None:
     """The counts of a rest alone do not tell the gyroscope's scale; a log with moves of the same logger does."""
     folder = reference / "mpu6050_multi_position"

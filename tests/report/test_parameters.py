@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.records import FittedEffect, SensorCalibration
 from pipeline.report.comparison import unit_figures
-from pipeline.report.parameters import fitted_parameters, reading_errors
+from pipeline.report.parameters import beyond_limits, fitted_parameters, parameter_rows, reading_errors
 
 
 def part_with_unequal_freedom() -> dict:
@@ -52,3 +52,13 @@ def test_the_uncertainty_of_the_inverse_is_that_of_drawn_matrices() -> None:
         i, j = "xyz".index(axes[0]), "xyz".index(axes[-1])
         assert p.value == pytest.approx(np.linalg.inv(matrix)[i, j] - (kind == "scale_factor_error"))
         assert p.standard_uncertainty == pytest.approx(K[:, i, j].std(), rel=0.03)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_parameter_far_to_either_side_is_beyond_its_limit(sign: float) -> None:
+    K = np.eye(3) + sign * np.diag([0.06, 0.0, 0.0])
+    fit = SensorCalibration("gyroscope", np.array([0.0, sign * 5.0, 0.0]), np.linalg.inv(K), covariance=np.eye(12))
+    rows = parameter_rows(fit.to_json(), {"bias": 2.0, "scale_factor": 0.03, "cross_axis": 0.02})
+    shares = {row["p"].name: row["share"] for row in rows if row["share"] > 1e-9}
+    assert shares == pytest.approx({"bias_y": 2.5, "scale_factor_error_x": 2.0})
+    assert beyond_limits(rows, mounted=False) == ["bias y (250 %)", "scale factor error x (200 %)"]
