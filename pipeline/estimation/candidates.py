@@ -26,8 +26,8 @@ MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
 TILTS = ("d_x", "d_y")  # parameters of ``table_tilt``
 HELD_DEG = 1e-4  # standard deviation of a tilt that is fixed at 0: a hundredth of a good encoder's accuracy
 HELD = (
-    "The part of the tilt about the shaft is the same as a common zero of the turns: the recordings do not determine "
-    "it beside the mountings or zeros, table.levelling_deg does not state it, and it is held at 0."
+    "A tilt about the shaft has the same signal as a common zero of the turns: the recordings do not determine it "
+    "together with mountings or zeros. table.levelling_deg does not state it, so that it is fixed at 0."
 )
 ONE_SHAFT = 0.999  # cosine between shafts that count as one: mountings of 2 deg turn the level frame by as much
 SEAT_DEG = 5.0  # of mountings if the table's config states none: the default tolerance of ingest
@@ -199,7 +199,7 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
         if setups <= {name.partition("@")[2] for name in names if name.startswith(f"{own}@")}:
             base = "matrix" if own == "mounting" else "bias"
             raise NotObservableError(
-                f"{own} of its own in every setup ({', '.join(sorted(setups))}) cannot be told from the {base}: "
+                f"a separate {own} in every setup ({', '.join(sorted(setups))}) has the same signal as the {base}: "
                 "leave it out for one of them, the reference of the others"
             )
     for name in names:

@@ -5,7 +5,7 @@ Under one hypothesis about the noise (``pipeline.estimation.gauss_markov``) the 
 
     V = sum_c s_c^2 J_c (A_c diag(1/n) A_c^T + q a_c B(tau) a_c^T) J_c^T
 
-where ``a`` is A summed over the rows of each block, and n holds the samples of each row. One calibration does not
+where ``a`` is A summed over the rows of each block, and n the number of samples of a row. One calibration does not
 determine q and tau well. So each hypothesis of the prior's grid has the weight of its restricted likelihood times its
 prior (Patterson & Thompson, Biometrika 58, 1971), and the error of a parameter is distributed as a mixture over all
 hypotheses (``Posterior``). The mixture is approximated by a scaled Student's t that has the same probabilities within
@@ -301,7 +301,7 @@ def assess_noise(
     return replace(ResidualNoise.of(blocks, settings, 3.0 * logarithm, variance, free), spare=spare)
 
 
-def noise_beside(  # noqa: PLR0917  (what a restricted likelihood beside known errors is)
+def noise_beside(  # noqa: PLR0917  (what a restricted likelihood without known errors is)
     columns: Values,
     means: Values,
     blocks: Blocks,

@@ -150,7 +150,7 @@ class Given:
                 scale[row, used] = np.repeat([SCALES[s] for _, s in picks.values()], [len(c) for c in each])
         inner = products[:, at[:, :, None], at[:, None, :]] + scale[:, :, None] ** -2.0 * np.eye(shape[1])
         L = np.linalg.cholesky(inner)
-        self._half = np.linalg.inv(L) @ products[:, at]  # its squares are what each column shares with the sets
+        self._half = np.linalg.inv(L) @ products[:, at]  # its squares: the part of each column that the sets explain
         self.squares = problem.products[:, None, -1, -1] - np.sum(self._half[..., READINGS] ** 2, axis=2)
         logarithm = 2.0 * np.sum(np.log(np.einsum("tskk->tsk", L)), axis=2) + 2.0 * np.sum(np.log(scale), axis=1)
         chosen = [sum(SCALE_PRIOR[s] + problem.versions[n][v].log_weight for n, (v, s) in p.items()) for p in sets]

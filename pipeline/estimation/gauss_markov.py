@@ -288,9 +288,7 @@ class GaussMarkov:
         assert info == 0  # noqa: S101
         solved = np.asarray(solved.T).reshape(w.shape)
         solved[:, :, :-1] -= self._phi * solved[:, :, 1:]
-        found = np.empty((*self._half.shape, len(solved)))
-        found[:, self._order] = (solved / self._half).transpose(1, 2, 0)
-        return found
+        return np.ascontiguousarray((solved / self._half)[:, :, np.argsort(self._order)].transpose(1, 2, 0))
 
     def restricted(self, design: Values, values: Values) -> tuple[Values, Values]:
         """Return the terms of the restricted likelihood of (m, c) values given the columns of a design.
@@ -345,9 +343,7 @@ class Products:
 
     def influence(self, setting: Setting) -> Values:
         """Return ``A^T C^-1``: (p, n) array."""
-        label = self.blocks.label(len(self.weight))
-        solved = GaussMarkov(self.blocks, [setting]).solve(self.means)[0] / self.blocks.weight[:, None]
-        return np.asarray((self.weight[:, None] * (self.columns + (solved - self.means)[label])).T)
+        return np.asarray((self.weight[:, None] * (self.columns - self.bias(setting))).T)
 
     def bias(self, setting: Setting) -> Values:
         """Return ``E[bias | columns]`` of each row: (n, p) array."""

@@ -9,8 +9,8 @@ the standard uncertainty of independent errors:
     wobble         once a turn, each axis about both others: cosine and sine of the table angle
     levelling      tilt of the table about level x and y (``table_tilt``)
     gravity        local gravity
-    azimuth        of level x, where Earth's rotation is in the model
-    time base      of the sensor's clock, relative, where the log holds no rate: the rate is the change of the angle
+    azimuth        of level x, if Earth's rotation is in the model
+    time base      of the sensor's clock, relative, if the log has no rate: the rate is the change of the angle
                    over the time by that clock
 
 An attitude log has no stops: its angle errors are three constant turns of each recording, about the body axes.
@@ -131,7 +131,7 @@ def disturbance(
 def noise_on_table(
     reference: Reference, residuals: Values, design: Values, blocks: Blocks, prior: Prior
 ) -> ResidualNoise:
-    """Weight the hypotheses of a prior by the residuals of a fit on a table; arguments as of ``assess_noise``."""
+    """Weight the hypotheses of a prior by the residuals of a fit on a table; arguments: see ``assess_noise``."""
     return assess_noise(residuals, design, blocks, prior, disturbance(reference, residuals, blocks))
 
 

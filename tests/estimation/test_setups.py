@@ -95,7 +95,7 @@ def test_the_gyroscope_of_two_mountings_too() -> None:
 
 
 def test_a_mounting_of_its_own_in_every_setup_is_no_mounting_but_the_matrix() -> None:
-    with pytest.raises(NotObservableError, match=r"mounting of its own in every setup \(home, precise\)"):
+    with pytest.raises(NotObservableError, match=r"a separate mounting in every setup \(home, precise\)"):
         fit_joint("accelerometer", on_two_tables(20), ["mounting@home", "mounting@precise"], None, SETTINGS)
 
 
