@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 COMMAND = [sys.executable, "-PS", str(Path(__file__).with_name("job_command.py"))]  # imports no package
 # glibc returns freed memory to the system by default, which clears it when it is used again: 8 % of the stages' time.
-# Large pages save another 2 to 5 %, where the system allows a program to ask for them.
+# Large pages save another 2 %, where the system lets a program ask for them.
 KEEP_FREED_MEMORY = {
     "MALLOC_TRIM_THRESHOLD_": "500000000",
     "MALLOC_MMAP_THRESHOLD_": "500000000",
