@@ -44,7 +44,7 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     """
     if not names:
         return []
-    observations, fit = selection.observations.weakened, selection.fit
+    observations, fit = selection.observations.less_stop_errors, selection.fit
     slices = placed(fit.terms)
     design = design_at(observations, fit)
     products = design.products([fit.setting])[0]
@@ -77,7 +77,7 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
 
 def _shares_of_blocks(selection: Selection, design: Design, products: Values, term: Term, index: Index) -> Values:
     """Return the share of each block in the gain of an effect: (m,) array."""
-    observations, fit = selection.observations.weakened, selection.fit
+    observations, fit = selection.observations.less_stop_errors, selection.fit
     change = np.zeros(design.count)
     nonlinear = () if term.effect.moves else term.effect.nonlinear
     linear = [p.name not in nonlinear for p in term.effect.parameters(observations.sensor)]

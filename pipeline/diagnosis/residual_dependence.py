@@ -145,7 +145,7 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
 
 def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     """Return ``share_worse``, the share of simulations that fit worse, and ``simulations``, their number."""
-    bases, observations, scan = _bases_of(selection), selection.observations.weakened, Scan(selection)
+    bases, observations, scan = _bases_of(selection), selection.observations.less_stop_errors, Scan(selection)
     fitted = ProjectedCurves(scan, _curves_of(bases))
     within = np.append(scan.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
     left, cross = np.zeros((len(scan.left), 1 + SIMULATIONS)), []  # of the readings and each simulation
@@ -173,7 +173,7 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
 
 def _draws(selection: Selection) -> Values:
     """Return draws from the noise of the fit, in units of the white noise of one sample: (3, n, s) array."""
-    observations, rng = selection.observations.weakened, np.random.default_rng(0)
+    observations, rng = selection.observations.less_stop_errors, np.random.default_rng(0)
     blocks, weight = observations.blocks, observations.weight
     label, noise = blocks.label(len(weight)), GaussMarkov(blocks, [selection.fit.setting])
     found = []

@@ -208,7 +208,7 @@ class _Columns:
     """The columns of each axis and the residual of a selection's fit."""
 
     def __init__(self, selection: Selection) -> None:
-        self.observations = selection.observations.weakened
+        self.observations = selection.observations.less_stop_errors
         self.weight = self.observations.weight
         self.design = design_at(self.observations, selection.fit)
         of_axis = [self.design.of_axis(c) for c in range(3)]

@@ -68,7 +68,7 @@ class Scan:
 
     def __init__(self, selection: Selection, explained: Curves | None = None) -> None:
         self.scale = selection.start.scale
-        observations = selection.observations.weakened
+        observations = selection.observations.less_stop_errors
         self.samples = 3.0 * observations.samples
         self.within = float(np.sum(observations.scatter / self.scale**2))
         self._motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]

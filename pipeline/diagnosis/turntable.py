@@ -86,7 +86,7 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         held_out = {"error_before": errors[0], "error_after": errors[-1], "floor": floor}
     hidden = not_observable(reported, case.configured)
     squares = [fit.residual_rms**2 for fit in fits]
-    reference = observations.weakened.expected_square
+    reference = observations.less_stop_errors.expected_square
     noise_square = None if noise is None else float(np.mean(reference * noise.white**2 + noise.wander**2))
     least = squares[-1] if noise_square is None else noise_square
     at_noise = not reported.names and squares[0] < CLOSE * least

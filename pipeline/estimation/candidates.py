@@ -101,7 +101,7 @@ def turns_of(observations: Observations) -> dict[str, str]:
 
 
 def prior_of(
-    this: Effect, observed: Observations, accelerometer: SensorCalibration | None, beside: Sequence[str] = ()
+    this: Effect, observed: Observations, accelerometer: SensorCalibration | None, fitted: Sequence[str] = ()
 ) -> NormalPrior | None:
     """Return the prior of an effect of the bench; None for other effects.
 
@@ -109,10 +109,10 @@ def prior_of(
     its estimate is the prior of the gyroscope's: both sensors share the frame of the mean of the mountings. For a tilt
     of the table see ``tilt_like_zeros``.
 
-    ``accelerometer``: for the gyroscope. ``beside``: the effects of the fit.
+    ``accelerometer``: for the gyroscope. ``fitted``: the effects of the fit.
     """
     if this.name == TILT:
-        along = tilt_like_zeros([part.motion for part in observed.parts], beside)
+        along = tilt_like_zeros([part.motion for part in observed.parts], fitted)
         width = observed.levelling_deg or HELD_DEG
         return None if along is None else NormalPrior(np.zeros(2), np.outer(along, along) / width**2)
     if this.name != MOUNTING:
@@ -134,14 +134,14 @@ def prior_of(
     return NormalPrior(mean, np.asarray(np.linalg.inv(covariance), np.float64))
 
 
-def tilt_like_zeros(motions: Sequence[Motion], beside: Sequence[str]) -> Values | None:
+def tilt_like_zeros(motions: Sequence[Motion], fitted: Sequence[str]) -> Values | None:
     """Return the direction of (d_x, d_y) in which a tilt is equivalent to a rotation of the unit in every turn.
 
     It is the direction of the shaft, if one level shaft makes all turns and each has a separate mounting or zero. The
     readings do not determine this component of the tilt: its prior is the table's levelling, or it is fixed at 0. None
     if the readings determine both components.
     """
-    owner = next((effect(name) for name in (MOUNTING, ZERO) if name in beside), None)
+    owner = next((effect(name) for name in (MOUNTING, ZERO) if name in fitted), None)
     if owner is None or any(m.axis is None or m.level is None for m in motions):
         return None
     turns = {(m.setup or m.recording if owner.name == MOUNTING else m.recording, m.axis) for m in motions}

@@ -291,7 +291,7 @@ def assess_noise(
         white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
         settings = prior.grid(float(np.sqrt(np.mean(white**2))))
         columns = np.asarray(np.kron(np.eye(3), scaled).reshape(3, len(count), -1), np.float64)
-        return noise_beside(columns, means, blocks, settings, white, disturbance)
+        return noise_outside_known_errors(columns, means, blocks, settings, white, disturbance)
     U, s, _ = np.linalg.svd(scaled, full_matrices=False)
     basis = U[:, s > AVERAGED_OUT * s[0]]
     settings = prior.grid(float(np.sqrt(np.mean(residuals**2))))
@@ -301,7 +301,7 @@ def assess_noise(
     return replace(ResidualNoise.of(blocks, settings, 3.0 * logarithm, variance, free), spare=spare)
 
 
-def noise_beside(  # noqa: PLR0917  (what a restricted likelihood without known errors is)
+def noise_outside_known_errors(  # noqa: PLR0917  (what a restricted likelihood without known errors is)
     columns: Values,
     means: Values,
     blocks: Blocks,

@@ -51,7 +51,7 @@ RANDOM_WALK = 8.0  # correlation time over the measured one, with the same varia
 # A random walk of the bias: factors on ratio and time of a setting, and its share of that setting's prior. Of 80
 # simulated random walks 17 showed an invented effect without it, and 6 with it.
 WALK_RATIO, WALK_TIME, WALK_SHARE = 8.0, 64.0, 0.3
-SLOW = 0.3  # share of white noise's spectrum, see ``steady_s``: right answers as with 0.05 (docs/blind_study.md)
+SLOW = 0.3  # share of white noise's spectrum, see ``constant_bias_s``: right answers as with 0.05 (docs/blind_study.md)
 FAST_S = 25.0  # correlation time below which ``information`` replaces the model, because its blocks last seconds
 
 
@@ -156,7 +156,7 @@ def information(noise: Noise | None, interval: float) -> float:
     return 1.0 / (1.0 + 2.0 * _static_ratio(noise) ** 2 * noise.correlation_time / interval)
 
 
-def steady_s(noise: Noise | None, interval: float) -> float:
+def constant_bias_s(noise: Noise | None, interval: float) -> float:
     """Return the time over which a bias is assumed constant, s: L with ``2 q L^2 / (pi^2 tau) = SLOW dt``.
 
     At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is ``SLOW`` times that of white noise, dt.

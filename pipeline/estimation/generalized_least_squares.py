@@ -35,7 +35,7 @@ from pipeline.estimation.design import (
     stepped,
     without_unknown_motion,
 )
-from pipeline.estimation.engine import RANK, Posterior, ResidualNoise, noise_beside
+from pipeline.estimation.engine import RANK, Posterior, ResidualNoise, noise_outside_known_errors
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import with_matrix
@@ -102,7 +102,7 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         if not linear:
             solved = _solve(design_at(observations, state), observations, settings)
     residual, _ = _residual(observations, state)
-    noise = observations.weakened
+    noise = observations.less_stop_errors
     squares = np.sum(noise.weight[:, None] * residual**2) + np.sum(noise.scatter)
     covariance, freedom = solved.posterior.averaged()
     return Fit(
@@ -129,10 +129,10 @@ def _with_all_columns(start: Start, terms: Sequence[Term]) -> Start:
     return Start(start.bias, start.K, start.scale, tuple(full))
 
 
-def design_at(observations: Observations, at: Start, beside: Sequence[Term] | None = None) -> Design:
-    """Return the design, with the residual, of a model at given parameters, or of terms ``beside`` it."""
+def design_at(observations: Observations, at: Start, candidates: Sequence[Term] | None = None) -> Design:
+    """Return the design of a model at given parameters with its residual, or that of the terms ``candidates``."""
     residual, base = _residual(observations, at)
-    terms, project = (at.terms, False) if beside is None else (beside, True)
+    terms, project = (at.terms, False) if candidates is None else (candidates, True)
     return Design(observations, terms, at.K, np.maximum(at.scale, 1e-300), target=residual, base=base, project=project)
 
 
@@ -224,7 +224,7 @@ def _residual_noise(
         columns /= blocks.weight[:, None]
         X = columns[:, :, :-1] * (np.sqrt(blocks.weight) / white[:, None])[:, :, None]
         X /= np.maximum(np.linalg.norm(X, axis=(0, 1)), 1e-300)
-        return noise_beside(X, columns[:, :, -1].T, blocks, settings, white, disturbed, weight)
+        return noise_outside_known_errors(X, columns[:, :, -1].T, blocks, settings, white, disturbed, weight)
     solved, free = _solve(design, observations, settings), max(3.0 * observations.samples - design.count, 1.0)
     squares = solved.squares[:, None] / free
     found = ResidualNoise.of(observations.blocks, settings, solved.logarithms, squares, free, weight)

@@ -115,7 +115,7 @@ def through(posterior: Posterior, stated: Sequence[Values], results: Callable[[V
     return draw
 
 
-def beside_trials(
+def with_trials(
     calibration: SensorCalibration, draw: Draw, trials: int, direct: Sequence[Contribution] = ()
 ) -> SensorCalibration:
     """Return a calibration whose budget also has the Monte Carlo run and its comparison.

@@ -295,7 +295,7 @@ def _reason(kind: int, names: Sequence[str], spectrum: Spectrum) -> str:
     slow = [name for name in names if name in SLOW]
     if kind < WHITE or slow:
         others = [name.replace("_", " ") for name in dict.fromkeys(slow if kind > WHITE else names)]
-        return f"not seen beside {' and '.join(others)}"
+        return f"not detected in the presence of {' and '.join(others)}"
     return (
         f"the recording is too short: over its {spectrum.length:.3g} s the Allan deviation falls like that of white "
         f"noise up to averaging times of {LONGEST_AVERAGE_SHARE * spectrum.length:.3g} s"

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.gauss_markov import Blocks, information, steady_s
+from pipeline.estimation.gauss_markov import Blocks, constant_bias_s, information
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import Rows, reference_valid, rows_of
 from pipeline.model.effects import stated_priors
@@ -88,8 +88,8 @@ class Observations:
         return np.concatenate([part.weight for part in self.parts])
 
     @cached_property
-    def weakened(self) -> Observations:
-        """The observations with weights reduced for errors of the angle, for sums in which these count as noise."""
+    def less_stop_errors(self) -> Observations:
+        """The observations with smaller weights at the stops, for sums in which errors of the angle count as noise."""
         parts = []
         for part in self.parts if self.angle_deg > 0.0 else ():
             weight, rests = part.weight / (1.0 + _lost_at_stops(part, self)), part.motion.still
@@ -173,7 +173,7 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
         if part.rounding is not None and white > 0.0:  # the scatter is of rests: their rate has no such noise
             weight = weight / (1.0 + part.rounding / white**2)
         parts.append(replace(part, weight=weight, scatter=share * part.scatter))
-    steady = min((steady_s(noise, part.interval) for part in parts), default=float("inf"))
+    steady = min((constant_bias_s(noise, part.interval) for part in parts), default=float("inf"))
     reduced = replace(observations, parts=tuple(parts), white=white, steady=steady)
     lost = [_lost_at_stops(part, reduced).max(initial=0.0) for part in parts]
     return reduced if max(lost, default=0.0) > HIDDEN_ANGLE else replace(reduced, angle_deg=0.0)

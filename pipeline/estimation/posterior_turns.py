@@ -123,13 +123,13 @@ def _products(
         configured = fit.terms[: len(selection.base.terms)]
         design = design_at(selection.observations, fit, [*configured, *(term for _, term, _ in listed)])
         stacked, logarithms = design.products([WHITE, *selection.settings, *walks])
-        beside = without(stacked, np.arange(known))[:, known:, known:]
-        return design, stacked[:, :known, :known], beside, logarithms, design.slices[len(configured) :]
+        projected = without(stacked, np.arange(known))[:, known:, known:]
+        return design, stacked[:, :known, :known], projected, logarithms, design.slices[len(configured) :]
     stacked, logarithms = ranking.design.products(walks)
-    beside = without(stacked, np.arange(known))[:, known:, known:]
+    projected = without(stacked, np.arange(known))[:, known:, known:]
     base = np.concatenate([ranking.stacked[:, :known, :known], stacked[:, :known, :known]])
-    beside = np.concatenate([ranking.beside, beside])
-    return ranking.design, base, beside, np.append(ranking.logarithms, logarithms), [places[key] for key in keys]
+    projected = np.concatenate([ranking.projected, projected])
+    return ranking.design, base, projected, np.append(ranking.logarithms, logarithms), [places[key] for key in keys]
 
 
 def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> Problem:

@@ -52,8 +52,8 @@ class Ranking:
     Fitted effects are at their values, others at each of their starts: one effect may have several candidates.
 
     ``base``: the fit of base and configured effects. ``candidates``: by name. Attributes of each candidate: ``spans``,
-    its columns in ``beside``, the products after projection of the base; ``blocks``, its excited directions, (k, r),
-    scaled to unit norm under white noise; ``places``, these directions in ``products``. The readings come last.
+    its columns in ``projected``, the products after projection; ``blocks``, its excited directions, (k, r), scaled to
+    unit norm under white noise; ``places``, these directions in ``products``. The readings come last.
     """
 
     def __init__(
@@ -80,12 +80,12 @@ class Ranking:
         self.design, self.stacked, self.logarithms = design, stacked, logarithms
         self.penalty = 0.5 * logarithms - np.array([setting.prior for setting in self.settings])
         known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
-        self.beside = without(stacked, np.arange(known))[:, known:, known:]
+        self.projected = without(stacked, np.arange(known))[:, known:, known:]
         self.spans = [slice(s.start - known, s.stop - known) for s in design.slices[len(configured) :]]
         size = np.where(design.sizes() > 0, design.sizes(), 1.0)[known:]
         self.blocks: list[Values] = []
         for span in self.spans:
-            values, vectors = np.linalg.eigh(self.beside[0, span, span] / np.outer(size[span], size[span]))
+            values, vectors = np.linalg.eigh(self.projected[0, span, span] / np.outer(size[span], size[span]))
             kept = values > EXCITED**2
             self.blocks.append(vectors[:, kept] / np.sqrt(values[kept]) / size[span, None])
         ends = np.cumsum([block.shape[1] for block in self.blocks]).tolist()
@@ -95,7 +95,7 @@ class Ranking:
             parts = [columns[:, :, span] @ block for span, block in zip(self.spans, self.blocks, strict=True)]
             return np.concatenate([*parts, columns[:, :, -1:]], axis=2)
 
-        self.products: Values = reduced(reduced(self.beside).transpose(0, 2, 1))
+        self.products: Values = reduced(reduced(self.projected).transpose(0, 2, 1))
 
     def indices(self, name: str) -> list[int]:
         """Return the indices of the candidates of an effect that the motion excites."""
@@ -233,7 +233,7 @@ class Ranking:
     def visibility(self, j: int, limits: Values) -> Values:
         """Return the expected gain in 2 log L of an effect whose parameters are all at their limits: (t,) array."""
         block = self.spans[j]
-        squares = np.einsum("tii->ti", self.beside[:, block, block])
+        squares = np.einsum("tii->ti", self.projected[:, block, block])
         return np.asarray(np.sum(limits[: squares.shape[1]] ** 2 * squares, axis=1))
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.estimation.candidates import TILT, tilt_like_zeros
 from pipeline.estimation.design import BASE, BASE_NAMES, Term
-from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
+from pipeline.estimation.monte_carlo import through, trials_of, with_trials
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.records import (
     LIMIT,
@@ -221,10 +221,10 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     stated, _ = table_errors(reference, first, estimated)
     covariances = [c.covariance for c in (*stated, rounding(first)) if isinstance(c, Contribution)]
     draw = through(noise.posterior(first), covariances, results)
-    return beside_trials(complete, draw, trials, contributions[1:])
+    return with_trials(complete, draw, trials, contributions[1:])
 
 
-def covariance_beside_reference(calibration: SensorCalibration) -> Values:
+def covariance_without_reference(calibration: SensorCalibration) -> Values:
     """Return the covariance without errors that calibration and held-out reference share: local gravity, time base.
 
     Both scale the matrix, ``dM = M e``, and the reference equally, so that held-out errors do not contain them.

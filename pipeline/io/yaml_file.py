@@ -104,10 +104,10 @@ def _check_size(events: Iterable[yaml.Event], where: str, largest: int) -> None:
             known.pop(event.anchor or "", None)
             added, deepest = 1, 0
         elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, before, beside = above.pop()
+            anchor, before, others = above.pop()
             if anchor:
                 known[anchor] = (size - before, deepest + 1)
-            depth, deepest = deepest + 1, beside
+            depth, deepest = deepest + 1, others
         size, deepest = size + added, max(deepest, depth)
         _check_limits(size, largest, len(above) + deepest, f"{where}:{line}")
 

@@ -222,7 +222,7 @@ class TurntableLimits(DetectionLimits):
             signs = np.where(bits & 1, -1.0, 1.0)
         else:
             signs = np.random.default_rng(count).choice([-1.0, 1.0], (MOST_SIGNS, count))
-        return np.asarray(signs * sizes[:count] @ self.ranking.beside[0, block, block] @ self.ranking.blocks[j])
+        return np.asarray(signs * sizes[:count] @ self.ranking.projected[0, block, block] @ self.ranking.blocks[j])
 
     def _explained(self, i: int, j: int, q: Values) -> Values:
         """Return the part of the signals of candidate j that candidate i explains: (t, s) array."""

@@ -67,8 +67,8 @@ if TYPE_CHECKING:
 
 FEWEST = 10  # samples, five times the unknowns of an angle
 ACROSS = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
-# Smallest eigenvalue of the mean square of (cos A, sin A) beside a constant: reached by an arc of 110 deg. Below, a
-# nonlinearity of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
+# Smallest eigenvalue of the covariance of (cos A, sin A): that of an arc of 110 deg. For a shorter arc, a nonlinearity
+# of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
 LEAST_COVERAGE = 0.017
 SMALLEST_SHARE = 1e-6  # of the largest eigenvalue, below which a function of the rate is one of the others
 LARGEST_UNCERTAINTY = 0.02  # g, of p and q: 1 deg

@@ -165,8 +165,8 @@ class Noise:
 
     ``source``, ``wander_source`` and ``time_source`` name the source of the white noise, the wander and its correlation
     time: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in
-    turns about a local polynomial) or ``sensor_file``. ``length`` is the duration, s, of the static rest, or of all
-    rests by hand that show the wander, else 0; the relative uncertainty of the wander is about
+    turns about a local polynomial) or ``data_sheet`` (the sensor file). ``length`` is the duration, s, of the static
+    rest, or of all rests by hand that show the wander, else 0; the relative uncertainty of the wander is about
     ``sqrt(correlation_time / length)``. ``likelihood`` is None without a static recording.
     """
 

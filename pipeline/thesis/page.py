@@ -1,4 +1,4 @@
-"""Render the page of the thesis: its tables and figures beside ours, its errata, and a verdict on each conclusion.
+"""Render the page of the thesis: its tables and figures with ours, its errata, and a verdict on each conclusion.
 
 A letter marks each cell that differs from the printed one by more than a quarter, and refers to the reason. The figures
 follow chapter 5: error per procedure, held-out motion, error before and after, and the comparison of methods.

@@ -28,7 +28,7 @@ from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import moves_of, observed_rests
 from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
-from pipeline.estimation.uncertainty_budget import covariance_beside_reference
+from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect
 from pipeline.records import Integers, Noise, Recording, SensorCalibration, Values, continuous, level_in_body
@@ -236,7 +236,7 @@ def gravity_direction(
     if gyroscope.covariance is not None and gyroscope.covariance[3:12, 3:12].any():
         ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
         details = gyroscope.stages[-1].details if gyroscope.stages else {}
-        covariance, freedom = covariance_beside_reference(gyroscope), gyroscope.effective_freedom()
+        covariance, freedom = covariance_without_reference(gyroscope), gyroscope.effective_freedom()
         found["largest_expected_rms_deg"] = model.largest_direction_error(
             states["after"], covariance, freedom, details, ratio
         )

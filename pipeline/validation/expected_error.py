@@ -41,7 +41,7 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
 from pipeline.estimation.selection import INFLATED
-from pipeline.estimation.uncertainty_budget import DITHERED, covariance_beside_reference
+from pipeline.estimation.uncertainty_budget import DITHERED, covariance_without_reference
 from pipeline.model.measurement import inverse_of
 from pipeline.validation.error_breakdown import last_step
 from pipeline.validation.samples import Samples, mean_squares, reference_vector
@@ -179,7 +179,7 @@ def _of_parameters(calibration: SensorCalibration, table: Mapping[str, Any]) -> 
     lines = (calibration.budget or {}).get("contributions", ())
     out, nu = np.zeros((size + 1, size + 1)), np.full(size + 1, np.inf)
     if calibration.covariance is not None:
-        covariance = covariance_beside_reference(calibration)
+        covariance = covariance_without_reference(calibration)
         total, remaining = np.diag(calibration.covariance), np.diag(covariance)
         lack = np.sum([np.square(line["parts"][LACK_OF_FIT]) for line in lines if LACK_OF_FIT in line["parts"]], axis=0)
         scale = np.sqrt(np.clip(1.0 - lack / np.where(remaining > 0.0, remaining, 1.0), 0.0, 1.0)) * np.ones(size)

@@ -35,7 +35,7 @@ from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import NAMES
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.rest_means import count_of_rests
-from pipeline.estimation.uncertainty_budget import covariance_beside_reference
+from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.io.quality_flags import STUCK
 from pipeline.model.effects import bench_priors, effect_of
 from pipeline.model.effects.base import unit_of
@@ -276,8 +276,8 @@ def _agreement(
         return None
     slopes /= sum(part.number for part in parts)
     error = np.linalg.inv(fit.matrix).ravel() - np.eye(3).ravel()
-    C = covariance_beside_reference(fit)[MATRIX, MATRIX]
-    C += slopes @ covariance_beside_reference(calibration) @ slopes.T
+    C = covariance_without_reference(fit)[MATRIX, MATRIX]
+    C += slopes @ covariance_without_reference(calibration) @ slopes.T
     freedom = min(float(np.min(each.effective_freedom()[MATRIX])) for each in (fit, calibration))
     from scipy.special import fdtrc  # noqa: PLC0415  (only held-out motion with a vector reference needs it)
 

@@ -90,13 +90,13 @@ def test_effects_that_cannot_be_seen_are_grouped_by_reason() -> None:
         "bias_temperature": "the recordings hold no temperature; it needs rests while the sensor warms",
         "low_pass_lag": "there is no table",
         "scale_factor_temperature": "the recordings hold no temperature; it needs each axis up and down",
-        "lever_arm": "nobody knows the heading",
+        "lever_arm": "the heading is unknown",
     }
     hidden = [{"effect": name, "reason": reason} for name, reason in reasons.items()]
     lines = in_words(part("nothing_missing", [], []) | {"not_observable": hidden}, "accelerometer")
     assert lines[-1] == (
         "Not observable: time offset and low pass lag (there is no table); bias temperature and scale factor "
-        "temperature (the recordings hold no temperature); lever arm (nobody knows the heading)."
+        "temperature (the recordings hold no temperature); lever arm (the heading is unknown)."
     )
 
 
@@ -117,13 +117,13 @@ def test_the_share_of_simulations_says_what_is_expected(share: float, says: str)
     assert says in " ".join(in_words(found, "gyroscope"))
 
 
-def test_a_tilt_that_is_held_is_no_estimate() -> None:
+def test_a_tilt_that_is_fixed_is_no_estimate() -> None:
     found = part("missing_effect", ["table_tilt"], [])
     u = {"unit": "deg", "standard_uncertainty": 1e-4}
     found["ranking"][0]["parameters"] = {"d_x": {**u, "value": 1e-9}, "d_y": {**u, "value": 0.02}}
     said = " ".join(in_words(found, "accelerometer"))
-    assert "d_x = 0 deg (held), d_y = 0.02 +- 0.0002 deg" in said
-    assert "the same as a common zero of the turns" in said
+    assert "d_x = 0 deg (fixed), d_y = 0.02 +- 0.0002 deg" in said
+    assert "the same signal as a common zero of the turns" in said
 
 
 def test_an_effect_that_contains_another_needs_no_distinction() -> None:

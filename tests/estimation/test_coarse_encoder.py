@@ -60,5 +60,5 @@ def test_rounding_and_ripple_are_no_effect_of_the_sensor() -> None:
     observations = observe("gyroscope", recordings(), {"gravity_g": 1.0})
     selection = select(observations, (), NOISE, SHEET)
     assert selection.names == []
-    expected = WHITE * np.sqrt(selection.observations.weakened.expected_square)
+    expected = WHITE * np.sqrt(selection.observations.less_stop_errors.expected_square)
     assert 0.95 * expected < selection.fit.residual_rms < 1.15 * expected

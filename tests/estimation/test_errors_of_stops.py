@@ -80,8 +80,8 @@ def test_errors_of_the_angle_that_noise_hides_change_nothing() -> None:
     assert observed(ANGLE_DEG).angle_deg == ANGLE_DEG
     hidden = observed(1e-4)
     assert hidden.angle_deg == 0.0
-    assert np.array_equal(hidden.weakened.weight, observed(0.0).weight)
-    lower = observed(ANGLE_DEG).weakened.weight / hidden.weight
+    assert np.array_equal(hidden.less_stop_errors.weight, observed(0.0).weight)
+    lower = observed(ANGLE_DEG).less_stop_errors.weight / hidden.weight
     assert 0.01 < lower.min() <= lower.max() < 0.1  # 12 samples of 8e-4 g beside 8.7e-4 g, once a stop
 
 

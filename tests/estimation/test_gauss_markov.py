@@ -15,8 +15,8 @@ from pipeline.estimation.gauss_markov import (
     Products,
     Setting,
     block_covariance,
+    constant_bias_s,
     orthonormal,
-    steady_s,
     variance_of_average,
 )
 from pipeline.records import Noise
@@ -131,8 +131,8 @@ def test_a_bias_counts_as_constant_while_its_spectrum_is_below_that_of_white_noi
     white, wander, tau, interval = 2.0, 3.0, 100.0, 0.1
     noise = Noise(np.full(3, white), np.full(3, wander), tau, "static")
     lags = np.arange(-200_000, 200_001) * 0.01  # s
-    frequency = 1.0 / (2.0 * steady_s(noise, interval))
+    frequency = 1.0 / (2.0 * constant_bias_s(noise, interval))
     spectrum = 0.01 * np.sum(wander**2 * np.exp(-np.abs(lags) / tau) * np.cos(2.0 * np.pi * frequency * lags))
     assert spectrum == pytest.approx(SLOW * white**2 * interval, rel=0.01)
-    assert steady_s(Noise(np.full(3, white), np.zeros(3), tau, "static"), interval) == np.inf
-    assert steady_s(Noise(np.full(3, white), np.full(3, wander), tau, "rests"), interval) == np.inf
+    assert constant_bias_s(Noise(np.full(3, white), np.zeros(3), tau, "static"), interval) == np.inf
+    assert constant_bias_s(Noise(np.full(3, white), np.full(3, wander), tau, "rests"), interval) == np.inf

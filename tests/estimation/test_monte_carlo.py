@@ -12,7 +12,7 @@ from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through
+from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.records import LIMIT, SensorCalibration
 from pipeline.report.pages import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit
@@ -42,14 +42,14 @@ def drawn(function: Any, u: float) -> Any:
 
 
 def test_a_linear_model_is_validated() -> None:
-    run = (beside_trials(stated(0.02), drawn(lambda e: e, 0.02), 40_000).budget or {})["monte_carlo"]
+    run = (with_trials(stated(0.02), drawn(lambda e: e, 0.02), 40_000).budget or {})["monte_carlo"]
     assert run["all_validated"]
     assert run["standard_uncertainty"][0] == pytest.approx(0.02, rel=0.02)
     assert run["high"][0] == pytest.approx(1.96 * 0.02, rel=0.02)
 
 
 def test_a_square_is_not_validated_and_its_interval_is_that_of_chi_squared() -> None:
-    found = beside_trials(stated(0.02), drawn(lambda e: 10.0 * e**2, 0.02), 40_000)
+    found = with_trials(stated(0.02), drawn(lambda e: 10.0 * e**2, 0.02), 40_000)
     run = (found.budget or {})["monte_carlo"]
     assert not run["validated"][0]
     assert run["high"][0] == pytest.approx(10.0 * 0.02**2 * 5.0239, rel=0.05)  # 97.5 % of chi squared, one degree
@@ -57,7 +57,7 @@ def test_a_square_is_not_validated_and_its_interval_is_that_of_chi_squared() -> 
 
 
 def test_the_same_run_gives_the_same_numbers() -> None:
-    first, second = (beside_trials(stated(0.02), drawn(np.sinh, 0.02), 2000).budget for _ in range(2))
+    first, second = (with_trials(stated(0.02), drawn(np.sinh, 0.02), 2000).budget for _ in range(2))
     assert first == second
 
 

@@ -128,7 +128,7 @@ def test_terms_of_a_mixture_are_found_within_their_intervals() -> None:
         assert low < truth < high
         assert low < part["value"] < high
     assert x["terms"]["random_walk"]["unit"] == "deg/s/sqrt(s)"
-    assert x["terms"]["bias_instability"]["reason"] == "not seen beside random walk"
+    assert x["terms"]["bias_instability"]["reason"] == "not detected in the presence of random walk"
     for part in (x, y, z):
         assert part["p_value"] > 1e-3
         assert part["doubts"] == []

@@ -13,7 +13,7 @@ from table_turns import SHEETS, Bench, settings
 
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.stated_lines import with_stated
-from pipeline.estimation.uncertainty_budget import covariance_beside_reference
+from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.io.arrow import to_parquet
 from pipeline.model.calibration_file import beyond_uncertainty
 from pipeline.records import FittedEffect, Note
@@ -171,7 +171,7 @@ def test_a_scale_that_the_held_out_reference_shares_is_not_expected_in_its_error
     without, _ = by_angle(sensor, counted=False)
     stated, _ = by_angle(sensor, counted=False, **{key: u})
     assert stated.covariance[3, 3] > 4.0 * without.covariance[3, 3]
-    beside = covariance_beside_reference(stated)
+    beside = covariance_without_reference(stated)
     assert beside == pytest.approx(without.covariance, rel=1e-6, abs=1e-6 * np.max(np.abs(without.covariance)))
 
 

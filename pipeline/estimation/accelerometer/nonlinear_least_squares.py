@@ -26,7 +26,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE, Prior
 from pipeline.estimation.least_squares import ScaledColumns
-from pipeline.estimation.monte_carlo import KEY, beside_trials, quadratic_results, through, trials_of
+from pipeline.estimation.monte_carlo import KEY, quadratic_results, through, trials_of, with_trials
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, AccelerometerModel, limit_of_misalignment
 from pipeline.estimation.multi_position.fit import Fit
 from pipeline.estimation.multi_position.fit import fit as fit_model
@@ -340,7 +340,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         errors = np.pad(drawn / white[solved.rows], ((0, 0), (0, len(white) - len(count))))
         return np.asarray(estimate + steps(errors) @ PLACED.T)
 
-    return beside_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines[1:])
+    return with_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines[1:])
 
 
 def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]]:

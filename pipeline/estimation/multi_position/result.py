@@ -20,7 +20,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import AUTO, limits_of
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import certified
-from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, trials_of
+from pipeline.estimation.monte_carlo import quadratic_results, trials_of, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
 from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_observable
@@ -192,7 +192,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
             missing[TIME_BASE] = "table.clock_accuracy_ppm is not stated"
         else:
             lines.append(clock_contribution(calibration, float(table["clock_accuracy_ppm"])))
-        missing["Earth's rotation"] = "not in the model: by hand nobody knows the heading; up to 0.0042 deg/s of bias"
+        missing["Earth's rotation"] = "not in the model: by hand the heading is unknown; up to 0.0042 deg/s of bias"
     complete, trials = combined(calibration, [*lines, *limit], missing), trials_of(settings)
     return _with_monte_carlo(complete, model, fitted, trials, lines[1:]) if trials else complete
 
@@ -243,7 +243,7 @@ def _with_monte_carlo(
             steps[rows] = solvers[k](draw_normal(rng, covariances[k], int(np.count_nonzero(rows))))
         return np.asarray(estimate + steps @ place.T)
 
-    return beside_trials(calibration, draw, trials, direct)
+    return with_trials(calibration, draw, trials, direct)
 
 
 def curvature(model: Model, fitted: Fit) -> Values:

@@ -269,9 +269,9 @@ def refusal(candidate: Effect, sensor: str, rests: Rests) -> str:
         (sensor not in candidate.sensors, f"{candidate.name} is no effect of the {sensor}"),
         (sensor in candidate.unseen, candidate.unseen.get(sensor, "")),
         (candidate.owner == Owner.TABLE or candidate.moves, "there is no table"),
-        (candidate.owner == Owner.MOUNTING, "by hand nobody knows the unit's heading, nor about which point it turns"),
+        (candidate.owner == Owner.MOUNTING, "by hand the heading of the unit and the centre of its turns are unknown"),
         ("temperature" in candidate.needs and np.isnan(rests.temperature).any(), "the recordings hold no temperature"),
-        (bool(unknown), f"without a table nobody knows the {' and '.join(unknown)}"),
+        (bool(unknown), f"without a table {' and '.join(unknown)} cannot be known"),
         (candidate.needs_clock and not rests.clock_shared, "the time between the recordings is not known"),
     ]
     return next((reason for applies, reason in checks if applies), "")

@@ -124,7 +124,7 @@ def test_where_nothing_is_missing_auto_leaves_the_calibration_as_it_was() -> Non
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("table_tilt", "there is no table"), ("hysteresis", "do not determine"), ("lever_arm", "by hand nobody knows")],
+    [("table_tilt", "there is no table"), ("hysteresis", "do not determine"), ("lever_arm", "the heading of the unit")],
 )
 def test_an_effect_that_rests_cannot_show_is_refused_with_the_reason(name: str, reason: str) -> None:
     with pytest.raises(NotObservableError, match=reason):
