@@ -50,7 +50,7 @@ from pipeline.io.ingest_settings import check_ingest
 from pipeline.model.sensor_file import completed, range_settings, without_overridden
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from omegaconf import DictConfig
@@ -233,10 +233,18 @@ class Composer:
         if sensor not in applies:
             raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
 
+    def _check_limits(self, sensor: str, limits: Mapping[str, Any]) -> None:
+        """Refuse a limit that is neither of an effect nor of its parameter, such as ``warm_up_time_constant``."""
+        for name in limits:
+            if name not in self.effects and not any(name.startswith(f"{effect}_") for effect in self.effects):
+                hint = nearest(name, self.effects)
+                raise Problem(f"sensor.{sensor}.effects.{name}: no effect is called {name!r}{hint}")
+
     def _check_meaning(self, config: dict[str, Any]) -> None:
         stated = {key for key in OF_BENCH if config["table"].get(key)}
         of_bench = [name for name in self.effects if stated and read_option("effect", name, ()).get("prior") in stated]
         for sensor, names in config["effects"].items():
+            self._check_limits(sensor, config["sensor"][sensor]["effects"])
             for name in [] if names == "auto" else names:
                 self._check_effect(sensor, name, config["procedure"])
             for name in [] if names == "auto" else [*of_bench, *names]:

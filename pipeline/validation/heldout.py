@@ -1,10 +1,13 @@
 """Held-out errors: the errors of a calibration on samples that no fit used, and the error by noise alone.
 
 The recordings of role ``validation`` are held out; without one, every third rest (``procedure.holdout_every``). Where
-nothing is held out, the samples of the fit are used, and the result says so. With the truth t, the matrix M, the noise
-n of a sample (white noise after the filter, and bias wander) and its covariance V, which is diagonal,
+nothing is held out, the samples of the fit are used, and the result says so. With the truth t, the matrix M, and the
+noise n of a sample with its diagonal covariance V (``Samples.variance``: white noise after the filter, bias wander,
+resolution of the encoder, uncertainty of the creep at rest; not the uncertainty of the calibration or the table),
 
     noise_floor = sqrt(mean E[(|t + M n| - |t|)^2]),    vector_noise_floor = sqrt(mean tr(M V M^T))
+
+Where no attitude is logged, |t| is the reference's magnitude, and the calibrated reading gives the direction of t.
 
 A calibration is worse than the raw readings where its error is above its expected interval
 (``pipeline.validation.expected_error``) and a t-test confirms it. The test compares the mean squared error of each

@@ -10,10 +10,10 @@ fixed axis. Errors of the rate by the resolution of the encoder count as white n
 
 The mean squared error of the magnitude of a vector t, given the covariance S of the vector's error x, is
 
-    E(|t + x| - |t|)^2 = tr(W S),    W = u u' + g (1 - u u'),    u = t/|t|
+    E(|t + x| - |t|)^2 = tr(W S),    W = u u' + g (I - u u'),    u = t/|t|
 
 Where |t| is beyond 30 standard deviations of x, the norm is linear in x and g = 0. Nearer to zero (a gyroscope at rest)
-g follows from the mean ``2 |t|^2 + tr S - 2 |t| E|t + x|``, with
+g is such that the mean squared error is ``2 |t|^2 + tr S - 2 |t| E|t + x|``, with
 
     E|t + x| = 1/sqrt(pi) int_0^inf (1 - phi(v^2)) / v^2 dv
     phi(s) = prod_i (1 + 2 s l_i)^(-1/2) exp(-s t_i^2 / (1 + 2 s l_i))

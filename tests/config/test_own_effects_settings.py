@@ -52,6 +52,14 @@ def load(bench: Path, **settings: object) -> Campaign:
     return load_campaign({"campaign": str(bench), "results": str(bench.parent / "results"), **settings})
 
 
+def test_a_limit_of_an_effect_that_does_not_exist_is_refused_with_the_nearest(bench: Path) -> None:
+    wrong = "+sensor.gyroscope.effects.g_sensitivty=0.01"
+    with pytest.raises(ConfigurationError, match="no effect is called 'g_sensitivty'; nearest: g_sensitivity"):
+        load(bench, overrides=[wrong])
+    limits = load(bench).units["U1"].config["sensor"]["gyroscope"]["effects"]
+    assert {"bend", "warm_up", "warm_up_time_constant"} <= limits.keys()
+
+
 def carried(campaign: Campaign, output: str) -> tuple[list[str], int]:
     files = settings_of_jobs(campaign)[next(iter(campaign.batches))]
     content: dict[str, Any] = json.loads(files[output].content)
