@@ -105,7 +105,12 @@ def table_errors(
         if reason:
             missing[source] = reason
         elif u:
-            by_input = reference.summed(fit, partial(change, reference), inputs) if change else _angle(reference, fit)
+            if change is None:
+                by_input = _angle(reference, fit)
+            elif change is _rate and reference.table.get("motion") == "commanded":
+                by_input = _rate_of_each(reference, fit)
+            else:
+                by_input = reference.summed(fit, partial(change, reference), inputs)
             lines.append(type_b(source, NORMAL, float(u), unit, by_input))
     return lines, missing
 
@@ -236,6 +241,22 @@ def _rate(reference: Reference, motion: Motion) -> Values | None:
         travelled = np.concatenate([[0.0], np.cumsum(np.diff(motion.angle))])[:, None]
         du[:, :, motion.axis] = -np.radians(travelled * (motion.specific_force @ ABOUT[motion.axis].T))
     return du
+
+
+def _rate_of_each(reference: Reference, fit: LinearMap) -> Values:
+    """Return the change of the parameters by a relative error of the rate in each recording: (p, recordings) array.
+
+    A motor without an encoder loses steps in fast turns, so that recordings about one axis have different errors.
+    """
+
+    def of_turn(turn: Motion) -> Values:
+        def change(motion: Motion) -> Values | None:
+            return _rate(reference, motion) if motion is turn else None
+
+        return reference.summed(fit, change, 3)[:, turn.axis]
+
+    columns = [of_turn(motion) for motion in reference.motions if motion.axis is not None]
+    return np.stack(columns, axis=1) if columns else np.zeros((fit.parameters, 0))
 
 
 def _orthogonality(reference: Reference, motion: Motion) -> Values | None:

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.reference_least_squares import fit
+from pipeline.estimation.stages import fit_stage
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 
@@ -64,6 +65,17 @@ def test_the_length_of_gravity_is_not_charged_with_errors_of_the_attitude() -> N
     ratios = _ratios(found, true)
     assert ratios.max() < 2.2
     assert np.median(ratios) == pytest.approx(1.0, abs=0.3)
+
+
+def test_an_effect_fitted_to_turns_of_different_speed_errors_leaves_the_bias_within_its_uncertainty() -> None:
+    inside = []
+    for n in range(UNITS):
+        recordings, hidden = _unit(n)
+        settings = SETTINGS | {"effects": {"gyroscope": ["g_sensitivity"]}, "method": {"as_printed": False}}
+        part = fit_stage("gyroscope", "effects", recordings, None, settings).to_json()
+        error = np.array(part["bias"]) - hidden["gyroscope"]["bias"]
+        inside.append(np.abs(error) <= part["expanded_uncertainty"]["bias"])
+    assert np.mean(inside) > 0.85  # 95 % in truth; 60 % if all turns about an axis had the same error
 
 
 def test_an_accuracy_that_does_not_touch_the_gyroscope_changes_nothing() -> None:
