@@ -76,6 +76,10 @@ class Reference:
                 total += np.stack([rows.of(du[:, :, j] @ self.K.T) for j in range(inputs)], axis=1)
         return total
 
+    def of_one(self, fit: LinearMap, motion: Motion, du: Values) -> Values:
+        """Return the change of the parameters by inputs of one recording; ``du``: (n, 3, inputs), as in ``summed``."""
+        return self.summed(fit, lambda other: du if other is motion else None, du.shape[2])
+
 
 def type_b(  # noqa: PLR0917  (the columns of a budget's line)
     source: str, distribution: str, u: float, unit: str, effect: Values, remark: str = ""
@@ -227,7 +231,7 @@ def _turned(reference: Reference, fit: LinearMap, motion: Motion) -> Values:
     """Return the change of the parameters by a rotation of one recording about each axis, per deg: (p, 3) array."""
     u = truth(reference.sensor, motion)
     du = np.stack([-np.radians(u @ about.T) for about in ABOUT], axis=2)
-    return reference.summed(fit, lambda other: du if other is motion else None, 3)
+    return reference.of_one(fit, motion, du)
 
 
 def _rate(reference: Reference, motion: Motion) -> Values | None:
@@ -248,15 +252,9 @@ def _rate_of_each(reference: Reference, fit: LinearMap) -> Values:
 
     A motor without an encoder loses steps in fast turns, so that recordings about one axis have different errors.
     """
-
-    def of_turn(turn: Motion) -> Values:
-        def change(motion: Motion) -> Values | None:
-            return _rate(reference, motion) if motion is turn else None
-
-        return reference.summed(fit, change, 3)[:, turn.axis]
-
-    columns = [of_turn(motion) for motion in reference.motions if motion.axis is not None]
-    return np.stack(columns, axis=1) if columns else np.zeros((fit.parameters, 0))
+    changes = [(motion, _rate(reference, motion)) for motion in reference.motions]  # other axes have zeros
+    columns = [reference.of_one(fit, m, du.sum(axis=2, keepdims=True)) for m, du in changes if du is not None]
+    return np.concatenate(columns, axis=1) if columns else np.zeros((fit.parameters, 0))
 
 
 def _orthogonality(reference: Reference, motion: Motion) -> Values | None:
