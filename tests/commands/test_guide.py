@@ -203,12 +203,16 @@ def test_an_attitude_is_proposed_again_with_the_reason(capsys: pytest.CaptureFix
     assert True in reasons
 
 
+def copied(rests: Path, tmp_path: Path) -> Path:
+    """Return the recording in a copy of its campaign."""
+    shutil.copytree(rests.parents[2], tmp_path / "bench")
+    return tmp_path / "bench" / "raw" / "U1" / "recording.csv"
+
+
 def test_a_recording_for_validation_leaves_every_rest_to_the_fit(
     rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bench = tmp_path / "bench"
-    shutil.copytree(rests.parents[2], bench)
-    recording = bench / "raw" / "U1" / "recording.csv"
+    recording = copied(rests, tmp_path)
     assert main(["guide", str(recording), "--goal", "1"]) == 0
     assert "one of 3 rests is held out of the fit" in capsys.readouterr().out
     header, table = readings_of(recording)
@@ -224,9 +228,7 @@ def test_a_recording_for_validation_leaves_every_rest_to_the_fit(
 def test_the_gyroscope_is_planned_with_the_effects_of_its_configuration(
     rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bench = tmp_path / "bench"
-    shutil.copytree(rests.parents[2], bench)
-    recording = bench / "raw" / "U1" / "recording.csv"
+    recording = copied(rests, tmp_path)
     header, table = readings_of(recording)
     table[:, 4:] += 0.5 * table[:, [2, 3, 1]]  # deg/s/g, across the axes
     lines = lines_of(header, table)
@@ -234,9 +236,9 @@ def test_the_gyroscope_is_planned_with_the_effects_of_its_configuration(
     stated = []
     for listed in ("", "[g_sensitivity]"):
         if listed:
-            (bench / "devices").mkdir()
+            (recording.parents[2] / "devices").mkdir()
             lines = [f"effects.gyroscope={listed}", "effects.accelerometer=[quadratic_nonlinearity]"]
-            (bench / "devices" / "U1.yaml").write_text(f"overrides: {lines}\n")
+            (recording.parents[2] / "devices" / "U1.yaml").write_text(f"overrides: {lines}\n")
         assert main(["guide", str(recording), "--goal", "1", "--gyroscope-goal", "0.001"]) == 0
         out = capsys.readouterr().out
         assert ("accelerometer is forecast without its configured effects: quadratic_nonlinearity" in out) == bool(
