@@ -251,11 +251,8 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
 
 def _shared(recording: Recording, motion: Motion, rows: Rows) -> Motion:
     """Return the motion at the rows, which is mostly the same for both sensors of a recording."""
-    key = "rows", id(motion.specific_force), rows.kept.tobytes(), rows.first.tobytes()  # the array is cached, too
-    if key not in recording.cache:
-        recording.cache[key] = rows.motion(motion)
-    at_rows: Motion = recording.cache[key]
-    return at_rows
+    key = "rows", id(motion.specific_force), rows.kept.tobytes(), rows.first.tobytes()  # the recording keeps the array
+    return recording.once(key, lambda: rows.motion(motion))
 
 
 def filtered_motion(motion: Motion, recording: Recording) -> Motion:

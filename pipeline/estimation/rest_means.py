@@ -61,9 +61,7 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
     ``every``: the middle one of so many accepted rests is held out, so that the first and the last rest are in the fit;
     0 holds out none.
     """
-    if "rests" not in recording.cache:
-        recording.cache["rests"] = rests_from_table(recording) or find_rests(recording)
-    rests: list[Rest] = recording.cache["rests"]
+    rests = recording.once("rests", lambda: rests_from_table(recording) or find_rests(recording))
     accepted = [rest for rest in rests if rest.accepted]
     held = range(every // 2, len(accepted), every) if every else range(0)
     return RestSplit(

@@ -63,8 +63,7 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
     usable = [r for r in recordings if r.role == sensor and r.reading(sensor) is not None]
     parts = []
     for recording in usable:
-        without = recording if recording.cache else replace(recording, temperature=None)  # these fits do not use it
-        motion = table_motion(without, table)
+        motion = table_motion(recording, table)
         if motion is not None:
             parts.append(Part(recording, motion, recording.valid))
     if not parts:

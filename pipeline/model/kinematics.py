@@ -86,8 +86,8 @@ def reference_motion(
 ) -> Motion | None:
     """Return the motion of a recording by the log of the table; None where the recording has no such log.
 
-    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``. The motion is cached in the recording;
-    its arrays are shared. ``earth_rate_level``: Earth's rotation in the level frame, (3,), deg/s, or None.
+    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``. It is computed once a
+    recording; its arrays are shared. ``earth_rate_level``: Earth's rotation in the level frame, (3,), deg/s, or None.
     ``one_shaft``: level x is the axis about which the encoder counts right-handed, the same in all turns
     (``table.azimuth_of``), not the body axis at angle 0. Raises ``InputError`` if there are too few samples to
     differentiate the log.
@@ -98,8 +98,8 @@ def reference_motion(
         build = _motion_of_attitude
     else:
         return None
-    key = (gravity_g, None if earth_rate_level is None else earth_rate_level.tobytes(), one_shaft)
-    if key not in recording.cache:
+
+    def motion() -> Motion:
         if recording.samples < 6:
             raise InputError(
                 f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the "
@@ -115,9 +115,10 @@ def reference_motion(
             recording=recording.name,
             setup=recording.setup,
         )
-        recording.cache[key] = build(recording, gravity_g, earth_rate_level, logged)
-    found: Motion = recording.cache[key]
-    return found
+        return build(recording, gravity_g, earth_rate_level, logged)
+
+    level = None if earth_rate_level is None else earth_rate_level.tobytes()
+    return recording.once(("motion", gravity_g, level, one_shaft), motion)
 
 
 def _motion_of_turn(

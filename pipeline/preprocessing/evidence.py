@@ -169,10 +169,7 @@ def alike(one: Values, two: Values) -> float:
 
 def gravity_turned(recording: Recording) -> Values | None:
     """Return the angle by which gravity turned about the turn axis in each interval, deg; None if it does not turn."""
-    if "gravity_turned" not in recording.cache:
-        recording.cache["gravity_turned"] = _gravity_turned(recording)
-    turned: Values | None = recording.cache["gravity_turned"]
-    return turned
+    return recording.once("gravity_turned", lambda: _gravity_turned(recording))
 
 
 def _gravity_turned(recording: Recording) -> Values | None:

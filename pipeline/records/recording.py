@@ -20,12 +20,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Hashable
 
     from numpy.typing import NDArray
 
@@ -34,6 +34,7 @@ Values: TypeAlias = "NDArray[np.float64]"
 Mask: TypeAlias = "NDArray[np.bool_]"
 Integers: TypeAlias = "NDArray[np.int64]"
 Index: TypeAlias = "NDArray[np.intp]"
+Computed = TypeVar("Computed")
 
 AXES = ("x", "y", "z")
 SENSORS = ("accelerometer", "gyroscope")
@@ -112,9 +113,26 @@ class Recording:
         return float(median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
 
     @cached_property
-    def cache(self) -> dict[Any, Any]:
-        """Cached results for several steps: smoothed temperature, reference motions."""
+    def _computed(self) -> dict[Hashable, Any]:
+        """The quantities of ``once``."""
         return {}
+
+    def once(self, key: Hashable, compute: Callable[[], Computed]) -> Computed:
+        """Return a quantity that follows from this recording and ``key``, computed at the first call.
+
+        The steps of a unit pass on its recordings (``UnitRecordings``), so that each motion of the table, smoothed
+        temperature and list of rests is computed once a unit.
+        """
+        if key not in self._computed:
+            self._computed[key] = compute()
+        found: Computed = self._computed[key]
+        return found
+
+    def with_readings(self, **fields: Any) -> Self:  # noqa: ANN401  (of the dataclass)
+        """Return the recording with other readings, flags or role, and the motions that are already computed."""
+        changed = replace(self, **fields)
+        changed._computed.update({k: v for k, v in self._computed.items() if isinstance(v, Motion)})  # noqa: SLF001
+        return changed
 
     @property
     def table_seconds(self) -> float:

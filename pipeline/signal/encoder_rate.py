@@ -59,13 +59,10 @@ class EncoderRate:
 
 def rate_by_angle(recording: Recording) -> EncoderRate | None:
     """Return the rate from the angle; None where the table logs a rate or no angle, or below 6 samples."""
-    if recording.table_rate is not None or recording.table_angle is None or recording.samples < FEWEST:
+    angle = recording.table_angle
+    if recording.table_rate is not None or angle is None or recording.samples < FEWEST:
         return None
-    key = "encoder_rate"
-    if key not in recording.cache:
-        recording.cache[key] = _rate_of(recording.time * recording.table_seconds, recording.table_angle)
-    found: EncoderRate = recording.cache[key]
-    return found
+    return recording.once("encoder_rate", lambda: _rate_of(recording.time * recording.table_seconds, angle))
 
 
 def _rate_of(time: Values, angle: Values) -> EncoderRate:

@@ -309,11 +309,10 @@ def smooth_temperature(time: Values, temperature: Values, bandwidth: float = 10.
 
 
 def temperature_of(recording: Recording) -> Values:
-    """Return the smoothed temperature of a recording that logs it: (n,) array, degC; cached."""
-    assert recording.temperature is not None  # noqa: S101
-    if "temperature" not in recording.cache:
-        recording.cache["temperature"] = smooth_temperature(recording.time, recording.temperature)
-    return np.asarray(recording.cache["temperature"])
+    """Return the smoothed temperature of a recording that logs it: (n,) array, degC."""
+    logged = recording.temperature
+    assert logged is not None  # noqa: S101
+    return recording.once("temperature", lambda: smooth_temperature(recording.time, logged))
 
 
 def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:

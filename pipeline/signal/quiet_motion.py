@@ -115,16 +115,16 @@ def _parabolas(time: Values) -> Values:
 
 def creep_of_rest(recording: Recording, start: int, stop: int) -> Creep:
     """Return the creep in the samples ``start <= n < stop`` of a recording, without flagged and missing ones."""
-    key = "creep", start, stop
-    if key not in recording.cache:
-        force = recording.accelerometer
-        assert force is not None  # noqa: S101
+    force = recording.accelerometer
+    assert force is not None  # noqa: S101
+
+    def creep() -> Creep:
         good = (recording.valid[start:stop]) & np.isfinite(force[start:stop]).all(axis=1)
         count = np.array([max(int(good.sum()), 1)])
         share = float(variance_of_mean(filter_autocovariance(recording), count)[0])
-        recording.cache[key] = creep_of_readings(recording.time[start:stop][good], force[start:stop][good], share)
-    found: Creep = recording.cache[key]
-    return found
+        return creep_of_readings(recording.time[start:stop][good], force[start:stop][good], share)
+
+    return recording.once(("creep", start, stop), creep)
 
 
 def creep_of_readings(time: Values, force: Values, share: float = 0.0) -> Creep:

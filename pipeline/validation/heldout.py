@@ -28,7 +28,6 @@ of local gravity and of the time base are the same in calibration and reference.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,7 +42,7 @@ from pipeline.io.quality_flags import STUCK
 from pipeline.model.effects import bench_priors, effect_of
 from pipeline.model.effects.base import unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
-from pipeline.records import AXES, Motion
+from pipeline.records import AXES
 from pipeline.signal.rests import Rest
 from pipeline.validation.error_breakdown import (
     direction_known,
@@ -268,8 +267,7 @@ def _agreement(
         slopes += part.number * per_parameter.reshape(9, -1)
         flags = np.zeros(len(known), np.uint16) if recording.flags is None else recording.flags
         values: dict[str, Any] = {"role": sensor, sensor: np.nan_to_num(reading)}
-        calibrated.append(replace(recording, flags=np.where(known, flags, flags | STUCK), **values))
-        calibrated[-1].cache.update({k: motion for k, motion in recording.cache.items() if isinstance(motion, Motion)})
+        calibrated.append(recording.with_readings(flags=np.where(known, flags, flags | STUCK), **values))
     at_rest = [r for r in case.recordings if r.role == "static"]
     table = {**settings["table"], **dict.fromkeys(bench_priors().values())}
     plain = {"table": table, "sensor": settings.get("sensor") or {}, "noise": {sensor: case.noise}}
