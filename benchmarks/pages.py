@@ -21,12 +21,12 @@ import numpy as np
 
 from pipeline.diagnosis.words import in_words
 from pipeline.pack import Pack
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, calibrated, fit_from_json
 from pipeline.report import campaign_page
 from pipeline.report.certificate import certificate, certificate_page
 from pipeline.report.unit_page import render, sensor_temperature
 from pipeline.stages.batch import merge_common
-from pipeline.stages.unit_files import load_fits, recordings_of
+from pipeline.stages.unit_files import recordings_of
 from pipeline.validation.attitude import attitude
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def unit_costs(results: Path, runs: int) -> dict[str, float]:
     documents = [Pack(batch / f"{stage}.zip").json(f"{UNIT}.json") for stage in ("calibration", "validate", "diagnose")]
     recordings = recordings_of({stage: Pack(batch / f"{stage}.zip") for stage in ("ingest", "filter")}, UNIT)
     last = {s: Pack(max((batch / "fit" / s).glob("*.zip"), key=lambda f: f.stat().st_mtime)) for s in SENSORS}
-    fits = load_fits(last, UNIT)
+    fits = calibrated({s: fit_from_json(s, pack.json(f"{UNIT}.json")) for s, pack in last.items()})
     words = {s: in_words(documents[2][s], s) for s in SENSORS}
 
     def report() -> str:

@@ -21,8 +21,8 @@ from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.posterior import Answers
 from pipeline.pack import Pack
-from pipeline.records import SENSORS, SensorCalibration
-from pipeline.stages.unit_files import recordings_of, require_noises
+from pipeline.records import SENSORS, Noise, SensorCalibration
+from pipeline.stages.unit_files import recordings_of
 
 NOISE = ".noise.json"
 
@@ -47,8 +47,8 @@ def main(results: Path) -> None:
             stages = [Pack(file).json(f"{unit}.json") for file in (batch / "fit" / sensor).glob("*.zip")]
             data = max(stages, key=lambda found: len(found.get("stages", ())))
             fits[sensor] = None if "not_calibrated" in data else SensorCalibration.from_json(sensor, data)
-        recordings = recordings_of(packs, unit)
-        noises = require_noises(packs["filter"], unit, recordings, settings[unit]["sensor"], fits)
+        stored = packs["filter"].json(f"{unit}{NOISE}")
+        noises = {s: noise and Noise.from_json(noise) for s, noise in stored.items()}
         for sensor, fit in fits.items():
             if fit is None:
                 continue

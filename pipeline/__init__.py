@@ -32,15 +32,85 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.version import VERSION
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
+
+    import pandas as pd
 
     from pipeline.campaign_results import CampaignResults
     from pipeline.model.compensation import Compensation
+    from pipeline.result import UnitResult
 
-__version__ = "0.1.0"
-__all__ = ["__version__", "load_calibration", "load_campaign"]
+__version__ = VERSION
+__all__ = ["__version__", "calibrate", "calibrate_unit", "load_calibration", "load_campaign"]
+
+
+def calibrate(
+    recordings: str | Path | Mapping[str, str | Path | pd.DataFrame],
+    *,
+    sensor: str,
+    table: str = "hand",
+    procedure: str | None = None,
+    method: str | None = None,
+    overrides: Sequence[str] = (),
+) -> UnitResult:
+    """Calibrate a unit from its recordings, in memory; no file is written.
+
+    Parameters
+    ----------
+    recordings : str, Path or mapping
+        A folder with the files that the procedure names, or the file or DataFrame of each recording by its name, for
+        example ``{"accel_x": frame}``. A DataFrame has the columns of the canonical CSV (``time_s``, ``accel_x_g``,
+        ``gyro_x_dps``, ``table_angle_deg`` ...).
+    sensor, table, procedure, method : str
+        Options of these groups, with the defaults of ``units.csv``.
+    overrides : sequence of str
+        Further settings, as in ``overrides=`` of a run, for example ``["effects.gyroscope=[g_sensitivity]"]``.
+
+    Raises
+    ------
+    PipelineError
+        The error whose code, message and file a run publishes for a failed unit.
+    """
+    from pipeline.one_unit import unit_without_campaign  # noqa: PLC0415  (Hydra is imported only where needed)
+    from pipeline.result import UnitResult  # noqa: PLC0415
+
+    chosen = {"sensor": sensor, "table": table, "procedure": procedure, "method": method}
+    layers = [f"{group}={option}" for group, option in chosen.items() if option is not None]
+    configured = unit_without_campaign(recordings, [*layers, *overrides])
+    return UnitResult.of(configured, configured.run_to("calibration"))
+
+
+def calibrate_unit(campaign: str | Path, unit: str, *, overrides: Sequence[str] = ()) -> UnitResult:
+    """Calibrate one unit of a campaign as a run does, in memory; no file is written.
+
+    Parameters
+    ----------
+    campaign : str or Path
+        A campaign's name or directory.
+    unit : str
+        A unit of its ``units.csv``.
+    overrides : sequence of str
+        Hydra overrides for this unit, as in ``overrides=`` of a run.
+
+    Raises
+    ------
+    ConfigurationError
+        If the campaign, the unit or a setting is not valid.
+    PipelineError
+        The error whose code, message and file a run publishes for a failed unit.
+    """
+    from pipeline.config import load_campaign as load  # noqa: PLC0415  (Hydra is imported only where needed)
+    from pipeline.one_unit import notes_of_campaign, unit_of_campaign  # noqa: PLC0415
+    from pipeline.result import UnitResult  # noqa: PLC0415
+
+    settings = {"campaign": str(campaign)} | ({"overrides": list(overrides)} if overrides else {})
+    loaded = load(settings)
+    configured = unit_of_campaign(loaded, unit)
+    return UnitResult.of(configured, configured.run_to("calibration"), notes_of_campaign(loaded, unit))
 
 
 def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:

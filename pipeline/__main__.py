@@ -30,13 +30,21 @@ def _summary(module: str, function: str) -> str:
     return text[start:].split('"""', 2)[1].splitlines()[0]
 
 
-def _help() -> str:
-    lines = [f"usage: {PROGRAM} COMMAND ... (COMMAND --help says more; --version)", "", "commands:"]
+def _stage_summary(stage: str, module: str) -> str:
+    """Read the summary line of a stage: of its module, or of its function in a module of several stages."""
+    alone = [*STAGES.values()].count(module) == 1
+    return _summary(f"stages.{module}", "main" if alone and stage != "verdict" else stage)
+
+
+def _help(*, stages: bool) -> str:
+    hint = "COMMAND --help says more; --help --all names the stages of a run; --version"
+    lines = [f"usage: {PROGRAM} COMMAND ... ({hint})", "", "commands:"]
     lines += [
         f"  {name:<12} {_summary(f'commands.{module}', function)}" for name, (module, function) in COMMANDS.items()
     ]
-    lines += ["", "stages, which the rules of the workflow call:"]
-    lines += [f"  {name:<12} {_summary(f'stages.{module}', name)}" for name, module in STAGES.items()]
+    if stages:
+        lines += ["", "stages, which the rules of the workflow call:"]
+        lines += [f"  {name:<12} {_stage_summary(name, module)}" for name, module in STAGES.items()]
     return "\n".join(lines)
 
 
@@ -46,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
     if command in ("-h", "--help", "--version"):
         from pipeline import __version__  # noqa: PLC0415  (nothing of the package is needed before)
 
-        print(f"imu-calibration {__version__}" if command == "--version" else _help())
+        print(f"imu-calibration {__version__}" if command == "--version" else _help(stages="--all" in rest))
         return 0
     if command == "job-server":  # started by workflow/rules/common.smk
         import socket  # noqa: PLC0415

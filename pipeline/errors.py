@@ -7,7 +7,10 @@ a batch a user error becomes the failure record of one unit. Any other exception
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import traceback
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -102,6 +105,21 @@ class CannotCalibrateError(PipelineError):
     """The procedure or method cannot calibrate this sensor: its result is ``null`` with a reason, not a failure."""
 
     code = "cannot_calibrate"
+
+
+def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
+    """Return the record of a unit's failure; print the traceback of an exception that is a bug."""
+    code, message, file = "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)", None
+    if isinstance(error, DamagedFileError):
+        with suppress(OSError), Path(str(error.file)).open("ab") as stream:
+            stream.write(b"\0")  # changes the size: the next run detects that the file was changed
+    if isinstance(error, PipelineError):
+        code, message, file = error.code, error.message, error.file
+    elif isinstance(error, OSError) and error.filename is not None:
+        code, message, file = "bad_input", error.strerror or str(error), str(error.filename)
+    else:
+        traceback.print_exc()
+    return {"unit": unit, "stage": stage, "code": code, "message": message, "file": file}
 
 
 def first(names: Sequence[str], most: int, of: str = "") -> list[str]:

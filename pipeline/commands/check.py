@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.commands import parser_of
 from pipeline.commands.readings import Reading, campaign_of, config_of_log, grouped, recordings_of_files
-from pipeline.commands.trial import try_unit
 from pipeline.config.campaign import find_campaign, load_campaign
 from pipeline.config.options import nearest
 from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError
@@ -21,22 +20,24 @@ from pipeline.files import write_atomically
 from pipeline.io.files import FILE, SUFFIXES, recording_files
 from pipeline.model.calibration_file import LEFT_OUT
 from pipeline.model.sensor_file import settings_of_ranges
+from pipeline.one_unit import try_unit, unit_of_campaign
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.profile_text import as_yaml, not_found
 from pipeline.profile_detection.proposal import propose
 from pipeline.profile_detection.recording_facts import as_text, counted, facts, topic_lines, topics_of
 from pipeline.profile_detection.unit_guesses import UNKNOWN
+from pipeline.records import SENSORS
 from pipeline.run_progress import Countdown
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
-    from pipeline.commands.trial import Trial
     from pipeline.config.campaign import Campaign
     from pipeline.profile_detection.columns import Log
     from pipeline.profile_detection.proposal import Proposal
     from pipeline.profile_detection.recording_facts import Line
+    from pipeline.records import Recording
 
 SEARCHED_BYTES = 1 << 25  # of a log, for its layout
 MOST_IN_FULL = 3  # logs of one layout
@@ -198,18 +199,20 @@ def _check_log(reading: Reading) -> Outcome:
 
 def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
     """Return the result of a run for a unit: content and notes of the named recordings, or a summary of all."""
-    trial, missing = try_unit(campaign, unit, "fit" if names else "calibration"), ""
+    configured, missing = unit_of_campaign(campaign, unit), ""
+    trial = try_unit(configured, "fit", fits=False) if names else try_unit(configured, "calibration")
     if names and trial.failure and trial.failure["code"] == "missing_file":
         missing = (
             f"a run needs more recordings of unit {unit}; they are not compared before: {trial.failure['message']}"
         )
-        trial = try_unit(campaign, unit, "ingest", incomplete=True)
+        trial = try_unit(configured.with_missing(), "ingest")
+    checked = trial.state.checked or []
     read = _readings_of(campaign, unit)
     texts = []
     refused: list[Refused] = []
-    for name in names or (read if not trial.recordings else ()):
+    for name in names or (read if not checked else ()):
         try:
-            lines = _facts_of_recording(read[name], campaign, trial)
+            lines = _facts_of_recording(read[name], campaign, checked)
             texts += [_described(read[name], lines)] if names else []
         except PipelineError as error:
             text, found = _refusal_of(read[name], error)
@@ -222,10 +225,11 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         lines = [*file, ("REFUSED", trial.failure["message"]), ("code", trial.failure["code"])]
         texts.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
     elif not names and not refused:
-        lines = [(sensor, f"null: {reason}") for sensor, reason in trial.not_calibrated.items()]
-        lines += [(sensor, text) for sensor, text in trial.not_determined.items() if text]
+        document = trial.state.calibration or {}
+        lines = [(sensor, f"null: {reason}") for sensor, reason in document["not_calibrated"].items()]
+        lines += [(s, text) for s in SENSORS if document[s] and (text := document[s]["not_determined"])]
         noted: dict[str, dict[tuple[str, str], list[str]]] = {}
-        for recording in trial.recordings:
+        for recording in checked:
             for note in recording.notes:
                 place = f", line {note.first} to {note.last}" if note.code in LEFT_OUT and note.first else ""
                 noted.setdefault(note.code, {}).setdefault((place, note.detail), []).append(recording.name)
@@ -235,7 +239,7 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
             for (place, detail), (name, *others) in found.items()
         ]
         lines += [("notes" if i == 0 else "", note) for i, note in enumerate(notes)]
-        head = f"unit {unit}: {counted(len(trial.recordings), 'recording')}, no refusal"
+        head = f"unit {unit}: {counted(len(checked), 'recording')}, no refusal"
         texts.append("\n".join([head, *([as_text(lines)] if lines else [])]))
     return "\n\n".join([*texts, *([missing] if missing else [])]), refused
 
@@ -253,12 +257,12 @@ def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
     return found
 
 
-def _facts_of_recording(reading: Reading, campaign: Campaign, trial: Trial) -> list[Line]:
+def _facts_of_recording(reading: Reading, campaign: Campaign, checked: Sequence[Recording]) -> list[Line]:
     """Return the content of a recording after ingest, and the parts if ingest cuts it."""
     ((name, entry),) = reading.settings["procedure"]["recordings"].items()
     parts = [
         r
-        for r in trial.recordings
+        for r in checked
         if campaign.recorded / r.source["file"] == reading.files[0] and r.source.get("session") == entry.get("session")
     ]
     if [part.name for part in parts] == [name]:

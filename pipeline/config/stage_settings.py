@@ -117,6 +117,21 @@ def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> 
     return settings
 
 
+def settings_of_unit(unit: UnitRow, stage: str, sensor: str = "") -> dict[str, Any]:
+    """Return the settings of a unit that a stage reads, without those of its campaign."""
+    digest = {"config_sha256": unit.config_sha256} if stage in WITH_DIGEST else {}
+    settings = select_settings(unit.config | digest, stage, sensor)
+    if stage == "report":
+        settings["row"] = {c: unit.row[c] for c in ("serial", "lot", "date") if unit.row.get(c)}
+    return settings
+
+
+def as_job_reads(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings as read from the file of a job: keys, and with them recordings, are in alphabetical order."""
+    found: dict[str, Any] = json.loads(_canonical(settings))
+    return found
+
+
 @cache
 def _paths(stage: str, sensor: str) -> list[list[str]]:
     return [key.format(sensor=sensor).split(".") for key in READS.get(stage, FIT)]
@@ -184,12 +199,10 @@ def _content(
     campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: str, summaries: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return the settings that a stage reads for the units of a batch; ``sensor``: of a stage of a fit."""
-    digests = [{"config_sha256": r.config_sha256} if stage in WITH_DIGEST else {} for r in rows]
-    settings = {r.name: select_settings(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
+    settings = {row.name: settings_of_unit(row, stage, sensor) for row in rows}
     if stage == "report":
         for row in rows:
-            cells = {c: row.row[c] for c in ("serial", "lot", "date") if row.row.get(c)}
-            settings[row.name] |= {"row": cells, "run": campaign.run_settings(row.name)}
+            settings[row.name] |= {"run": campaign.run_settings(row.name)}
     if stage == "summary":
         settings = {row.name: settings[row.name] | summaries[row.name] for row in rows}
     if stage == "calibration" and campaign.boards:
@@ -270,8 +283,11 @@ def code_digest(module: str) -> str:
     It includes all files of a package that imports its modules by name, the folder ``templates`` of a module that
     imports jinja2, and ``configs/effect/`` with the effects.
     """
+    files = _closure(module)
+    if module.startswith("pipeline.stages."):
+        files |= _closure("pipeline.stages.unit_files")  # loads and stores what the step reads and returns
     digest = hashlib.sha256()
-    for file in sorted(_closure(module)):
+    for file in sorted(files):
         digest.update(str(file.relative_to(PACKAGE.parent)).encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]
 

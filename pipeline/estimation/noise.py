@@ -71,7 +71,7 @@ from pipeline.signal.rests import rest_readings, stretches_of, usable
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Integers, Mask, Values
+    from pipeline.records import Integers, Mask, SensorCalibration, UnitRecordings, Values
 
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times of the grid, over that of the sensor file
 TIMES_BY_HAND = np.exp2(np.arange(-11.0, 4.0))  # the same by hand: from 0.05 s at 100 s; a tremor has 8 to 12 Hz
@@ -364,6 +364,19 @@ def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
         return estimate_noise(sensor, recordings, settings.get("sensor", {}).get(sensor) or {})
     except (ConfigurationError, InputError):
         return None
+
+
+def required_noises(
+    recordings: UnitRecordings,
+    sensor_configs: Mapping[str, Any],
+    calibrations: Mapping[str, SensorCalibration | None],
+) -> dict[str, Noise]:
+    """Return the noise of each calibrated sensor; ``ConfigurationError`` if nothing determines it."""
+    return {
+        sensor: recordings.noises[sensor] or estimate_noise(sensor, recordings.filtered, sensor_configs[sensor])
+        for sensor, calibration in calibrations.items()
+        if calibration is not None
+    }
 
 
 def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Prior:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -82,11 +82,16 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
 def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
     """Read the channels of one file; an ``IngestError`` names the line."""
     with unchanged(path), path.open("rb") as stream:
-        log = TextLog(stream, str(path), settings)
-        rows = Rows(log)
-        for body, lines in log:
-            rows.add(body, lines)
-        rows.finish(checks)
+        return read_stream(stream, str(path), settings, checks)
+
+
+def read_stream(stream: BinaryIO, name: str, settings: CsvFormat, checks: Checks) -> ChannelTable:
+    """Read the channels of an open text log; ``name`` stands for it in errors and notes."""
+    log = TextLog(stream, name, settings)
+    rows = Rows(log)
+    for body, lines in log:
+        rows.add(body, lines)
+    rows.finish(checks)
     values, count_sizes = {}, {}
     for column, index in rows.layout.columns:
         if column.channel != "time":

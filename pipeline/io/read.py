@@ -8,14 +8,17 @@ coarse to differentiate.
 
 from __future__ import annotations
 
+import io
 import itertools
 import os
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import IngestError, MissingInputError
+from pipeline.files import CONFIGS
 from pipeline.io.channel_table import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.io.encoder_log import unwrapped
@@ -39,11 +42,16 @@ MOST_NAMED = 5  # further files that an error lists
 
 
 def read_recordings(
-    procedure: Mapping[str, Any], ingest: Mapping[str, Any], sensor: Mapping[str, Any], folder: Path
+    procedure: Mapping[str, Any],
+    ingest: Mapping[str, Any],
+    sensor: Mapping[str, Any],
+    folder: Path,
+    in_memory: Mapping[str, bytes] = MappingProxyType({}),
 ) -> list[Recording]:
     """Read all existing recordings of a unit, in the order of the procedure.
 
-    ``procedure``, ``ingest`` and ``sensor`` are sections of the unit's configuration. Raises ``MissingInputError`` if
+    ``procedure``, ``ingest`` and ``sensor`` are sections of the unit's configuration. ``in_memory``: canonical CSV
+    by the name of its recording, read in place of files. Raises ``MissingInputError`` if
     files that are not optional do not exist, ``InputError`` if files cannot be used; one error lists all such files.
     """
     checks, layouts = checks_of(ingest), csv_formats(ingest) if ingest.get("csv") else None
@@ -52,8 +60,7 @@ def read_recordings(
     refused: list[InputError] = []
     for name, candidates in candidate_files(procedure, ingest).items():
         entry = procedure["recordings"][name]
-        present = [[f for f in files if os.path.exists(f"{folder}/{f}")] for files in candidates]  # noqa: PTH110  (fast)
-        files, wanted = next(((f, c) for f, c in zip(present, candidates, strict=True) if f), ([], []))
+        files, wanted, unread = _existing(candidates, folder) if name not in in_memory else ([name], [name], [])
         if not files:
             missing += [] if entry.get("optional", False) else [f"{name} (tried {_tried(candidates)})"]
             continue
@@ -62,15 +69,17 @@ def read_recordings(
             missing += [f"{name} ({file})" for file in wanted if file not in files]
             continue
         try:
-            table = read_table([folder / f for f in files], ingest, layouts, entry.get("session"))
+            if name in in_memory:
+                table = read_canonical(name, in_memory[name], checks)
+            else:
+                table = read_table([folder / f for f in files], ingest, layouts, entry.get("session"))
             recording = to_recording(name, entry, table, sensor, checks)
         except IngestError as error:
             refused.append(error)
             continue
-        other = [f for existing in present for f in existing if f not in files]
-        if other:
-            detail = f"{', '.join(other)} exists too and was not read"
-            recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(other), 0, 0, detail)))
+        if unread:
+            detail = f"{', '.join(unread)} exists too and was not read"
+            recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(unread), 0, 0, detail)))
         recordings.append(recording)
     if missing:
         reason = "" if folder.is_dir() else "; the folder does not exist"
@@ -110,6 +119,23 @@ def read_table(
         return read_csv(paths, layouts, checks_of(ingest))
     table = read_csv(paths, [f.model_copy(update={"session": session}) for f in layouts], checks_of(ingest))
     return replace(table, source={**table.source, "session": session})
+
+
+def read_canonical(name: str, text: bytes, checks: Checks) -> ChannelTable:
+    """Read a canonical CSV that is in memory."""
+    from pipeline.io.csv_read import read_stream  # noqa: PLC0415  (a log of messages needs no parser of text)
+    from pipeline.io.yaml_file import read_yaml  # noqa: PLC0415
+
+    (layout,) = csv_formats(read_yaml(CONFIGS / "ingest" / "canonical_csv.yaml"))
+    return read_stream(io.BytesIO(text), f"{name} (DataFrame)", layout, checks)
+
+
+def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[str], list[str], list[str]]:
+    """Return the files of the first candidate of which any exists, all files of it, and further existing files."""
+    here = str(folder)
+    present = [[f for f in c if os.path.exists(os.path.join(here, f))] for c in candidates]  # noqa: PTH110, PTH118
+    files, wanted = next(((f, list(c)) for f, c in zip(present, candidates, strict=True) if f), ([], []))
+    return files, wanted, [f for existing in present for f in existing if f not in files]
 
 
 def _tried(candidates: Sequence[Sequence[str]]) -> str:

@@ -256,8 +256,12 @@ def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compens
     for python_file in python_effects:
         register(load_python_effect(python_file))
     file = Path(path)
-    document = read_calibration(file)
-    accelerometer, gyroscope = (sensor_of(document, sensor, file) for sensor in SENSORS)
+    return compensation_of(read_calibration(file), file)
+
+
+def compensation_of(document: dict[str, Any], file: Path | None = None) -> Compensation:
+    """Return the calibration of a document (``calibrations/<unit>.json``); ``file`` names it in errors."""
+    accelerometer, gyroscope = (sensor_of(document, sensor, file or Path()) for sensor in SENSORS)
     covariances = {s: c for s in SENSORS if (c := sample_covariance(document, s)) is not None}
     known = document.get("calibrated_range", {})
     return Compensation(accelerometer, gyroscope, str(document.get("unit", "")), covariances, known)

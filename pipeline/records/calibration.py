@@ -7,11 +7,13 @@ truth   = matrix @ (reading - bias - effects)
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from pipeline.records.recording import Values
@@ -129,6 +131,31 @@ class SensorCalibration:
             budget=data.get("uncertainty_budget"),
             convergence=data.get("convergence"),
         )
+
+
+@dataclass(frozen=True)
+class NotCalibrated:
+    """The result of a fit where the recordings or the method cannot calibrate the sensor."""
+
+    reason: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the reason as a JSON document."""
+        return {"not_calibrated": self.reason}
+
+
+Fit: TypeAlias = SensorCalibration | NotCalibrated
+
+
+def fit_from_json(sensor: str, data: dict[str, Any]) -> Fit:
+    """Return the fit of a sensor from the value of its ``to_json``."""
+    reason = data.get("not_calibrated")
+    return SensorCalibration.from_json(sensor, data) if reason is None else NotCalibrated(reason)
+
+
+def calibrated(fits: Mapping[str, Fit]) -> dict[str, SensorCalibration | None]:
+    """Return the calibration of each sensor; None for a sensor that is not calibrated."""
+    return {sensor: None if isinstance(fit, NotCalibrated) else fit for sensor, fit in fits.items()}
 
 
 def _shaped(values: Values) -> dict[str, Any]:

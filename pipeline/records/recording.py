@@ -212,6 +212,17 @@ class Noise:
         return cls(**values)
 
 
+@dataclass
+class UnitRecordings:
+    """The recordings of one unit after checks and filter, and the noise of each sensor.
+
+    The steps of a unit pass them on in memory, so that ``Recording.once`` computes each quantity once a unit.
+    """
+
+    filtered: list[Recording]  # with the filter ``none``, those of ingest
+    noises: dict[str, Noise | None]  # by sensor, of the filtered readings; None where nothing determines it
+
+
 def noise_of_steps(step: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
     """Return the standard deviation of white noise, ``median |x[n+1] - x[n]| / 0.9539``, along an axis.
 

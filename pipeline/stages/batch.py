@@ -10,18 +10,18 @@ import argparse
 import hashlib
 import json
 import sys
-import traceback
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import DamagedFileError, PipelineError
+from pipeline.errors import DamagedFileError, failure_of
 from pipeline.files import read_json, write_json
 from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written, repetitions
 from pipeline.stages import MODULES
+from pipeline.unit import STEPS, Task, run_step
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,6 +45,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
 }
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last", "code"), "diagnose": ("code",)}
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
+NOT_LAST = "no"  # value of the option --last
 BY_INPUTS = ("fit", "diagnose")  # the longest stages: a unit with unchanged inputs is copied from the last run
 
 
@@ -61,9 +62,11 @@ class Job:
 
 
 def main(stage: str, argv: Sequence[str]) -> int:
-    """Run the function ``<stage>_unit(job, unit, settings)`` for each unit, or ``<stage>_batch(job)`` for all.
+    """Run a step (``pipeline.unit.STEPS``) for each unit, or the function ``<stage>_batch(job)`` for all.
 
-    ``<stage>_unit`` returns the files of the unit. ``<stage>_failed(job, unit, settings, failure)``, if it exists,
+    A stage that is no step has ``<stage>_unit(job, unit, settings)``, which returns the files of the unit.
+    ``<stage>_in_batch(job, unit, settings, made)``, if it exists, returns what a step made with what other units of the
+    batch tell. ``<stage>_failed(job, unit, settings, failure)``, if it exists,
     returns the files of a unit that failed in this stage or before. The exit code is 0 even if units have failed: their
     failures are part of the output.
     """
@@ -186,28 +189,13 @@ def _below(job: Job, output: Path) -> str:
     return output.relative_to(job.results).as_posix().removeprefix(".") if output.is_relative_to(job.results) else ""
 
 
-def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
-    """Return the record of a unit's failure; print the traceback of an exception that is a bug."""
-    code, message, file = "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)", None
-    if isinstance(error, DamagedFileError):
-        with suppress(OSError), Path(str(error.file)).open("ab") as stream:
-            stream.write(b"\0")  # changes the size: the next run detects that the file was changed
-    if isinstance(error, PipelineError):
-        code, message, file = error.code, error.message, error.file
-    elif isinstance(error, OSError) and error.filename is not None:
-        code, message, file = "bad_input", error.strerror or str(error), str(error.filename)
-    else:
-        traceback.print_exc()
-    return {"unit": unit, "stage": stage, "code": code, "message": message, "file": file}
-
-
 def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> dict[str, bytes]:
     """Return the files of a unit; for a unit that failed here or before, with the record of its failure."""
     name = unit + FAILED
     try:
         earlier = next((pack for pack in job.inputs.values() if name in pack), None)
         if not earlier:
-            return _encoded(getattr(module, f"{job.stage}_unit")(job, unit, settings))
+            return _encoded(_made(module, job, unit, settings))
         failure = earlier.json(name)
     except Exception as error:
         if isinstance(error, OSError) and error.filename is None:
@@ -217,6 +205,20 @@ def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any])
         print(f"{stage}: {unit} FAILED: {failure['message']}", file=sys.stderr, flush=True)
     of_failed = getattr(module, f"{job.stage}_failed", None)
     return _encoded({name: failure} | (of_failed(job, unit, settings, failure) if of_failed else {}))
+
+
+def _made(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> Files:
+    """Load what a step reads from the files of earlier stages, call it, and return what it made as files."""
+    if job.stage not in STEPS:
+        files: Files = getattr(module, f"{job.stage}_unit")(job, unit, settings)
+        return files
+    from pipeline.stages.unit_files import FILES, StoredUnit  # noqa: PLC0415  (numpy, for the jobs only)
+
+    run = job.run
+    task = Task(job.stage, run.get("sensor", ""), run.get("stage", ""), last=run.get("last") != NOT_LAST)
+    made = run_step(task, StoredUnit(job, unit), settings)
+    of_batch = getattr(module, f"{job.stage}_in_batch", None)
+    return FILES[job.stage](unit, of_batch(job, unit, settings, made) if of_batch else made)
 
 
 def _encoded(files: Files) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""Stage calibration: compose the published calibration of a unit.
+"""Step calibration: compose the published calibration of a unit.
 
 A sensor whose fit has a significantly larger held-out error than the raw readings is null in it, with the reason. A
 unit without any calibrated sensor has failed.
@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline import __version__
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.chips import chip_document
@@ -21,55 +20,67 @@ from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.channel_table import axis_maps
 from pipeline.io.quality_flags import GAP
 from pipeline.model.calibration_file import implausible, not_determined
-from pipeline.pack import FAILED, Files
-from pipeline.records import SENSORS, Recording, SensorCalibration
-from pipeline.stages.unit_files import recordings_of
+from pipeline.pack import FAILED
+from pipeline.records import SENSORS, NotCalibrated, Recording, calibrated
+from pipeline.stages.unit_files import StoredUnit
+from pipeline.version import VERSION
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    from pipeline.records import Fit
     from pipeline.stages.batch import Job
 
 MOVE = "record turns of 100 deg/s and more about all axes"
 LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
-def calibration_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Return one document with the fits, noise at rest, inputs and software.
+def calibration_document(
+    unit: str,
+    checked: list[Recording],
+    fits: Mapping[str, Fit],
+    validation: Mapping[str, Any],
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return ``calibrations/<unit>.json``: the fits, noise at rest, inputs and software.
 
     Raises ``CannotCalibrateError`` if no sensor is calibrated.
     """
-    fits, reasons = _fits(job, unit, settings)
+    reasons = not_calibrated(fits, validation, settings)
     if len(reasons) == len(SENSORS):
         told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
         raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
     axes = {s: list(m) for s, m in axis_maps(settings["sensor"]).items()}
-    recordings = recordings_of({"ingest": job.inputs["ingest"]}, unit)
     document = header(unit, settings) | {
         "status": "ok",
         "error": None,
         "log": {"ingest": settings["ingest"], "axis_map": axes},
-        "inputs": inputs(recordings),
-        "calibrated_range": calibrated_range(recordings),
+        "inputs": inputs(checked),
+        "calibrated_range": calibrated_range(checked),
         "not_calibrated": reasons,
-        "noise": identify_noise(recordings),
+        "noise": identify_noise(checked),
     }
     for sensor, fit in fits.items():
-        document[sensor] = None if sensor in reasons else judged(sensor, fit, settings["sensor"][sensor])
-    if board := settings.get("board"):
-        document["board"] = _on_board(job, unit, board)
-    return {f"{unit}.json": document}
+        found = None if sensor in reasons else judged(sensor, fit.to_json(), settings["sensor"][sensor])
+        document[sensor] = found
+    return document
 
 
-def _fits(job: Job, unit: str, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the fit of each sensor of a unit, and the reasons for sensors that are not calibrated."""
-    fits = {sensor: job.inputs[sensor].json(f"{unit}.json") for sensor in SENSORS}
-    reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
+def not_calibrated(
+    fits: Mapping[str, Fit], validation: Mapping[str, Any], settings: Mapping[str, Any]
+) -> dict[str, str]:
+    """Return the sensors that are not calibrated, each with the reason."""
+    reasons = {sensor: fit.reason for sensor, fit in fits.items() if isinstance(fit, NotCalibrated)}
     if not settings["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
-        validation = job.inputs["validate"].json(f"{unit}.json")
-        fitted = {s: validation[s] for s in SENSORS if s not in reasons}
+        fitted = {sensor: validation[sensor] for sensor in SENSORS if sensor not in reasons}
         reasons |= {s: v["worse_than_raw"] for s, v in fitted.items() if v and v["worse_than_raw"]}
-    return fits, reasons
+    return reasons
+
+
+def calibration_in_batch(job: Job, unit: str, settings: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
+    """Return the document with what the other units of the batch tell: the chips of a board."""
+    board = settings.get("board")
+    return document | {"board": _on_board(job, unit, board)} if board else document
 
 
 def _on_board(job: Job, unit: str, board: dict[str, Any]) -> dict[str, Any]:
@@ -90,9 +101,10 @@ def _on_board(job: Job, unit: str, board: dict[str, Any]) -> dict[str, Any]:
 
 def _chip(job: Job, unit: str) -> Chip:
     """Return a chip of a board, with the recordings and calibrations of its unit."""
-    fits, reasons = _fits(job, unit, job.units[unit])
-    found = {s: None if s in reasons else SensorCalibration.from_json(s, fit) for s, fit in fits.items()}
-    return Chip(unit, recordings_of({"ingest": job.inputs["ingest"]}, unit), found, job.units[unit]["sensor"])
+    stored, settings = StoredUnit(job, unit), job.units[unit]
+    reasons = not_calibrated(stored.fits, stored.validation, settings)
+    found = {s: None if s in reasons else c for s, c in calibrated(stored.fits).items()}
+    return Chip(unit, stored.checked, found, settings["sensor"])
 
 
 def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -120,7 +132,7 @@ def judged(sensor: str, fit: dict[str, Any], sensor_config: dict[str, Any]) -> d
     return fit | lists | {"not_determined": not_determined(fit)}
 
 
-def header(unit: str, settings: dict[str, Any]) -> dict[str, Any]:
+def header(unit: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the part of a calibration document that does not depend on the fit."""
     return {
         "schema_version": 1,
@@ -138,7 +150,7 @@ def header(unit: str, settings: dict[str, Any]) -> dict[str, Any]:
 def _software() -> dict[str, str]:
     """Return the versions of the software; cached, because each lookup reads files."""
     libraries = {library: version(library) for library in LIBRARIES}
-    return {"imu-calibration": __version__, "python": platform.python_version(), **libraries}
+    return {"imu-calibration": VERSION, "python": platform.python_version(), **libraries}
 
 
 def _missing_s(recording: Recording) -> float:

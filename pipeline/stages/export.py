@@ -1,20 +1,14 @@
-"""Stage export: write the calibration in the formats of other tools."""
+"""Step export: write the calibration in the formats of other tools."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipeline.exports import exports
 
-if TYPE_CHECKING:
-    from pipeline.pack import Files
-    from pipeline.stages.batch import Job
 
-
-def export_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Write the calibration in the formats of other tools."""
-    calibration, validation, diagnosis = (
-        job.inputs[stage].json(f"{unit}.json") for stage in ("calibration", "validate", "diagnose")
-    )
-    written = exports(calibration, settings, validation, diagnosis)
-    return {f"{unit}/{file}": text for file, text in written.items()}
+def export(
+    calibration: dict[str, Any], validation: dict[str, Any], diagnosis: dict[str, Any], settings: dict[str, Any]
+) -> dict[str, str]:
+    """Return the files of ``exports/<unit>/`` by name."""
+    return exports(calibration, settings, validation, diagnosis)

@@ -1,26 +1,20 @@
-"""Stage filter: filter the readings of every recording as configured, and estimate their noise.
-
-The noise of the filtered readings is estimated once for all later stages (``<unit>.noise.json``). Without a filter,
-later stages read the recordings of ingest (``unit_files.recordings_of``).
-"""
+"""Step filter: filter the readings of every recording as configured, and estimate their noise once for all steps."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.io.arrow import to_parquet
+from pipeline.estimation.noise import noise_of
+from pipeline.records import SENSORS, Recording, UnitRecordings
 from pipeline.signal.filters import apply_filter
-from pipeline.stages.unit_files import noise_file, recordings_of
 
 if TYPE_CHECKING:
-    from pipeline.pack import Files
-    from pipeline.stages.batch import Job
+    from collections.abc import Mapping
 
 
-def filter_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Filter the readings of a unit as configured, and estimate their noise."""
-    recordings, files = recordings_of(job.inputs, unit), {}
+def filter_recordings(checked: list[Recording], settings: Mapping[str, Any]) -> UnitRecordings:
+    """Filter the recordings of a unit, and estimate the noise of each sensor."""
+    filtered = checked
     if settings["filter"]["name"] != "none":
-        recordings = [apply_filter(r, settings["filter"]) for r in recordings]
-        files = {f"{unit}.parquet": to_parquet(recordings)}
-    return files | noise_file(unit, recordings, settings)
+        filtered = [apply_filter(recording, settings["filter"]) for recording in checked]
+    return UnitRecordings(filtered, {sensor: noise_of(sensor, filtered, settings) for sensor in SENSORS})

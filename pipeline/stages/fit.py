@@ -1,41 +1,40 @@
-"""Stage fit: fit one stage of a method, by the module that ``pipeline.estimation.stages`` finds."""
+"""Step fit: fit one stage of a method, by the module that ``pipeline.estimation.stages`` finds."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CannotCalibrateError
-from pipeline.estimation.stages import fit_stage
+from pipeline.estimation.stages import GIVEN, fit_stage
 from pipeline.estimation.stated_lines import with_stated
-from pipeline.pack import Files, Pack
-from pipeline.records import SensorCalibration
-from pipeline.stages.unit_files import load_noises, recordings_of
+from pipeline.records import NotCalibrated
 
 if TYPE_CHECKING:
-    from pipeline.stages.batch import Job
+    from collections.abc import Mapping
 
-NOT_LAST = "no"  # value of the option --last
+    from pipeline.records import Fit, UnitRecordings
 
 
-def fit_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Fit one stage of a method to one sensor, on the result of the stage before it.
+def fit(
+    recordings: UnitRecordings,
+    fits: Mapping[str, Fit],
+    settings: Mapping[str, Any],
+    *,
+    sensor: str,
+    stage: str,
+    last: bool,
+) -> Fit:
+    """Fit one stage of a method to one sensor, on the result of the stage before it in ``fits``.
 
-    The result is ``{"not_calibrated": reason}`` where the recordings cannot determine the parameters.
+    ``last``: whether it is the last stage of the sensor. The result is ``NotCalibrated`` where the recordings cannot
+    determine the parameters.
     """
-    sensor, stage, previous = (job.run[key] for key in ("sensor", "stage", "previous"))
-    file = f"{unit}.json"
-    before = Pack(Path(previous)).json(file) if previous else None
-    if before and "not_calibrated" in before:
-        return {file: before}
-    fitted = SensorCalibration.from_json(sensor, before) if before else None
-    recordings = recordings_of(job.inputs, unit)
-    noises = load_noises(job.inputs["filter"], unit)
+    previous = fits.get(sensor)
+    if isinstance(previous, NotCalibrated):
+        return previous
     try:
-        found = fit_stage(sensor, stage, recordings, fitted, settings | {"noise": noises})
+        found = fit_stage(sensor, stage, recordings.filtered, previous, {**settings, "noise": recordings.noises})
         # only after the last stage, or it would be counted twice; a given calibration states its own uncertainty
-        if job.run["last"] != NOT_LAST and stage != "given":
-            found = with_stated(found, recordings, settings)
-        return {file: found.to_json()}
+        return with_stated(found, recordings.filtered, settings) if last and stage != GIVEN else found
     except CannotCalibrateError as reason:
-        return {file: {"not_calibrated": reason.message}}
+        return NotCalibrated(reason.message)

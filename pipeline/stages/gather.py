@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from pipeline.errors import failure_of
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record
 from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes
@@ -23,7 +24,7 @@ from pipeline.report.fleet import fleet_statistics, parameter_table, write_param
 from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
 from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
-from pipeline.stages.batch import failure_of, record_output
+from pipeline.stages.batch import record_output
 from pipeline.stages.summary import failed_files, failed_summary
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Stages collect and ingest: read a unit's files, and write its recordings as one Parquet file."""
+"""Steps collect and ingest: read, cut and check the recordings of a unit."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import IngestError, PipelineError
-from pipeline.io.arrow import to_parquet
+from pipeline.errors import IngestError, PipelineError, failure_of
 from pipeline.io.files import candidate_files, recording_files, unchanged
 from pipeline.io.read import read_recordings
-from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
+from pipeline.pack import FAILED, Pack, as_bytes, new_pack
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.segments import cut, held_out_windows
-from pipeline.stages.batch import Job, failure_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from pipeline.records import Recording
+    from pipeline.stages.batch import Job
+    from pipeline.unit import UnitFiles
 
 
 def collect_batch(job: Job) -> None:
@@ -69,37 +69,35 @@ def _member(path: Path) -> str:
     return os.path.normpath(path).lstrip("/")
 
 
-def ingest_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Read, cut and check the recordings of a unit.
-
-    Files inside the campaign's directory are named by their path relative to it.
-    """
-    directory = Path(job.run["directory"])
-    folder = directory / settings["procedure"]["folder"]
-    if "recordings" not in job.inputs:
-        return {f"{unit}.parquet": to_parquet(_ingested(directory, folder, settings))}
+def ingest(files: UnitFiles, settings: dict[str, Any]) -> list[Recording]:
+    """Read, cut and check the recordings of a unit."""
+    if files.archive is None:
+        return _ingested(files, settings)
     with tempfile.TemporaryDirectory() as root:
         try:
-            _extract(job.inputs["recordings"], settings, folder, root)
-            ingested = _ingested(Path(f"{root}{directory}"), Path(f"{root}{folder}"), settings)
+            _extract(files.archive, settings, files.folder, root)
+            extracted = replace(files, directory=Path(f"{root}{files.directory}"), folder=Path(f"{root}{files.folder}"))
+            ingested = _ingested(extracted, settings)
         except PipelineError as error:
             error.message, error.file = error.message.replace(root, ""), error.file and error.file.replace(root, "")
             raise
-        named = [replace(r, source=_named(r.source, lambda file: file.removeprefix(root))) for r in ingested]
-        return {f"{unit}.parquet": to_parquet(named)}
+        return [replace(r, source=_named(r.source, lambda file: file.removeprefix(root))) for r in ingested]
 
 
-def _ingested(directory: Path, folder: Path, settings: dict[str, Any]) -> list[Recording]:
+def _ingested(files: UnitFiles, settings: dict[str, Any]) -> list[Recording]:
     procedure, recordings = settings["procedure"], []
-    whole = read_recordings(procedure, settings["ingest"], settings["sensor"], folder)
+    whole = files.recordings or read_recordings(
+        procedure, settings["ingest"], settings["sensor"], files.folder, files.in_memory
+    )
     held_out = any(read.role == "validation" for read in whole)
     for read in whole:
-        windows = procedure["recordings"][read.name].get("windows")
+        windows = procedure["recordings"].get(read.name, {}).get("windows")
         if read.role == "rests" and procedure["turns"] and not held_out:
             turns = held_out_windows(read, procedure["turns"])
             recordings += cut(read, turns, found=True) if turns else [read]
         else:
             recordings += cut(read, windows) if read.role == "session" else [read]
+    directory = files.directory
 
     def below(file: str) -> str:
         return str(Path(file).relative_to(directory)) if Path(file).is_relative_to(directory) else file
@@ -109,5 +107,7 @@ def _ingested(directory: Path, folder: Path, settings: dict[str, Any]) -> list[R
 
 def _named(source: Mapping[str, Any], name: Callable[[str], str]) -> dict[str, Any]:
     """Rename the file of a recording's source, and the files joined with it, by the function ``name``."""
+    if "file" not in source:  # of a simulation
+        return dict(source)
     joined = {"joined": [_named(other, name) for other in source["joined"]]} if "joined" in source else {}
     return {**source, "file": name(source["file"]), **joined}

@@ -79,6 +79,7 @@ def _prepare() -> None:
     for module in {*MODULES.values()} - {"gather"}:  # runs once, and imports pandas
         import_module(f"pipeline.stages.{module}")
     for module in (
+        "pipeline.stages.unit_files",
         "scipy.interpolate",
         "scipy.spatial.transform",
         "imufusion",

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import DamagedFileError
 from pipeline.exports import exports
 from pipeline.pack import DOCUMENTS, STAGE_OF, Pack, as_bytes, new_pack
-from pipeline.records import SENSORS, SensorCalibration
+from pipeline.records import SENSORS, fit_from_json
 from pipeline.report.combined import Estimate, Prior, calibration_with_prior, priors_of, with_card
 from pipeline.stages.batch import record_output
 from pipeline.stages.summary import failed_files
-from pipeline.stages.unit_files import recordings_of, require_noises
-from pipeline.stages.validate import held_out
+from pipeline.stages.unit_files import StoredUnit
+from pipeline.stages.validate import held_out_errors
 
 if TYPE_CHECKING:
     from pipeline.pack import Files
@@ -55,10 +55,8 @@ def prior_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     document = calibration_with_prior(calibration, priors)
     files: Files = {}
     if document:
-        fits = {s: SensorCalibration.from_json(s, document[s]) if document[s] else None for s in SENSORS}
-        recordings = recordings_of(job.inputs, unit)
-        noises = require_noises(job.inputs["filter"], unit, recordings, settings["sensor"], fits)
-        after = held_out(fits, recordings, noises, settings)
+        fits = {s: fit_from_json(s, document[s] or {"not_calibrated": ""}) for s in SENSORS}
+        after = held_out_errors(StoredUnit(job, unit).recordings, fits, settings)
         for sensor in [s for s in priors if not priors[s].refused]:
             errors = {"without": validation[sensor], "with": after[sensor]}
             rms = {name: part["steps"][-1]["rms_error"] if part["held_out"] else None for name, part in errors.items()}

@@ -1,4 +1,4 @@
-"""Stage report: render the page of each unit, also of failed units, and the calibration report of the others."""
+"""Step report: render the page of each unit, also of failed units, and the calibration report of the others."""
 
 from __future__ import annotations
 
@@ -16,19 +16,23 @@ from pipeline.stages.unit_files import recordings_of
 
 if TYPE_CHECKING:
     from pipeline.pack import Files
+    from pipeline.records import UnitRecordings
     from pipeline.stages.batch import Job
 
-DOCUMENTS = ("calibration", "validate", "diagnose")  # stages whose documents are shown
 
-
-def report_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Write the page and the calibration report (certificate) of a unit."""
-    calibration, validation, diagnosis = (job.inputs[s].json(f"{unit}.json") for s in DOCUMENTS)
-    recordings = recordings_of(job.inputs, unit)
+def report(
+    recordings: UnitRecordings,
+    calibration: dict[str, Any],
+    validation: dict[str, Any],
+    diagnosis: dict[str, Any],
+    settings: dict[str, Any],
+) -> Files:
+    """Return the page and the calibration report (certificate) of a unit, by their names below ``reports``."""
+    unit, filtered = calibration["unit"], recordings.filtered
     words = {sensor: in_words(diagnosis[sensor], sensor, most_values=3) for sensor in SENSORS}
-    page = render(calibration, validation, diagnosis, recordings, settings, words=words)
-    report = certificate(calibration, validation, settings, sensor_temperature(recordings))
-    kinds = {"json": report, "html": certificate_page(unit, report), "xml": digital_certificate(unit, report)}
+    page = render(calibration, validation, diagnosis, filtered, settings, words=words)
+    document = certificate(calibration, validation, settings, sensor_temperature(filtered))
+    kinds = {"json": document, "html": certificate_page(unit, document), "xml": digital_certificate(unit, document)}
     return {f"{unit}.html": page} | {f"certificates/{unit}.{kind}": made for kind, made in kinds.items() if made}
 
 

@@ -1,4 +1,4 @@
-"""Stage summary: compute the part of each unit in the files that summarise all units.
+"""Step summary: compute the part of each unit in the files that summarise all units.
 
 ``gather`` joins the outputs of this stage, and reads no calibration, validation or diagnosis.
 """
@@ -20,20 +20,18 @@ JSON = dict[str, Any]
 KEPT = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
 
 
-def summary_unit(job: Job, unit: str, settings: JSON) -> Files:
+def summarise(calibration: JSON, validation: JSON, diagnosis: JSON, settings: JSON) -> JSON:
     """Return the summary of a calibrated unit."""
-    documents = [job.inputs[stage].json(f"{unit}.json") for stage in ("calibration", "validate", "diagnose")]
-    calibration, _, diagnosis = documents
-    found = summary(settings, None, *documents)
+    found = summary(settings, None, calibration, validation, diagnosis)
     if settings["compared"]:
         from pipeline.report.comparison import unit_figures  # noqa: PLC0415  (pandas, where units are compared)
 
-        found["figures"] = unit_figures(*documents)
+        found["figures"] = unit_figures(calibration, validation, diagnosis)
     if settings["lot_prior"]:
         from pipeline.report.combined import estimates  # noqa: PLC0415  (only where a lot is the prior)
 
         found["estimates"] = [e._asdict() for e in estimates(settings["row"], calibration, diagnosis)]
-    return {f"{unit}.json": found}
+    return found
 
 
 def summary_failed(job: Job, unit: str, settings: JSON, failure: JSON) -> Files:

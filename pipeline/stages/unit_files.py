@@ -1,56 +1,103 @@
-"""Read the files of a unit that several stages use: its recordings, the fit of each sensor and its noise."""
+"""Load what the steps of a unit read from the files of earlier jobs, and write what they return."""
 
 from __future__ import annotations
 
+from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.noise import estimate_noise, noise_of
-from pipeline.io.arrow import from_parquet
-from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
+from pipeline.io.arrow import from_parquet, to_parquet
+from pipeline.pack import Pack
+from pipeline.records import SENSORS, Noise, UnitRecordings, fit_from_json
+from pipeline.unit import UnitFiles
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
-    from pipeline.pack import Files, Pack
+    from pipeline.pack import Files
+    from pipeline.records import Fit, Recording
+    from pipeline.stages.batch import Job
 
 
 def recordings_of(packs: Mapping[str, Pack], unit: str) -> list[Recording]:
-    """Return the filtered recordings of a unit, or those of ingest without a filter or before the stage filter."""
+    """Return the filtered recordings of a unit; without a filter, or before it, those of ingest."""
     name = f"{unit}.parquet"
     pack = packs["filter"] if "filter" in packs and name in packs["filter"] else packs["ingest"]
     return from_parquet(pack.read(name), str(pack.path))
 
 
-def load_fits(packs: Mapping[str, Pack], unit: str) -> dict[str, SensorCalibration | None]:
-    """Return the calibration of each sensor; None for a sensor that could not be calibrated."""
-    found = {sensor: packs[sensor].json(f"{unit}.json") for sensor in SENSORS}
-    return {s: None if "not_calibrated" in data else SensorCalibration.from_json(s, data) for s, data in found.items()}
+class StoredUnit:
+    """A unit of a job: what its steps read (``pipeline.unit.UnitState``), loaded from files on first use."""
+
+    def __init__(self, job: Job, unit: str) -> None:
+        self.job, self.unit = job, unit
+
+    def _json(self, stage: str) -> Any:  # noqa: ANN401  (a JSON document)
+        return self.job.inputs[stage].json(f"{self.unit}.json")
+
+    @cached_property
+    def files(self) -> UnitFiles:
+        """Files of the recordings."""
+        directory = Path(self.job.run["directory"])
+        folder = directory / self.job.units[self.unit]["procedure"]["folder"]
+        return UnitFiles(directory, folder, self.job.inputs.get("recordings"))
+
+    @cached_property
+    def checked(self) -> list[Recording]:
+        """Recordings as ingest returned them."""
+        pack = self.job.inputs["ingest"]
+        return from_parquet(pack.read(f"{self.unit}.parquet"), str(pack.path))
+
+    @cached_property
+    def recordings(self) -> UnitRecordings:
+        """Recordings as the filter returned them."""
+        filtered = recordings_of(self.job.inputs, self.unit)
+        found = self.job.inputs["filter"].json(f"{self.unit}.noise.json")
+        noises = {sensor: data and Noise.from_json(data) for sensor, data in found.items()}
+        return UnitRecordings(filtered, noises)
+
+    @cached_property
+    def fits(self) -> dict[str, Fit]:
+        """Fit of each sensor; in a job of the stage fit, that of the stage before."""
+        run, file = self.job.run, f"{self.unit}.json"
+        if self.job.stage == "fit":
+            before = Pack(Path(run["previous"])).json(file) if run["previous"] else None
+            return {run["sensor"]: fit_from_json(run["sensor"], before)} if before else {}
+        return {sensor: fit_from_json(sensor, self._json(sensor)) for sensor in SENSORS}
+
+    @cached_property
+    def validation(self) -> dict[str, Any]:
+        """``validations/<unit>.json``."""
+        return dict(self._json("validate"))
+
+    @cached_property
+    def diagnosis(self) -> dict[str, Any]:
+        """``diagnoses/<unit>.json``."""
+        return dict(self._json("diagnose"))
+
+    @cached_property
+    def calibration(self) -> dict[str, Any]:
+        """``calibrations/<unit>.json``."""
+        return dict(self._json("calibration"))
 
 
-def noise_file(unit: str, recordings: list[Recording], settings: dict[str, Any]) -> Files:
-    """Return the file with the noise of each sensor; null if neither recordings nor data sheet determine it."""
-    found = {sensor: noise_of(sensor, recordings, settings) for sensor in SENSORS}
-    return {f"{unit}.noise.json": {sensor: noise and noise.to_json() for sensor, noise in found.items()}}
+def _files_of_filter(unit: str, result: UnitRecordings) -> Files:
+    """Write the recordings only where the filter changed them."""
+    changed = any(recording.filter["name"] != "none" for recording in result.filtered)
+    recordings = {f"{unit}.parquet": to_parquet(result.filtered)} if changed else {}
+    noises = {sensor: noise and noise.to_json() for sensor, noise in result.noises.items()}
+    return recordings | {f"{unit}.noise.json": noises}
 
 
-def load_noises(pack: Pack, unit: str) -> dict[str, Noise | None]:
-    """Read the noise of each sensor from the file of ``noise_file``."""
-    found = pack.json(f"{unit}.noise.json")
-    return {sensor: data and Noise.from_json(data) for sensor, data in found.items()}
-
-
-def require_noises(
-    pack: Pack,
-    unit: str,
-    recordings: list[Recording],
-    sensor_configs: dict[str, dict[str, Any]],
-    fits: Mapping[str, SensorCalibration | None],
-) -> dict[str, Noise]:
-    """Read the noise of each calibrated sensor.
-
-    Raises ``ConfigurationError`` if nothing determines it; its message states what is missing.
-    """
-    found = load_noises(pack, unit)
-    return {
-        s: found[s] or estimate_noise(s, recordings, sensor_configs[s]) for s, fit in fits.items() if fit is not None
-    }
+# Step to the files of what it returned for a unit.
+FILES: dict[str, Callable[[str, Any], Files]] = {
+    "ingest": lambda unit, recordings: {f"{unit}.parquet": to_parquet(recordings)},
+    "filter": _files_of_filter,
+    "fit": lambda unit, fit: {f"{unit}.json": fit.to_json()},
+    "validate": lambda unit, document: {f"{unit}.json": document},
+    "diagnose": lambda unit, found: {f"{unit}.json": found.document} | found.effect_files,
+    "calibration": lambda unit, document: {f"{unit}.json": document},
+    "export": lambda unit, files: {f"{unit}/{file}": text for file, text in files.items()},
+    "report": lambda _, files: files,
+    "summary": lambda unit, document: {f"{unit}.json": document},
+}

@@ -1,43 +1,41 @@
-"""Stage validate: compute the errors on held-out motion, and the noise floors."""
+"""Step validate: compute the errors on held-out motion, and the noise floors."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.stages.unit_files import load_fits, recordings_of, require_noises
+from pipeline.estimation.noise import required_noises
+from pipeline.records import calibrated
 from pipeline.validation.attitude import attitude, gravity_direction
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
-    from pipeline.pack import Files
-    from pipeline.records import Noise, Recording, SensorCalibration
-    from pipeline.stages.batch import Job
+    from pipeline.records import Fit, UnitRecordings
 
 
-def validate_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Compute the errors on held-out motion after each step of both fits, and the noise floors."""
-    recordings = recordings_of(job.inputs, unit)
-    fits = load_fits(job.inputs, unit)
-    noises = require_noises(job.inputs["filter"], unit, recordings, settings["sensor"], fits)
-    document: dict[str, Any] = {"schema_version": 1, "unit": unit} | held_out(fits, recordings, noises, settings)
-    document["attitude"] = attitude(fits["accelerometer"], fits["gyroscope"], recordings)
-    document["gravity_direction"] = gravity_direction(
-        **fits, recordings=recordings, noise=noises.get("gyroscope"), settings=settings
-    )
-    return {f"{unit}.json": document}
-
-
-def held_out(
-    fits: Mapping[str, SensorCalibration | None],
-    recordings: Sequence[Recording],
-    noises: Mapping[str, Noise],
-    settings: dict[str, Any],
+def held_out_document(
+    unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the part of each sensor in ``validations/<unit>.json``; None for a sensor without a fit."""
+    """Return ``validations/<unit>.json``: the errors on held-out motion after each step of both fits."""
+    filtered, found = recordings.filtered, calibrated(fits)
+    document: dict[str, Any] = {"schema_version": 1, "unit": unit} | held_out_errors(recordings, fits, settings)
+    document["attitude"] = attitude(found["accelerometer"], found["gyroscope"], filtered)
+    document["gravity_direction"] = gravity_direction(
+        **found, recordings=filtered, noise=recordings.noises.get("gyroscope"), settings=settings
+    )
+    return document
+
+
+def held_out_errors(recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part of each sensor in ``validations/<unit>.json``; None for a sensor without a calibration."""
+    known = calibrated(fits)
+    noises = required_noises(recordings, settings["sensor"], known)
     found = {}
-    for sensor, fit in fits.items():
-        other = next(f for s, f in fits.items() if s != sensor)
-        found[sensor] = fit and validate(fit, recordings, noises[sensor], settings, other=other)
+    for sensor, calibration in known.items():
+        other = next(c for s, c in known.items() if s != sensor)
+        found[sensor] = calibration and validate(
+            calibration, recordings.filtered, noises[sensor], settings, other=other
+        )
     return found

@@ -18,7 +18,8 @@ from pipeline.io.arrow import to_parquet
 from pipeline.model.calibration_file import beyond_uncertainty
 from pipeline.records import FittedEffect, Note
 from pipeline.stages import batch
-from pipeline.stages.unit_files import noise_file
+from pipeline.stages.filter import filter_recordings
+from pipeline.stages.unit_files import FILES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -183,7 +184,8 @@ def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:
     (tmp_path / "part.json").write_text(json.dumps({"units": {"U": part}}))
     stages = [tmp_path / "bias", tmp_path / "cholesky_lu"]
     ingested = write_pack(tmp_path / "ingest.zip", {"U.parquet": to_parquet([*turns, still])})
-    filtered = write_pack(tmp_path / "filter.zip", noise_file("U", [*turns, still], settings()))
+    recordings = filter_recordings([*turns, still], settings() | {"filter": {"name": "none"}})
+    filtered = write_pack(tmp_path / "filter.zip", FILES["filter"]("U", recordings))
     for stage, previous, last in zip(stages, ["", str(stages[0])], ["no", "yes"], strict=True):
         chosen = ["--sensor", "gyroscope", "--stage", stage.name, "--previous", previous, "--last", last]
         folders = ["--config", str(tmp_path / "part.json"), "--output", str(stage)]

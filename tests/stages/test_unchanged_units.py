@@ -22,11 +22,11 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201
     """Return a function that runs the diagnosis of two units, and returns the units that were computed."""
     computed: list[str] = []
 
-    def diagnose(_: batch.Job, unit: str, settings: dict) -> dict:
+    def diagnose(_: object, __: batch.Job, unit: str, settings: dict) -> dict:
         computed.append(unit)
         return {f"{unit}.json": {"found": settings["effects"]}}
 
-    monkeypatch.setattr("pipeline.stages.diagnose.diagnose_unit", diagnose)
+    monkeypatch.setattr(batch, "_made", diagnose)
     monkeypatch.setattr(batch, "hold_as_job", lambda _: None)
 
     def run_job(files: dict[str, dict[str, str]] = HERE, code: str = "a", again: int = 0, **effects: int) -> list[str]:

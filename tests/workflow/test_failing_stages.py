@@ -7,7 +7,6 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from urllib.parse import unquote
 
@@ -37,18 +36,13 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         shutil.copytree(simulated, directory / "raw" / name)
     (directory / "units.csv").write_text("unit\n" + "\n".join(names) + "\n")
     campaign = load_campaign({"campaign": str(directory), "results": str(directory.parent / "results")})
-    files_of, failure, render = batch._files_of, Batch.failure, report.render
+    made_of, failure, render = batch._made, Batch.failure, report.render
 
     def faulty(module: Any, job: batch.Job, unit: str, settings: dict[str, Any]) -> Any:
-        real = getattr(module, f"{job.stage}_unit")
-
-        def fails(job: batch.Job, unit: str, settings: dict[str, Any]) -> None:
-            real(job, unit, settings)
-            raise MemoryError(f"no room for {unit}") if job.stage == "export" else RuntimeError(f"fault at {unit}")
-
+        made = made_of(module, job, unit, settings)
         if unit == f"at_{job.stage}":
-            module = SimpleNamespace(**vars(module) | {f"{job.stage}_unit": fails})
-        return files_of(module, job, unit, settings)
+            raise MemoryError(f"no room for {unit}") if job.stage == "export" else RuntimeError(f"fault at {unit}")
+        return made
 
     def faulty_gather(packs: Batch, unit: str) -> Any:
         if unit == "at_gather":
@@ -61,7 +55,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         return render(document, *rest, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch, "_files_of", faulty)
+        patch.setattr(batch, "_made", faulty)
         patch.setattr(Batch, "failure", faulty_gather)
         patch.setattr(report, "render", faulty_render)
         assert run_jobs(campaign) == 1

@@ -96,6 +96,18 @@ def register_user_effects(section: Mapping[str, Any]) -> None:
         register(load_python_effect(entry["path"], entry["sha256"]))
 
 
+@contextmanager
+def registered(section: Mapping[str, Any]) -> Iterator[None]:
+    """Add the effects of a configuration to the catalogue within a ``with`` block (``register_user_effects``)."""
+    before = dict(_registered)
+    try:
+        register_user_effects(section)
+        yield
+    finally:
+        _registered.clear()
+        _registered.update(before)
+
+
 def forget(*names: str) -> None:
     """Remove registered effects from the catalogue; all of them where none is named."""
     for name in names or tuple(_registered):

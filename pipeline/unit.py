@@ -1,0 +1,120 @@
+"""Calibrate one unit: the chain of its steps, in memory or, one rule of the workflow for each, through files.
+
+A step is a function of its inputs and of the settings that it reads. A run loads the inputs of a step from the files of
+earlier jobs (``pipeline.stages.unit_files``), calls ``run_step``, and stores the result. ``run_steps`` calls all steps
+of a unit in memory; ``pipeline.calibrate``, the commands, the study and the tests use it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from pipeline.pack import Pack
+    from pipeline.records import Fit, Recording, UnitRecordings
+
+
+class Step(NamedTuple):
+    """A step of the chain."""
+
+    function: str  # module of pipeline.stages, and its function
+    reads: tuple[str, ...]  # attributes of ``UnitState`` that the function takes, beside ``settings``
+    returns: str  # attribute of ``UnitState`` that it returns; of ``fits``, the entry of one sensor
+
+
+DOCUMENTS = ("calibration", "validation", "diagnosis")
+STEPS = {  # in the order of a run
+    "ingest": Step("ingest.ingest", ("files",), "checked"),
+    "filter": Step("filter.filter_recordings", ("checked",), "recordings"),
+    "fit": Step("fit.fit", ("recordings", "fits"), "fits"),  # once for each stage of the method of each sensor
+    "validate": Step("validate.held_out_document", ("unit", "recordings", "fits"), "validation"),
+    "diagnose": Step("diagnose.diagnose_unit", ("unit", "recordings", "fits", "validation"), "diagnosed"),
+    "calibration": Step("calibration.calibration_document", ("unit", "checked", "fits", "validation"), "calibration"),
+    "export": Step("export.export", DOCUMENTS, "exports"),
+    "report": Step("report.report", ("recordings", *DOCUMENTS), "pages"),
+    "summary": Step("summary.summarise", DOCUMENTS, "summary"),
+}
+
+
+@dataclass(frozen=True)
+class UnitFiles:
+    """The files of a unit's recordings."""
+
+    directory: Path  # of the campaign: files in it are named by their path relative to it
+    folder: Path  # of the unit
+    archive: Pack | None = None  # of the stage collect, for a machine without access to these folders
+    in_memory: Mapping[str, bytes] = field(default_factory=dict)  # canonical CSV by the name of its recording
+    recordings: Sequence[Recording] = ()  # of a simulation, instead of files
+
+
+@dataclass
+class UnitState:
+    """What the steps of a unit read and return; ``None`` before the step that returns it."""
+
+    unit: str
+    files: UnitFiles
+    checked: list[Recording] | None = None
+    recordings: UnitRecordings | None = None
+    fits: dict[str, Fit] = field(default_factory=dict)  # by sensor, after the last stage so far
+    validation: dict[str, Any] | None = None  # ``validations/<unit>.json``
+    diagnosed: Any = None  # ``pipeline.stages.diagnose.Diagnosis``
+    calibration: dict[str, Any] | None = None  # ``calibrations/<unit>.json``
+    exports: dict[str, str] | None = None  # ``exports/<unit>/``: text by file
+    pages: dict[str, Any] | None = None  # page and certificates, by their path below ``reports/``
+    summary: dict[str, Any] | None = None
+
+    @property
+    def diagnosis(self) -> dict[str, Any] | None:
+        """``diagnoses/<unit>.json``."""
+        return None if self.diagnosed is None else dict(self.diagnosed.document)
+
+
+class Task(NamedTuple):
+    """One call of a step; of a fit, the stage of a sensor's method, and whether it is the last."""
+
+    step: str
+    sensor: str = ""
+    stage: str = ""
+    last: bool = True
+
+    @property
+    def name(self) -> str:
+        """Name of the task's output in a run, for example ``fit/gyroscope/bias``."""
+        return "/".join(filter(None, (self.step, self.sensor, self.stage)))
+
+
+def tasks_of(stages: Mapping[str, Sequence[str]], until: str = "diagnose") -> Iterator[Task]:
+    """Yield the tasks of a unit in their order, up to the step ``until``; ``stages``: of the fit of each sensor."""
+    for step in STEPS:
+        if step == "fit":
+            for sensor, names in stages.items():
+                yield from (Task(step, sensor, name, name == names[-1]) for name in names)
+        else:
+            yield Task(step)
+        if step == until:
+            return
+
+
+def run_step(task: Task, state: Any, settings: Mapping[str, Any]) -> Any:  # noqa: ANN401  (each step has its types)
+    """Call the function of a step with what it reads of ``state``, and return its result."""
+    step = STEPS[task.step]
+    module, _, function = step.function.rpartition(".")
+    options = {"sensor": task.sensor, "stage": task.stage, "last": task.last} if task.sensor else {}
+    inputs = {name: getattr(state, name) for name in step.reads}
+    return getattr(import_module(f"pipeline.stages.{module}"), function)(**inputs, settings=settings, **options)
+
+
+def run_steps(state: UnitState, tasks: Iterator[Task], settings_of: Callable[[Task], Mapping[str, Any]]) -> UnitState:
+    """Run the tasks of a unit in memory; ``settings_of`` returns the settings that a task reads."""
+    for task in tasks:
+        made = run_step(task, state, settings_of(task))
+        if task.sensor:
+            state.fits = {**state.fits, task.sensor: made}
+        else:
+            setattr(state, STEPS[task.step].returns, made)
+    return state
