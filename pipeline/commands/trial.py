@@ -67,12 +67,12 @@ def try_unit(campaign: Campaign, unit: str, until: str = "calibration", *, incom
             content = merge_common(json.loads(files[output].content))
             (settings,) = content.pop("units").values()
             last = "yes" if sensor and name == chains[batch][sensor][-1] else "no"
-            previous = str(packs[sensor].path) if sensor in packs else ""
-            content |= {"sensor": sensor, "stage": name, "previous": previous, "last": last}
+            inputs = packs | ({"previous": packs[sensor]} if sensor in packs else {})
+            content |= {"sensor": sensor, "stage": name, "last": last}
             path = Path(folder) / f"{output.replace('/', '-')}.zip"
             register_user_effects(content.get("user_effects", {}))
             try:
-                job = Job(stage, {unit: settings}, content, packs, path, Path(folder))
+                job = Job(stage, {unit: settings}, content, inputs, path, Path(folder))
                 made = getattr(import_module(f"pipeline.stages.{MODULES[stage]}"), f"{stage}_unit")(job, unit, settings)
             except Exception as error:  # noqa: BLE001  (like in a run, it stops only this unit)
                 trial.failure = failure_of(error, unit, output)

@@ -115,12 +115,11 @@ def forget_last_outputs(results: Path) -> None:
 
 def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:
     """Return a digest of a unit's settings, code and files of earlier stages; empty if a file is damaged."""
-    packs = [*job.inputs.values(), *([Pack(Path(job.run["previous"]))] if job.run.get("previous") else [])]
-    run = {key: value for key, value in job.run.items() if key not in {"previous", "again"}}
+    run = {key: value for key, value in job.run.items() if key != "again"}
     found = hashlib.sha256(json.dumps([run, settings], sort_keys=True).encode())
     prefixes = (f"{unit}.", f"{unit}_")
     try:
-        for pack in packs:
+        for pack in job.inputs.values():
             for name in (n for n in pack.names() if n.startswith(prefixes) and not n.endswith(INPUTS_OF)):
                 found.update(name.encode() + pack.read(name))
     except DamagedFileError:
@@ -158,8 +157,9 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
         register_user_effects(content["user_effects"])
     units, output = content.pop("units"), arguments.pop("output")
     inputs = {name: Pack(arguments.pop(name)) for name in INPUTS[stage]}
-    if arguments.get("recordings"):
-        inputs["recordings"] = Pack(Path(arguments["recordings"]))
+    for name in ("recordings", "previous"):
+        if path := arguments.pop(name, ""):
+            inputs[name] = Pack(Path(path))
     return Job(stage, units, content | arguments, inputs, output, results)
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.stated_lines import with_stated
-from pipeline.pack import Files, Pack
 from pipeline.records import SensorCalibration
 from pipeline.stages.unit_files import load_noises, recordings_of
 
 if TYPE_CHECKING:
+    from pipeline.pack import Files
     from pipeline.stages.batch import Job
 
 NOT_LAST = "no"  # value of the option --last
@@ -23,9 +22,8 @@ def fit_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
 
     The result is ``{"not_calibrated": reason}`` where the recordings cannot determine the parameters.
     """
-    sensor, stage, previous = (job.run[key] for key in ("sensor", "stage", "previous"))
-    file = f"{unit}.json"
-    before = Pack(Path(previous)).json(file) if previous else None
+    sensor, stage, file = job.run["sensor"], job.run["stage"], f"{unit}.json"
+    before = job.inputs["previous"].json(file) if "previous" in job.inputs else None
     if before and "not_calibrated" in before:
         return {file: before}
     fitted = SensorCalibration.from_json(sensor, before) if before else None

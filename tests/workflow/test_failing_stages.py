@@ -17,6 +17,7 @@ from whole_run import run_campaign, run_jobs
 import pipeline
 from pipeline import results_folder
 from pipeline.commands import add, apply, convert, explain, unpack
+from pipeline.commands.trial import try_unit
 from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.campaign import Campaign
 from pipeline.errors import ConfigurationError, DamagedFileError, InputError
@@ -165,18 +166,27 @@ def keep_the_first_rest(file: Path) -> None:
 
 
 def test_other_failures_are_named_too(tmp_path: Path, simulated: Path) -> None:
-    for unit in ("good", "incomplete", "short"):
+    for unit in ("good", "incomplete", "short", "in_stages"):
         shutil.copytree(simulated, tmp_path / "bench" / "raw" / unit)
-    (tmp_path / "bench" / "units.csv").write_text("unit\ngood\nincomplete\nshort\n")
+    (tmp_path / "bench" / "units.csv").write_text("unit,method\ngood,\nincomplete,\nshort,\nin_stages,staged\n")
     (tmp_path / "bench" / "raw" / "incomplete" / "accel_z.csv").unlink()
-    for file in (tmp_path / "bench" / "raw" / "short").glob("accel_*.csv"):
-        keep_the_first_rest(file)
+    for unit in ("short", "in_stages"):
+        for file in (tmp_path / "bench" / "raw" / unit).glob("accel_*.csv"):
+            keep_the_first_rest(file)
     campaign, code = run_campaign(tmp_path / "bench")
     assert code == 1
     failures = json.loads((campaign.results / "failures.json").read_text())
-    assert [(f["unit"], f["code"]) for f in failures] == [("incomplete", "missing_file"), ("short", "not_observable")]
+    assert [(f["unit"], f["code"], f["stage"]) for f in failures] == [
+        ("incomplete", "missing_file", "ingest"),
+        ("short", "not_observable", "fit/accelerometer/reference_least_squares"),
+        ("in_stages", "not_observable", "fit/accelerometer/orthogonality"),  # the first of four stages
+    ]
     assert "accel_z" in failures[0]["message"]
     assert "accelerometer" in failures[1]["message"]
+    assert "does not show a sinusoid" in failures[2]["message"]
+    page, index = (campaign.results / name for name in ("reports/in_stages.html", "index.html"))
+    assert all("does not show a sinusoid" in file.read_text() for file in (page, index))
+    assert try_unit(campaign, "in_stages").failure == failures[2]
     assert json.loads((campaign.results / "calibrations" / "good.json").read_text())["status"] == "ok"
 
 
