@@ -2,6 +2,10 @@
 
 A job reads and writes one file for each stage, a ``pipeline.pack``. It contains ``<unit>.failed.json`` for a failed
 unit. Later stages copy this member, and ``verdict`` sets the exit code from it.
+
+A stage after the fit (``AFTER_FIT``) that fails for a unit does not fail the unit: its calibration is published. The
+pack then contains what the function ``<stage>_without`` of the stage returns instead, and ``<unit>.incomplete.json``
+with the cause. Page, summary and the last lines of the run state it.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.files import read_json, write_json
-from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
+from pipeline.pack import FAILED, INCOMPLETE, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written, repetitions
 from pipeline.stages import MODULES
 
@@ -44,6 +48,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "gather": (),
 }
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last", "code"), "diagnose": ("code",)}
+AFTER_FIT = ("diagnose", "export", "report", "summary", "prior")  # a calibration does not depend on them
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
 BY_INPUTS = ("fit", "diagnose")  # the longest stages: a unit with unchanged inputs is copied from the last run
 
@@ -64,8 +69,9 @@ def main(stage: str, argv: Sequence[str]) -> int:
     """Run the function ``<stage>_unit(job, unit, settings)`` for each unit, or ``<stage>_batch(job)`` for all.
 
     ``<stage>_unit`` returns the files of the unit. ``<stage>_failed(job, unit, settings, failure)``, if it exists,
-    returns the files of a unit that failed in this stage or before. The exit code is 0 even if units have failed: their
-    failures are part of the output.
+    returns the files of a unit that failed in this stage or before, and ``<stage>_without`` with the same arguments
+    those that replace the files of a stage after the fit that failed. The exit code is 0 even if units have failed:
+    their failures are part of the output.
     """
     if stage == "verdict":
         return verdict(argv)
@@ -86,7 +92,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
             else:
                 files = _files_of(module, job, unit, settings)
             add(files)
-            if inputs and unit + FAILED not in files:
+            if inputs and not {unit + FAILED, unit + INCOMPLETE} & files.keys():
                 add({unit + INPUTS_OF: as_bytes({"sha256": inputs, "files": [*files]})})
     if stage in BY_INPUTS:
         _link_output(job.output)
@@ -201,22 +207,52 @@ def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
     return {"unit": unit, "stage": stage, "code": code, "message": message, "file": file}
 
 
+def omission(error: Exception, unit: str, stage: str) -> dict[str, Any]:
+    """Return the record of what a stage after the fit cannot make of a unit, and print it.
+
+    Raises the error again if it is of the run, such as a full disk, or a damaged file, which the next run writes anew.
+    """
+    if isinstance(error, DamagedFileError) or _of_run(error):
+        raise error
+    record = failure_of(error, unit, stage)
+    print(f"{stage}: {unit} NOT COMPLETE: {record['message']}", file=sys.stderr, flush=True)
+    return record
+
+
+def _of_run(error: Exception) -> bool:
+    """Return whether an error is of the run, not of the unit: a full disk."""
+    return isinstance(error, OSError) and error.filename is None
+
+
 def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> dict[str, bytes]:
     """Return the files of a unit; for a unit that failed here or before, with the record of its failure."""
     name = unit + FAILED
+    stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
     try:
         earlier = next((pack for pack in job.inputs.values() if name in pack), None)
         if not earlier:
-            return _encoded(getattr(module, f"{job.stage}_unit")(job, unit, settings))
+            return _made(module, job, unit, settings, stage)
         failure = earlier.json(name)
     except Exception as error:
-        if isinstance(error, OSError) and error.filename is None:
-            raise  # an error of the run, not of the unit: a full disk
-        stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
+        if _of_run(error):
+            raise
         failure = failure_of(error, unit, stage)
         print(f"{stage}: {unit} FAILED: {failure['message']}", file=sys.stderr, flush=True)
     of_failed = getattr(module, f"{job.stage}_failed", None)
     return _encoded({name: failure} | (of_failed(job, unit, settings, failure) if of_failed else {}))
+
+
+def _made(module: ModuleType, job: Job, unit: str, settings: dict[str, Any], stage: str) -> dict[str, bytes]:
+    """Return the files that a stage makes of a unit; of a stage after the fit that fails, those that replace them."""
+    try:
+        return _encoded(getattr(module, f"{job.stage}_unit")(job, unit, settings))
+    except Exception as error:
+        if job.stage not in AFTER_FIT:
+            raise
+        record = omission(error, unit, stage)
+        without = getattr(module, f"{job.stage}_without", None)
+        instead = without(job, unit, settings, record) if without else {}
+        return _encoded({**instead, unit + INCOMPLETE: [record]})
 
 
 def _encoded(files: Files) -> dict[str, bytes]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.rest_means import rests_by_use
+from pipeline.pack import INCOMPLETE
 from pipeline.records import SENSORS
 from pipeline.report.certificate import certificate, certificate_page, digital_certificate
 from pipeline.report.pages import failure_page
@@ -26,10 +27,17 @@ def report_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     calibration, validation, diagnosis = (job.inputs[s].json(f"{unit}.json") for s in DOCUMENTS)
     recordings = recordings_of(job.inputs, unit)
     words = {sensor: in_words(diagnosis[sensor], sensor, most_values=3) for sensor in SENSORS}
-    page = render(calibration, validation, diagnosis, recordings, settings, words=words)
+    name, earlier = unit + INCOMPLETE, (job.inputs[stage] for stage in ("diagnose", "export"))
+    records = [record for pack in earlier if name in pack for record in pack.json(name)]
+    page = render(calibration, validation, diagnosis, recordings, settings, words=words, incomplete=records)
     report = certificate(calibration, validation, settings, sensor_temperature(recordings))
     kinds = {"json": report, "html": certificate_page(unit, report), "xml": digital_certificate(unit, report)}
     return {f"{unit}.html": page} | {f"certificates/{unit}.{kind}": made for kind, made in kinds.items() if made}
+
+
+def report_without(job: Job, unit: str, settings: dict[str, Any], record: dict[str, Any]) -> Files:  # noqa: ARG001
+    """Return a page that states why the page of a calibrated unit could not be made."""
+    return {f"{unit}.html": failure_page(unit, record, calibrated=True)}
 
 
 def report_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:

@@ -36,6 +36,11 @@ def summary_unit(job: Job, unit: str, settings: JSON) -> Files:
     return {f"{unit}.json": found}
 
 
+def summary_without(job: Job, unit: str, settings: JSON, record: JSON) -> Files:  # noqa: ARG001
+    """Return the summary of a calibrated unit whose documents could not be summarised."""
+    return {f"{unit}.json": summary(settings, None, {"unit": unit, "status": "ok"})}
+
+
 def summary_failed(job: Job, unit: str, settings: JSON, failure: JSON) -> Files:
     """Return the summary of a failed unit; for one that fails in this stage, with its document and its page."""
     name, report, files = f"{unit}.calibration.json", job.inputs["report"], {}
