@@ -92,7 +92,8 @@ class CampaignResults:
         ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
         (g or deg/s), ``_verdict``, ``_selected`` (missing effects, joined by ";"), ``_reason``, ``_answers`` (number of
         answers in the answer set), ``_implausible``, ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held
-        out); ``pass``; ``left_out`` (rows that no fit uses); and other columns of ``units.csv``.
+        out); ``pass``; ``left_out`` (rows that no fit uses); ``incomplete`` (stages after the fit that failed, and
+        why); and other columns of ``units.csv``.
         """
         kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}
         return pd.read_csv(self.folder / "summary.csv", dtype=kinds, keep_default_na=False, na_values=[""])

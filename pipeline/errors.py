@@ -7,6 +7,7 @@ a batch a user error becomes the failure record of one unit. Any other exception
 
 from __future__ import annotations
 
+import sys
 import traceback
 from contextlib import suppress
 from pathlib import Path
@@ -120,6 +121,23 @@ def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
     else:
         traceback.print_exc()
     return {"unit": unit, "stage": stage, "code": code, "message": message, "file": file}
+
+
+def omission(error: Exception, unit: str, stage: str) -> dict[str, Any]:
+    """Return the record of what a step after the fit cannot make of a unit, and print it.
+
+    Raises the error again if it is of the run, such as a full disk, or a damaged file, which the next run writes anew.
+    """
+    if isinstance(error, DamagedFileError) or is_of_run(error):
+        raise error
+    record = failure_of(error, unit, stage)
+    print(f"{stage}: {unit} NOT COMPLETE: {record['message']}", file=sys.stderr, flush=True)  # noqa: T201
+    return record
+
+
+def is_of_run(error: Exception) -> bool:
+    """Return whether an error is of the run, not of the unit: a full disk."""
+    return isinstance(error, OSError) and error.filename is None
 
 
 def first(names: Sequence[str], most: int, of: str = "") -> list[str]:

@@ -86,7 +86,7 @@ def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> Trial:
     try:
         return Trial(unit.run_to(until, fits=fits, state=state))
     except Exception as error:  # noqa: BLE001  (as in a run)
-        return Trial(state, failure_of(error, unit.row.name, until))
+        return Trial(state, failure_of(error, unit.row.name, state.task))
 
 
 def unit_of_campaign(campaign: Campaign, unit: str) -> ConfiguredUnit:

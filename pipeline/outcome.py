@@ -32,6 +32,7 @@ VERDICTS = {
     "not_enough_data": "",
     "nothing_missing": "good",
 }  # verdict: CSS class on the pages; in the order of the lines: effects that can be added, then what is in doubt
+DIAGNOSIS_FAILED = "diagnosis_failed"  # stands for a verdict in lists; in documents it is "not_enough_data"
 NAMED = 5  # units that a line names, and lines of one kind
 SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
@@ -57,13 +58,17 @@ def read_summary(results: Path) -> list[dict[str, str]]:
 
 
 def findings_of(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Return the verdict on each sensor in rows of ``summary.csv``."""
-    return [
-        Finding(row["unit"], sensor, verdict, list(filter(None, (row[f"{sensor}_selected"] or "").split(";"))))
-        for row in rows
-        for sensor in SENSORS
-        if (verdict := row.get(f"{sensor}_verdict"))
-    ]
+    """Return the verdict on each sensor in rows of ``summary.csv``, or that its diagnosis failed."""
+    found = []
+    for row in rows:
+        causes = (row.get("incomplete") or "").split("; ")
+        for sensor in [s for s in SENSORS if row.get(f"{s}_verdict")]:
+            failed = any(cause.startswith(("diagnose: ", f"diagnose/{sensor}: ")) for cause in causes)
+            selected = list(filter(None, (row[f"{sensor}_selected"] or "").split(";")))
+            found.append(
+                Finding(row["unit"], sensor, DIAGNOSIS_FAILED if failed else row[f"{sensor}_verdict"], selected)
+            )
+    return found
 
 
 def verdict_groups(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
@@ -144,7 +149,8 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     ]
     lines += _reasons(results, [row["unit"] for row in rows])
     lines += lines_of(_not_in_uncertainty(rows).items())
-    lines += first([f"{r['unit']}, left out: {what}" for r in rows if (what := r.get("left_out"))], NAMED, "units")
+    for column, words in (("left_out", "left out"), ("incomplete", "not complete")):
+        lines += first([f"{r['unit']}, {words}: {what}" for r in rows if (what := r.get(column))], NAMED, "units")
     entries = read_history(results) if of_this_run else []
     if entries:
         lines += first(_changes(entries), NAMED, "sensors that changed")

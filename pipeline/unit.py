@@ -36,7 +36,7 @@ STEPS = {  # in the order of a run
     "diagnose": Step("diagnose.diagnose_unit", ("unit", "recordings", "fits", "validation"), "diagnosed"),
     "calibration": Step("calibration.calibration_document", ("unit", "checked", "fits", "validation"), "calibration"),
     "export": Step("export.export", DOCUMENTS, "exports"),
-    "report": Step("report.report", ("recordings", *DOCUMENTS), "pages"),
+    "report": Step("report.report", ("recordings", *DOCUMENTS, "omissions"), "pages"),
     "summary": Step("summary.summarise", DOCUMENTS, "summary"),
 }
 
@@ -58,6 +58,7 @@ class UnitState:
 
     unit: str
     files: UnitFiles
+    task: str = ""  # name of the current or last task
     checked: list[Recording] | None = None
     recordings: UnitRecordings | None = None
     fits: dict[str, Fit] = field(default_factory=dict)  # by sensor, after the last stage so far
@@ -72,6 +73,11 @@ class UnitState:
     def diagnosis(self) -> dict[str, Any] | None:
         """``diagnoses/<unit>.json``."""
         return None if self.diagnosed is None else dict(self.diagnosed.document)
+
+    @property
+    def omissions(self) -> list[dict[str, Any]]:
+        """Records of what the diagnosis could not make."""
+        return [] if self.diagnosed is None else list(self.diagnosed.omissions)
 
 
 class Task(NamedTuple):
@@ -112,6 +118,7 @@ def run_step(task: Task, state: Any, settings: Mapping[str, Any]) -> Any:  # noq
 def run_steps(state: UnitState, tasks: Iterator[Task], settings_of: Callable[[Task], Mapping[str, Any]]) -> UnitState:
     """Run the tasks of a unit in memory; ``settings_of`` returns the settings that a task reads."""
     for task in tasks:
+        state.task = task.name
         made = run_step(task, state, settings_of(task))
         if task.sensor:
             state.fits = {**state.fits, task.sensor: made}

@@ -17,7 +17,16 @@ from pipeline.exports.reading import counts_of, read_any
 from pipeline.files import read_json
 from pipeline.history import read_history
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
-from pipeline.outcome import NOT_CONVERGED, Finding, commands_of, lines_of, next_commands, read_summary, verdict_groups
+from pipeline.outcome import (
+    DIAGNOSIS_FAILED,
+    NOT_CONVERGED,
+    Finding,
+    commands_of,
+    lines_of,
+    next_commands,
+    read_summary,
+    verdict_groups,
+)
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import FAR
@@ -127,10 +136,10 @@ def explain(folder: Path, diagnoses: dict[str, JSON], failures: dict[str, JSON])
             "board": explain_board(calibration),
         })  # fmt: skip
     findings = [
-        Finding(unit, sensor, document[sensor]["verdict"], document[sensor]["selected"])
+        Finding(unit, sensor, DIAGNOSIS_FAILED if part.get("failed") else part["verdict"], part["selected"])
         for unit, document in diagnoses.items()
         for sensor in SENSORS
-        if document.get(sensor)
+        if (part := document.get(sensor))
     ]
     counts = Counter(finding.verdict.replace("_", " ") for finding in findings).most_common()
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)

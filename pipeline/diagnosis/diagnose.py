@@ -232,6 +232,19 @@ def _doubts_of_axes(leaning: Mapping[str, float], calibration: SensorCalibration
     ]
 
 
+def without_diagnosis(sensor: str, settings: Mapping[str, Any], failure: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the document of a sensor whose diagnosis failed; ``failure``: its ``code`` and ``message``.
+
+    The verdict is ``not_enough_data``, because nothing is known of what is missing.
+    """
+    listed = (settings.get("effects") or {}).get(sensor)
+    bug = failure["code"] == "internal_error"
+    remedy = "report this fault with the traceback, which is in the log of the stage diagnose" if bug else ""
+    document = _not_enough_data(sensor, list(listed) if isinstance(listed, list) else [], "", remedy)
+    reason = f"The diagnosis failed: {failure['message']}. The calibration does not depend on it."
+    return document | {"failed": failure["message"], "reason": reason, "not_observable": []}
+
+
 def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> dict[str, Any]:
     """Return the document for recordings that cannot show any effect; ``needed``: what to record."""
     names = [name for name, each in catalogue().items() if sensor in each.sensors and name not in configured]

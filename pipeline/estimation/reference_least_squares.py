@@ -37,7 +37,7 @@ from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import Part, noise_of_fit, parts_of, settled
+from pipeline.estimation.turns import Part, noise_of_fit, parts_of, settled, used_motions
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import truth
@@ -79,7 +79,7 @@ def fit(
         J[channel, 3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
     weights = factors.weights()
     fit = LinearMap((weights, weights, weights), (J[0], J[1], J[2]))
-    reference = Reference(sensor, [part.used_motion for part in parts], K, settings["table"])
+    reference = Reference(sensor, used_motions(parts), K, settings["table"])
     noise = noise_of_fit(parts, reference, residuals, X, prior)
     contributions = [noise_contribution(noise, fit, prior)]
     result = StageResult(

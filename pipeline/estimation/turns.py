@@ -55,6 +55,11 @@ class Part:
         return reading[self.keep]
 
 
+def used_motions(parts: Sequence[Part]) -> list[Motion]:
+    """Return the motion at the used samples of each part; a part without any is left out."""
+    return [part.used_motion for part in parts if part.keep.any()]
+
+
 def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, Any], method: str) -> list[Part]:
     """Return the recordings made for a sensor with its readings and the table's motion, without invalid samples.
 
@@ -136,7 +141,7 @@ def noise_of_turns(
     parts: Sequence[Part], prior: Prior, table: Mapping[str, Any], *, two_sided: bool = False
 ) -> ResidualNoise:
     """Return the noise of an accelerometer on a table, from the residuals of ``y = b + K u``, or ``+ C |u|`` too."""
-    motions = [part.used_motion for part in parts]
+    motions = used_motions(parts)
     u = np.concatenate([motion.specific_force for motion in motions])
     reading = np.concatenate([part.reading("accelerometer") for part in parts])
     X = np.column_stack([np.ones(len(u)), u, np.abs(u)] if two_sided else [np.ones(len(u)), u])

@@ -366,7 +366,8 @@ def _interval(squares: Values, room: float, steps: int) -> tuple[float, float, f
     """
     best = _nearest_minimum(squares, room)
     least = max(float(squares.min()), float(np.finfo(float).tiny))
-    open_to = np.flatnonzero(steps * np.log(np.maximum(squares, least) / least) <= SURE * np.sqrt(2.0 * len(squares)))
+    over = np.log(np.maximum(squares, least)) - np.log(least)  # their quotient may exceed the largest number
+    open_to = np.flatnonzero(steps * over <= SURE * np.sqrt(2.0 * len(squares)))
     if open_to[0] == 0 and open_to[-1] == len(squares) - 1:
         return None
     return best, min(best, float(open_to[0])), max(best, float(open_to[-1]))

@@ -90,15 +90,22 @@ def script_data(value: object) -> Markup:
     return Markup(text.replace("<", "\\u003c"))  # noqa: S704  (no tag can begin)
 
 
-def failure_page(unit: str, failure: Mapping[str, Any]) -> str:
+def failure_page(unit: str, failure: Mapping[str, Any], *, calibrated: bool = False) -> str:
     """Return a page for a unit whose page cannot be rendered; it needs no template and no results."""
     where = f"{failure['file']}: " if failure["file"] else ""
+    address = quote(unit)
+    result = (
+        f'is calibrated (<a href="../calibrations/{address}.json">calibrations/{escape(unit)}.json</a>), but its page '
+        "and its calibration report could not be made"
+        if calibrated
+        else "has no result"
+    )
     cause = escape(f"{where}{failure['message']}")
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(unit)}</title>'
         '<meta name="viewport" content="width=device-width"><style>:root { color-scheme: light dark; } '
         "body { font: 15px/1.5 sans-serif; margin: 24px; } pre { white-space: pre-wrap; }</style></head>\n"
-        f"<body><h1>{escape(unit)}</h1><p>This unit has no result: the stage {escape(failure['stage'])} failed "
+        f"<body><h1>{escape(unit)}</h1><p>This unit {result}: the stage {escape(failure['stage'])} failed "
         f"({escape(failure['code'])}).</p><pre>{cause}</pre>\n"
         '<p><a href="../index.html">The campaign</a></p></body></html>\n'
     )

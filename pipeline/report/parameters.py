@@ -35,7 +35,8 @@ SENSOR_COLUMNS = (
     "answers",
 )  # fmt: skip
 OF_CALIBRATION = tuple(f"{s}_{c}" for c in ("implausible", "not_in_uncertainty", "not_held_out") for s in SENSORS)
-COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, "left_out")
+OF_UNIT = ("left_out", "incomplete")  # ``incomplete``: written by ``gather``, which knows what no stage could make
+COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT)
 PARAMETERS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "fitted")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}

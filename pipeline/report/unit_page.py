@@ -5,7 +5,7 @@ One file that works offline: style, script and charts are inline, and its conten
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from pipeline.report.parameters import beyond_limits, fitted_parameters, paramet
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
 from pipeline.signal.rests import Rest, rests_from_table
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 JSON = dict[str, Any]
 LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name
 USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found in the readings, with their colours
@@ -58,12 +61,13 @@ def render(
     settings: JSON,
     *,
     words: dict[str, list[str]] | None = None,
+    incomplete: Sequence[JSON] = (),
 ) -> str:
     """Return the page of one unit as HTML.
 
     ``calibration, validation, diagnosis``: as in their files, the last two None where their stage failed;
     ``recordings``: after the filter, may be empty; ``settings``: the unit's resolved configuration; ``words``: the
-    diagnosis of each sensor in sentences.
+    diagnosis of each sensor in sentences; ``incomplete``: ``stage`` and ``message`` of what could not be made.
     """
     validation, diagnosis, words = validation or {}, diagnosis or {}, words or {}
     attitude, moves = validation.get("attitude") or {}, validation.get("gravity_direction") or {}
@@ -90,6 +94,7 @@ def render(
         passed=passes(calibration, validation),
         checks=checks(validation),
         left_out=left_out(calibration.get("inputs")),
+        incomplete=incomplete,
         files_read=files_read(calibration.get("inputs")),
         sensors=sorted(sensors, key=lambda s: 99 if s["part"] is None else place(s["diagnosis"].get("verdict"))),
         attitude=attitude if attitude.get("curve") else None,
@@ -116,6 +121,7 @@ def _sensor(
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
     limits, kind = limit_rows(sensor, found, sensor_config), VERDICTS.get(found.get("verdict", ""), "")
+    kind = "warn" if found.get("failed") else kind
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)

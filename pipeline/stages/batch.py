@@ -2,6 +2,10 @@
 
 A job reads and writes one file for each stage, a ``pipeline.pack``. It contains ``<unit>.failed.json`` for a failed
 unit. Later stages copy this member, and ``verdict`` sets the exit code from it.
+
+A stage after the fit (``AFTER_FIT``) that fails for a unit does not fail the unit: its calibration is published. The
+pack then contains what the function ``<stage>_without`` of the stage returns instead, and ``<unit>.incomplete.json``
+with the cause. Page, summary and the last lines of the run state it.
 """
 
 from __future__ import annotations
@@ -16,9 +20,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import DamagedFileError, failure_of
+from pipeline.errors import DamagedFileError, failure_of, is_of_run, omission
 from pipeline.files import read_json, write_json
-from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
+from pipeline.pack import FAILED, INCOMPLETE, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written, repetitions
 from pipeline.stages import MODULES
 from pipeline.unit import STEPS, Task, run_step
@@ -44,6 +48,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "gather": (),
 }
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last", "code"), "diagnose": ("code",)}
+AFTER_FIT = ("diagnose", "export", "report", "summary", "prior")  # a calibration does not depend on them
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
 NOT_LAST = "no"  # value of the option --last
 BY_INPUTS = ("fit", "diagnose")  # the longest stages: a unit with unchanged inputs is copied from the last run
@@ -66,9 +71,9 @@ def main(stage: str, argv: Sequence[str]) -> int:
 
     A stage that is no step has ``<stage>_unit(job, unit, settings)``, which returns the files of the unit.
     ``<stage>_in_batch(job, unit, settings, made)``, if it exists, returns what a step made with what other units of the
-    batch tell. ``<stage>_failed(job, unit, settings, failure)``, if it exists,
-    returns the files of a unit that failed in this stage or before. The exit code is 0 even if units have failed: their
-    failures are part of the output.
+    batch tell. ``<stage>_failed(job, unit, settings, failure)``, if it exists, returns the files of a unit that failed
+    in this stage or before, and ``<stage>_without`` with the same arguments those that replace the files of a stage
+    after the fit that failed. The exit code is 0 even if units have failed: their failures are part of the output.
     """
     if stage == "verdict":
         return verdict(argv)
@@ -89,7 +94,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
             else:
                 files = _files_of(module, job, unit, settings)
             add(files)
-            if inputs and unit + FAILED not in files:
+            if inputs and not {unit + FAILED, unit + INCOMPLETE} & files.keys():
                 add({unit + INPUTS_OF: as_bytes({"sha256": inputs, "files": [*files]})})
     if stage in BY_INPUTS:
         _link_output(job.output)
@@ -118,12 +123,11 @@ def forget_last_outputs(results: Path) -> None:
 
 def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:
     """Return a digest of a unit's settings, code and files of earlier stages; empty if a file is damaged."""
-    packs = [*job.inputs.values(), *([Pack(Path(job.run["previous"]))] if job.run.get("previous") else [])]
-    run = {key: value for key, value in job.run.items() if key not in {"previous", "again"}}
+    run = {key: value for key, value in job.run.items() if key != "again"}
     found = hashlib.sha256(json.dumps([run, settings], sort_keys=True).encode())
     prefixes = (f"{unit}.", f"{unit}_")
     try:
-        for pack in packs:
+        for pack in job.inputs.values():
             for name in (n for n in pack.names() if n.startswith(prefixes) and not n.endswith(INPUTS_OF)):
                 found.update(name.encode() + pack.read(name))
     except DamagedFileError:
@@ -161,8 +165,9 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
         register_user_effects(content["user_effects"])
     units, output = content.pop("units"), arguments.pop("output")
     inputs = {name: Pack(arguments.pop(name)) for name in INPUTS[stage]}
-    if arguments.get("recordings"):
-        inputs["recordings"] = Pack(Path(arguments["recordings"]))
+    for name in ("recordings", "previous"):
+        if path := arguments.pop(name, ""):
+            inputs[name] = Pack(Path(path))
     return Job(stage, units, content | arguments, inputs, output, results)
 
 
@@ -192,19 +197,34 @@ def _below(job: Job, output: Path) -> str:
 def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> dict[str, bytes]:
     """Return the files of a unit; for a unit that failed here or before, with the record of its failure."""
     name = unit + FAILED
+    stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
     try:
         earlier = next((pack for pack in job.inputs.values() if name in pack), None)
         if not earlier:
-            return _encoded(_made(module, job, unit, settings))
+            return _made_or_replaced(module, job, unit, settings, stage)
         failure = earlier.json(name)
     except Exception as error:
-        if isinstance(error, OSError) and error.filename is None:
-            raise  # an error of the run, not of the unit: a full disk
-        stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
+        if is_of_run(error):
+            raise
         failure = failure_of(error, unit, stage)
         print(f"{stage}: {unit} FAILED: {failure['message']}", file=sys.stderr, flush=True)
     of_failed = getattr(module, f"{job.stage}_failed", None)
     return _encoded({name: failure} | (of_failed(job, unit, settings, failure) if of_failed else {}))
+
+
+def _made_or_replaced(
+    module: ModuleType, job: Job, unit: str, settings: dict[str, Any], stage: str
+) -> dict[str, bytes]:
+    """Return the files that a stage makes of a unit; of a stage after the fit that fails, those that replace them."""
+    try:
+        return _encoded(_made(module, job, unit, settings))
+    except Exception as error:
+        if job.stage not in AFTER_FIT:
+            raise
+        record = omission(error, unit, stage)
+        without = getattr(module, f"{job.stage}_without", None)
+        instead = without(job, unit, settings, record) if without else {}
+        return _encoded({**instead, unit + INCOMPLETE: [record]})
 
 
 def _made(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> Files:

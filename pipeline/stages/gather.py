@@ -80,6 +80,8 @@ def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
         found = _shared(batch.packs["summary"].json(f"{unit}.json"))
         failure = batch.failure(unit)
         files = dict(batch.files(unit)) if publish else {}
+        records = [] if failure else batch.incomplete(unit)
+        found["row"]["incomplete"] = "; ".join(f"{r['stage']}: {r['message']}" for r in records) or None
     except Exception as error:  # noqa: BLE001  (one unit never stops the campaign)
         failure = failure_of(error, unit, "gather")
         document, page = failed_files(batch.packs["calibration"], unit, failure).values()

@@ -21,19 +21,29 @@ if TYPE_CHECKING:
 
 
 def report(
+    *,
     recordings: UnitRecordings,
     calibration: dict[str, Any],
     validation: dict[str, Any],
     diagnosis: dict[str, Any],
+    omissions: list[dict[str, Any]],
     settings: dict[str, Any],
 ) -> Files:
-    """Return the page and the calibration report (certificate) of a unit, by their names below ``reports``."""
+    """Return the page and the calibration report (certificate) of a unit, by their names below ``reports``.
+
+    ``omissions``: records of what earlier steps could not make; the page states them.
+    """
     unit, filtered = calibration["unit"], recordings.filtered
     words = {sensor: in_words(diagnosis[sensor], sensor, most_values=3) for sensor in SENSORS}
-    page = render(calibration, validation, diagnosis, filtered, settings, words=words)
+    page = render(calibration, validation, diagnosis, filtered, settings, words=words, incomplete=omissions)
     document = certificate(calibration, validation, settings, sensor_temperature(filtered))
     kinds = {"json": document, "html": certificate_page(unit, document), "xml": digital_certificate(unit, document)}
     return {f"{unit}.html": page} | {f"certificates/{unit}.{kind}": made for kind, made in kinds.items() if made}
+
+
+def report_without(job: Job, unit: str, settings: dict[str, Any], record: dict[str, Any]) -> Files:  # noqa: ARG001
+    """Return a page that states why the page of a calibrated unit could not be made."""
+    return {f"{unit}.html": failure_page(unit, record, calibrated=True)}
 
 
 def report_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:

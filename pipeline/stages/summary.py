@@ -34,6 +34,11 @@ def summarise(calibration: JSON, validation: JSON, diagnosis: JSON, settings: JS
     return found
 
 
+def summary_without(job: Job, unit: str, settings: JSON, record: JSON) -> Files:  # noqa: ARG001
+    """Return the summary of a calibrated unit whose documents could not be summarised."""
+    return {f"{unit}.json": summary(settings, None, {"unit": unit, "status": "ok"})}
+
+
 def summary_failed(job: Job, unit: str, settings: JSON, failure: JSON) -> Files:
     """Return the summary of a failed unit; for one that fails in this stage, with its document and its page."""
     name, report, files = f"{unit}.calibration.json", job.inputs["report"], {}

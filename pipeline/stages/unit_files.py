@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.io.arrow import from_parquet, to_parquet
-from pipeline.pack import Pack
+from pipeline.pack import INCOMPLETE, Pack
 from pipeline.records import SENSORS, Noise, UnitRecordings, fit_from_json
 from pipeline.unit import UnitFiles
 
@@ -59,10 +59,9 @@ class StoredUnit:
     @cached_property
     def fits(self) -> dict[str, Fit]:
         """Fit of each sensor; in a job of the stage fit, that of the stage before."""
-        run, file = self.job.run, f"{self.unit}.json"
         if self.job.stage == "fit":
-            before = Pack(Path(run["previous"])).json(file) if run["previous"] else None
-            return {run["sensor"]: fit_from_json(run["sensor"], before)} if before else {}
+            sensor = self.job.run["sensor"]
+            return {sensor: fit_from_json(sensor, self._json("previous"))} if "previous" in self.job.inputs else {}
         return {sensor: fit_from_json(sensor, self._json(sensor)) for sensor in SENSORS}
 
     @cached_property
@@ -74,6 +73,12 @@ class StoredUnit:
     def diagnosis(self) -> dict[str, Any]:
         """``diagnoses/<unit>.json``."""
         return dict(self._json("diagnose"))
+
+    @cached_property
+    def omissions(self) -> list[dict[str, Any]]:
+        """Records of what the stages diagnose and export could not make."""
+        name, packs = self.unit + INCOMPLETE, (self.job.inputs[stage] for stage in ("diagnose", "export"))
+        return [record for pack in packs if name in pack for record in pack.json(name)]
 
     @cached_property
     def calibration(self) -> dict[str, Any]:
@@ -95,7 +100,11 @@ FILES: dict[str, Callable[[str, Any], Files]] = {
     "filter": _files_of_filter,
     "fit": lambda unit, fit: {f"{unit}.json": fit.to_json()},
     "validate": lambda unit, document: {f"{unit}.json": document},
-    "diagnose": lambda unit, found: {f"{unit}.json": found.document} | found.effect_files,
+    "diagnose": lambda unit, found: (
+        {f"{unit}.json": found.document}
+        | found.effect_files
+        | ({unit + INCOMPLETE: found.omissions} if found.omissions else {})
+    ),
     "calibration": lambda unit, document: {f"{unit}.json": document},
     "export": lambda unit, files: {f"{unit}/{file}": text for file, text in files.items()},
     "report": lambda _, files: files,

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from table_turns import Bench, ramped_rate, run_stages, settings
+from table_turns import INTERVAL, Bench, ramped_rate, run_stages, settings
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.gyroscope.staged import fit as fit_stage
@@ -104,6 +104,18 @@ def test_a_static_recording_gives_the_bias_only_where_the_turns_hold_no_rest() -
     assert np.allclose(calibrate([*moving, other]).bias, np.add(BIAS, 1.0), atol=1e-10)
     with pytest.raises(NotObservableError, match="hold no rest"):
         calibrate(moving)
+
+
+def test_a_recording_without_a_rest_or_a_steady_turn_changes_nothing() -> None:
+    bench = Bench("gyroscope", BIAS, K, white=0.05)
+    recordings = bench.turns_at([60.0])
+    rate = np.linspace(5.0, 60.0, 12)
+    speeding_up = bench.turn("x", np.cumsum(rate) * INTERVAL, rate)
+    stated = {"angle_accuracy_deg": 0.01, "rate_accuracy": 1e-4, "motion": "logged"}
+    alone, both = (calibrate(each, **stated) for each in (recordings, [*recordings, speeding_up]))
+    assert np.array_equal(alone.matrix, both.matrix)
+    assert np.array_equal(alone.bias, both.bias)
+    assert np.allclose(alone.covariance, both.covariance, rtol=1e-9, atol=0.0)
 
 
 def test_earth_rotation_does_not_pass_for_bias_where_place_and_azimuth_are_known() -> None:

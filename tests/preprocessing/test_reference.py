@@ -17,7 +17,7 @@ from pipeline.diagnosis.diagnose import doubts_of
 from pipeline.errors import IngestError
 from pipeline.preprocessing.at_rest import check_static
 from pipeline.preprocessing.checks import check_recordings
-from pipeline.preprocessing.reference import check_motion
+from pipeline.preprocessing.reference import _interval, check_motion
 from pipeline.records import Recording
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_config, read_description
@@ -188,3 +188,8 @@ def test_the_attitude_of_a_turn_is_compared_with_the_gyroscope(axis: int, kind: 
     with pytest.raises(IngestError, match="other body axes") as caught:
         check_motion([turn], {}, SETTINGS)
     assert caught.value.code == "reference_contradiction"
+
+
+def test_a_delay_without_any_residual_excludes_all_others() -> None:
+    squares = 1e6 * np.abs(np.arange(21.0) - 10.0)
+    assert _interval(squares, 0.0, 20) == (10.0, 10.0, 10.0)

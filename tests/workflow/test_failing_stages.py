@@ -1,4 +1,7 @@
-"""A fault in any stage fails one unit: its page names the cause, all others and the campaign's page are complete."""
+"""A fault in any stage up to the calibration fails one unit: its page names the cause, all others are complete.
+
+A fault in a stage after it leaves the calibration published, and is stated wherever the unit is.
+"""
 
 import csv
 import html
@@ -10,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
 from whole_run import run_campaign, run_jobs
 
@@ -18,12 +22,21 @@ from pipeline import results_folder
 from pipeline.commands import add, apply, convert, explain, unpack
 from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.campaign import Campaign
+from pipeline.diagnosis.words import in_words
 from pipeline.errors import ConfigurationError, DamagedFileError, InputError
-from pipeline.pack import Batch
+from pipeline.one_unit import try_unit, unit_of_campaign
+from pipeline.outcome import outcome
+from pipeline.pack import Batch, Pack
 from pipeline.results_folder import HELD
-from pipeline.stages import batch, gather, report
+from pipeline.stages import batch, diagnose, gather, report
+from pipeline.stages.unit_files import StoredUnit
+from pipeline.unit import Task, run_step
 
-STAGES = ("ingest", "filter", "fit", "calibration", "validate", "diagnose", "export", "report", "summary", "gather")
+from .schemas import violations
+
+FAILING = ("ingest", "filter", "fit", "validate", "calibration", "gather")
+AFTER_FIT = ("diagnose", "export", "report", "summary")
+STAGES = (*FAILING, *AFTER_FIT)
 FOLDERS = ("calibrations", "validations", "diagnoses", "reports", "certificates", "exports")
 
 
@@ -50,7 +63,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         return failure(packs, unit)
 
     def faulty_render(document: dict[str, Any], *rest: Any, **more: Any) -> str:
-        if document["unit"] == "at_report" and document["status"] == "failed":
+        if document["unit"] == "at_filter" and document["status"] == "failed":
             raise ValueError("the template fails too")
         return render(document, *rest, **more)
 
@@ -72,17 +85,80 @@ def test_a_fault_in_any_stage_fails_its_unit_alone(published: tuple[Campaign, Pa
     index = (results / "index.html").read_text()
     failures = {f["unit"]: f for f in json.loads((results / "failures.json").read_text())}
     assert failures == {f["unit"]: f for f in json.loads((results / "batches" / "gathered.json").read_text())}
-    for stage in STAGES:
+    assert failures.keys() == {f"at_{stage}" for stage in FAILING}
+    for stage in FAILING:
         unit = f"at_{stage}"
-        cause = "no room for" if stage == "export" else "fault at"
         assert failures[unit]["stage"].startswith(stage), failures[unit]
-        assert f"{cause} {unit}" in failures[unit]["message"]
+        assert f"fault at {unit}" in failures[unit]["message"]
         assert rows[unit]["status"] == "failed"
         assert json.loads((results / "calibrations" / f"{unit}.json").read_text())["status"] == "failed"
-        assert f"{cause} {unit}" in (results / "reports" / f"{unit}.html").read_text()
+        assert f"fault at {unit}" in (results / "reports" / f"{unit}.html").read_text()
         assert unit in index
         assert not any((results / f / f"{unit}.json").exists() for f in ("validations", "diagnoses", "certificates"))
         assert not (results / "exports" / unit).exists()
+
+
+def test_a_fault_after_the_fit_leaves_the_calibration_and_is_stated_everywhere(
+    published: tuple[Campaign, Path],
+) -> None:
+    campaign, results = published
+    rows = {r["unit"]: r for r in csv.DictReader((results / "summary.csv").read_text().splitlines())}
+    index, said = (results / "index.html").read_text(), outcome(results, campaign.settings, of_this_run=True)
+    good = json.loads((results / "calibrations" / "good.json").read_text())
+    for stage in AFTER_FIT:
+        unit = f"at_{stage}"
+        document = json.loads((results / "calibrations" / f"{unit}.json").read_text())
+        assert (document["status"], document["gyroscope"]) == ("ok", good["gyroscope"])
+        cause = f"no room for {unit}" if stage == "export" else f"fault at {unit}"
+        assert (rows[unit]["status"], rows[unit]["error"]) == ("ok", "")
+        assert rows[unit]["incomplete"].startswith(f"{stage}: ")
+        assert cause in rows[unit]["incomplete"]
+        assert f"{unit}, not complete: {rows[unit]['incomplete']}" in said
+        assert html.escape(rows[unit]["incomplete"]) in index
+        page = (results / "reports" / f"{unit}.html").read_text()
+        assert (cause in page) == (stage != "summary")  # the page is made before the summary
+        diagnosis = json.loads((results / "diagnoses" / f"{unit}.json").read_text())
+        verdicts = {diagnosis[s]["verdict"] for s in ("accelerometer", "gyroscope")}
+        assert (verdicts == {"not_enough_data"}) == (stage == "diagnose")
+        assert all((cause in diagnosis[s]["reason"]) == (stage == "diagnose") for s in ("accelerometer", "gyroscope"))
+        assert (results / "exports" / unit).is_dir() == (stage != "export")
+        assert (results / "certificates" / f"{unit}.json").is_file() == (stage != "report")
+    assert violations(results) == []
+    assert rows["good"]["incomplete"] == ""
+    assert "accelerometer, diagnosis failed: at_diagnose\n" in said
+    assert f"units calibrated: {1 + len(AFTER_FIT)}, failed: {len(FAILING)}" in said
+
+
+def test_a_diagnosis_of_one_sensor_that_fails_does_not_stop_the_other(
+    published: tuple[Campaign, Path], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    campaign, results = published
+    (name,) = campaign.batches
+    content = batch.merge_common(json.loads(settings_of_jobs(campaign)[name]["diagnose"].content))
+    folder = results / "batches" / name
+    packs = {stage: Pack(folder / f"{stage}.zip") for stage in ("ingest", "filter", "validate")}
+    packs |= {s: Pack(folder / "fit" / s / f"{campaign.chains[name][s][-1]}.zip") for s in batch.FITS}
+    whole = json.loads((results / "diagnoses" / "good.json").read_text())
+
+    def fails_for_the_gyroscope(calibration: Any, *_: Any, **__: Any) -> dict[str, Any]:
+        if calibration.sensor == "gyroscope":
+            raise np.linalg.LinAlgError("Singular matrix")
+        return dict(whole["accelerometer"])
+
+    monkeypatch.setattr(diagnose, "diagnose", fails_for_the_gyroscope)
+    stored = StoredUnit(batch.Job("diagnose", {}, {}, packs, folder, results), "good")
+    settings = content["units"]["good"]
+    found = run_step(Task("diagnose"), stored, settings)
+    assert found.document["accelerometer"] == whole["accelerometer"]
+    part = found.document["gyroscope"]
+    assert (part["verdict"], part["selected"], part["override"]) == ("not_enough_data", [], "")
+    assert "LinAlgError: Singular matrix" in part["reason"]
+    assert in_words(part, "gyroscope")[0].startswith("The diagnosis of the gyroscope failed")
+    assert [record["stage"] for record in found.omissions] == ["diagnose/gyroscope"]
+    assert "Traceback" in capfd.readouterr().err
+    monkeypatch.setattr(diagnose, "diagnose", lambda *_, **__: (_ for _ in ()).throw(DamagedFileError("damaged", "x")))
+    with pytest.raises(DamagedFileError):  # the next run writes the file anew, and diagnoses the unit
+        run_step(Task("diagnose"), stored, settings)
 
 
 def test_a_run_with_failed_units_ends_with_1_and_names_each(
@@ -92,7 +168,7 @@ def test_a_run_with_failed_units_ends_with_1_and_names_each(
     given = ["--results", str(published[1]), "--output", str(mark), "--failures"]
     assert batch.verdict([*given, str(published[1] / "batches" / "gathered.json")]) == 1
     said = capsys.readouterr().err
-    assert all(f"  at_{stage}: " in said for stage in STAGES)
+    assert all((f"  at_{stage}: " in said) == (stage in FAILING) for stage in STAGES)
     assert "good" not in said
     assert not mark.exists()
     (tmp_path / "none.json").write_text("[]")
@@ -159,18 +235,27 @@ def keep_the_first_rest(file: Path) -> None:
 
 
 def test_other_failures_are_named_too(tmp_path: Path, simulated: Path) -> None:
-    for unit in ("good", "incomplete", "short"):
+    for unit in ("good", "incomplete", "short", "in_stages"):
         shutil.copytree(simulated, tmp_path / "bench" / "raw" / unit)
-    (tmp_path / "bench" / "units.csv").write_text("unit\ngood\nincomplete\nshort\n")
+    (tmp_path / "bench" / "units.csv").write_text("unit,method\ngood,\nincomplete,\nshort,\nin_stages,staged\n")
     (tmp_path / "bench" / "raw" / "incomplete" / "accel_z.csv").unlink()
-    for file in (tmp_path / "bench" / "raw" / "short").glob("accel_*.csv"):
-        keep_the_first_rest(file)
+    for unit in ("short", "in_stages"):
+        for file in (tmp_path / "bench" / "raw" / unit).glob("accel_*.csv"):
+            keep_the_first_rest(file)
     campaign, code = run_campaign(tmp_path / "bench")
     assert code == 1
     failures = json.loads((campaign.results / "failures.json").read_text())
-    assert [(f["unit"], f["code"]) for f in failures] == [("incomplete", "missing_file"), ("short", "not_observable")]
+    assert [(f["unit"], f["code"], f["stage"]) for f in failures] == [
+        ("incomplete", "missing_file", "ingest"),
+        ("short", "not_observable", "fit/accelerometer/reference_least_squares"),
+        ("in_stages", "not_observable", "fit/accelerometer/orthogonality"),  # the first of four stages
+    ]
     assert "accel_z" in failures[0]["message"]
     assert "accelerometer" in failures[1]["message"]
+    assert "does not show a sinusoid" in failures[2]["message"]
+    page, index = (campaign.results / name for name in ("reports/in_stages.html", "index.html"))
+    assert all("does not show a sinusoid" in file.read_text() for file in (page, index))
+    assert try_unit(unit_of_campaign(campaign, "in_stages"), "calibration").failure == failures[2]
     assert json.loads((campaign.results / "calibrations" / "good.json").read_text())["status"] == "ok"
 
 

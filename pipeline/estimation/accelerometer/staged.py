@@ -42,7 +42,7 @@ from pipeline.estimation.engine import LinearMap, ResidualNoise
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before, two_sided
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import noise_of_turns, parts_of
+from pipeline.estimation.turns import noise_of_turns, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import (
     budgeted,
     combined,
@@ -282,7 +282,7 @@ def fit(
     kept = slice(0, 15 if last else 12)
     if as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
-    motions = [part.used_motion for turn in turns for part in turn.parts]
+    motions = used_motions([part for turn in turns for part in turn.parts])
     reference = Reference("accelerometer", motions, np.diag(found.k), settings["table"])
 
     def results(errors: Values) -> Values:

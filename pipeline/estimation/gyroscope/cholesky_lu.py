@@ -44,7 +44,7 @@ from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import of_channels
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import Part, noise_of_fit, parts_of
+from pipeline.estimation.turns import Part, noise_of_fit, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
 from pipeline.records import AXES, Index, Mask, Recording, SensorCalibration, StageResult, Values
 from pipeline.signal.rests import runs
@@ -91,7 +91,7 @@ def fit(
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
     prior = prior_of("gyroscope", recordings, settings)
     fit, of_bias = _linear_map(turns, A, previous, as_printed=as_printed)
-    reference = Reference("gyroscope", [part.used_motion for part in turns.parts], A, settings["table"])
+    reference = Reference("gyroscope", used_motions(turns.parts), A, settings["table"])
     noise = noise_of_fit(turns.parts, reference, residuals, design, prior)
     scatter = noise_contribution(noise, fit, prior)
     matrix = _matrix(A, as_printed=as_printed)

@@ -32,7 +32,7 @@ from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.stages import apply_correction, staged_result, stages_before
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import Part, noise_of_fit, parts_of, steady_turns
+from pipeline.estimation.turns import Part, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
 from pipeline.records import AXES, Mask, Recording, SensorCalibration, Values, motion_at_rest
 from pipeline.signal.rests import runs
@@ -158,8 +158,7 @@ def fit(
     found = follow(Response(theta[0], theta[1:], samples.speed, as_printed), [name], correction.get("steps", []))
     x, y, z = np.split(derivative(chain, here, np.full(12, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
-    motions = [part.used_motion for part in samples.parts]
-    reference = Reference("gyroscope", motions, theta[1:].T, settings["table"])
+    reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings["table"])
     noise = noise_of_fit(samples.parts, reference, residuals, design, prior)
     scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, samples.reading)

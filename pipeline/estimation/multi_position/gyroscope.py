@@ -116,12 +116,17 @@ class GyroscopeModel:
         return out
 
     def without(self, held: Mask) -> GyroscopeModel:
-        """Return the model with the rests ``held``, and the moves that end at them, held out."""
+        """Return the model with the rests ``held``, and the moves that end at them, held out.
+
+        Its kinds of scatter stay those of this model, also if too few moves are left, as hypotheses state each kind.
+        """
         out = self.every.held_out.copy()
         out[~self.every.held_out] = held
         moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
         rests = replace(self.every, held_out=out)
-        return GyroscopeModel(rests, moves, self.at_rests, self.noise, fewest=self.fewest, turns=self.turns)
+        part = GyroscopeModel(rests, moves, self.at_rests, self.noise, fewest=self.fewest, turns=self.turns)
+        part.kinds = self.kinds
+        return part
 
     def direction_errors(self, state: State) -> tuple[Values, Values]:
         """Return the angle of each move between integrated and measured gravity, and its mean by noise alone, deg.

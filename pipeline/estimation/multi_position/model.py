@@ -122,7 +122,7 @@ class Equations:
     # lists of (n, p); columns of the effects of the model, and of effects that are not in it
     effects: list[Values]
     candidates: list[Values]
-    scatter: Values  # (s, n); the g_j
+    scatter: Values  # (s, n); the g_j, zeros of a kind without equations
     bias: Values  # (3, n, t); H, axis by axis
     # each (t,), s; the stretches of time
     start: Values
@@ -193,7 +193,7 @@ def stacked(blocks: Sequence[Block], model: Model, state: State, candidates: Seq
     start, length, recording = (
         np.concatenate(times) for times in zip(*(b.stretches for b in blocks if b.stretches is not None), strict=True)
     )
-    scatter = np.zeros((sum(block.scattered for block in blocks), edges[-1]))
+    scatter = np.zeros((model.kinds, edges[-1]))
     bias, column = np.zeros((3, edges[-1], len(start))), 0
     for kind, (block, rows) in enumerate(zip(blocks, map(slice, edges[:-1], edges[1:]), strict=True)):
         if block.scattered:

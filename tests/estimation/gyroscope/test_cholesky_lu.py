@@ -227,6 +227,15 @@ def test_a_turn_with_clipped_readings_is_left_out_and_counted() -> None:
     assert calibration.matrix @ FORWARD == pytest.approx(np.eye(3), abs=1e-9)
 
 
+def test_a_recording_whose_every_row_is_clipped_changes_nothing() -> None:
+    recordings = _campaign(np.random.default_rng(6))
+    clipped = dataclasses.replace(recordings[0], flags=np.full(recordings[0].samples, 0b10, np.uint16))
+    alone, both = _fit(recordings), _fit([*recordings, clipped])
+    assert both.stages[-1].details["turns_left_out"] == 3
+    assert np.array_equal(alone.matrix, both.matrix)
+    assert np.allclose(alone.covariance, both.covariance, rtol=1e-9, atol=0.0)
+
+
 def test_the_angle_errors_are_a_table_of_turn_axes_by_sensor_axes() -> None:
     stage = _fit(_campaign(np.random.default_rng(3))).stages[-1]
     errors = np.array(stage.details["angle_error_rms_deg"], float)

@@ -11,8 +11,10 @@ from scipy import stats
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import NotObservableError
-from pipeline.estimation.multi_position.gyroscope import model_of
-from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.gauss_markov import WHITE
+from pipeline.estimation.multi_position.fit import fit
+from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, GyroscopeModel, model_of
+from pipeline.estimation.multi_position.model import NoiseHypothesis, State
 from pipeline.estimation.noise import estimate_noise, noise_of
 from pipeline.signal.rests import find_rests
 from pipeline.signal.segments import multiples, turns_by_hand
@@ -139,6 +141,28 @@ def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) 
         by_accelerometer = moves.shared @ np.linalg.lstsq(moves.shared, turned)[0]
         assert np.linalg.norm(turned) * FACE > 20.0  # standard deviations of the moves' noise
         assert np.linalg.norm(turned - by_accelerometer) * FACE < 0.2
+
+
+def test_a_part_with_too_few_moves_is_fitted_by_its_rests_and_turns_alone(whole: Session) -> None:
+    """Cross-validation leaves out every third rest with the move before it: few moves may be left."""
+    noise = noise_of("gyroscope", whole.recordings, whole.settings)
+    model = model_of(whole.recordings, None, noise, whole.settings)
+    assert model is not None
+    assert model.moves is not None
+    used = np.arange(model.moves.count) < FEWEST_MOVES
+    few = GyroscopeModel(model.every, model.moves.select(used), model.at_rests, noise, turns=model.turns)
+    held = np.arange(len(few.rests.time)) == np.flatnonzero(~few.every.held_out).tolist().index(model.moves.after[0])
+    part = few.without(held)
+    alone = GyroscopeModel(part.every, None, part.at_rests, noise, turns=part.turns)
+    assert (few.kinds, part.moves, alone.kinds) == (2, None, 1)
+    start = State(np.average(part.rests.reading, axis=0), np.eye(3))
+    levels = 0.0, 2.0, 6.0
+    both = fit(part, start, [NoiseHypothesis(WHITE, (a, b)) for a in levels for b in levels], {})
+    one = fit(alone, start, [NoiseHypothesis(WHITE, (a,)) for a in levels], {})
+    assert both.state.matrix == pytest.approx(one.state.matrix, abs=1e-12)
+    assert both.state.bias == pytest.approx(one.state.bias, abs=1e-12)
+    assert both.log_likelihood == pytest.approx(one.log_likelihood, abs=1e-9)
+    assert part.held_out_error(both.state) == pytest.approx(alone.held_out_error(one.state), abs=1e-12)
 
 
 def test_a_missing_face_is_named() -> None:
