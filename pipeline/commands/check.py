@@ -9,6 +9,7 @@ import textwrap
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.commands import parser_of
@@ -16,11 +17,12 @@ from pipeline.commands.readings import Reading, campaign_of, config_of_log, grou
 from pipeline.commands.trial import try_unit
 from pipeline.config.campaign import find_campaign, load_campaign
 from pipeline.config.options import nearest
-from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError
+from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, first
 from pipeline.files import write_atomically
 from pipeline.io.files import FILE, SUFFIXES, recording_files
 from pipeline.model.calibration_file import LEFT_OUT
 from pipeline.model.sensor_file import settings_of_ranges
+from pipeline.outcome import NAMED, as_overrides, found_mountings
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.profile_text import as_yaml, not_found
 from pipeline.profile_detection.proposal import propose
@@ -30,10 +32,11 @@ from pipeline.run_progress import Countdown
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.commands.trial import Trial
     from pipeline.config.campaign import Campaign
+    from pipeline.outcome import FoundMounting, Ways
     from pipeline.profile_detection.columns import Log
     from pipeline.profile_detection.proposal import Proposal
     from pipeline.profile_detection.recording_facts import Line
@@ -74,7 +77,16 @@ class Refused(NamedTuple):
     reading: Reading | None = None
 
 
-Outcome = tuple[str, list[Refused]]  # the printed text on a log or a unit, and its refusals
+class Outcome(NamedTuple):
+    """The result of one check: the printed text on a log or a unit, its refusals, and its mountings by gravity.
+
+    ``mounted``: the settings that describe a recording, where gravity shows another mounting than stated.
+    """
+
+    text: str
+    refused: list[Refused]
+    unit: str = ""
+    mounted: Mapping[str, Ways] = MappingProxyType({})
 
 
 def main(argv: Sequence[str]) -> int:
@@ -85,24 +97,28 @@ def main(argv: Sequence[str]) -> int:
     tasks = _tasks(arguments)
     countdown, refused = Countdown(len(tasks)), list[Refused]()
     alike: dict[str, list[str]] = {}
+    mounted = []
     for number, (what, task) in enumerate(tasks):
         countdown(number, f"checking {what} ({number + 1} of {len(tasks)})")
-        text, found = task()
+        outcome = task()
         countdown.end()
-        key = _same_layout(found)
+        key = _same_layout(outcome.refused)
         if key and key in alike:
             alike[key].append(what)
         else:
             alike[key] = [what]
-            print(f"{text}\n")
-        refused += found
-    for key, (first, *others) in alike.items():
+            print(f"{outcome.text}\n")
+        refused += outcome.refused
+        mounted.append((outcome.unit, outcome.mounted))
+    for key, (one, *others) in alike.items():
         if key and others:
-            print(textwrap.fill(f"REFUSED as {first}: {', '.join(others)}", WIDTH, subsequent_indent="  ") + "\n")
+            print(textwrap.fill(f"REFUSED as {one}: {', '.join(others)}", WIDTH, subsequent_indent="  ") + "\n")
+    whole_campaign = not arguments.files and not arguments.unit
+    _print_mountings(found_mountings(mounted), len(tasks) if whole_campaign else None)
     sys.stdout.flush()
     equal: dict[tuple[str, str], list[str]] = {}
-    for one in refused:
-        equal.setdefault((one.code, one.message), []).append(one.place)
+    for refusal in refused:
+        equal.setdefault((refusal.code, refusal.message), []).append(refusal.place)
     for (code, _), (place, *others) in equal.items():
         where = f"{1 + len(others)} files, for example {place}" if others else place
         print(f"python -m pipeline check: {where}: refused ({code})", file=sys.stderr, flush=True)
@@ -113,6 +129,25 @@ def main(argv: Sequence[str]) -> int:
     elif arguments.save:
         print(f"{arguments.save} was not written: no profile is proposed")
     return 2 if refused else 0
+
+
+def _print_mountings(groups: Sequence[FoundMounting], units: int | None) -> None:
+    """Print the settings that describe the mountings by gravity: once for all units that share them.
+
+    ``units``: of the campaign, if all were checked; settings of all belong in ``campaign.yaml``.
+    """
+    for group in groups[:MOST_IN_FULL]:
+        of_units = f"devices/{group.units[0]}.yaml" if len(group.units) == 1 else "devices/UNIT.yaml of each unit"
+        place = "campaign.yaml" if len(group.units) == units else of_units
+        text = (
+            f"MOUNTING: gravity shows another one than stated in {', '.join(group.recordings)} of "
+            f"{', '.join(first(group.units, NAMED, 'units'))}, and it is used as found (N-FOUND). If the bench is so, "
+            f"state it in {place}; else correct the columns or the mounting (docs/mounting.md):"
+        )
+        print(textwrap.fill(text, WIDTH, subsequent_indent="  ") + f"\n\n{as_overrides(group.ways)}")
+    if others := [unit for group in groups[MOST_IN_FULL:] for unit in group.units]:
+        units_named = ", ".join(first(others, NAMED, "units"))
+        print(textwrap.fill(f"MOUNTING: other settings describe {units_named}: check each with --unit", WIDTH) + "\n")
 
 
 def _same_layout(refused: Sequence[Refused]) -> str:
@@ -177,11 +212,11 @@ def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Name
 
 def _logs_of_campaign(files: Sequence[Path], campaign: Campaign, units: Sequence[str]) -> list[Reading]:
     """Return logs that are no recordings of a campaign, read by its settings."""
-    first, *others = (campaign.units[unit].config for unit in units)
-    if any(first[section] != other[section] for other in others for section in ("ingest", "sensor")):
+    one, *others = (campaign.units[unit].config for unit in units)
+    if any(one[section] != other[section] for other in others for section in ("ingest", "sensor")):
         message = "the units are read by different settings (ingest, sensor): choose one by --unit"
         raise ConfigurationError(message, str(campaign.directory / "units.csv"))
-    ingest, sensor = first["ingest"], first["sensor"]
+    ingest, sensor = one["ingest"], one["sensor"]
     names = f"ingest={ingest['name']}, sensor={sensor['name']}"
     read_with = f"campaign {campaign.name}, as no recording of a unit: {names}"
     return [Reading.alone(group, ingest, sensor, read_with) for group in grouped(files, ingest)]
@@ -191,7 +226,7 @@ def _check_log(reading: Reading) -> Outcome:
     """Return content and notes of a log that is checked alone, or its refusal."""
     try:
         recording = reading.checked()
-        return _described(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), []
+        return Outcome(_described(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), [])
     except PipelineError as error:
         return _refusal_of(reading, error)
 
@@ -212,9 +247,9 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
             lines = _facts_of_recording(read[name], campaign, trial)
             texts += [_described(read[name], lines)] if names else []
         except PipelineError as error:
-            text, found = _refusal_of(read[name], error)
-            texts.append(text)
-            refused += found
+            outcome = _refusal_of(read[name], error)
+            texts.append(outcome.text)
+            refused += outcome.refused
     if trial.failure and (not refused or trial.failure["code"] == "missing_file"):
         place = trial.failure["file"] or f"unit {unit}"
         refused.append(Refused(trial.failure["code"], trial.failure["message"], place))
@@ -226,7 +261,7 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         lines += [(sensor, text) for sensor, text in trial.not_determined.items() if text]
         noted: dict[str, dict[tuple[str, str], list[str]]] = {}
         for recording in trial.recordings:
-            for note in recording.notes:
+            for note in (n for n in recording.notes if not n.settings):
                 place = f", line {note.first} to {note.last}" if note.code in LEFT_OUT and note.first else ""
                 noted.setdefault(note.code, {}).setdefault((place, note.detail), []).append(recording.name)
         notes = [
@@ -237,7 +272,8 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         lines += [("notes" if i == 0 else "", note) for i, note in enumerate(notes)]
         head = f"unit {unit}: {counted(len(trial.recordings), 'recording')}, no refusal"
         texts.append("\n".join([head, *([as_text(lines)] if lines else [])]))
-    return "\n\n".join([*texts, *([missing] if missing else [])]), refused
+    mounted = {r.name: n.settings for r in trial.recordings for n in r.notes if n.settings}
+    return Outcome("\n\n".join([*texts, *([missing] if missing else [])]), refused, unit, mounted)
 
 
 def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
@@ -285,7 +321,7 @@ def _refusal_of(reading: Reading, error: PipelineError) -> Outcome:
     refused = Refused(error.code, error.message, error.file or str(reading.files[0]), reading)
     text = _described(reading, [*lines, *_topics(reading, fields=error.code == "missing_topic")])
     parts = getattr(error, "sessions", 0)
-    return f"{text}\n\n{_recipe(reading, parts)}" if parts else text, [refused]
+    return Outcome(f"{text}\n\n{_recipe(reading, parts)}" if parts else text, [refused])
 
 
 def _recipe(reading: Reading, parts: int) -> str:
@@ -345,9 +381,9 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
             ingest = proposal.ingest(name, sensor)
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for number, group in enumerate(groups):
-                text, refused = _check_log(Reading.alone(group, ingest, sensor, "the proposed profile"))
-                if number < MOST_IN_FULL or refused:
-                    print(f"{text}\n")
+                outcome = _check_log(Reading.alone(group, ingest, sensor, "the proposed profile"))
+                if number < MOST_IN_FULL or outcome.refused:
+                    print(f"{outcome.text}\n")
             if len(groups) > MOST_IN_FULL:
                 print("Every other file is read without a refusal: check it alone for what it holds.\n")
         print(textwrap.fill(f"PROPOSED PROFILE for {', '.join(proposal.files)}", WIDTH, subsequent_indent="  ") + "\n")

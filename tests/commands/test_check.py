@@ -348,9 +348,23 @@ def test_equal_notes_of_recordings_are_one_and_others_are_told_apart(
             row[place] = f"{sign * float(row[place]) + shift:.6f}"
         file.unlink()
         file.write_text("\ufeff" + "\n".join([header, *(",".join(row) for row in cells)]) + "\n", encoding="utf-8")
-    words = Checked(capsys, "--campaign", linked).words
-    assert re.search(r"N-BOM gyro_y: [^;]*; likewise gyro_z", words)
-    assert re.search(r"N-FOUND gyro_y: .*at a table angle of 10.0 deg, .*N-FOUND gyro_z: .*angle of 20.0 deg", words)
+    alone = Checked(capsys, linked / "raw" / "U" / "gyro_y.csv")
+    assert "N-FOUND x 421: used as found, body +z up at a table angle of 10.0 deg" in alone.words
+    assert "state it in devices/U.yaml" in alone.words
+    checked = Checked(capsys, "--campaign", linked)
+    assert re.search(r"N-BOM gyro_y: [^;]*; likewise gyro_z", checked.words)
+    assert "gravity shows another one than stated in gyro_y, gyro_z of U, and it is used as found" in checked.words
+    assert "state it in campaign.yaml" in checked.words
+    assert checked.out.count("N-FOUND") == 1
+    block = checked.out[checked.out.index("overrides:") :]
+    assert yaml.safe_load(block) == {
+        "overrides": ["procedure.recordings.gyro_y.zero_deg=10.00", "procedure.recordings.gyro_z.zero_deg=20.00"]
+    }
+    (linked / "campaign.yaml").write_text(block)
+    pasted = Checked(capsys, "--campaign", linked)
+    assert pasted.code == 0
+    assert "N-FOUND" not in pasted.out
+    assert re.search(r"N-MOUNTING gyro_y: as stated, body \+z up at a table angle of 10.0 deg", pasted.words)
 
 
 def test_slow_full_turns_of_a_table_are_no_rests_and_no_contradiction(
