@@ -6,8 +6,8 @@ import json
 import shlex
 import sys
 import textwrap
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -32,7 +32,7 @@ from pipeline.run_progress import Countdown
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.commands.trial import Trial
     from pipeline.config.campaign import Campaign
@@ -80,13 +80,34 @@ class Refused(NamedTuple):
 class Outcome(NamedTuple):
     """The result of one check: the printed text on a log or a unit, its refusals, and its mountings by gravity.
 
-    ``mounted``: the settings that describe a recording, where gravity shows another mounting than stated.
+    ``mounted``: the settings that describe a recording, where gravity shows another mounting than stated. ``saved``:
+    the profile of the campaign that reads what is refused.
     """
 
     text: str
     refused: list[Refused]
     unit: str = ""
     mounted: Mapping[str, Ways] = MappingProxyType({})
+    saved: Path | None = None
+
+
+@dataclass
+class SavedProfiles:
+    """The ingest profiles in ``configs/ingest`` of a campaign, and its units as each of them reads them."""
+
+    directory: Path
+    unusable: dict[Path, str] = field(default_factory=dict)  # why, such as a value that is to be filled in
+
+    @cached_property
+    def campaigns(self) -> dict[Path, Campaign]:
+        """The campaign by each profile that can be used; read when it is first needed."""
+        found = {}
+        for file in sorted((self.directory / "configs" / "ingest").glob("*.yaml")):
+            try:
+                found[file] = load_campaign({"campaign": str(self.directory), "overrides": [f"ingest={file.stem}"]})
+            except ConfigurationError as error:
+                self.unusable[file] = str(error)
+        return found
 
 
 def main(argv: Sequence[str]) -> int:
@@ -97,7 +118,7 @@ def main(argv: Sequence[str]) -> int:
     tasks = _tasks(arguments)
     countdown, refused = Countdown(len(tasks)), list[Refused]()
     alike: dict[str, list[str]] = {}
-    mounted = []
+    mounted, saved = [], dict[Path, list[str]]()
     for number, (what, task) in enumerate(tasks):
         countdown(number, f"checking {what} ({number + 1} of {len(tasks)})")
         outcome = task()
@@ -110,18 +131,16 @@ def main(argv: Sequence[str]) -> int:
             print(f"{outcome.text}\n")
         refused += outcome.refused
         mounted.append((outcome.unit, outcome.mounted))
+        if outcome.saved:
+            saved.setdefault(outcome.saved, []).append(what.removeprefix("unit "))
     for key, (one, *others) in alike.items():
         if key and others:
             print(textwrap.fill(f"REFUSED as {one}: {', '.join(others)}", WIDTH, subsequent_indent="  ") + "\n")
     whole_campaign = not arguments.files and not arguments.unit
     _print_mountings(found_mountings(mounted), len(tasks) if whole_campaign else None)
+    _print_saved(saved)
     sys.stdout.flush()
-    equal: dict[tuple[str, str], list[str]] = {}
-    for refusal in refused:
-        equal.setdefault((refusal.code, refusal.message), []).append(refusal.place)
-    for (code, _), (place, *others) in equal.items():
-        where = f"{1 + len(others)} files, for example {place}" if others else place
-        print(f"python -m pipeline check: {where}: refused ({code})", file=sys.stderr, flush=True)
+    _print_refused(refused)
     unknown = [(r.reading, layout) for r in refused if r.reading for layout in _layouts(r.reading, r.code)]
     if unknown:
         sensor = unknown[0][0].settings["sensor"]
@@ -129,6 +148,16 @@ def main(argv: Sequence[str]) -> int:
     elif arguments.save:
         print(f"{arguments.save} was not written: no profile is proposed")
     return 2 if refused else 0
+
+
+def _print_refused(refused: Sequence[Refused]) -> None:
+    """Print a line for each cause of refusals."""
+    equal: dict[tuple[str, str], list[str]] = {}
+    for refusal in refused:
+        equal.setdefault((refusal.code, refusal.message), []).append(refusal.place)
+    for (code, _), (place, *others) in equal.items():
+        where = f"{1 + len(others)} files, for example {place}" if others else place
+        print(f"python -m pipeline check: {where}: refused ({code})", file=sys.stderr, flush=True)
 
 
 def _print_mountings(groups: Sequence[FoundMounting], units: int | None) -> None:
@@ -181,10 +210,10 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
     places: dict[Path | None, list[Path]] = {} if arguments.files else {given: []}
     for file in arguments.files:
         places.setdefault(given or campaign_of(file), []).append(file)
-    units, logs = [], []
+    tasks: list[tuple[str, partial[Outcome]]] = []
     for directory, files in places.items():
         if directory is None or stated:
-            logs += _logs(files, directory, arguments)
+            tasks += [(str(log.files[0]), partial(_check_log, log)) for log in _logs(files, directory, arguments)]
             continue
         campaign = load_campaign({"campaign": str(directory)})
         known = [arguments.unit] if arguments.unit else list(campaign.units)
@@ -193,9 +222,12 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
                 f"no unit {known[0]!r}{nearest(known[0], campaign.units)}", str(directory / "units.csv")
             )
         chosen, others = recordings_of_files(files, campaign, known) if files else ({unit: [] for unit in known}, [])
-        units += [(f"unit {unit}", partial(_check_unit, campaign, unit, names)) for unit, names in chosen.items()]
-        logs += _logs_of_campaign(others, campaign, known) if others else []
-    return [*units, *((str(log.files[0]), partial(_check_log, log)) for log in logs)]
+        saved = SavedProfiles(directory)
+        checks = {f"unit {unit}": partial(_check_unit, unit=unit, names=names) for unit, names in chosen.items()}
+        for log in _logs_of_campaign(others, campaign, known) if others else []:
+            checks[str(log.files[0])] = partial(_check_log_of_campaign, files=log.files, units=known)
+        tasks += [(what, partial(_check_or_saved, check, campaign, saved)) for what, check in checks.items()]
+    return sorted(tasks, key=lambda task: not task[0].startswith("unit "))
 
 
 def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Namespace) -> list[Reading]:
@@ -229,6 +261,52 @@ def _check_log(reading: Reading) -> Outcome:
         return Outcome(_described(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), [])
     except PipelineError as error:
         return _refusal_of(reading, error)
+
+
+def _check_or_saved(check: Callable[[Campaign], Outcome], campaign: Campaign, profiles: SavedProfiles) -> Outcome:
+    """Check by the settings of a campaign; where they need another profile, by those that the campaign holds.
+
+    The refusal remains, because a run uses no profile that the settings do not name.
+    """
+    outcome = check(campaign)
+    if not _needs_profile(outcome):
+        return outcome
+    for file, other in profiles.campaigns.items():
+        try:
+            by_profile = check(other)
+        except ConfigurationError:  # the log has none of the names that the profile gives to the parts of a recording
+            continue
+        if not _needs_profile(by_profile):
+            one = outcome.refused[0]
+            why = f"the profile that the settings name does not describe it ({one.code}), and the saved one does:"
+            refused = [each._replace(reading=None) for each in (*outcome.refused, *by_profile.refused)]
+            text = f"{one.place}\n{as_text([('REFUSED', why), ('saved profile', str(file))])}\n\n{by_profile.text}"
+            return by_profile._replace(text=text, refused=refused, saved=file)
+    lines = [("saved profile", f"{file} cannot be used: {why}") for file, why in profiles.unusable.items()]
+    profiles.unusable.clear()  # told once
+    return outcome._replace(text=f"{outcome.text}\n{as_text(lines)}") if lines else outcome
+
+
+def _needs_profile(outcome: Outcome) -> bool:
+    """Return whether files are missing, or have a layout that the profile does not describe."""
+    return any(one.code in (*UNKNOWN_LAYOUT, "missing_file") for one in outcome.refused)
+
+
+def _print_saved(saved: Mapping[Path, Sequence[str]]) -> None:
+    """Print how a run uses the saved profiles that read what is refused; ``saved``: profile to the units or logs."""
+    for file, names in saved.items():
+        text = (
+            f"SAVED PROFILE: {file} describes the files of {', '.join(first(names, NAMED))}. A run uses it where the "
+            f"settings name it: write {file.stem} into the column ingest of units.csv, or for all units into "
+            "campaign.yaml:"
+        )
+        print(textwrap.fill(text, WIDTH, subsequent_indent="  ") + f"\n\n{as_overrides([[f'ingest={file.stem}']])}")
+
+
+def _check_log_of_campaign(campaign: Campaign, files: Sequence[Path], units: Sequence[str]) -> Outcome:
+    """Return content and notes of a log that is no recording of a campaign, read by its settings."""
+    (reading,) = _logs_of_campaign(files, campaign, units)
+    return _check_log(reading)
 
 
 def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
