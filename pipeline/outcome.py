@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
+    Ways = Sequence[Sequence[str]]
+
 JSON = dict[str, Any]
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 VERDICTS = {
@@ -33,6 +35,8 @@ VERDICTS = {
     "nothing_missing": "good",
 }  # verdict: CSS class on the pages; in the order of the lines: effects that can be added, then what is in doubt
 DIAGNOSIS_FAILED = "diagnosis_failed"  # stands for a verdict in lists; in documents it is "not_enough_data"
+ZERO = re.compile(r"(?<=zero_deg=)-?[0-9.]+")
+ALIKE_DEG = 0.1  # gravity shows a zero to some hundredths of a degree (docs/mounting.md, What is checked)
 NAMED = 5  # units that a line names, and lines of one kind
 SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
@@ -49,6 +53,53 @@ class Finding(NamedTuple):
     sensor: str
     verdict: str
     selected: Sequence[str]
+
+
+class FoundMounting(NamedTuple):
+    """Units whose mounting by gravity is not the stated one, and the settings that describe it in all of them.
+
+    ``ways``: alternatives, each a list of overrides.
+    """
+
+    units: list[str]
+    recordings: list[str]
+    ways: list[list[str]]
+
+
+def found_mountings(found: Iterable[tuple[str, Mapping[str, Ways]]]) -> list[FoundMounting]:
+    """Group the units whose settings are equal, with zeros that agree; each zero is the mean of the group.
+
+    ``found``: units, each with the settings of the notes on its recordings (``Note.settings``) by recording.
+    """
+    groups: list[tuple[FoundMounting, list[list[float]]]] = []  # with the zeros of each unit
+    for unit, recordings in found:
+        if not recordings:
+            continue
+        ways = [[*way] for way in next(iter(recordings.values()))]
+        zeros = [float(text) for way in ways for setting in way for text in ZERO.findall(setting)]
+        plain = [[ZERO.sub("", setting) for setting in way] for way in ways]
+        for group, known in groups:
+            near = all(abs(a - b) <= ALIKE_DEG for a, b in zip(zeros, known[0], strict=False))
+            if near and (group.recordings, group.ways) == ([*recordings], plain):
+                group.units.append(unit)
+                known.append(zeros)
+                break
+        else:
+            groups.append((FoundMounting([unit], [*recordings], plain), [zeros]))
+    return [group._replace(ways=_with_zeros(group.ways, known)) for group, known in groups]
+
+
+def _with_zeros(ways: Ways, zeros: Sequence[Sequence[float]]) -> list[list[str]]:
+    """Return settings with the mean zeros of units, which were taken out in the order of the settings."""
+    means = iter([math.fsum(values) / len(values) for values in zip(*zeros, strict=True)])
+    return [[f"{s}{next(means):.2f}" if s.endswith("zero_deg=") else s for s in way] for way in ways]
+
+
+def as_overrides(ways: Ways) -> str:
+    """Return settings as the text of a file with overrides; the alternatives to the first are comments."""
+    first_way, *others = ([f"  - {setting}" for setting in way] for way in ways)
+    comments = [f"  # {line.strip()}" for way in others for line in ("or, in place of these:", *way)]
+    return "\n".join(["overrides:", *first_way, *comments]) + "\n"
 
 
 def read_summary(results: Path) -> list[dict[str, str]]:

@@ -6,11 +6,20 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from snakemake.cli import parse_config
 
-from pipeline.outcome import _reasons, add_command, commands_of, once_command, run_command
+from pipeline.outcome import (
+    _reasons,
+    add_command,
+    as_overrides,
+    commands_of,
+    found_mountings,
+    once_command,
+    run_command,
+)
 
 TEXT = st.text(
     st.characters(codec="utf-8", exclude_characters="\0\n\r\x85\u2028\u2029", exclude_categories=("Cc", "Cs"))
@@ -92,3 +101,25 @@ def test_the_closing_lines_name_a_fit_that_did_not_converge(tmp_path: Path) -> N
     (line,) = _reasons(tmp_path, ["U1", "U2"])
     assert line.startswith("accelerometer, the fit did not converge")
     assert line.endswith(": U1")
+
+
+def test_units_of_one_bench_share_the_settings_of_their_mounting_with_the_mean_of_their_zeros() -> None:
+    def of_table(zero: str) -> dict[str, tuple[tuple[str, ...], ...]]:
+        way = ("table.sense=-1", f"table.zero_deg={zero}")
+        return dict.fromkeys(("accel_x", "gyro_x"), (way, ("sensor.axis_map=[-y,+x,+z]",)))
+
+    faces = {"accel_x": (("procedure.recordings.accel_x.up=-y",),)}
+    found = [("U1", of_table("-44.20")), ("U2", {}), ("U3", of_table("-44.26")), ("U4", of_table("-44.60"))]
+    groups = found_mountings([*found, ("U5", faces), ("U6", faces)])
+    assert [(group.units, group.recordings) for group in groups] == [
+        (["U1", "U3"], ["accel_x", "gyro_x"]),
+        (["U4"], ["accel_x", "gyro_x"]),
+        (["U5", "U6"], ["accel_x"]),
+    ]
+    zeros = ["-44.23", "-44.60"]
+    assert [group.ways for group in groups[:2]] == [[[*way] for way in of_table(z)["accel_x"]] for z in zeros]
+    text = as_overrides(groups[0].ways)
+    assert yaml.safe_load(text) == {"overrides": ["table.sense=-1", "table.zero_deg=-44.23"]}
+    assert yaml.safe_load(text.partition("or, in place of these:\n")[2].replace("  # - ", "- ")) == [
+        "sensor.axis_map=[-y,+x,+z]"
+    ]

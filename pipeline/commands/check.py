@@ -6,21 +6,23 @@ import json
 import shlex
 import sys
 import textwrap
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.commands import parser_of
 from pipeline.commands.readings import Reading, campaign_of, config_of_log, grouped, recordings_of_files
 from pipeline.config.campaign import find_campaign, load_campaign
 from pipeline.config.options import nearest
-from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError
+from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, first
 from pipeline.files import write_atomically
 from pipeline.io.files import FILE, SUFFIXES, recording_files
 from pipeline.model.calibration_file import LEFT_OUT
 from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.one_unit import try_unit, unit_of_campaign
+from pipeline.outcome import NAMED, as_overrides, found_mountings
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.profile_text import as_yaml, not_found
 from pipeline.profile_detection.proposal import propose
@@ -31,9 +33,10 @@ from pipeline.run_progress import Countdown
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.config.campaign import Campaign
+    from pipeline.outcome import FoundMounting, Ways
     from pipeline.profile_detection.columns import Log
     from pipeline.profile_detection.proposal import Proposal
     from pipeline.profile_detection.recording_facts import Line
@@ -75,7 +78,37 @@ class Refused(NamedTuple):
     reading: Reading | None = None
 
 
-Outcome = tuple[str, list[Refused]]  # the printed text on a log or a unit, and its refusals
+class Outcome(NamedTuple):
+    """The result of one check: the printed text on a log or a unit, its refusals, and its mountings by gravity.
+
+    ``mounted``: the settings that describe a recording, where gravity shows another mounting than stated. ``saved``:
+    the profile of the campaign that reads what is refused.
+    """
+
+    text: str
+    refused: list[Refused]
+    unit: str = ""
+    mounted: Mapping[str, Ways] = MappingProxyType({})
+    saved: Path | None = None
+
+
+@dataclass
+class SavedProfiles:
+    """The ingest profiles in ``configs/ingest`` of a campaign, and its units as each of them reads them."""
+
+    directory: Path
+    unusable: dict[Path, str] = field(default_factory=dict)  # why, such as a value that is to be filled in
+
+    @cached_property
+    def campaigns(self) -> dict[Path, Campaign]:
+        """The campaign by each profile that can be used; read when it is first needed."""
+        found = {}
+        for file in sorted((self.directory / "configs" / "ingest").glob("*.yaml")):
+            try:
+                found[file] = load_campaign({"campaign": str(self.directory), "overrides": [f"ingest={file.stem}"]})
+            except ConfigurationError as error:
+                self.unusable[file] = str(error)
+        return found
 
 
 def main(argv: Sequence[str]) -> int:
@@ -86,27 +119,29 @@ def main(argv: Sequence[str]) -> int:
     tasks = _tasks(arguments)
     countdown, refused = Countdown(len(tasks)), list[Refused]()
     alike: dict[str, list[str]] = {}
+    mounted, saved = [], dict[Path, list[str]]()
     for number, (what, task) in enumerate(tasks):
         countdown(number, f"checking {what} ({number + 1} of {len(tasks)})")
-        text, found = task()
+        outcome = task()
         countdown.end()
-        key = _same_layout(found)
+        key = _same_layout(outcome.refused)
         if key and key in alike:
             alike[key].append(what)
         else:
             alike[key] = [what]
-            print(f"{text}\n")
-        refused += found
-    for key, (first, *others) in alike.items():
+            print(f"{outcome.text}\n")
+        refused += outcome.refused
+        mounted.append((outcome.unit, outcome.mounted))
+        if outcome.saved:
+            saved.setdefault(outcome.saved, []).append(what.removeprefix("unit "))
+    for key, (one, *others) in alike.items():
         if key and others:
-            print(textwrap.fill(f"REFUSED as {first}: {', '.join(others)}", WIDTH, subsequent_indent="  ") + "\n")
+            print(textwrap.fill(f"REFUSED as {one}: {', '.join(others)}", WIDTH, subsequent_indent="  ") + "\n")
+    whole_campaign = not arguments.files and not arguments.unit
+    _print_mountings(found_mountings(mounted), len(tasks) if whole_campaign else None)
+    _print_saved(saved)
     sys.stdout.flush()
-    equal: dict[tuple[str, str], list[str]] = {}
-    for one in refused:
-        equal.setdefault((one.code, one.message), []).append(one.place)
-    for (code, _), (place, *others) in equal.items():
-        where = f"{1 + len(others)} files, for example {place}" if others else place
-        print(f"python -m pipeline check: {where}: refused ({code})", file=sys.stderr, flush=True)
+    _print_refused(refused)
     unknown = [(r.reading, layout) for r in refused if r.reading for layout in _layouts(r.reading, r.code)]
     if unknown:
         sensor = unknown[0][0].settings["sensor"]
@@ -114,6 +149,35 @@ def main(argv: Sequence[str]) -> int:
     elif arguments.save:
         print(f"{arguments.save} was not written: no profile is proposed")
     return 2 if refused else 0
+
+
+def _print_refused(refused: Sequence[Refused]) -> None:
+    """Print a line for each cause of refusals."""
+    equal: dict[tuple[str, str], list[str]] = {}
+    for refusal in refused:
+        equal.setdefault((refusal.code, refusal.message), []).append(refusal.place)
+    for (code, _), (place, *others) in equal.items():
+        where = f"{1 + len(others)} files, for example {place}" if others else place
+        print(f"python -m pipeline check: {where}: refused ({code})", file=sys.stderr, flush=True)
+
+
+def _print_mountings(groups: Sequence[FoundMounting], units: int | None) -> None:
+    """Print the settings that describe the mountings by gravity: once for all units that share them.
+
+    ``units``: of the campaign, if all were checked; settings of all belong in ``campaign.yaml``.
+    """
+    for group in groups[:MOST_IN_FULL]:
+        of_units = f"devices/{group.units[0]}.yaml" if len(group.units) == 1 else "devices/UNIT.yaml of each unit"
+        place = "campaign.yaml" if len(group.units) == units else of_units
+        text = (
+            f"MOUNTING: gravity shows another one than stated in {', '.join(group.recordings)} of "
+            f"{', '.join(first(group.units, NAMED, 'units'))}, and it is used as found (N-FOUND). If the bench is so, "
+            f"state it in {place}; else correct the columns or the mounting (docs/mounting.md):"
+        )
+        print(textwrap.fill(text, WIDTH, subsequent_indent="  ") + f"\n\n{as_overrides(group.ways)}")
+    if others := [unit for group in groups[MOST_IN_FULL:] for unit in group.units]:
+        units_named = ", ".join(first(others, NAMED, "units"))
+        print(textwrap.fill(f"MOUNTING: other settings describe {units_named}: check each with --unit", WIDTH) + "\n")
 
 
 def _same_layout(refused: Sequence[Refused]) -> str:
@@ -147,10 +211,10 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
     places: dict[Path | None, list[Path]] = {} if arguments.files else {given: []}
     for file in arguments.files:
         places.setdefault(given or campaign_of(file), []).append(file)
-    units, logs = [], []
+    tasks: list[tuple[str, partial[Outcome]]] = []
     for directory, files in places.items():
         if directory is None or stated:
-            logs += _logs(files, directory, arguments)
+            tasks += [(str(log.files[0]), partial(_check_log, log)) for log in _logs(files, directory, arguments)]
             continue
         campaign = load_campaign({"campaign": str(directory)})
         known = [arguments.unit] if arguments.unit else list(campaign.units)
@@ -159,9 +223,12 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
                 f"no unit {known[0]!r}{nearest(known[0], campaign.units)}", str(directory / "units.csv")
             )
         chosen, others = recordings_of_files(files, campaign, known) if files else ({unit: [] for unit in known}, [])
-        units += [(f"unit {unit}", partial(_check_unit, campaign, unit, names)) for unit, names in chosen.items()]
-        logs += _logs_of_campaign(others, campaign, known) if others else []
-    return [*units, *((str(log.files[0]), partial(_check_log, log)) for log in logs)]
+        saved = SavedProfiles(directory)
+        checks = {f"unit {unit}": partial(_check_unit, unit=unit, names=names) for unit, names in chosen.items()}
+        for log in _logs_of_campaign(others, campaign, known) if others else []:
+            checks[str(log.files[0])] = partial(_check_log_of_campaign, files=log.files, units=known)
+        tasks += [(what, partial(_check_or_saved, check, campaign, saved)) for what, check in checks.items()]
+    return sorted(tasks, key=lambda task: not task[0].startswith("unit "))
 
 
 def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Namespace) -> list[Reading]:
@@ -178,11 +245,11 @@ def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Name
 
 def _logs_of_campaign(files: Sequence[Path], campaign: Campaign, units: Sequence[str]) -> list[Reading]:
     """Return logs that are no recordings of a campaign, read by its settings."""
-    first, *others = (campaign.units[unit].config for unit in units)
-    if any(first[section] != other[section] for other in others for section in ("ingest", "sensor")):
+    one, *others = (campaign.units[unit].config for unit in units)
+    if any(one[section] != other[section] for other in others for section in ("ingest", "sensor")):
         message = "the units are read by different settings (ingest, sensor): choose one by --unit"
         raise ConfigurationError(message, str(campaign.directory / "units.csv"))
-    ingest, sensor = first["ingest"], first["sensor"]
+    ingest, sensor = one["ingest"], one["sensor"]
     names = f"ingest={ingest['name']}, sensor={sensor['name']}"
     read_with = f"campaign {campaign.name}, as no recording of a unit: {names}"
     return [Reading.alone(group, ingest, sensor, read_with) for group in grouped(files, ingest)]
@@ -192,9 +259,58 @@ def _check_log(reading: Reading) -> Outcome:
     """Return content and notes of a log that is checked alone, or its refusal."""
     try:
         recording = reading.checked()
-        return _described(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), []
+        return Outcome(_described(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), [])
     except PipelineError as error:
         return _refusal_of(reading, error)
+
+
+def _check_or_saved(check: Callable[[Campaign], Outcome], campaign: Campaign, profiles: SavedProfiles) -> Outcome:
+    """Check by the settings of a campaign; where they need another profile, by those that the campaign holds.
+
+    The refusal remains, because a run uses no profile that the settings do not name.
+    """
+    outcome = check(campaign)
+    if not _needs_profile(outcome):
+        return outcome
+    for file, other in profiles.campaigns.items():
+        try:
+            by_profile = check(other)
+        except ConfigurationError:  # the log has none of the names that the profile gives to the parts of a recording
+            continue
+        if not _needs_profile(by_profile):
+            one = outcome.refused[0]
+            why = f"the profile that the settings name does not describe it ({one.code}), and the saved one does:"
+            refused = [each._replace(reading=None) for each in (*outcome.refused, *by_profile.refused)]
+            text = f"{one.place}\n{as_text([('REFUSED', why), ('saved profile', str(file))])}\n\n{by_profile.text}"
+            return by_profile._replace(text=text, refused=refused, saved=file)
+    lines = [("saved profile", f"{file} cannot be used: {why}") for file, why in profiles.unusable.items()]
+    profiles.unusable.clear()  # told once
+    return outcome._replace(text=f"{outcome.text}\n{as_text(lines)}") if lines else outcome
+
+
+def _needs_profile(outcome: Outcome) -> bool:
+    """Return whether files are missing, or have a layout that the profile does not describe."""
+    return any(one.code in (*UNKNOWN_LAYOUT, "missing_file") for one in outcome.refused)
+
+
+def _print_saved(saved: Mapping[Path, Sequence[str]]) -> None:
+    """Print how a run uses the saved profiles that read what is refused; ``saved``: profile to the units or logs."""
+    for file, names in saved.items():
+        text = (
+            f"SAVED PROFILE: {file} describes the files of {', '.join(first(names, NAMED))}. A run uses it where the "
+            f"settings name it: write {file.stem} into the column ingest of units.csv, or for all units into "
+            "campaign.yaml:"
+        )
+        print(
+            textwrap.fill(text, WIDTH, subsequent_indent="  ")
+            + f"\n\n{as_overrides([[f'ingest={file.stem}']])}"
+        )
+
+
+def _check_log_of_campaign(campaign: Campaign, files: Sequence[Path], units: Sequence[str]) -> Outcome:
+    """Return content and notes of a log that is no recording of a campaign, read by its settings."""
+    (reading,) = _logs_of_campaign(files, campaign, units)
+    return _check_log(reading)
 
 
 def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
@@ -215,9 +331,9 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
             lines = _facts_of_recording(read[name], campaign, checked)
             texts += [_described(read[name], lines)] if names else []
         except PipelineError as error:
-            text, found = _refusal_of(read[name], error)
-            texts.append(text)
-            refused += found
+            outcome = _refusal_of(read[name], error)
+            texts.append(outcome.text)
+            refused += outcome.refused
     if trial.failure and (not refused or trial.failure["code"] == "missing_file"):
         place = trial.failure["file"] or f"unit {unit}"
         refused.append(Refused(trial.failure["code"], trial.failure["message"], place))
@@ -230,7 +346,7 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         lines += [(s, text) for s in SENSORS if document[s] and (text := document[s]["not_determined"])]
         noted: dict[str, dict[tuple[str, str], list[str]]] = {}
         for recording in checked:
-            for note in recording.notes:
+            for note in (n for n in recording.notes if not n.settings):
                 place = f", line {note.first} to {note.last}" if note.code in LEFT_OUT and note.first else ""
                 noted.setdefault(note.code, {}).setdefault((place, note.detail), []).append(recording.name)
         notes = [
@@ -241,7 +357,8 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         lines += [("notes" if i == 0 else "", note) for i, note in enumerate(notes)]
         head = f"unit {unit}: {counted(len(checked), 'recording')}, no refusal"
         texts.append("\n".join([head, *([as_text(lines)] if lines else [])]))
-    return "\n\n".join([*texts, *([missing] if missing else [])]), refused
+    mounted = {r.name: n.settings for r in checked for n in r.notes if n.settings}
+    return Outcome("\n\n".join([*texts, *([missing] if missing else [])]), refused, unit, mounted)
 
 
 def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
@@ -289,7 +406,7 @@ def _refusal_of(reading: Reading, error: PipelineError) -> Outcome:
     refused = Refused(error.code, error.message, error.file or str(reading.files[0]), reading)
     text = _described(reading, [*lines, *_topics(reading, fields=error.code == "missing_topic")])
     parts = getattr(error, "sessions", 0)
-    return f"{text}\n\n{_recipe(reading, parts)}" if parts else text, [refused]
+    return Outcome(f"{text}\n\n{_recipe(reading, parts)}" if parts else text, [refused])
 
 
 def _recipe(reading: Reading, parts: int) -> str:
@@ -349,9 +466,9 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
             ingest = proposal.ingest(name, sensor)
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for number, group in enumerate(groups):
-                text, refused = _check_log(Reading.alone(group, ingest, sensor, "the proposed profile"))
-                if number < MOST_IN_FULL or refused:
-                    print(f"{text}\n")
+                outcome = _check_log(Reading.alone(group, ingest, sensor, "the proposed profile"))
+                if number < MOST_IN_FULL or outcome.refused:
+                    print(f"{outcome.text}\n")
             if len(groups) > MOST_IN_FULL:
                 print("Every other file is read without a refusal: check it alone for what it holds.\n")
         print(textwrap.fill(f"PROPOSED PROFILE for {', '.join(proposal.files)}", WIDTH, subsequent_indent="  ") + "\n")

@@ -37,6 +37,7 @@ from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.model import NEW, NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
 from pipeline.estimation.multi_position.selection import Selection, posterior
+from pipeline.estimation.stages import is_given
 from pipeline.model.effects import catalogue, effect_from
 
 if TYPE_CHECKING:
@@ -138,7 +139,7 @@ def _model_of_all_rests(case: Case) -> Model:
     """Return the model with no rest held out.
 
     The accelerometer is calibrated again by all rests, which shows rests that contradict the others, unless it has
-    effects or all rests do not determine it.
+    effects or all rests do not determine it. One that is given stays as it is, because the gyroscope refers to it.
     """
     settings = {**case.settings, "procedure": {**case.settings["procedure"], "holdout_every": 0}}
 
@@ -154,6 +155,8 @@ def _model_of_all_rests(case: Case) -> Model:
     calibration, other = case.calibration, None
     if case.sensor == "accelerometer":
         calibration = with_all_rests(calibration, case.noise)
+    elif case.accelerometer and is_given("accelerometer", settings):
+        other = case.accelerometer
     elif case.accelerometer:
         other = with_all_rests(case.accelerometer, None)
     return require_model(case.recordings, calibration, case.noise, settings, other)

@@ -77,6 +77,11 @@ def fit_stage(
     return calibration
 
 
+def is_given(sensor: str, settings: Mapping[str, Any]) -> bool:
+    """Return whether the calibration of a sensor is given, and not fitted."""
+    return sensor in ((settings.get("method") or {}).get("given") or {})
+
+
 def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibration:
     """Return the given calibration of a sensor from the configuration (``method.given``).
 
@@ -100,12 +105,18 @@ def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibra
     effects = tuple(e for e in found.effects if e.name not in bench)
     calibration = SensorCalibration(sensor, found.bias, found.matrix, effects=effects, stages=(stage,))
     if not part["uncertain"]:
-        return combined(
-            calibration, [], {GIVEN_SOURCE: f"{source} states no uncertainty: none is known, and zeros stand for it"}
-        )
+        return combined(calibration, [], unknown_uncertainty(sensor, settings))
     freedom = np.full(len(kept), np.inf) if found.freedom is None else found.freedom[kept]
     line = Contribution(GIVEN_SOURCE, "B", NORMAL, covariance, freedom, remark=f"as {source} states it")
     return combined(calibration, [line], {})
+
+
+def unknown_uncertainty(sensor: str, settings: Mapping[str, Any]) -> dict[str, str]:
+    """Return the entry of a budget for a given calibration whose file states no uncertainty; empty if it does."""
+    given = settings["method"]["given"]
+    if given[sensor] is None or given[sensor]["uncertain"]:
+        return {}
+    return {GIVEN_SOURCE: f"{given['source']} states no uncertainty: none is known, and zeros stand for it"}
 
 
 def staged_result(  # noqa: PLR0917  (the results of a stage)

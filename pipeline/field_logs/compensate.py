@@ -29,7 +29,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError
 from pipeline.field_logs.log_checks import LogChecks
 from pipeline.io.channel_table import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
-from pipeline.io.files import MESSAGE_FORMATS, not_regular
+from pipeline.io.files import GIT_LFS, MESSAGE_FORMATS, not_regular
 from pipeline.io.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS, Recording
@@ -263,7 +263,7 @@ def require_apart(source: Path, target: Path) -> None:
         raise MissingInputError("there is no such log", str(source))
     other = not_regular(source)
     if other:
-        raise InputError(f"{other}: save the log, then name that file", str(source))
+        raise InputError(other if other == GIT_LFS else f"{other}: save the log, then name that file", str(source))
     if (descriptor := _descriptor(target)) is not None:
         with suppress(OSError):  # it may be closed
             if os.path.samestat(os.fstat(descriptor), source.stat()):

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict
 from functools import cached_property, partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -123,7 +122,7 @@ def to_parquet(recordings: Sequence[Recording]) -> bytes:
             **{name: getattr(r, name) for name in PLAIN},
             "rows": r.samples,
             "columns": list(columns),
-            "notes": [asdict(n) for n in r.notes],
+            "notes": [n.to_json() for n in r.notes],
         }
         for r, columns in zip(recordings, stored, strict=True)
     ]
@@ -199,7 +198,7 @@ class _StoredRecording(Recording):
         vars(recording).update(
             {n: entry[n] for n in PLAIN},
             time_ns=read(["time_ns"])[0],
-            notes=tuple(Note(**n) for n in entry["notes"]),
+            notes=tuple(map(Note.of, entry["notes"])),
             stored=lambda names: read(names) if names[0] in entry["columns"] else None,
         )
         return recording

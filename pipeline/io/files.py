@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -52,6 +52,9 @@ KINDS = {
     stat.S_IFBLK: "a device",
 }
 UTF_16 = "UTF-16 text: save it as UTF-8"
+# A text of less than 1024 bytes that Git LFS keeps in place of a file (git-lfs, docs/spec.md, "The Pointer").
+POINTER, LARGEST_POINTER = b"version https://git-lfs.github.com/spec/", 1024
+GIT_LFS = "is a Git LFS pointer, not the file itself: run git lfs pull"
 # First bytes of files that are no text logs, and what to do.
 FOREIGN = {
     b"\x89MCAP": "an MCAP file: give it the suffix .mcap",
@@ -142,19 +145,27 @@ def wrong_name(name: str) -> str:
 
 
 def not_regular(path: Path) -> str:
-    """Return why a path cannot be read as a file; empty for a regular file or a link to one.
+    """Return why a path cannot be read as a file; empty for a regular file with its content, or a link to one.
 
     Raises ``OSError`` if the path does not exist.
     """
     try:
-        kind = stat.S_IFMT(path.stat().st_mode)
+        status = path.stat()
     except FileNotFoundError:
         if not os.path.lexists(path):
             raise
         return f"is a symbolic link to {path.readlink()}, which does not exist; correct the link or remove it"
+    kind = stat.S_IFMT(status.st_mode)
     if kind == stat.S_IFREG:
-        return ""
+        return GIT_LFS if status.st_size < LARGEST_POINTER and _starts_with(POINTER, path) else ""
     return f"is {KINDS.get(kind, 'no regular file')}; a regular file, or a symbolic link to one, is expected"
+
+
+def _starts_with(start: bytes, path: Path) -> bool:
+    """Return whether a file starts with these bytes; False for one without the permission to read it."""
+    with suppress(PermissionError), path.open("rb") as stream:
+        return stream.read(len(start)) == start
+    return False
 
 
 def read_text(path: Path, largest: int, what: str) -> str:
@@ -183,7 +194,7 @@ def unchanged(path: Path) -> Iterator[None]:
     try:
         other = not_regular(path)
         if other:
-            raise IngestError(other, str(path), code="unreadable")
+            raise IngestError(other, str(path), code="git_lfs" if other == GIT_LFS else "unreadable")
         before = path.stat()
         if before.st_size == 0:
             raise IngestError("the file is empty (0 bytes)", str(path), code="empty")

@@ -107,7 +107,8 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     if _negated(found, tolerance) or (mapped and exchanged):  # a stated axis map may be wrong
         refused = list(departures.values())
     zeros = refined_zeros(found)
-    hint = _hint(refused or list(departures.values()), len(turns), zeros, accelerometer, maps, seated=seated)
+    ways = _ways(refused or list(departures.values()), len(turns), zeros, accelerometer, maps, seated=seated)
+    hint = _hint(ways)
     if refused:
         first, *others = refused
         also = f"; likewise refused: {', '.join(d.turn.name for d in others)}" if others else ""
@@ -128,7 +129,7 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
             turn = replace(turn, recording=replace(turn.recording, axis=bench.axis), stated=bench)  # noqa: PLW2901
         used.append(turn)
     doubts = seat_notes(used, table, sensor)
-    conventional = {t.name: _applied(t, doubts.get(t.name), details.get(t.name, "")) for t in used}
+    conventional = {t.name: _applied(t, doubts.get(t.name), details.get(t.name, ""), ways) for t in used}
     return [conventional[r.name] if r.name in conventional else _turned_attitude(r) for r in recordings]
 
 
@@ -171,7 +172,7 @@ def _accelerometer_axes(turns: Sequence[Turn]) -> Values | None:
     return nearest
 
 
-def _hint(
+def _ways(
     departures: Sequence[_Departure],
     turns: int,
     zeros: Mapping[str, float],
@@ -179,8 +180,8 @@ def _hint(
     maps: Mapping[str, Sequence[str]],
     *,
     seated: bool,
-) -> str:
-    """Return the settings that describe the mounting, or the axis map with which it is as stated.
+) -> tuple[tuple[str, ...], ...]:
+    """Return the settings that describe the mounting, and the axis map with which it is as stated: one or the other.
 
     ``seated``: each turn has a separate mounting, which includes the difference of its zero from the common one.
     """
@@ -194,16 +195,21 @@ def _hint(
     alike = len(departures) == turns > 1 and all(f == found[0] for f in found)
     ways = []
     if alike and found[0] and set(found[0]) <= {"sense", "zero_deg"}:
-        ways.append(", ".join(f"table.{k}={v}" for k, v in found[0].items()))
+        ways.append(tuple(f"table.{k}={v}" for k, v in found[0].items()))
     elif all(d.turn.configurable for d in departures) and any(found):
         named = [(d.turn.name, *item) for d, f in zip(departures, found, strict=True) for item in f.items()]
-        ways.append(", ".join(f"procedure.recordings.{name}.{k}={v}" for name, k, v in named))
+        ways.append(tuple(f"procedure.recordings.{name}.{k}={v}" for name, k, v in named))
     if accelerometer is not None and not np.array_equal(accelerometer, np.eye(3)):
         key = "sensor.accelerometer.axis_map" if np.linalg.det(accelerometer) < 0.0 else "sensor.axis_map"
-        ways.append(f"{key}={as_map(accelerometer.T @ axis_matrix(maps['accelerometer']))}")
+        ways.append((f"{key}={as_map(accelerometer.T @ axis_matrix(maps['accelerometer']))}",))
+    return tuple(ways)
+
+
+def _hint(ways: Sequence[Sequence[str]]) -> str:
     if not ways:
         return "mount the unit as docs/mounting.md says, or correct the columns and sensor.axis_map"
-    return f"if the bench is so, set {', or '.join(ways)} (docs/mounting.md); else correct the columns or the mounting"
+    settings = ", or ".join(map(", ".join, ways))
+    return f"if the bench is so, set {settings} (docs/mounting.md); else correct the columns or the mounting"
 
 
 def _turned_attitude(recording: Recording) -> Recording:
@@ -246,10 +252,11 @@ def _negated(turns: Sequence[Turn], tolerance: float) -> bool:
     return opposite and len({f.sense * s.sense for f, s in found if f is not None}) == 1
 
 
-def _applied(turn: Turn, doubt: Note | None, as_found: str) -> Recording:
+def _applied(turn: Turn, doubt: Note | None, as_found: str, ways: tuple[tuple[str, ...], ...] = ()) -> Recording:
     """Return the recording with angle and rate by the convention, with notes on that and its doubt.
 
-    ``as_found``: the difference from the stated mounting and the hint; empty where the stated one is applied.
+    ``as_found``: the difference from the stated mounting and the hint; empty where the stated one is applied. ``ways``:
+    the settings that describe the mountings that were found.
     """
     recording, bench = turn.recording, turn.stated
     angle, rate = recording.table_angle, recording.table_rate
@@ -266,7 +273,8 @@ def _applied(turn: Turn, doubt: Note | None, as_found: str) -> Recording:
     )
     if bench.vertical:
         detail = f"as stated, body {bench.up} always points up; the angle used is {bench.sense:+d} times the logged one"
-    notes.append(Note("N-FOUND" if as_found else "N-MOUNTING", recording.samples, 0, 0, detail))
+    code, settings = ("N-FOUND", ways) if as_found else ("N-MOUNTING", ())
+    notes.append(Note(code, recording.samples, 0, 0, detail, settings=settings))
     return replace(
         recording,
         up=bench.up if bench.vertical else "",

@@ -75,8 +75,8 @@ def not_found(proposal: Proposal) -> list[str]:
     ]
     if not channels & set(TABLE_CHANNELS):
         missing.append(
-            "the angle or rate of a table. If a column is its encoder, add table_angle with the column, unit: counts "
-            "and counts_per_unit (counts per turn / 360). Without a table, add nothing."
+            "the angle or rate of a table. If a column is its encoder, add table_angle with the column and its unit: "
+            "deg, rad, or counts with counts_per_unit (counts per turn / 360). Without a table, add nothing."
         )
     if "temperature" not in channels:
         missing.append("the temperature. If a column holds it, add temperature with the column and unit: degC.")

@@ -41,6 +41,7 @@ from pipeline.profile_detection.unit_guesses import (
     temperature_counts,
     time_unit,
     unit_by_table,
+    unit_of_turn,
 )
 
 if TYPE_CHECKING:
@@ -333,10 +334,17 @@ def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str)
         entries[channel] = {"column": log.keys[index], "unit": stated or usual, "optional": True}
         span = f"{values.min():.6g} to {values.max():.6g}"
         proposal.evidence[channel] = f"{why}: {span}" if stated else f"{span}, so {usual}"
+        if channel == "table_angle" and stated is not None and columns.turn:
+            turn, seen = columns.turn
+            proposal.evidence[channel] += f"; {seen}"
+            if unit_of_turn(turn) != stated:
+                proposal.remarks.append(f"{log.names[index]}: {why}, and yet {seen}")
         if channel == "table_angle" and stated is None and columns.turn:
             turn, why = columns.turn
-            entries[channel] |= {"unit": COUNTS, "counts_per_unit": float(f"{turn / 360.0:.12g}")}
-            proposal.evidence[channel] = f"{span}, and {why}: {turn} / 360 counts per degree"
+            unit = unit_of_turn(turn)
+            of_counts = {"unit": COUNTS, "counts_per_unit": float(f"{turn / 360.0:.12g}")}
+            entries[channel] |= {"unit": unit} if unit else of_counts
+            proposal.evidence[channel] = f"{span}, and {why}" + (f": {turn} / 360 counts per degree" * (not unit))
         if channel == "table_angle" and CENTIDEGREES in words_of(log.names[index]):
             entries[channel] |= {"unit": COUNTS, "counts_per_unit": 100.0}
             proposal.evidence[channel] = f"the name says hundredths of a degree: {span}"

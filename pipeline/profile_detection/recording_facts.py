@@ -258,7 +258,8 @@ def _notes(notes: Sequence[Note]) -> list[str]:
         count = f" x {note.count}" if note.count > 1 else ""
         last = f" to {note.last}" if note.last != note.first else ""
         place = f", line {note.first}{last}" if note.first else ""
-        lines.append(f"{note.code}{count}{place}: {note.detail}")
+        detail = note.detail.rpartition("; ")[2] if note.settings else note.detail  # ``check`` prints them once
+        lines.append(f"{note.code}{count}{place}: {detail}")
     return (lines + [f"and {len(notes) - LISTED_NOTES} more"] * (len(notes) > LISTED_NOTES)) or ["none"]
 
 

@@ -3,8 +3,8 @@
 specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; in counts, it is the number of counts per g
 angular rate   : the unit in which the integrated rates rotate gravity from rest to rest (``gravity_rotation``)
 time           : intervals of sensors are 0.05 to 200 ms long
-encoder        : gravity turns with the table, f = c + a cos(2 pi n / N) + b sin(2 pi n / N), with N counts per turn;
-                 about a vertical shaft, the gyroscope determines N to within its scale factor
+encoder        : gravity turns with the table, f = c + a cos(2 pi n / N) + b sin(2 pi n / N), with N counts per turn,
+                 360 for degrees; about a vertical shaft, the gyroscope determines N to within its scale factor
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ FLATTEST = 0.1  # smallest over largest extent of rests in a plane: misalignment
 FEWEST_RESTS_FOR_A_SPHERE = 9  # twice the four unknowns, and one
 
 CENTIDEGREES = "cdeg"  # in the name of a table's angle
-NO_ENCODER = NO_SENSOR | {"roll", "pitch", "yaw", "heading", "tilt", "angle", "quat"}  # estimates of a sensor
+NO_ENCODER = NO_SENSOR | {"roll", "pitch", "yaw", "heading", "tilt", "quat"}  # estimates of a sensor, as angle_x
+TURN_OF = {"deg": 360.0, "rad": 2.0 * np.pi}  # a turn in units of angle
 # Counts per turn of encoders: 8 to 20 bits, and usual numbers of lines, once, twice and four times.
 ENCODERS = (
     *(2**bits for bits in range(8, 21)),
@@ -275,13 +276,27 @@ def find_encoder(
         if named is not None and (turn := counts_a_turn(numbers[named])):
             columns.turn = turn, f"starts again after {turn} counts"
             continue
-        free = [i for i in columns.free() if not set(words_of(names[i])) & NO_ENCODER]
+        free = [i for i in columns.free() if not _is_estimate(words_of(names[i]))]
+        free.sort(key=lambda i: not whole(numbers[i]))  # counts are of an encoder, an angle may be an estimate
         turns = ((i, _encoder_turn(numbers[i], force, rate_dps, time_s)) for i in (free if named is None else [named]))
         index, columns.turn = next(((i, turn) for i, turn in turns if turn), (named, None))
         if columns.turn and index is not None:
             columns.others["table_angle"] = index
             what = f"{names[index]} is taken as the table's encoder by its numbers" if named is None else names[index]
-            columns.remarks.append(f"{what}: check counts and sign, and add offset, the count at angle 0")
+            remark = "check counts and sign, and add offset, the count at angle 0"
+            if unit_of_turn(columns.turn[0]):
+                remark = "check sign and unit, and leave it out if it is an estimate from the same readings"
+            columns.remarks.append(f"{what}: {remark}")
+
+
+def _is_estimate(words: Sequence[str]) -> bool:
+    """Return whether a name is that of an angle which was computed from the readings, such as AngleX."""
+    return bool(set(words) & NO_ENCODER) or ("angle" in words and bool(set(words) & {*"xyz"}))
+
+
+def unit_of_turn(turn: float) -> str:
+    """Return the unit of angle in which this is a turn; empty for a number of counts."""
+    return next((unit for unit, size in TURN_OF.items() if turn == size), "")
 
 
 def unit_by_table(columns: Columns, rate: Values, time_s: Values | None) -> Guess | None:
@@ -319,19 +334,25 @@ def counts_a_turn(values: Values) -> int | None:
 def _encoder_turn(
     counts: Values, force: Values | None, rate_dps: Values | None, time_s: Values | None
 ) -> tuple[float, str] | None:
-    """Return the counts per turn of an encoder and the evidence; None if they cannot be determined.
+    """Return the counts per turn of an encoder, or a turn in deg or rad, and the evidence; None if undetermined.
 
     They follow from gravity, f = c + a cos(2 pi n / N) + b sin(2 pi n / N), or from the slope of the counts over the
     rate of the gyroscope, (n, 3) in deg/s, to within its scale factor.
     """
-    if not whole(counts) or even_steps(counts) or not np.any(np.diff(counts)):
+    if even_steps(counts) or not np.any(np.diff(counts)):
         return None
     if force is not None:
         return _turn_by_gravity(counts, force)
     if rate_dps is None or time_s is None or not np.all(np.diff(time_s) > 0):
         return None
-    size = slope(rate_dps, np.gradient(counts, time_s))
-    if size is None or size * np.std(np.gradient(counts, time_s)) < SLOWEST:
+    for turn in TURN_OF.values():
+        speed = np.gradient(np.unwrap(counts, period=turn), time_s)
+        size = slope(rate_dps, speed)
+        if size and size * np.std(speed) > SLOWEST and abs(turn * size / 360.0 - 1.0) < CLOSE_BY_TABLE:
+            return turn, f"the gyroscope turns once in {360.0 / size:.4g} {unit_of_turn(turn)}"
+    speed = np.gradient(counts, time_s)
+    size = slope(rate_dps, speed) if whole(counts) else None
+    if size is None or size * np.std(speed) < SLOWEST:
         return None
     usual = sorted(ENCODERS, key=lambda n: abs(np.log(n * size / 360.0)))
     near = [n for n in usual if abs(n * size / 360.0 - 1.0) < CLOSE_BY_TABLE]
@@ -341,6 +362,8 @@ def _encoder_turn(
 
 
 def _turn_by_gravity(counts: Values, force: Values) -> tuple[float, str] | None:
+    counted = whole(counts)  # any number of counts may be a turn, of an angle in deg or rad only one
+    known = (*TURN_OF.values(), *(ENCODERS if counted else ()))
     step = -(-len(counts) // MOST_FITTED)
     counts, force = counts[::step] - counts[0], force[::step]
     power = float(np.sum((force - force.mean(axis=0)) ** 2))
@@ -352,14 +375,17 @@ def _turn_by_gravity(counts: Values, force: Values) -> tuple[float, str] | None:
         A = np.column_stack([np.ones(len(phase)), np.cos(phase), np.sin(phase)])
         return float(np.sqrt(np.sum((force - A @ np.linalg.lstsq(A, force, rcond=None)[0]) ** 2) / power))
 
-    usual = min((n for n in ENCODERS if n * SHORTEST_TURN < np.ptp(counts)), key=misfit, default=None)
+    usual = min((n for n in known if n * SHORTEST_TURN < np.ptp(counts)), key=misfit, default=None)
     if usual is None:
         return None
     bounds = (usual * (1.0 - SEARCHED), usual * (1.0 + SEARCHED))
     measured = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
     if min(misfit(measured), misfit(usual)) > LARGEST_MISFIT:
         return None
-    seen = f"gravity turns once in {measured:.4g} counts, to within {misfit(measured):.1%}"
+    unit = unit_of_turn(usual)
+    seen = f"gravity turns once in {measured:.4g} {unit or 'counts'}, to within {misfit(measured):.1%}"
     if misfit(usual) < LARGEST_MISFIT and abs(measured / usual - 1.0) < CLOSE_TURN:
-        return usual, f"{seen}; {usual} is the usual number near it"
+        return (usual, seen) if unit else (usual, f"{seen}; {usual} is the usual number near it")
+    if unit or not counted:
+        return None
     return float(f"{measured:.4g}"), f"{seen} (no usual number)"

@@ -53,7 +53,8 @@ class Note:
     """A machine-readable remark on an input: what was found or repaired, how often and where.
 
     ``first`` and ``last`` are line numbers in the file, from 1, or 0 if lines do not apply. ``start_s`` and ``end_s``
-    are the times of the first and the last sample concerned, in the clock of the file.
+    are the times of the first and the last sample concerned, in the clock of the file. ``settings``: the overrides that
+    state what was found, so that it is no longer noted; alternatives, each of one or more overrides.
     """
 
     code: str
@@ -63,6 +64,16 @@ class Note:
     detail: str
     start_s: float | None = None
     end_s: float | None = None
+    settings: tuple[tuple[str, ...], ...] = ()
+
+    @classmethod
+    def of(cls, entry: dict[str, Any]) -> Note:
+        """Return the note of an entry that ``to_json`` made."""
+        return cls(**{**entry, "settings": tuple(map(tuple, entry.get("settings", ())))})
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields, without empty ``settings``."""
+        return {key: value for key, value in vars(self).items() if key != "settings" or value}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.files import json_text
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
-from pipeline.outcome import VERDICTS, commands_of, place, run_command
+from pipeline.outcome import VERDICTS, as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, Line, Panel, chart
 from pipeline.report.diagnosis_section import (
@@ -96,6 +96,7 @@ def render(
         left_out=left_out(calibration.get("inputs")),
         incomplete=incomplete,
         files_read=files_read(calibration.get("inputs")),
+        mounting=found_mounting(calibration),
         sensors=sorted(sensors, key=lambda s: 99 if s["part"] is None else place(s["diagnosis"].get("verdict"))),
         attitude=attitude if attitude.get("curve") else None,
         attitude_figure=attitude_over_time(attitude),
@@ -109,6 +110,18 @@ def render(
         settings_text=json_text({k: v for k, v in settings.items() if k not in ("row", "run", "certificate")}),
     )
     return page
+
+
+def found_mounting(calibration: JSON) -> JSON | None:
+    """Return the recordings that gravity shows mounted otherwise than stated, and the overrides that state it."""
+    noted = {
+        i.get("recording", i.get("file")): note["settings"]
+        for i in calibration.get("inputs") or []
+        for note in i.get("notes") or []
+        if isinstance(note, dict) and note.get("settings")
+    }
+    groups = found_mountings([(calibration["unit"], noted)])
+    return {"recordings": groups[0].recordings, "overrides": as_overrides(groups[0].ways)} if groups else None
 
 
 def _sensor(

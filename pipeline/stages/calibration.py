@@ -175,7 +175,7 @@ def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
             "rate_hz": round(1.0 / r.interval, 6) if r.interval > 0 else None,
             "duration_s": round(float(r.time[-1] - r.time[0]), 6) if r.samples else 0.0,
             "missing_s": _missing_s(r),
-            "notes": [vars(n) for n in r.notes],
+            "notes": [n.to_json() for n in r.notes],
             **{key: r.source[key] for key in ("joined", "program") if key in r.source},
         }
         for r in recordings

@@ -213,7 +213,10 @@ def test_standard_output_and_devices_are_written_to(
 def test_what_is_no_log_and_no_place_for_one_is_refused(calibration: Path, tmp_path: Path) -> None:
     log = write(tmp_path / "log.csv", readings()[:50])
     os.mkfifo(tmp_path / "pipe.csv")
+    pointer = tmp_path / "pointer.csv"
+    pointer.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'4d7a2146' * 8}\nsize 12345\n")
     cases = [
+        (pointer, tmp_path / "out.csv", "is a Git LFS pointer, not the file itself: run git lfs pull$"),
         (tmp_path / "pipe.csv", tmp_path / "out.csv", "a FIFO"),
         (tmp_path, tmp_path / "out.csv", "a directory"),
         (Path("/dev/null"), tmp_path / "out.csv", "is a device"),

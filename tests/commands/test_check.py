@@ -348,9 +348,63 @@ def test_equal_notes_of_recordings_are_one_and_others_are_told_apart(
             row[place] = f"{sign * float(row[place]) + shift:.6f}"
         file.unlink()
         file.write_text("\ufeff" + "\n".join([header, *(",".join(row) for row in cells)]) + "\n", encoding="utf-8")
-    words = Checked(capsys, "--campaign", linked).words
-    assert re.search(r"N-BOM gyro_y: [^;]*; likewise gyro_z", words)
-    assert re.search(r"N-FOUND gyro_y: .*at a table angle of 10.0 deg, .*N-FOUND gyro_z: .*angle of 20.0 deg", words)
+    alone = Checked(capsys, linked / "raw" / "U" / "gyro_y.csv")
+    assert "N-FOUND x 421: used as found, body +z up at a table angle of 10.0 deg" in alone.words
+    assert "state it in devices/U.yaml" in alone.words
+    checked = Checked(capsys, "--campaign", linked)
+    assert re.search(r"N-BOM gyro_y: [^;]*; likewise gyro_z", checked.words)
+    assert "gravity shows another one than stated in gyro_y, gyro_z of U, and it is used as found" in checked.words
+    assert "state it in campaign.yaml" in checked.words
+    assert checked.out.count("N-FOUND") == 1
+    block = checked.out[checked.out.index("overrides:") :]
+    assert yaml.safe_load(block) == {
+        "overrides": ["procedure.recordings.gyro_y.zero_deg=10.00", "procedure.recordings.gyro_z.zero_deg=20.00"]
+    }
+    (linked / "campaign.yaml").write_text(block)
+    pasted = Checked(capsys, "--campaign", linked)
+    assert pasted.code == 0
+    assert "N-FOUND" not in pasted.out
+    assert re.search(r"N-MOUNTING gyro_y: as stated, body \+z up at a table angle of 10.0 deg", pasted.words)
+
+
+def test_a_profile_that_the_campaign_holds_is_named_where_its_settings_do_not_name_it(
+    linked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for file in (linked / "raw" / "U").iterdir():
+        text = file.read_text().replace("time_s,", "t_ms,", 1).replace("accel_", "a_").replace("gyro_", "w_")
+        header, *rows = text.splitlines()
+        rows = [f"{1e3 * float(row.partition(',')[0]):.3f},{row.partition(',')[2]}" for row in rows]
+        file.unlink()
+        file.write_text("\n".join([header, *rows]) + "\n")
+    columns: dict[str, dict[str, str | bool]] = {"time": {"column": "t_ms", "unit": "ms"}}
+    columns |= {f"accel_{a}": {"column": f"a_{a}_g", "unit": "g"} for a in "xyz"}
+    columns |= {f"gyro_{a}": {"column": f"w_{a}_dps", "unit": "deg/s"} for a in "xyz"}
+    others = {"temperature": "degC", "table_angle": "deg", "table_rate": "deg/s"}
+    for channel, unit in (others | {f"table_q{a}": "1" for a in "wxyz"}).items():
+        suffix = {"deg/s": "_dps", "1": ""}.get(unit, f"_{unit.lower()}")
+        columns[channel] = {"column": channel + suffix, "unit": unit, "optional": True}
+    profile = linked / "configs" / "ingest" / "my_logger.yaml"
+    profile.parent.mkdir(parents=True)
+    entries = {"name": "my_logger", "csv": {"columns": columns}}
+    columns["time"]["unit"] = "???"
+    profile.write_text(yaml.safe_dump(entries))
+    shutil.copy(linked / "raw" / "U" / "gyro_x.csv", linked / "loose.csv")
+    incomplete = Checked(capsys, linked / "loose.csv")
+    assert f"saved profile {profile} cannot be used:" in incomplete.words
+    assert "PROPOSED PROFILE" in incomplete.out
+    columns["time"]["unit"] = "ms"
+    profile.write_text(yaml.safe_dump(entries))
+    for arguments in (("--campaign", linked), (linked / "loose.csv",)):
+        checked = Checked(capsys, *arguments)
+        assert checked.code == 2
+        assert "the profile that the settings name does not describe it (missing_column)" in checked.words
+        assert f"SAVED PROFILE: {profile} describes the files of" in checked.words
+        assert "PROPOSED" not in checked.out
+        assert "???" not in checked.out
+    assert "ingest=my_logger" in checked.words
+    (linked / "campaign.yaml").write_text(checked.out[checked.out.index("overrides:") :])
+    used = Checked(capsys, "--campaign", linked)
+    assert (used.code, used.out) == (0, "unit U: 8 recordings, no refusal\n\n")
 
 
 def test_slow_full_turns_of_a_table_are_no_rests_and_no_contradiction(

@@ -11,6 +11,7 @@ from pipeline.config import load_campaign
 from pipeline.errors import ConfigurationError
 from pipeline.simulation.description import read_description
 
+LFS_POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'4d7a2146' * 8}\nsize 12345\n"
 FILES = (
     "units.csv",
     "campaign.yaml",
@@ -54,6 +55,7 @@ def test_only_regular_files_and_links_to_them_are_read(tmp_path: Path, file: str
         (lambda: os.mkfifo(path), "is a FIFO; a regular file"),
         (lambda: path.symlink_to("/dev/zero"), "is a device; a regular file"),
         (lambda: path.symlink_to("absent"), "is a symbolic link to absent, which does not exist"),
+        (lambda: path.write_text(LFS_POINTER), "is a Git LFS pointer, not the file itself: run git lfs pull"),
         (path.mkdir, "is a directory; a regular file"),
     ):
         path.unlink(missing_ok=True)

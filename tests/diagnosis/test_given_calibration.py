@@ -4,9 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hand_simulator import Hand, draw
+from scipy.spatial.transform import Rotation
 
+from pipeline.diagnosis.findings import Case
 from pipeline.diagnosis.method_errors import given_differences
+from pipeline.diagnosis.multi_position import _model_of_all_rests
 from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged
+from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+from pipeline.estimation.stages import fit_stage
 from pipeline.records import Recording, SensorCalibration, StageResult
 
 ABOVE = HeldOut(0.5, 0.01, 0.1)
@@ -72,6 +79,43 @@ def test_the_given_calibration_is_blamed_where_a_fit_of_the_recordings_leaves_no
     inside = replace(GIVEN, published=HeldOut(0.05, 0.01, 0.1))
     assert decide(inside) == ("nothing_missing", "")
     assert decide(replace(inside, approximations=("bias",)))[0] == "left_by_method"
+
+
+def test_a_gyroscope_by_hand_refers_to_the_given_accelerometer() -> None:
+    """Seven rests do not determine the accelerometer; a given one does, here in a frame 3 deg off that of the rests."""
+    hand = draw(Hand(rests=7, rest_s=2.0, rate_hz=50.0), 2)
+    settings = {**hand.settings, "procedure": {"holdout_every": 0}}
+    with pytest.raises(CannotCalibrateError, match="the 7 orientations are nearly degenerate"):
+        fit_stage("gyroscope", "rests_and_moves", [hand.recording], None, settings)
+    frame = Rotation.from_rotvec([2.0, -2.0, 1.0], degrees=True).as_matrix()
+    known = SensorCalibration(
+        "accelerometer", hand.bias["accelerometer"], frame @ hand.matrix["accelerometer"], covariance=np.eye(12) * 1e-12
+    )
+    part = known.to_json() | {"stages": [], "uncertain": True, "of_the_bench": []}
+    file = {"source": "known.json", "sha256": "0" * 64, "notes": [], "accelerometer": part}
+    settings["method"] = {"as_printed": False, "given": file}
+    found = fit_stage("gyroscope", "rests_and_moves", [hand.recording], None, settings)
+    expanded = np.array(found.to_json()["expanded_uncertainty"]["matrix"])
+    assert np.all(np.abs(found.matrix - frame @ hand.matrix["gyroscope"]) < 2.0 * expanded)
+    assert np.abs(found.matrix - hand.matrix["gyroscope"]).max() > 5.0 * expanded.max()
+    file["accelerometer"] = None
+    with pytest.raises(CannotCalibrateError, match=r"known\.json holds nothing of the accelerometer"):
+        fit_stage("gyroscope", "rests_and_moves", [hand.recording], None, settings)
+
+
+def test_the_diagnosis_of_a_gyroscope_by_hand_keeps_the_given_accelerometer() -> None:
+    hand = draw(Hand(rests=8, rest_s=2.0, rate_hz=50.0), 1)
+    frame = Rotation.from_rotvec([2.0, -2.0, 1.0], degrees=True).as_matrix()
+    known = SensorCalibration("accelerometer", hand.bias["accelerometer"], frame @ hand.matrix["accelerometer"])
+    gyroscope = SensorCalibration("gyroscope", hand.bias["gyroscope"], frame @ hand.matrix["gyroscope"])
+    settings = {**hand.settings, "method": {"given": {"accelerometer": known.to_json()}}}
+    model = _model_of_all_rests(Case(gyroscope, [hand.recording], None, settings, known, []))
+    spans = np.split(np.arange(len(hand.still)), np.flatnonzero(np.diff(hand.still.astype(int))) + 1)
+    assert hand.recording.accelerometer is not None
+    rests = [hand.recording.accelerometer[span].mean(axis=0) for span in spans if hand.still[span[0]]]
+    force = (np.array(rests) - known.bias) @ known.matrix.T
+    assert isinstance(model, GyroscopeModel)
+    np.testing.assert_allclose(model.at_rests.force, force, rtol=0, atol=2e-3)  # noise of 100 samples: 3e-4 g
 
 
 def test_no_effect_is_offered_where_nothing_is_fitted() -> None:

@@ -78,6 +78,13 @@ def one(content: bytes, **expected: Any) -> Case:
     return Case({FILE: content}, **expected)
 
 
+# As git-lfs writes it (docs/spec.md of git-lfs, "The Pointer").
+LFS_POINTER = (
+    b"version https://git-lfs.github.com/spec/v1\n"
+    b"oid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n"
+)
+
+
 def without(*rows: int) -> np.ndarray:
     return np.setdiff1d(np.arange(SAMPLES), rows)
 
@@ -194,6 +201,12 @@ def cases() -> dict[str, Case]:
         "04 excel": one(b"PK\x03\x04" + whole, fault="foreign", says="a zip or Excel file"),
         "04 mcap": one(b"\x89MCAP0\r\n", fault="foreign", says="give it the suffix .mcap"),
         "04 sqlite": one(b"SQLite format 3\0" + whole, fault="foreign", says="give a ROS 2 bag the suffix .db3"),
+        **{
+            f"04 pointer{suffix}": Case(
+                {f"log{suffix}": LFS_POINTER}, fault="git_lfs", says="is a Git LFS pointer, .* run git lfs pull"
+            )
+            for suffix in (".csv", ".gcsv", ".mcap", ".bag", ".db3", ".ulg", ".bin", ".h5", ".mat")
+        },
         "05": one(b"\xef\xbb\xbf" + whole, notes=("N-BOM",), kept=ALL),
         "06": one(text().decode().encode("utf-16"), fault="utf16", says="UTF-16 text: save it as UTF-8"),
         "06 without mark": one(text().decode().encode("utf-16-le"), fault="utf16", says="UTF-16 text"),

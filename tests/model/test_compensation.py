@@ -339,6 +339,10 @@ def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="no calibration"):
             load(file)
     os.mkfifo(tmp_path / "pipe")
+    pointer = tmp_path / "pointer.json"
+    pointer.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'4d7a2146' * 8}\nsize 12345\n")
+    with pytest.raises(InputError, match=r"this is a Git LFS pointer, not the file itself: run git lfs pull$"):
+        load(pointer)
     for path, kind in ((tmp_path, "a directory"), (tmp_path / "pipe", "a FIFO"), (Path("/dev/null"), "a device")):
         with pytest.raises(InputError, match=f"this is .*{kind}"):
             load(path)

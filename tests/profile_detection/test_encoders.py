@@ -59,6 +59,35 @@ def test_an_encoder_is_found_by_gravity_or_by_the_gyroscope(turn: int, shaft: st
         assert proposal.columns[0]["gyro_x"]["unit"] == "rad/s"
 
 
+@pytest.mark.parametrize(
+    ("name", "turn", "shaft", "unit"),
+    [
+        ("motor_deg", 360.0, "level", "deg"),
+        ("angle", 360, "level", "deg"),  # whole degrees
+        ("theta", 2.0 * np.pi, "level", "rad"),
+        ("pos", 360.0, "upright", "deg"),
+    ],
+)
+def test_an_angle_that_turns_as_gravity_or_the_gyroscope_does_is_proposed_with_its_unit(
+    name: str, turn: float, shaft: str, unit: str
+) -> None:
+    gyroscope = ",".join(f"gyr_{axis} (rad/s)" for axis in "xyz")
+    head, *rows = turned(turn, shaft, header=f"{gyroscope},{name}").splitlines()
+    shown = (np.cumsum(RATE) / HZ * turn / 360.0 + 0.7 * turn) % turn
+    text = "%d" if isinstance(turn, int) else "%.4f"
+    cells = [row.split(",") for row in rows]
+    lines = [",".join([*c[:7], text % a, *c[8:]]) for c, a in zip(cells, shown, strict=True)]
+    proposal = proposed("\n".join([head, *lines]) + "\n")
+    assert proposal.columns[0]["table_angle"] == {"column": name, "unit": unit, "optional": True}
+    assert "turns once in" in proposal.evidence["table_angle"]
+    assert any(
+        f"{name} is taken as the table's encoder by its numbers: check sign and unit" in r for r in proposal.remarks
+    )
+    assert proposal.columns[0]["gyro_x"]["unit"] == "rad/s"
+    estimate = "\n".join([head.replace(name, "roll"), *lines]) + "\n"
+    assert "table_angle" not in proposed(estimate).columns[0]
+
+
 def test_every_other_column_is_listed_with_what_it_holds() -> None:
     proposal = proposed(turned(8192, "level", header="q1,q2,q3,ticks"))
     text = as_yaml(proposal, "mine")

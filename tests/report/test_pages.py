@@ -121,6 +121,21 @@ def test_a_sensor_that_was_not_calibrated_is_named_with_the_reason(unit: Unit) -
     assert "Not calibrated: no turns were recorded" in Text(page).text
 
 
+def test_settings_that_state_a_mounting_by_gravity_stand_once_on_the_page(unit: Unit) -> None:
+    way = ["table.sense=-1", "table.zero_deg=37.00"]
+    detail = f"mounted otherwise than stated; if the bench is so, set {', '.join(way)}; used as found, body +z up"
+    note = {"code": "N-FOUND", "count": 9, "first": 0, "last": 0, "detail": detail, "settings": [way]}
+    inputs = [
+        i | {"recording": name, "notes": [note]} for name, i in zip("ab", unit.calibration["inputs"], strict=False)
+    ]
+    page = render(unit.calibration | {"inputs": inputs}, None, None, [], unit.settings)
+    assert "<code>overrides:\n  - table.sense=-1\n  - table.zero_deg=37.00\n</code>" in page
+    text = Text(page).text
+    assert text.count("table.zero_deg=37.00") == 1
+    assert text.count("used as found, body +z up") == 2
+    assert "Gravity shows another mounting than stated in a, b, and it is used as found" in text
+
+
 def test_rests_that_were_left_out_are_listed_with_the_reason(unit: Unit) -> None:
     part = dict(unit.calibration["accelerometer"])
     rest = {"recording": "recording", "time_s": 47.52, "duration_s": 3.08, "reason": "it turned by 2.1 deg"}

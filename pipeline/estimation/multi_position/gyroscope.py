@@ -37,6 +37,7 @@ from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, whi
 from pipeline.estimation.multi_position.faces_and_turns import Turns, require_turns, turns_of
 from pipeline.estimation.multi_position.model import Block, Equations, State, effect_readings, motion_of, stacked
 from pipeline.estimation.multi_position.moves import Gravity, Moves, moves_of, observed_rests, tangents, to_the_end
+from pipeline.estimation.stages import given_calibration, is_given
 from pipeline.model.kinematics import skew
 
 if TYPE_CHECKING:
@@ -299,16 +300,19 @@ def model_of(
     """Return the model of the recordings' rests and moves, or None if there is no rest.
 
     ``calibration``: of the gyroscope; its outlying moves are not used. ``settings``: sections ``table`` and
-    ``procedure``. ``accelerometer``: without it, the accelerometer is calibrated here, which raises
-    ``CannotCalibrateError`` if it fails. ``moved``: (12,), see ``moves.observed_rests``; by default that of
-    ``calibration``.
+    ``procedure``. ``accelerometer``: by default the given calibration (``method.given``), else the accelerometer is
+    calibrated here; ``CannotCalibrateError`` if that fails. ``moved``: (12,), see ``moves.observed_rests``; by default
+    that of ``calibration``.
     """
     if accelerometer is None:
         from pipeline.estimation.accelerometer import nonlinear_least_squares  # noqa: PLC0415  (needs this package)
 
         try:
-            accelerometer = nonlinear_least_squares.fit(recordings, None, settings)
-        except NotObservableError as lack:
+            if is_given("accelerometer", settings):
+                accelerometer = given_calibration("accelerometer", settings)
+            else:
+                accelerometer = nonlinear_least_squares.fit(recordings, None, settings)
+        except (NotObservableError, CannotCalibrateError) as lack:
             raise CannotCalibrateError(
                 f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
             ) from lack

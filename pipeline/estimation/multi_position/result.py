@@ -28,6 +28,7 @@ from pipeline.estimation.multi_position.model import Model, State, prior_hypothe
 from pipeline.estimation.multi_position.selection import Selection, fit_configured, refusal
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
+from pipeline.estimation.stages import is_given, unknown_uncertainty
 from pipeline.estimation.table_errors import TIME_BASE
 from pipeline.estimation.uncertainty_budget import (
     TEMPERATURE,
@@ -192,6 +193,8 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
             missing[TIME_BASE] = "table.clock_accuracy_ppm is not stated"
         else:
             lines.append(clock_contribution(calibration, float(table["clock_accuracy_ppm"])))
+        if is_given("accelerometer", settings):
+            missing |= unknown_uncertainty("accelerometer", settings)
         missing["Earth's rotation"] = "not in the model: by hand the heading is unknown; up to 0.0042 deg/s of bias"
     complete, trials = combined(calibration, [*lines, *limit], missing), trials_of(settings)
     return _with_monte_carlo(complete, model, fitted, trials, lines[1:]) if trials else complete
