@@ -136,7 +136,7 @@ def main(argv: Sequence[str]) -> int:
             saved.setdefault(outcome.saved, []).append(what.removeprefix("unit "))
     for key, (one, *others) in alike.items():
         if key and others:
-            print(textwrap.fill(f"REFUSED as {one}: {', '.join(others)}", WIDTH, subsequent_indent="  ") + "\n")
+            print(_wrapped(f"REFUSED as {one}: {', '.join(others)}") + "\n")
     whole_campaign = not arguments.files and not arguments.unit
     _print_mountings(found_mountings(mounted), len(tasks) if whole_campaign else None)
     _print_saved(saved)
@@ -174,10 +174,15 @@ def _print_mountings(groups: Sequence[FoundMounting], units: int | None) -> None
             f"{', '.join(first(group.units, NAMED, 'units'))}, and it is used as found (N-FOUND). If the bench is so, "
             f"state it in {place}; else correct the columns or the mounting (docs/mounting.md):"
         )
-        print(textwrap.fill(text, WIDTH, subsequent_indent="  ") + f"\n\n{as_overrides(group.ways)}")
+        print(_wrapped(text) + f"\n\n{as_overrides(group.ways)}")
     if others := [unit for group in groups[MOST_IN_FULL:] for unit in group.units]:
         units_named = ", ".join(first(others, NAMED, "units"))
-        print(textwrap.fill(f"MOUNTING: other settings describe {units_named}: check each with --unit", WIDTH) + "\n")
+        print(_wrapped(f"MOUNTING: other settings describe {units_named}: check each with --unit") + "\n")
+
+
+def _wrapped(text: str) -> str:
+    """Return a text in lines; the path of a file is not broken."""
+    return textwrap.fill(text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def _same_layout(refused: Sequence[Refused]) -> str:
@@ -301,10 +306,7 @@ def _print_saved(saved: Mapping[Path, Sequence[str]]) -> None:
             f"settings name it: write {file.stem} into the column ingest of units.csv, or for all units into "
             "campaign.yaml:"
         )
-        print(
-            textwrap.fill(text, WIDTH, subsequent_indent="  ")
-            + f"\n\n{as_overrides([[f'ingest={file.stem}']])}"
-        )
+        print(_wrapped(text) + f"\n\n{as_overrides([[f'ingest={file.stem}']])}")
 
 
 def _check_log_of_campaign(campaign: Campaign, files: Sequence[Path], units: Sequence[str]) -> Outcome:
@@ -471,7 +473,7 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
                     print(f"{outcome.text}\n")
             if len(groups) > MOST_IN_FULL:
                 print("Every other file is read without a refusal: check it alone for what it holds.\n")
-        print(textwrap.fill(f"PROPOSED PROFILE for {', '.join(proposal.files)}", WIDTH, subsequent_indent="  ") + "\n")
+        print(_wrapped(f"PROPOSED PROFILE for {', '.join(proposal.files)}") + "\n")
         text = as_yaml(proposal, name)
         print(textwrap.indent(text, "    "))
         if proposal.unknown():
@@ -499,5 +501,5 @@ def _next_step(proposal: Proposal, name: str, save: Path | None) -> str:
             "recording of the procedure; no other file is needed for it. For a procedure with several recordings, "
             f"write {FILE}, the name of a recording, into the names of the profile, for example {text}."
         )
-        lines.append(textwrap.fill(words, WIDTH))
+        lines.append(_wrapped(words))
     return "\n".join(lines) + "\n"
