@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.errors import first
 from pipeline.files import INSTALLED, read_json
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -25,16 +26,7 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
-VERDICTS = {
-    "missing_effect": "warn",
-    "reference_in_doubt": "warn",
-    "unexplained": "warn",
-    "floor_in_doubt": "warn",
-    "left_by_method": "warn",
-    "not_enough_data": "",
-    "nothing_missing": "good",
-}  # verdict: CSS class on the pages; in the order of the lines: effects that can be added, then what is in doubt
-DIAGNOSIS_FAILED = "diagnosis_failed"  # stands for a verdict in lists; in documents it is "not_enough_data"
+DIAGNOSIS_FAILED = "diagnosis_failed"  # stands for a verdict in lists; in documents it is ``Verdict.NOT_ENOUGH_DATA``
 ZERO = re.compile(r"(?<=zero_deg=)-?[0-9.]+")
 ALIKE_DEG = 0.1  # gravity shows a zero to some hundredths of a degree (docs/mounting.md, What is checked)
 NAMED = 5  # units that a line names, and lines of one kind
@@ -127,15 +119,15 @@ def verdict_groups(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
     groups: dict[tuple[int, str], list[str]] = {}
     for unit, sensor, verdict, selected in findings:
         missing = [f"{effect} missing" for effect in selected]
-        texts = missing if verdict == "missing_effect" else [verdict.replace("_", " ")]
-        for what in texts if verdict != "nothing_missing" else []:
+        texts = missing if verdict == Verdict.MISSING_EFFECT else [verdict.replace("_", " ")]
+        for what in texts if verdict != Verdict.NOTHING_MISSING else []:
             groups.setdefault((place(verdict), f"{sensor}, {what}"), []).append(unit)
     return [(what, units) for (_, what), units in sorted(groups.items())]
 
 
 def place(verdict: str | None) -> int:
-    """Return the index of a verdict in ``VERDICTS``; an unknown verdict comes last."""
-    return [*VERDICTS, verdict].index(verdict)
+    """Return the index of a verdict in ``Verdict``; an unknown verdict comes last."""
+    return [*Verdict, verdict].index(verdict)
 
 
 def lines_of(groups: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
@@ -155,7 +147,7 @@ def commands_of(
     if not part.get("override"):
         return {}
     effects = [f"{sensor}.{name}" for name in part["selected"]]
-    verb = "add" if part["verdict"] == "missing_effect" else "try"
+    verb = "add" if part["verdict"] == Verdict.MISSING_EFFECT else "try"
     return {
         "verb": f"{verb} {'it' if len(effects) == 1 else 'them'}",
         "add": add_command(settings, unit, effects, results),
@@ -169,7 +161,7 @@ def next_commands(
     """Return the purpose and the text of each command with which the user can continue."""
     missing: dict[str, list[str]] = {}
     for unit, sensor, verdict, selected in findings:
-        if verdict == "missing_effect":
+        if verdict == Verdict.MISSING_EFFECT:
             missing.setdefault(unit, []).extend(f"{sensor}.{effect}" for effect in selected)
     lines = []
     if len(missing) == 1:
@@ -178,7 +170,7 @@ def next_commands(
     elif missing:
         command = _command("add", settings, ["--missing"], results)
         lines.append(("to add to each unit its missing effects", command))
-    if any(f.verdict != "nothing_missing" for f in findings):
+    if any(f.verdict != Verdict.NOTHING_MISSING for f in findings):
         campaign = str(settings.get("campaign", "demo")).rstrip("/")
         lines.append(("for the evidence", _command("explain", {"campaign": campaign}, [], results)))
     return lines

@@ -20,6 +20,7 @@ from pipeline.model.effects import catalogue
 from pipeline.outcome import RESULTS, read_summary, run_command
 from pipeline.pack import read_published
 from pipeline.records import SENSORS
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     import argparse
@@ -166,7 +167,7 @@ def _missing(row: Mapping[str, str], only: str) -> list[tuple[str, str]]:
     effects = [
         (sensor, name)
         for sensor in SENSORS
-        if row.get(f"{sensor}_verdict") == "missing_effect"
+        if row.get(f"{sensor}_verdict") == Verdict.MISSING_EFFECT
         for name in row[f"{sensor}_selected"].split(";")
     ]
     return [(sensor, name) for sensor, name in effects if not only or name == only]

@@ -23,12 +23,16 @@ from pipeline.model.effects import catalogue, effect
 from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
 from pipeline.validation.heldout import last_error, static_error
 from pipeline.validation.samples import HeldOutCase
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
 
-IN_DOUBT = ("reference_in_doubt", "unexplained")  # verdicts on an accelerometer whose mountings may be wrong
+IN_DOUBT = (
+    Verdict.REFERENCE_IN_DOUBT,
+    Verdict.UNEXPLAINED,
+)  # an accelerometer whose mountings may be wrong
 LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that tilt a turn axis in the body
 COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # errors of a method that its uncertainty excludes
 
@@ -88,7 +92,7 @@ def diagnose(
     if unknown and findings.search:
         findings = findings.search() or findings
         document, _ = judge(findings, document_of(findings, case))
-    if findings.deeper and (full or document["verdict"] != "nothing_missing"):
+    if findings.deeper and (full or document["verdict"] != Verdict.NOTHING_MISSING):
         document |= findings.deeper()
     return document
 
@@ -141,7 +145,7 @@ def evidence_of(
     contradicted = published is not None and published.above
     return Evidence(
         sensor,
-        str(document["verdict"]),
+        document["verdict"],
         tuple(document["selected"]),
         document["residual_over_noise"],
         findings.left_over_noise if findings else None,
@@ -249,7 +253,7 @@ def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: st
     """Return the document for recordings that cannot show any effect; ``needed``: what to record."""
     names = [name for name, each in catalogue().items() if sensor in each.sensors and name not in configured]
     return {
-        "verdict": "not_enough_data",
+        "verdict": Verdict.NOT_ENOUGH_DATA,
         "residual_over_noise": None,
         "selected": [],
         "ranking": [],

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.diagnosis.verdict import if_observable
 from pipeline.diagnosis.words import next_experiment, to_distinguish
 from pipeline.estimation.design import Term, placed
 from pipeline.estimation.free_curves import OTHER
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.ranking import Score
     from pipeline.records import Noise, Recording, SensorCalibration, Values
+    from pipeline.verdicts import Verdict
 
 
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
@@ -60,7 +62,7 @@ class Findings:
 
     sensor: str
     selected: Sequence[str]
-    verdict: str  # by the selection alone
+    verdict: Verdict  # by the selection alone
     steps: Mapping[str, Score]  # of each selected effect when it was accepted
     alone: Mapping[str, Score]  # of each candidate given base and configured effects
     terms: Sequence[Term]  # configured and selected effects with their fitted values
@@ -79,7 +81,7 @@ class Findings:
     noises: Sequence[tuple[Setting, float]]  # noise settings and log L
     white: float  # noise, unit of the sensor
     expected_wander: float | None
-    advice: Callable[[str], str]  # what to record next if no effect was selected, by the verdict
+    advice: Callable[[Verdict], str]  # what to record next if no effect was selected, by the verdict
     free: Callable[[], SensorCalibration] | None = None  # by a free fit of the same recordings
     full: Callable[[], SensorCalibration] | None = None  # the same with the selected effects, if there are any
     other: SensorCalibration | None = None  # of the other sensor
@@ -98,9 +100,7 @@ def document_of(findings: Findings, case: Case) -> dict[str, Any]:
     others = sorted(findings.alone.values(), key=lambda score: -score.delta_bic)
     unselected = [s.name for s in others if s.name not in findings.selected and s.name not in findings.hidden]
     ranking = [_entry(findings, name) for name in (*findings.selected, *unselected)]
-    verdict = findings.verdict
-    if verdict == "nothing_missing" and not ranking and findings.hidden:
-        verdict = "not_enough_data"
+    verdict = if_observable(findings.verdict, ranking, findings.hidden)
     override = f"effects.{case.sensor}=[{','.join([*listed, *findings.selected])}]"
     return {
         "verdict": verdict,

@@ -27,6 +27,7 @@ from pipeline.diagnosis.method_errors import given_differences
 from pipeline.diagnosis.observability import MORE, never_shown, not_observable_by_hand
 from pipeline.diagnosis.residual_dependence import significant
 from pipeline.diagnosis.residual_plots import added_variable_of_rests
+from pipeline.diagnosis.verdict import verdict_of_selection_by_hand
 from pipeline.diagnosis.words import listed, plain
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
@@ -39,6 +40,7 @@ from pipeline.estimation.multi_position.result import calibration_of, model_of
 from pipeline.estimation.multi_position.selection import Selection, posterior
 from pipeline.estimation.stages import is_given
 from pipeline.model.effects import catalogue, effect_from
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -47,7 +49,6 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Noise, Recording, SensorCalibration
 
 NEEDED = MORE
-FAR_ABOVE = 10.0  # times the noise: nobody sets down or holds a unit so badly
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
 FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
 SPARE = 2  # least number of equations beyond the parameters in a fold
@@ -76,9 +77,7 @@ def findings(case: Case) -> Findings:
         float(np.sum(project_out(model.equations(fit.state), [with_scatter]).residual ** 2)) for fit in selection.fits
     ]
     over, left_over = (_over_noise(model, selection.fits[k], expected) for k in (0, -1))
-    verdict = "missing_effect" if selection.names else "nothing_missing"
-    if (unknown and not selection.names) or (left_over or 0.0) > FAR_ABOVE:
-        verdict = "unexplained"
+    verdict = verdict_of_selection_by_hand(selection.names, unknown, left_over)
     scores = project_out(model.equations(selection.fits[-1].state), selection.hypotheses).scores()
     best = selection.hypotheses[int(np.argmax(scores))]
     signal = selection.first.signal
@@ -86,10 +85,10 @@ def findings(case: Case) -> Findings:
     def calibrated(fit: Fit) -> SensorCalibration:
         return calibration_of(model, fit, calibration, case.settings)
 
-    def advice(verdict: str) -> str:
-        if verdict == "not_enough_data":
+    def advice(verdict: Verdict) -> str:
+        if verdict == Verdict.NOT_ENOUGH_DATA:
             return f"{MORE}{WITH_FACES if case.settings['procedure'].get('faces') else ''}"
-        if left_over is not None and (left_over > FIRM or verdict == "unexplained"):
+        if left_over is not None and (left_over > FIRM or verdict == Verdict.UNEXPLAINED):
             return _of_scatter(_suspects(selection, hidden), left_over)
         warmth = catalogue()["bias_temperature"]
         return f"to make bias temperature observable: record {warmth.excitation}" if warmth.name in hidden else ""

@@ -32,6 +32,7 @@ from pipeline.records import Noise, SensorCalibration
 from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.heldout import noise_floors
 from pipeline.validation.samples import samples_of_motion
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,8 +113,8 @@ def _described(discovery: Discovery, case: Case) -> Findings:
 
     final, _ = fit_in_mean_frame(reported.fit)
 
-    def advice(verdict: str) -> str:
-        if verdict == "unexplained":
+    def advice(verdict: Verdict) -> str:
+        if verdict == Verdict.UNEXPLAINED:
             return FAR_OFF
         if one_way(observations):
             return "make every turn in the other direction too: five effects are observable only in both directions"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.words import of_unknown, template
 from pipeline.model.effects.base import unit_of
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +27,7 @@ HELPFUL = 0.1  # least relative reduction of the held-out mean square by an effe
 LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms of 3 x 1000 samples
 DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null families was 0.006
 QUIET = 0.6  # times the noise: a smaller residual contradicts the noise of the rests
+FAR_ABOVE_BY_HAND = 10.0  # times the noise: nobody sets down or holds a unit so badly
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 FREE = ("reference_least_squares", "nonlinear_least_squares", "rests_and_moves", "cholesky_lu")  # bias and matrix free
 SAME_SESSION = "record static in the session of the other recordings, without switching the unit off in between"
@@ -55,7 +57,7 @@ class Evidence:
     """The evidence for the verdict on a sensor."""
 
     sensor: str
-    found: str  # verdict of the selection alone
+    found: Verdict  # of the selection alone
     selected: Sequence[str] = ()
     over_noise: float | None = None  # residual over the noise, of the fit without the selected effects
     left_over_noise: float | None = None  # the same with them
@@ -94,12 +96,12 @@ class Evidence:
     @property
     def missing(self) -> bool:
         """Whether effects were selected; those beyond the sensor's limits must lower the held-out error."""
-        return self.found == "missing_effect" and not self._unconfirmed
+        return self.found == Verdict.MISSING_EFFECT and not self._unconfirmed
 
     @property
     def unexplained(self) -> bool:
         """Whether no plausible effect explains the residual."""
-        return self.found == "unexplained" or self._unconfirmed
+        return self.found == Verdict.UNEXPLAINED or self._unconfirmed
 
     @property
     def _unconfirmed(self) -> bool:
@@ -121,12 +123,12 @@ class Evidence:
     def too_quiet(self) -> bool:
         """Whether the residual is too small for the noise estimate."""
         small = self.over_noise is not None and self.over_noise < QUIET
-        return small and self.on_table and self.found == "nothing_missing"
+        return small and self.on_table and self.found == Verdict.NOTHING_MISSING
 
     @property
     def disagrees(self) -> bool:
         """Whether held-out motion contradicts the matrix and the selection found nothing."""
-        return bool(self.agreement and self.found == "nothing_missing" and self.agreement["p_value"] < DISAGREES)
+        return bool(self.agreement and self.found == Verdict.NOTHING_MISSING and self.agreement["p_value"] < DISAGREES)
 
     @property
     def given(self) -> bool:
@@ -146,7 +148,7 @@ class Evidence:
     @property
     def static_differs(self) -> bool:
         """Whether the static recording contradicts a fit that neither a missing effect nor the method makes wrong."""
-        explained = self.found in {"nothing_missing", "not_enough_data"} and self.of_free_method
+        explained = self.found in {Verdict.NOTHING_MISSING, Verdict.NOT_ENOUGH_DATA} and self.of_free_method
         return explained and not self.approximations and self.static is not None and self.static.above
 
     @property
@@ -167,8 +169,8 @@ def verdict_of_selection(
     above_noise: bool,
     held_out: Mapping[str, float] | None,
     beyond: float = 0.0,
-) -> str:
-    """Return the verdict by the selection alone.
+) -> Verdict:
+    """Return the verdict by the selection on a table alone.
 
     If the residual has another cause too, selected effects must explain most of its excess. A dependence of the
     residual (``unknown``) that is small next to a large effect may be the error of that effect's linear equation.
@@ -177,15 +179,33 @@ def verdict_of_selection(
     is higher if held-out motion shows noise alone.
     """
     if _made_worse(held_out) or len(names) > BELIEVED:
-        return "unexplained"
+        return Verdict.UNEXPLAINED
     at_floor = held_out is not None and held_out["error_after"] <= held_out["floor"]
     if names and beyond > (SURE if at_floor else LIKELY):
-        return "unexplained"
+        return Verdict.UNEXPLAINED
     if (unknown or above_noise) and (not names or share < MOSTLY):
-        return "unexplained"
+        return Verdict.UNEXPLAINED
     if unknown and max(float(entry["delta_bic"]) for entry in unknown) > UNKNOWN_SHARE * gain:
-        return "unexplained"
-    return "missing_effect" if names else "nothing_missing"
+        return Verdict.UNEXPLAINED
+    return Verdict.MISSING_EFFECT if names else Verdict.NOTHING_MISSING
+
+
+def verdict_of_selection_by_hand(
+    names: Sequence[str], unknown: Sequence[Mapping[str, Any]], left_over_noise: float | None
+) -> Verdict:
+    """Return the verdict by the selection in rests and moves alone; parameters as of ``verdict_of_selection``.
+
+    ``left_over_noise``: residual with the selected effects over the noise.
+    """
+    if (unknown and not names) or (left_over_noise or 0.0) > FAR_ABOVE_BY_HAND:
+        return Verdict.UNEXPLAINED
+    return Verdict.MISSING_EFFECT if names else Verdict.NOTHING_MISSING
+
+
+def if_observable(verdict: Verdict, ranking: Sequence[object], hidden: Mapping[str, str]) -> Verdict:
+    """Return the verdict by a selection whose candidates may all be ``hidden``: then it shows nothing."""
+    shows_nothing = verdict == Verdict.NOTHING_MISSING and not ranking and hidden
+    return Verdict.NOT_ENOUGH_DATA if shows_nothing else verdict
 
 
 def _made_worse(held_out: Mapping[str, float] | None) -> bool:
@@ -197,25 +217,25 @@ def _made_worse(held_out: Mapping[str, float] | None) -> bool:
 
 # Verdict, its reason (a macro of ``templates/reasons.txt``), and the condition. ``e.above``: the held-out error of the
 # calibration is above its interval.
-RULES: tuple[tuple[str, str, Callable[[Evidence], object]], ...] = (
-    ("reference_in_doubt", "doubts", lambda e: e.doubts),
-    ("missing_effect", "beyond", lambda e: e.above and e.missing and not (e.full and e.full.above)),
-    ("unexplained", "above_and_unexplained", lambda e: e.above and e.unexplained),
-    ("left_by_method", "above_by_method", lambda e: e.above and e.of_method),
-    ("reference_in_doubt", "static", lambda e: e.static_differs),
-    ("unexplained", "above_as_the_residual", lambda e: e.above and e.at_noise is False),
-    ("reference_in_doubt", "contradiction", lambda e: e.above),
-    ("unexplained", "unexplained", lambda e: e.unexplained),
-    ("unexplained", "moves", lambda e: e.moves and e.moves[0] > e.moves[1] and not e.missing),
-    ("missing_effect", "beyond", lambda e: e.missing),
-    ("reference_in_doubt", "disagreement", lambda e: e.disagrees),
-    ("floor_in_doubt", "below", lambda e: e.published and e.published.below),
-    ("floor_in_doubt", "too_quiet", lambda e: e.too_quiet),
-    ("left_by_method", "approximations", lambda e: e.found == "nothing_missing" and e.approximations),
+RULES: tuple[tuple[Verdict, str, Callable[[Evidence], object]], ...] = (
+    (Verdict.REFERENCE_IN_DOUBT, "doubts", lambda e: e.doubts),
+    (Verdict.MISSING_EFFECT, "beyond", lambda e: e.above and e.missing and not (e.full and e.full.above)),
+    (Verdict.UNEXPLAINED, "above_and_unexplained", lambda e: e.above and e.unexplained),
+    (Verdict.LEFT_BY_METHOD, "above_by_method", lambda e: e.above and e.of_method),
+    (Verdict.REFERENCE_IN_DOUBT, "static", lambda e: e.static_differs),
+    (Verdict.UNEXPLAINED, "above_as_the_residual", lambda e: e.above and e.at_noise is False),
+    (Verdict.REFERENCE_IN_DOUBT, "contradiction", lambda e: e.above),
+    (Verdict.UNEXPLAINED, "unexplained", lambda e: e.unexplained),
+    (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves[0] > e.moves[1] and not e.missing),
+    (Verdict.MISSING_EFFECT, "beyond", lambda e: e.missing),
+    (Verdict.REFERENCE_IN_DOUBT, "disagreement", lambda e: e.disagrees),
+    (Verdict.FLOOR_IN_DOUBT, "below", lambda e: e.published and e.published.below),
+    (Verdict.FLOOR_IN_DOUBT, "too_quiet", lambda e: e.too_quiet),
+    (Verdict.LEFT_BY_METHOD, "approximations", lambda e: e.found == Verdict.NOTHING_MISSING and e.approximations),
 )
 
 
-def decide(e: Evidence) -> tuple[str, str]:
+def decide(e: Evidence) -> tuple[Verdict, str]:
     """Return the verdict and its reason in one or two sentences; without a reason if the selection decides."""
     for verdict, reason, applies in RULES:
         if applies(e):
@@ -227,7 +247,7 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     """Return the document of a selection with the verdict by the evidence, its reason and the next experiment."""
     verdict, reason = decide(e)
     given, step = {"given": True} if e.given else {}, _next_step(verdict, document, e)
-    if given and verdict == "missing_effect":
+    if given and verdict == Verdict.MISSING_EFFECT:
         effects = ", ".join(document["selected"])
         step = f"calibrate these recordings by a method that fits, with effects.{e.sensor}=[{effects}]"
     decided = {
@@ -239,42 +259,42 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     return document | given | decided
 
 
-def may_be_unknown(verdict: str, e: Evidence) -> bool:
+def may_be_unknown(verdict: Verdict, e: Evidence) -> bool:
     """Return whether physics outside the catalogue may be the cause, as no check of the recordings names another one.
 
     Also true if the held-out error with the selected effects is above the noise floor.
     """
-    if verdict == "missing_effect" and e.held_out is not None:
+    if verdict == Verdict.MISSING_EFFECT and e.held_out is not None:
         return e.held_out["error_after"] > LEFT_OVER * e.held_out["floor"]
-    return verdict == "unexplained" or (verdict == "reference_in_doubt" and not e.doubts)
+    return verdict == Verdict.UNEXPLAINED or (verdict == Verdict.REFERENCE_IN_DOUBT and not e.doubts)
 
 
-def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
+def _offered(verdict: Verdict, document: Mapping[str, Any], e: Evidence) -> bool:
     """Return whether to offer the selected effects: if ``unexplained``, each must be plausible and help on held-out."""
     if e.given:
         return False
-    if verdict != "unexplained" or e.implausible or e.too_many:
-        return verdict == "missing_effect"
+    if verdict != Verdict.UNEXPLAINED or e.implausible or e.too_many:
+        return verdict == Verdict.MISSING_EFFECT
     entries = [entry for entry in document["ranking"] if entry["effect"] in document["selected"]]
     errors = [(entry["held_out_error_before"], entry["held_out_error_after"]) for entry in entries]
     return bool(errors) and all(None not in pair and pair[1] ** 2 < (1.0 - HELPFUL) * pair[0] ** 2 for pair in errors)
 
 
-def _next_step(verdict: str, document: Mapping[str, Any], e: Evidence) -> str:
+def _next_step(verdict: Verdict, document: Mapping[str, Any], e: Evidence) -> str:
     """Return the next step if it differs from the one that the selection proposes; empty otherwise."""
     experiment = of_unknown(document["unexplained"], on_table=e.on_table)
-    if verdict == "unexplained" and e.implausible:
+    if verdict == Verdict.UNEXPLAINED and e.implausible:
         step = "check that every recording is of this unit in one mounting, and check its range and units"
         return f"{step}; then {experiment}" if document["unexplained"] else step
-    if verdict == "unexplained" != e.found:
+    if verdict == Verdict.UNEXPLAINED != e.found:
         return experiment
-    if verdict == "reference_in_doubt":
+    if verdict == Verdict.REFERENCE_IN_DOUBT:
         suspect = "the table's log and the mounting" if e.on_table else "the rests and turns"
         check = f"check {suspect} as said above, and record the recordings concerned again"
         return SAME_SESSION if e.static_differs and not e.doubts else check
-    if verdict == "floor_in_doubt":
+    if verdict == Verdict.FLOOR_IN_DOUBT:
         return "record static again: ten minutes or more at rest, on a base that does not shake"
-    if verdict != "left_by_method":
+    if verdict != Verdict.LEFT_BY_METHOD:
         return ""
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
     free = ["the default method" if e.given else "a method that fits the full matrix (reference_least_squares)"]

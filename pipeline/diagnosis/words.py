@@ -13,6 +13,7 @@ from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.posterior import CERTAIN
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, unit_of
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -54,7 +55,7 @@ def _environment() -> Environment:
     )
     environment.filters |= {"plain": plain, "listed": listed, "said": _said}
     environment.globals |= {"is_held": is_held, "largest_by_unit": largest_by_unit, "plus_minus": PLUS_MINUS}
-    environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED}
+    environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED, "Verdict": Verdict}
     return environment
 
 
@@ -128,13 +129,13 @@ def _experiment(name: str, *, on_table: bool) -> str:
     return this.experiment if on_table else this.experiment_by_hand or this.experiment
 
 
-def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], findings: Findings) -> str:
+def next_experiment(verdict: Verdict, ranking: Sequence[Mapping[str, Any]], findings: Findings) -> str:
     """Return the most informative next experiment as one sentence."""
     on_table = findings.on_table
-    if verdict == "unexplained":
+    if verdict == Verdict.UNEXPLAINED:
         return of_unknown(findings.unknown, on_table=on_table) if findings.unknown else findings.advice(verdict)
     if not findings.selected:
-        if verdict == "nothing_missing" and findings.answers.sets[0][0]:
+        if verdict == Verdict.NOTHING_MISSING and findings.answers.sets[0][0]:
             pair = findings.answers.sets[0], ((), dict(findings.answers.sets).get((), 0.0))
             sets = [{"effects": names, "probability": min(p, CERTAIN)} for names, p in pair]
             return f"to distinguish {to_distinguish(sets, findings.sensor, on_table=on_table)}"

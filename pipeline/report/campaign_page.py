@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.outcome import VERDICTS, findings_of, next_commands, verdict_groups
+from pipeline.outcome import findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart, sentences
 from pipeline.report.fleet import parameter_table, wide
@@ -21,6 +21,7 @@ from pipeline.report.held_out_section import FAR
 from pipeline.report.numbers import number, percent, plain, unit_text
 from pipeline.report.pages import script_data, template
 from pipeline.report.parameters import COLUMNS, CROSS_AXIS
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -102,7 +103,7 @@ def render(
         values=script_data({figure.name: values for figure, values in [*fleet, *plots]}),
         first=FIRST,
         sections=comparisons,
-        verdicts=VERDICTS,
+        verdicts={verdict: verdict.css_class for verdict in Verdict},
         sensors=[s for s in SENSORS if frame[f"{s}_error_after"].notna().any()] or SENSORS,
         units=SENSOR_UNITS,
         kept=sorted(set(frame) - set(COLUMNS)),
@@ -138,7 +139,7 @@ def _medians(name: str, frame: pd.DataFrame) -> list[JSON]:
         }
         verdicts = Counter(known[f"{sensor}_verdict"])
         about = {"sensor": sensor, "name": name, "unit": SENSOR_UNITS[sensor], "count": len(known)}
-        counts = {verdict: verdicts[verdict] for verdict in VERDICTS if verdicts[verdict]}
+        counts = {verdict: verdicts[verdict] for verdict in Verdict if verdicts[verdict]}
         if len(known):
             found.append(about | figures | {"verdicts": counts, "missing": _missing(sensor, known)})
     return found
@@ -172,7 +173,7 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
     if count < FEWEST_UNITS:
         return None
     many = count > MOST_DOTS
-    complete = known & (frame[f"{sensor}_verdict"] == "nothing_missing").to_numpy(bool)
+    complete = known & (frame[f"{sensor}_verdict"] == Verdict.NOTHING_MISSING).to_numpy(bool)
     first, last = (before, order > 0, 3, "before"), (floor, order > 0, 4, "noise floor")  # the floor on top of the dots
     judged = [(after, complete, 2, "after, nothing missing"), (after, known & ~complete, 0, "after, any other verdict")]
     dotted = [first, *judged, last]

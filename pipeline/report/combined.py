@@ -56,6 +56,7 @@ from pipeline.report.numbers import number, plain
 from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters
 from pipeline.report.run_section import MARK
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -70,7 +71,11 @@ LACK_OF_FIT = "lack of fit"  # errors of a table are part of it: siblings may ha
 SHARED = f"{BENCH}, and {LACK_OF_FIT}"
 NONE = np.empty(0)
 MOST_FREEDOM = 1e12  # instead of infinitely many degrees of freedom, for which JSON has no number
-DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: the uncertainty is too small
+DOUBTFUL = (
+    Verdict.REFERENCE_IN_DOUBT,
+    Verdict.MISSING_EFFECT,
+    Verdict.UNEXPLAINED,
+)  # U is too small
 
 
 def combined_calibrations(

@@ -16,6 +16,7 @@ from markupsafe import Markup
 from pipeline.estimation.candidates import is_held
 from pipeline.report import numbers
 from pipeline.report.numbers import measured, number, plain, unit_text
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
@@ -44,7 +45,7 @@ def _environment() -> Environment:
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}
     environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
     environment.filters |= {"script_data": script_data, "numeric": "#{}".format}
-    environment.globals |= {"asset": asset, "unit_link": unit_link}
+    environment.globals |= {"asset": asset, "unit_link": unit_link, "Verdict": Verdict}
     return environment
 
 

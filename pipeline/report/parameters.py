@@ -22,6 +22,7 @@ from pipeline.model.calibration_file import beyond_uncertainty, left_out
 from pipeline.records import AXES, SENSORS
 from pipeline.report.held_out_section import first_and_last_step, passes
 from pipeline.report.numbers import percent, plain
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -171,7 +172,7 @@ def summary_row(
     for sensor in SENSORS:
         held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
         raw, final = first_and_last_step(held_out)
-        selected = found.get("selected") if found.get("verdict") == "missing_effect" else None
+        selected = found.get("selected") if found.get("verdict") == Verdict.MISSING_EFFECT else None
         errors = [step.get(error) for error in ("rms_error", "mean_abs_error") for step in (raw, final)]
         texts = [found.get("verdict"), ";".join(selected or []) or None, found.get("reason") or None]
         texts.append(len(found.get("answer_set") or []) or None)

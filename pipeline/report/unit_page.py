@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.files import json_text
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
-from pipeline.outcome import VERDICTS, as_overrides, commands_of, found_mountings, place, run_command
+from pipeline.outcome import as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, Line, Panel, chart
 from pipeline.report.diagnosis_section import (
@@ -38,6 +38,7 @@ from pipeline.report.pages import template
 from pipeline.report.parameters import beyond_limits, fitted_parameters, parameter_rows
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
 from pipeline.signal.rests import Rest, rests_from_table
+from pipeline.verdicts import css_class
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -133,7 +134,7 @@ def _sensor(
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
-    limits, kind = limit_rows(sensor, found, sensor_config), VERDICTS.get(found.get("verdict", ""), "")
+    limits, kind = limit_rows(sensor, found, sensor_config), css_class(found.get("verdict"))
     kind = "warn" if found.get("failed") else kind
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))

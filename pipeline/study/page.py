@@ -23,6 +23,7 @@ from pipeline.study.scores import (
     warned,
     wilson,
 )
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -132,7 +133,7 @@ def of_shapes(cases: Sequence[JSON]) -> Rows:
 
 def _outcome(case: JSON) -> str:
     if warned(case):
-        return "unexplained" if case["verdict"] == "unexplained" else "other warning"
+        return "unexplained" if case["verdict"] == Verdict.UNEXPLAINED else "other warning"
     if not case["selected"]:
         return "nothing"
     return "answered" if outside_answered(case) else "silent"

@@ -18,6 +18,7 @@ import scipy
 
 from pipeline.estimation.free_curves import OTHER
 from pipeline.report.chart import Dots, Figure, Line, Panel, chart
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -31,7 +32,7 @@ MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "tri
 ALIKE = 0.95  # share of a signal above which effects are look-alikes, as on the pages
 EXCESS = 0.05  # of the noise floor: smallest held-out excess that is counted
 STANDS_OUT = 100.0  # lambda: the largest that a selection needs
-DOUBTFUL = ("reference_in_doubt", "unexplained", "floor_in_doubt")
+DOUBTFUL = (Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT)
 
 
 def cases_of(truth: Iterable[JSON], results: Iterable[JSON]) -> list[JSON]:
