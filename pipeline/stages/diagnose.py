@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.effective_noise import effective_noise
 from pipeline.diagnosis.formula_discovery import effect_file
+from pipeline.records import SCHEMA_VERSION
 from pipeline.stages.unit_files import load_fits, recordings_of, require_noises
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ def diagnose_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     fits = load_fits(job.inputs, unit)
     noises = require_noises(job.inputs["filter"], unit, recordings, settings["sensor"], fits)
     validation = job.inputs["validate"].json(f"{unit}.json")
-    document: dict[str, Any] = {"schema_version": 1, "unit": unit}
+    document: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "unit": unit}
     files: Files = {f"{unit}.json": document}
     for sensor, calibration in fits.items():
         document[sensor] = found = calibration and diagnose(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.records import SCHEMA_VERSION
 from pipeline.stages.unit_files import load_fits, recordings_of, require_noises
 from pipeline.validation.attitude import attitude, gravity_direction
 from pipeline.validation.heldout import validate
@@ -21,7 +22,8 @@ def validate_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     recordings = recordings_of(job.inputs, unit)
     fits = load_fits(job.inputs, unit)
     noises = require_noises(job.inputs["filter"], unit, recordings, settings["sensor"], fits)
-    document: dict[str, Any] = {"schema_version": 1, "unit": unit} | held_out(fits, recordings, noises, settings)
+    document: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "unit": unit}
+    document |= held_out(fits, recordings, noises, settings)
     document["attitude"] = attitude(fits["accelerometer"], fits["gyroscope"], recordings)
     document["gravity_direction"] = gravity_direction(
         **fits, recordings=recordings, noise=noises.get("gyroscope"), settings=settings
