@@ -20,7 +20,7 @@ from pipeline.files import json_text, write_atomically
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect_of
 from pipeline.model.measurement import sensor_effects
-from pipeline.records import SENSOR_UNITS, SENSORS, SensorCalibration, coverage_factor
+from pipeline.records import SCHEMA_VERSION, SENSOR_UNITS, SENSORS, SensorCalibration, coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,7 +38,7 @@ def document_of(imported: ImportedCalibration) -> JSON:
         return imported.document
     missing = {s: f"{imported.format_name} holds no calibration of it" for s in SENSORS if s not in imported.sensors}
     return {
-        "schema_version": 1,
+        "schema_version": SCHEMA_VERSION,
         "unit": imported.unit,
         "status": "ok",
         "error": None,

@@ -36,7 +36,16 @@ from pipeline.model.checked import WrongValueError, each, fields, flag, items, m
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import parameter_limits
 from pipeline.pack import read_published
-from pipeline.records import AXES, LIMIT, SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration, Values
+from pipeline.records import (
+    AXES,
+    LIMIT,
+    READABLE_VERSIONS,
+    SENSOR_UNITS,
+    SENSORS,
+    FittedEffect,
+    SensorCalibration,
+    Values,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -44,7 +53,6 @@ if TYPE_CHECKING:
 
     from pipeline.model.checked import Check
 
-SCHEMA_VERSION = 1  # of the files that this version writes
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
 # (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.
 LARGEST_FACTOR = 1000.0
@@ -129,9 +137,10 @@ def read_calibration(file: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or "status" not in document:
         _refuse(file, "this is no calibration of a unit: it has no status; expected calibrations/<unit>.json")
     version = document.get("schema_version")
-    if version != SCHEMA_VERSION or isinstance(version, bool):
+    if version not in READABLE_VERSIONS or isinstance(version, bool):
         shown = "missing" if version is None else repr(version)
-        _refuse(file, f"schema_version is {shown}; this version reads {SCHEMA_VERSION}: calibrate the unit anew")
+        readable = " and ".join(map(str, READABLE_VERSIONS))
+        _refuse(file, f"schema_version is {shown}; this version reads {readable}: calibrate the unit anew")
     if document["status"] == "failed":
         error_entry = document.get("error")
         cause = error_entry.get("message", "unknown") if isinstance(error_entry, dict) else "unknown"

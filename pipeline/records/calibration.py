@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from pipeline.records.recording import Values
 
 SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+SCHEMA_VERSION = 2  # of published documents; the keys of each version are in pipeline/schemas
+READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null
 NORMAL, RECTANGULAR = "normal", "rectangular"
 LIMIT = "misalignment not determined by the rests: limit of the sensor file"  # a source of the uncertainty budget
 

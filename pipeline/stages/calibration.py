@@ -21,7 +21,7 @@ from pipeline.io.channel_table import axis_maps
 from pipeline.io.quality_flags import GAP
 from pipeline.model.calibration_file import implausible, not_determined
 from pipeline.pack import FAILED
-from pipeline.records import SENSORS, NotCalibrated, Recording, calibrated
+from pipeline.records import SCHEMA_VERSION, SENSORS, NotCalibrated, Recording, calibrated
 from pipeline.stages.unit_files import StoredUnit
 from pipeline.version import VERSION
 
@@ -135,7 +135,7 @@ def judged(sensor: str, fit: dict[str, Any], sensor_config: dict[str, Any]) -> d
 def header(unit: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the part of a calibration document that does not depend on the fit."""
     return {
-        "schema_version": 1,
+        "schema_version": SCHEMA_VERSION,
         "unit": unit,
         "status": None,
         "error": None,

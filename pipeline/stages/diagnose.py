@@ -9,7 +9,7 @@ from pipeline.diagnosis.effective_noise import effective_noise
 from pipeline.diagnosis.formula_discovery import effect_file
 from pipeline.errors import omission
 from pipeline.estimation.noise import required_noises
-from pipeline.records import calibrated
+from pipeline.records import SCHEMA_VERSION, calibrated
 from pipeline.stages.unit_files import StoredUnit
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def diagnose_unit(
     """
     known = calibrated(fits)
     noises = required_noises(recordings, settings["sensor"], known)
-    made = Diagnosis({"schema_version": 1, "unit": unit}, {}, [])
+    made = Diagnosis({"schema_version": SCHEMA_VERSION, "unit": unit}, {}, [])
     for sensor, calibration in known.items():
         if calibration is None:
             made.document[sensor] = None
@@ -63,7 +63,7 @@ def diagnose_without(job: Job, unit: str, settings: dict[str, Any], record: dict
     """Return the document of a unit without a diagnosis of either sensor."""
     known = calibrated(StoredUnit(job, unit).fits)
     parts = {s: c and without_diagnosis(s, settings, record) for s, c in known.items()}
-    return {f"{unit}.json": {"schema_version": 1, "unit": unit} | parts}
+    return {f"{unit}.json": {"schema_version": SCHEMA_VERSION, "unit": unit} | parts}
 
 
 def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.estimation.noise import required_noises
-from pipeline.records import calibrated
+from pipeline.records import SCHEMA_VERSION, calibrated
 from pipeline.validation.attitude import attitude, gravity_direction
 from pipeline.validation.heldout import validate
 
@@ -20,7 +20,9 @@ def held_out_document(
 ) -> dict[str, Any]:
     """Return ``validations/<unit>.json``: the errors on held-out motion after each step of both fits."""
     filtered, found = recordings.filtered, calibrated(fits)
-    document: dict[str, Any] = {"schema_version": 1, "unit": unit} | held_out_errors(recordings, fits, settings)
+    document: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "unit": unit} | held_out_errors(
+        recordings, fits, settings
+    )
     document["attitude"] = attitude(found["accelerometer"], found["gyroscope"], filtered)
     document["gravity_direction"] = gravity_direction(
         **found, recordings=filtered, noise=recordings.noises.get("gyroscope"), settings=settings

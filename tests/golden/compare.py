@@ -14,7 +14,10 @@ from pathlib import Path
 from typing import Any
 
 FOLDERS = ("calibrations", "validations", "diagnoses")
-TEXT = {"software", "config_sha256", "notes", "message", "reason", "next_experiment", "text", "words", "seconds"}
+TEXT = {
+    "schema_version", "software", "config_sha256", "notes", "message", "reason", "next_experiment", "text", "words",
+    "seconds",
+}  # fmt: skip
 RELATIVE = 1e-10
 OF_UNCERTAINTY = 1e-3
 COVERAGE = 2.0  # expanded uncertainty over standard uncertainty

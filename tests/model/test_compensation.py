@@ -351,8 +351,9 @@ def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path) -> None:
 Change = tuple[str, str, str]
 MATRIX = '"matrix": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]'
 FAULTS: list[Change] = [
-    ('"schema_version": 1, ', "", "schema_version is missing; this version reads 1"),
-    ('"schema_version": 1, ', '"schema_version": 2, ', "schema_version is 2; this version reads 1"),
+    ('"schema_version": 1, ', "", "schema_version is missing; this version reads 1 and 2"),
+    ('"schema_version": 1, ', '"schema_version": 3, ', "schema_version is 3; this version reads 1 and 2"),
+    ('"schema_version": 1, ', '"schema_version": true, ', "schema_version is True; this version reads 1 and 2"),
     (
         '"status": "ok"',
         '"status": "fine"',
