@@ -47,6 +47,9 @@ FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is wrong by a fact
 QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
 RATE_TOLERANCE = 0.2  # another unit of time is wrong by a factor of 1000
 ENOUGH = 200_000  # samples that a median is taken of
+# Largest readings of a sensor at rest: gravity with a bias of a fifth, zero-rate output of consumer MEMS (MPU-6050
+# product specification 3.1). Where a log is coarse, a rest repeats such a reading although it is not clipped.
+AT_REST = {"accelerometer": 1.2, "gyroscope": 20.0}
 TURNING_DPS = 5.0  # a smaller rate is of the size of a low-cost gyroscope's bias
 # Factors by which intervals are wrong, and the kind of times that this indicates.
 _OTHER_FACTORS = {
@@ -128,7 +131,7 @@ def flag_flat_tops(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) 
     """Flag readings that repeat the largest or the smallest value of their channel more often than noise allows.
 
     The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
-    chance, with p as for stuck readings, of the other values. Logs with the motion of a table are not searched: a table
+    chance, with p as for stuck readings, of the other values. An end that a sensor may read at rest is none. Logs with the motion of a table are not searched: a table
     may keep its largest rate, and its log contradicts a clipped reading.
     """
     notes: list[Note] = []
@@ -142,7 +145,7 @@ def flag_flat_tops(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) 
         if ends[1] - ends[0] < FEWEST_STEPS * np.min(steps, where=~same, initial=np.inf):
             continue
         share = max(equal_share(same & (values[1:] != ends[0]) & (values[1:] != ends[1])), 1.0 / WINDOW)
-        for end in ends:
+        for end in (e for e in ends if abs(e) > AT_REST[sensor]):
             at_end = values == end
             rows = np.flatnonzero(at_end & ((flags & CLIPPED) == 0))
             by_chance = len(values) * share ** np.count_nonzero(same & at_end[1:])

@@ -60,7 +60,7 @@ UNKNOWN_DEGC = 5.0  # change of temperature in some minutes of a room, where non
 HALF_TURN_DEG = 180.0  # in which both axes across a level turn vary by 1 g at least
 SPANNED = 0.2  # of what the motion requires
 INNER = (0.05, 0.95)  # shares of the samples
-COPIED = 0.5  # share of the changes of an axis that are another's to the last digit
+COPIED = 0.5  # share of the changes of an axis that another makes at the same row, to the last digit
 LEVEL_G = 0.5  # of the axes across a turn together, from which gravity turns in the body
 FEWEST = 32  # samples, of which an axis is copied or stays
 
@@ -281,6 +281,12 @@ def check_axes(recordings: Sequence[Recording]) -> None:
 
 
 def _check_copies(recording: Recording) -> None:
+    """Refuse an axis that is a copy of another.
+
+    Where axis a changes, its copy b reads ``b[n] = a[n]`` and not ``b[n-1] = a[n]``. In a log of few digits both are
+    equally frequent by chance, so the difference of their shares of k changes counts. Its standard deviation by chance
+    is at most ``sqrt(0.5 / k)``, that of two digits of equal frequency.
+    """
     for sensor, (one, two) in itertools.product(SENSORS, itertools.combinations(range(3), 2)):
         reading = recording.reading(sensor)
         if reading is None:
@@ -289,9 +295,10 @@ def _check_copies(recording: Recording) -> None:
         changing = a[1:] != a[:-1]
         if changing.sum() < FEWEST:
             continue
+        least = max(COPIED, SIGNIFICANT * float(np.sqrt(0.5 / changing.sum())))
         for sign, what in ((1.0, "a copy"), (-1.0, "the negative")):
-            same = (a == sign * b)[1:][changing]
-            if same.mean() > COPIED:
+            same, by_chance = ((a[1:] == sign * other)[changing] for other in (b[1:], b[:-1]))
+            if same.mean() - by_chance.mean() > least:
                 names = [TRIADS[sensor][i] for i in (one, two)]
                 raise refusal(
                     recording,

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.diagnosis.diagnose import doubts_of
 from pipeline.errors import IngestError
-from pipeline.preprocessing.at_rest import check_static
+from pipeline.preprocessing.at_rest import check_axes, check_static
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.preprocessing.reference import _interval, check_motion
 from pipeline.records import Recording
@@ -193,3 +193,32 @@ def test_the_attitude_of_a_turn_is_compared_with_the_gyroscope(axis: int, kind: 
 def test_a_delay_without_any_residual_excludes_all_others() -> None:
     squares = 1e6 * np.abs(np.arange(21.0) - 10.0)
     assert _interval(squares, 0.0, 20) == (10.0, 10.0, 10.0)
+
+
+def rounded_rest(seed: int, samples: int, noise: float) -> Recording:
+    """Return a rest in steps of 0.01 g with all axes level or nearly so, and noise in parts of a step."""
+    rng = np.random.default_rng(seed)
+    force = 0.01 * np.round(rng.uniform(-1.0, 1.0, 3) + noise * rng.standard_normal((samples, 3)))
+    return Recording("rests", "rests", None, np.arange(samples) * 10_000_000, accelerometer=force)
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.3])
+def test_a_log_of_few_digits_is_not_taken_for_a_copied_axis(noise: float) -> None:
+    alike = []
+    for seed in range(100):
+        recording = rounded_rest(seed, 100 + 20 * seed, noise)
+        x, y, _ = np.asarray(recording.accelerometer).T
+        alike.append(np.mean((x == y)[1:][np.diff(x) != 0.0]))
+        check_axes([recording])
+    assert np.max(alike) > 0.5  # of the rows in which the first axis changes
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_copied_axis_is_refused_in_a_log_of_few_digits(sign: float) -> None:
+    for seed in range(20):
+        recording = rounded_rest(seed, 400, 0.5)
+        force = np.array(recording.accelerometer)
+        force[100:, 2] = sign * force[100:, 1]  # the first quarter is not copied
+        with pytest.raises(IngestError, match="accel_z is (a copy|the negative) of accel_y") as refused:
+            check_axes([replace(recording, accelerometer=force)])
+        assert refused.value.code == "copied_axis"

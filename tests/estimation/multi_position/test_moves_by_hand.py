@@ -151,3 +151,15 @@ def test_moves_that_are_clipped_below_the_stated_range_are_left_out_and_named(sh
     assert found.stages[-1].details["moves"] == left
     assert np.abs(found.matrix - unit.true_matrix("gyroscope")).max() < 3e-4  # 0.1 with the clipped moves
     assert marked.diagnosed("gyroscope", calibration=found)["verdict"] == "nothing_missing"
+
+
+def test_rests_at_the_end_of_the_readings_of_a_coarse_log_are_not_clipped() -> None:
+    rng = np.random.default_rng(1)
+    rate = np.full((1000, 3), -2.4)
+    for start in range(100, 1000, 100):  # moves in one direction alone
+        rate[start : start + 30] += 60.0 * rng.uniform(size=3) * np.sin(np.linspace(0.0, np.pi, 30))[:, None]
+    values = dict(zip(TRIADS["gyroscope"], (0.2 * np.round(rate / 0.2)).T, strict=True))
+    table = ChannelTable("log.csv", 10_000_000 * np.arange(1000), values, {}, np.arange(1000), {})
+    flags, notes = examine(table, hand_held("mpu6050", 5).settings["sensor"], Checks())
+    assert notes == []
+    assert flags is None or not flags.any()
