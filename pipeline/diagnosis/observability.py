@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 LEAST_SPAN_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
 OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that shows the heading"}
+UNDESCRIBED = "the table's log describes no sample at which the rate changes"
 DRIFT = "bias_drift"
 LEAST_WEIGHT = float(np.log(0.01))  # log of the likelihood of a noise hypothesis over that of the likeliest
 FEWEST = 3  # equations beyond bias and matrix, to judge an effect with one coefficient
@@ -131,6 +132,7 @@ def _reason(this: Effect, selection: Selection) -> str:
         (not excited and this.needs_motion and not _moving(observations), "the table never moved while it was sampled"),
         (warm and (not excited or span < LEAST_SPAN_DEGC), _steady(span)),
         (not excited and this.needs_both_directions and one_way(observations), in_one),
+        (not excited and this.moves, UNDESCRIBED),
         (not excited, "bias and matrix explain all that it would add in this motion"),
     ]
     return next((reason for applies, reason in checks if applies), "") or _faint(this, selection)

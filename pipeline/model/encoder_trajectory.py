@@ -18,12 +18,16 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.records import Index, Mask, Values, median
+from pipeline.signal.encoder_rate import step_of
 
 TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3  # a good encoder's resolution; 17 ug of specific force
 GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for; and an interval without any
 MOVING_DPS = 0.02  # exceeds the rate noise of a resting table
 SAME_SHARE, SAME_DPS2 = 0.01, 0.1  # how nearly two neighbouring intervals must agree on an acceleration
 LAG_ROUNDING_DPS = 1e-11  # some hundred roundings of a rate of 400 deg/s
+ROUNDING = 1e-9  # relative: some roundings of a printed number
+MULTIPLES = 10  # of a step: as many different changes are not those of equal moves
+CLEARLY_ABOVE = 4.0  # times the step of an exact log: its angles may all be even multiples
 MEMORY_S = 0.3  # fifteen time constants of the slowest filter of 20 ms
 CORNER_DPS2 = 3.0  # over a filter of 20 ms: 0.06 deg/s
 
@@ -35,6 +39,8 @@ class EncoderTrajectory:
     ----------
     time, angle, rate : (n,) array, s, deg, deg/s
         At least 6 samples.
+    rate_logged : bool
+        Whether the table logs the rate; False: it was computed from the angle.
 
     Attributes
     ----------
@@ -42,7 +48,7 @@ class EncoderTrajectory:
         Intervals that one or two stretches of constant acceleration reproduce.
     valid : (n - 1,) array of bool
         Explained intervals, and intervals of smooth motion: ``dA = (r_0 + r_1) dt / 2 - (r'_1 - r'_0) dt^2 / 12`` to
-        1e-3 deg, or to the noise of the log. In other intervals the trajectory is not reliable.
+        1e-3 deg, to the noise of the log, or to its rounding. In other intervals the trajectory is not reliable.
     valid_samples : (n,) array of bool
         Samples followed by a valid interval, with only valid intervals in the 0.3 s before them, in which a filter
         inside the sensor settles. Samples at which a stretch ends are not valid.
@@ -50,34 +56,35 @@ class EncoderTrajectory:
         At the samples.
     """
 
-    def __init__(self, time: Values, angle: Values, rate: Values) -> None:
+    def __init__(self, time: Values, angle: Values, rate: Values, *, rate_logged: bool = True) -> None:
         self.time, self.angle, self.rate = time, angle, rate
         self._step = np.diff(time)
         self._mean = np.diff(rate) / self._step
         excess = np.diff(angle) - 0.5 * (rate[1:] + rate[:-1]) * self._step
         self._tolerance = float(np.clip(10.0 * median(np.abs(excess)), TIGHTEST_DEG, LOOSEST_DEG))
-        even = np.abs(excess) <= self._tolerance
+        rounding = self._rounding() if rate_logged else np.zeros((2, len(self._step)))
+        even = np.abs(excess) <= np.maximum(self._tolerance, rounding[0])
         self._bend, self._before, self._after, bent = self._bends(even)
         slope = nearest_slope(time, rate)
         miss = np.abs(excess + np.diff(slope) * self._step**2 / 12.0)
         gentle = np.convolve(miss > GENTLE_DEG, np.ones(3), "same") < 0.5
-        gentle &= np.abs(excess) > EXACT_DEG
+        gentle &= (np.abs(excess) > EXACT_DEG) & (rounding[0] < GENTLE_DEG)
         self.explained: Mask = np.logical_and(even | bent, np.logical_not(gentle))
         # At the samples from an adjacent explained interval, else from the nearest rates.
         known = np.append(self.explained, 0.0) + np.append(0.0, self.explained)
         total = np.append(self._before * self.explained, 0.0) + np.append(0.0, self._after * self.explained)
         self.acceleration: Values = np.where(known > 0.0, total / np.maximum(known, 1.0), slope)
         self.valid: Mask = self.explained | self._smooth(miss)
-        self.valid_samples = self._filter_settled()
+        self.valid_samples = self._filter_settled(rounding[1])
 
-    def _filter_settled(self) -> Mask:
-        """Return ``valid_samples``."""
+    def _filter_settled(self, rounding: Values) -> Mask:
+        """Return ``valid_samples``; ``rounding``: of the acceleration."""
         lost = np.concatenate([[0], np.cumsum(~self.valid)])  # invalid intervals before each sample
         first = np.searchsorted(self.time, self.time - MEMORY_S, side="right") - 1
         past = lost - lost[np.maximum(first, 0)] == 0
         known: Mask = np.logical_and(past, np.append(self.valid, True))
         jump = np.abs(self._before[1:] - self._after[:-1])  # of the acceleration, where a stretch ends
-        known[1:-1] &= ~(self.explained[1:] & self.explained[:-1] & (jump > CORNER_DPS2))
+        known[1:-1] &= ~(self.explained[1:] & self.explained[:-1] & (jump > CORNER_DPS2 + 2.0 * rounding[1:]))
         return known
 
     def _bends(self, even: Mask) -> tuple[Values, Values, Values, Mask]:
@@ -109,6 +116,24 @@ class EncoderTrajectory:
         inside = np.convolve(moving, np.ones(7), "same") > 6.5
         noise = 4.0 * float(median(miss[inside])) if inside.sum() > 20 else 0.0
         return np.asarray(miss <= max(LOOSEST_DEG, noise))
+
+    def _rounding(self) -> Values:
+        """Return the largest errors of each interval by the printed digits, or the counts, of angle and rate.
+
+        With the steps A and r, dA is wrong by up to A, its value by the rates by r dt / 2 and the acceleration by r / dt.
+        At a constant rate the errors may all be equal, so that the median excess does not show them. An exact log has
+        steps too if all stretches last multiples of a time g: r = a g and A = a g^2 / 2 = r^2 / (2 a).
+
+        (2, n - 1) array: of the excess, deg, and of the acceleration, deg/s^2; zeros for a log that is not rounded.
+        """
+        changes, rates = np.abs(np.diff(self.angle)), np.abs(self.rate)
+        angle = step_of(changes, ROUNDING * max(float(np.abs(self.angle).max()), 1.0))
+        rate = step_of(rates, ROUNDING * max(float(rates.max()), 1.0))
+        distinct = len(np.unique(np.rint(changes / angle))) if angle else 0
+        exact = 0.5 * rate**2 / max(float(np.abs(self._mean).max()), MOVING_DPS)
+        if distinct <= MULTIPLES or angle <= CLEARLY_ABOVE * exact:
+            return np.zeros((2, len(self._step)))
+        return np.array([angle + np.minimum(0.5 * rate * self._step, angle), rate / self._step])
 
     def at(self, time: Values) -> tuple[Values, Values, Values]:
         """Return angle (deg), rate (deg/s) and acceleration (deg/s^2) at any times; (n,) arrays."""

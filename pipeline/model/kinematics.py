@@ -136,7 +136,7 @@ def _motion_of_turn(
     if by_angle is not None:
         angle, rate = by_angle.angle, by_angle.rate
     assert rate is not None  # noqa: S101
-    log = EncoderTrajectory(time, angle, rate)
+    log = EncoderTrajectory(time, angle, rate, rate_logged=by_angle is None)
     if by_angle is not None:
         log.valid_samples &= ~by_angle.vague
     axis = AXES.index(recording.axis)

@@ -102,11 +102,24 @@ def _errors(time: Values, angle: Values) -> tuple[float, float]:
     moving = (changes[1:] > rounding) & (changes[:-1] > rounding)
     squares = np.sort(bent[moving] ** 2)[: max(int(MOST * np.count_nonzero(moving)), 1)]
     error = float(np.sqrt(np.mean(squares) / (6.0 * LEFT))) if moving.any() else 0.0
+    step = step_of(changes, rounding, printed=True)
+    return (step, step / np.sqrt(12.0)) if step and error <= BEYOND * step / np.sqrt(12.0) else (0.0, error)
+
+
+def step_of(changes: Values, rounding: float, *, printed: bool = False) -> float:
+    """Return the step of which all changes from sample to sample are multiples, in their unit; 0 if there is none.
+
+    ``changes``: absolute values, (n,). ``rounding``: the largest change that is a rounding error. ``printed``: whether
+    the step may be known by a few decimals only, so that its error grows with the multiple.
+    """
     distinct = np.diff(np.unique(changes), prepend=0.0)
-    step = float(np.min(distinct[distinct > rounding]))
+    larger = distinct[distinct > rounding]
+    if len(larger) == 0:
+        return 0.0
+    step = float(larger.min())
     multiples = changes / step
-    is_multiple = float(np.abs(multiples - np.rint(multiples)).max()) <= WHOLE * max(1.0, float(multiples.max()))
-    return (step, step / np.sqrt(12.0)) if is_multiple and error <= BEYOND * step / np.sqrt(12.0) else (0.0, error)
+    most = WHOLE * max(1.0, float(multiples.max()) if printed else 1.0)
+    return step if float(np.abs(multiples - np.rint(multiples)).max()) <= most else 0.0
 
 
 def _smoothed(time: Values, angle: Values, step: float, error: float) -> EncoderRate:

@@ -11,16 +11,31 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from bench_session import CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, Course, Session, record, values_of
+from bench_session import (
+    CONTINUOUS,
+    ONE_WAY,
+    SIZE,
+    STOP_AND_GO,
+    THESIS,
+    WANDER,
+    WHITE,
+    Course,
+    Session,
+    record,
+    values_of,
+)
 
 from pipeline.diagnosis.diagnose import diagnose
+from pipeline.diagnosis.observability import not_observable
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import Selection, select
 from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.kinematics import table_motion
-from pipeline.records import Recording, SensorCalibration
+from pipeline.records import Noise, Recording, SensorCalibration
 from pipeline.signal.filters import apply_filter
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
@@ -184,6 +199,27 @@ def test_lever_arm_delay_and_rate_effects_are_not_observable_in_stop_and_go_alon
     for name in ("lever_arm", "inner_lever_arms", "time_offset", "low_pass_lag", "rate_dependence"):
         assert "never moved" in reason_of(part, name), name
     assert reason_of(part, "table_tilt") == "observable"
+
+
+def test_a_delay_is_found_by_the_ramps_of_a_rounded_log_and_not_without_them() -> None:
+    """Angle and rate have one decimal; each ramp has some samples, whose log the steady turns do not resemble."""
+    course = replace(ONE_WAY, rates_dps=(20.0, 50.0, 100.0, 200.0), accelerometer_rates_dps=(30.0,), validation_s=0.0)
+    session = Session(2, course, {"gyroscope": {"time_offset": np.array([0.002])}}, interval=0.04)
+    turns = [r for r in record(session) if r.role == "gyroscope"]
+    rounded = [replace(r, table_angle=np.round(r.table_angle, 1), table_rate=np.round(r.table_rate, 1)) for r in turns]
+    noise = Noise(np.full(3, WHITE["gyroscope"]), np.full(3, WANDER["gyroscope"]), 100.0, "rests")
+
+    def selected(recordings: list[Recording], *, search: bool = True) -> Selection:
+        return select(observe("gyroscope", recordings, TABLE), [], noise, SHEET["gyroscope"], search=search)
+
+    found = selected(rounded)
+    assert found.names == ["time_offset"]
+    assert found.fit.terms[-1].values == pytest.approx([0.002], abs=3e-5)
+    assert "time_offset" not in not_observable(found, [])
+    ramps = [np.abs(np.gradient(r.table_rate)) > 0.0 for r in rounded]
+    steady = [replace(r, flags=(4 * ramp).astype(np.uint16)) for r, ramp in zip(rounded, ramps, strict=True)]  # stuck
+    reasons = not_observable(selected(steady, search=False), [])
+    assert all("no sample at which the rate changes" in reasons[name] for name in ("time_offset", "low_pass_lag"))
 
 
 def test_effects_of_temperature_are_not_observable_without_one_or_at_a_steady_one() -> None:

@@ -56,6 +56,22 @@ def test_a_step_between_two_samples_is_not_claimed_to_be_followed() -> None:
     assert np.flatnonzero(~log.valid).tolist() == [int(np.searchsorted(time, 3.0)) - 1]
 
 
+@pytest.mark.parametrize(("interval", "step"), [(0.01, 0.1), (0.04, 360.0 / 4096.0), (0.04, 0.1)])
+def test_ramps_of_a_rounded_log_are_followed_to_its_rounding(interval: float, step: float) -> None:
+    """At constant rates the angles hit the steps alike, so that only the ramps show the rounding."""
+    steps = [rest(2.0)]
+    for rate in (20.0, 50.0, 100.0, 200.0):
+        steps += [turn_with_plateau(360.0, rate, 400.0), rest(2.0)]
+    program = Program(steps)
+    time = np.arange(0.0, program.duration, interval)
+    angle, rate, acceleration, _ = program.at(time)
+    log = EncoderTrajectory(time, np.round(angle / step) * step, np.round(rate, 1))
+    assert log.valid_samples[np.abs(acceleration) > 1.0].mean() > 0.7  # without the corners
+    steady = np.append(np.isclose(np.diff(rate), interval * acceleration[:-1]), False)
+    later = steady & log.valid_samples
+    np.testing.assert_allclose(log.at(time[later] + 0.002)[1], program.at(time[later] + 0.002)[1], atol=0.05)
+
+
 def test_smooth_motion_is_interpolated_to_a_hundred_thousandth_of_its_amplitude() -> None:
     time = np.arange(0.0, 20.0, 0.12)
     w = 2 * np.pi * 0.3
