@@ -115,10 +115,11 @@ def _seconds(text: str) -> tuple[float, float]:
 
 def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:
     """Return the log, or all files with readings of one recording, in the order of the profile that joins them."""
-    if logs[0].suffix.lower() not in (".mcap", *MESSAGE_FORMATS):
+    suffix = logs[0].suffix.lower()
+    if suffix != ".mcap":
         from pipeline.field_logs.text_output import sensor_parts  # noqa: PLC0415  (a text parser, not for MCAP)
 
-        parts = sensor_parts(profile.ingest)
+        parts = sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS)
         if len(parts) > 1:
             from pipeline.commands.readings import grouped  # noqa: PLC0415  (imports Hydra: 0.3 s)
 

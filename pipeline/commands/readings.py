@@ -14,7 +14,7 @@ from pipeline.config.compose import Composer
 from pipeline.config.options import Problem, nearest
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
-from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES, candidate_files
+from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES, candidate_files, parts_of
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
@@ -64,10 +64,10 @@ class Reading:
 
 def grouped(files: Sequence[Path], ingest: dict[str, Any]) -> list[list[Path]]:
     """Return the files of each recording: one, or one for each part of the profile."""
-    parts = [part["file"] for part in (ingest["csv"] or {}).get("parts") or []]
+    parts, of_messages = [part["file"] for part in parts_of(ingest)], bool((ingest.get("mcap") or {}).get("parts"))
     groups: dict[Path, list[Path]] = {}
     for file in files:
-        if not parts or file.suffix.lower() in SUFFIXES[1:]:
+        if not parts or (file.suffix.lower() in SUFFIXES[1:] and not of_messages):
             groups[file] = [file]
             continue
         patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]

@@ -185,7 +185,7 @@ def compensate_log(
                 return McapLog(source, out, profile, stream, topic, smoothing).compensate()
             from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
 
-            wanted = 1 if suffix in MESSAGE_FORMATS else len(sensor_parts(profile.ingest))
+            wanted = len(sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS))
             if len(files) != wanted:
                 raise InputError(f"the profile reads a recording from {wanted} files; got {len(files)}", str(source))
             if len(files) > 1 or suffix in MESSAGE_FORMATS:

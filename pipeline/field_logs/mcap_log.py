@@ -21,6 +21,7 @@ from pipeline.io.mcap_copy import McapCopy
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.message_decoder import MAPPED, Topics, listed_topics, topic_of
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, new_imu, replaced
+from pipeline.io.timestamps import counted
 from pipeline.io.units import ACCELEROMETER, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.log_motion import ExponentialRegression
 
@@ -57,6 +58,7 @@ class McapLog:
         self.channels: dict[int, Channel] = {}  # channel of readings to the channel of their calibrated messages
         self.schema: Schema | None = None  # of the calibrated messages, if it is added
         self.origin_ns: int | None = None
+        self.first_ns = 0
 
     def compensate(self) -> Result:
         """Copy the log run by run, with the calibrated readings of each run after it."""
@@ -97,8 +99,12 @@ class McapLog:
             both = f"{self.readings.topic}, {decoder.topic}"
             message = f"2 topics are of type {IMU}: {both}; choose one in ingest.mcap.imu_topic"
             raise IngestError(message, str(self.source), code="ambiguous")
+        done, rate_hz = decoder.count, self.settings.rate_hz
         batch = decoder.read(rows, self.reader)
         time_ns = batch.times(rows)
+        if rate_hz is not None:  # counted from the recorder's time of the first message
+            self.first_ns = self.first_ns if done else int(time_ns[0])
+            time_ns = self.first_ns + counted(len(time_ns), rate_hz, done)
         if self.origin_ns is None:
             self.origin_ns = int(time_ns[0]) if time_ns[0] > SINCE_1970_NS else 0
         since = time_ns - self.origin_ns

@@ -23,7 +23,7 @@ from pipeline.io.arrow import text_scalar, times_as_decimals, to_arrow, to_numpy
 from pipeline.io.channel_table import in_house_unit
 from pipeline.io.csv_layout import Layout, find_faults, other_separator
 from pipeline.io.files import MESSAGE_FORMATS
-from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_format
+from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_formats
 from pipeline.io.text_log import TextLog
 from pipeline.io.units import (
     ACCELEROMETER,
@@ -173,9 +173,14 @@ class CsvLog:
         return signals
 
 
-def sensor_parts(ingest: Mapping[str, Any]) -> list[int]:
-    """Return the indices of the files with readings or the temperature in the profile's ``parts``."""
+def sensor_parts(ingest: Mapping[str, Any], *, messages: bool = False) -> list[int]:
+    """Return the indices of the files with readings or the temperature in the profile's ``parts``.
+
+    ``messages``: of message logs.
+    """
     channels = {*ACCELEROMETER, *GYROSCOPE, "temperature"}
+    if messages:
+        return list(range(len(mcap_formats(ingest))))
     return [i for i, layout in enumerate(csv_formats(ingest)) if channels & {c.channel for c in layout.columns}]
 
 
@@ -183,9 +188,9 @@ def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, st
     """Write the calibrated readings of a message log, or of files joined on equal time, as text."""
     source, ingest = files[0], profile.ingest
     if source.suffix.lower() in MESSAGE_FORMATS:
-        from pipeline.io.mcap import read_log  # noqa: PLC0415  (slow import, not for text logs)
+        from pipeline.io.mcap import read_logs  # noqa: PLC0415  (slow import, not for text logs)
 
-        table = read_log(source, mcap_format(ingest))
+        table = read_logs(files, ingest)
     else:
         from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (only for joined files)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError
+from pipeline.errors import ConfigurationError, IngestError
 from pipeline.io.units import COUNTS, TRIADS, to_house_unit
 from pipeline.records import AXES, Note
 
@@ -74,6 +74,33 @@ def in_house_unit(source: ChannelSource, numbers: Values) -> Values:
     if source.unit == COUNTS:
         return (numbers - source.offset) * (1.0 / source.counts_per_unit)
     return to_house_unit(source.channel, numbers, source.unit)
+
+
+def joined(tables: Sequence[ChannelTable]) -> ChannelTable:
+    """Join files row by row; raise ``IngestError`` if they were not logged at the same times."""
+    first, *others = tables
+    same = "parts of one recording need the same times"
+    for other in others:
+        rows = min(len(first.time_ns), len(other.time_ns))
+        differs = np.flatnonzero(first.time_ns[:rows] != other.time_ns[:rows])
+        if differs.size:
+            row = int(differs[0])
+            times = f"time {other.time_ns[row] / 1e9:.9g} s differs from {first.time_ns[row] / 1e9:.9g} s"
+            hint = "a table's log with a clock of its own is marked own_clock: true"
+            message = f"{times} in {first.place(row)}; {same}"
+            raise IngestError(message, other.place(row), code="other_times", hint=hint)
+        if len(first.time_ns) != len(other.time_ns):
+            message = f"{other.source['rows']} rows, but {first.path} has {first.source['rows']}; {same}"
+            raise IngestError(message, other.path, code="other_times")
+    if not others:
+        return first
+    return replace(
+        first,
+        values={k: v for t in tables for k, v in t.values.items()},
+        source={**first.source, "joined": [t.source for t in others]},
+        count_sizes={k: v for t in tables for k, v in t.count_sizes.items()},
+        notes=tuple(n for t in tables for n in t.notes),
+    )
 
 
 def axis_matrix(axis_map: Sequence[str]) -> Values:

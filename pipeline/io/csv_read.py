@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.channel_table import ChannelTable, in_house_unit
+from pipeline.io.channel_table import ChannelTable, in_house_unit, joined
 from pipeline.io.csv_layout import Fault, Layout, column_notes, find_columns, find_faults, refusal
 from pipeline.io.csv_times import (
     EXACT_BELOW_S,
@@ -70,13 +70,13 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
     tables = [_read_one(path, layout, checks or Checks()) for path, layout in zip(paths, formats, strict=True)]
     same = [t for t, layout in zip(tables, formats, strict=True) if not layout.own_clock]
     others = [t for t, layout in zip(tables, formats, strict=True) if layout.own_clock]
-    joined = _joined(same)
-    if others or TABLE_TIME in joined.values:
+    whole = joined(same)
+    if others or TABLE_TIME in whole.values:
         from pipeline.io.encoder_log import align, own_rows  # noqa: PLC0415  (few logs need it)
 
-        for log in others or [own_rows(joined)]:
-            joined = align(joined, log)
-    return joined
+        for log in others or [own_rows(whole)]:
+            whole = align(whole, log)
+    return whole
 
 
 def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
@@ -266,33 +266,6 @@ class Rows:
                 detail = f"{what}, each a gap; the longest run is {longest} long; the first: "
                 detail += dropped[0].message
                 self.notes.append(Note(code, len(dropped), dropped[0].line, dropped[-1].line, detail))
-
-
-def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
-    """Join files row by row; raise ``IngestError`` if they were not logged at the same times."""
-    first, *others = tables
-    same = "parts of one recording need the same times"
-    for other in others:
-        rows = min(len(first.time_ns), len(other.time_ns))
-        differs = np.flatnonzero(first.time_ns[:rows] != other.time_ns[:rows])
-        if differs.size:
-            row = int(differs[0])
-            times = f"time {other.time_ns[row] / 1e9:.9g} s differs from {first.time_ns[row] / 1e9:.9g} s"
-            hint = "a table's log with a clock of its own is marked own_clock: true"
-            message = f"{times} in {first.place(row)}; {same}"
-            raise IngestError(message, other.place(row), code="other_times", hint=hint)
-        if len(first.time_ns) != len(other.time_ns):
-            message = f"{other.source['rows']} rows, but {first.path} has {first.source['rows']}; {same}"
-            raise IngestError(message, other.path, code="other_times")
-    if not others:
-        return first
-    return replace(
-        first,
-        values={k: v for t in tables for k, v in t.values.items()},
-        source={**first.source, "joined": [t.source for t in others]},
-        count_sizes={k: v for t in tables for k, v in t.count_sizes.items()},
-        notes=tuple(n for t in tables for n in t.notes),
-    )
 
 
 def read_gcsv(path: Path, checks: Checks) -> ChannelTable:

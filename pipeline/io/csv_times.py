@@ -22,7 +22,7 @@ import pyarrow as pa
 from pipeline.errors import IngestError
 from pipeline.io.csv_layout import PARTS
 from pipeline.io.quality_flags import REPAIRED
-from pipeline.io.timestamps import blocks_error, sorted_once
+from pipeline.io.timestamps import blocks_error, counted, sorted_once
 from pipeline.io.units import UNITS
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def times_of(rows: Rows) -> Integers:
     """Return the time of each row, ns; raise ``IngestError`` for times out of range or too coarse."""
     settings = rows.settings
     if settings.rate_hz is not None:
-        return np.asarray(np.rint(np.arange(len(rows.lines)) * (1e9 / settings.rate_hz)).astype(np.int64))
+        return counted(len(rows.lines), settings.rate_hz)
     column, index = time_column(rows.layout)
     values, name, tick_ns = rows.numbers[index], rows.layout.names[index], settings.tick_ns
     unit_s = float(tick_ns) / 1e9 if tick_ns is not None else seconds_per_unit(column.unit)

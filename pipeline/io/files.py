@@ -1,8 +1,9 @@
 """Find the files of a unit's recordings, check names, and read files safely.
 
 A procedure names a recording's file without suffix; the first kind of file that exists is used, in the order of
-``SUFFIXES``. A name with a suffix is used unchanged. If the ingest profile has ``parts`` (files of one logger, joined
-on time), they replace the ``.csv``. Only regular files are opened: opening a FIFO would wait forever.
+``SUFFIXES``. A name with a suffix is used unchanged. If the ingest profile has ``parts`` (files of one logger, text or
+message logs, joined on time), they replace the ``.csv``. Only regular files are opened: opening a FIFO would wait
+forever.
 
 Only the standard library is imported here: the Snakefile looks up the files of thousands of units while it is parsed.
 """
@@ -103,7 +104,7 @@ def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], fol
 def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> dict[str, list[list[str]]]:
     """Return the possible files of each recording: alternatives in order of preference, each with all its files."""
     recordings: Mapping[str, Mapping[str, Any]] = procedure["recordings"]
-    parts: Sequence[Mapping[str, Any]] = (ingest.get("csv") or {}).get("parts") or ()
+    parts = parts_of(ingest)
     owner = _owner_of_parts(recordings, parts)
     out = {}
     for name, entry in recordings.items():
@@ -120,6 +121,12 @@ def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> 
     return out
 
 
+def parts_of(ingest: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
+    """Return the files of one recording, if the profile joins several text or message logs."""
+    found: Sequence[Mapping[str, Any]] = (ingest.get("csv") or {}).get("parts") or ()
+    return found or (ingest.get("mcap") or {}).get("parts") or ()
+
+
 def _owner_of_parts(recordings: Mapping[str, Mapping[str, Any]], parts: Sequence[Mapping[str, Any]]) -> str | None:
     """Return the recording to which parts with fixed names belong; None if their names contain ``{file}``."""
     fixed = [part["file"] for part in parts if FILE not in part["file"]]
@@ -128,8 +135,9 @@ def _owner_of_parts(recordings: Mapping[str, Mapping[str, Any]], parts: Sequence
     required = [name for name, entry in recordings.items() if not entry.get("optional", False)]
     if len(required) != 1:
         raise ConfigurationError(
-            f"ingest.csv.parts names {', '.join(fixed)} without {FILE}, which suits a procedure with one required "
-            f"recording; this one requires {', '.join(required)}: write {FILE} where the recording's name belongs"
+            f"parts of the ingest profile names {', '.join(fixed)} without {FILE}, which suits a procedure with one "
+            f"required recording; this one requires {', '.join(required)}: write {FILE} where the recording's name "
+            "belongs"
         )
     return required[0]
 

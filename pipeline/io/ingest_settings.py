@@ -279,7 +279,7 @@ def _check_channels(formats: Sequence[CsvFormat]) -> None:
 
 def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None = None) -> None:
     """Raise ``ConfigurationError`` for an invalid ingest profile, or if its parts do not match the procedure."""
-    mcap_format(ingest)
+    mcap_formats(ingest)
     checks_of(ingest)
     if ingest.get("csv"):
         csv_formats(ingest)
@@ -303,11 +303,19 @@ class MappedField(ChannelSource):
         return value if isinstance(value, FieldPath) else FieldPath.parse(value if isinstance(value, str) else "")
 
 
+class _LogPart(Section):
+    """One of several message logs of a recording."""
+
+    file: str = Field(min_length=1, description="the name of a file")
+    topics: Any = None
+
+
 class McapFormat(Section):
     """How an MCAP file is read (``ingest.mcap``).
 
     ``topics``: topic to channel (or ``time``) to field. ``time_source``: the stamps in the messages, or the recorder's
-    times. ``table_clock``: ``shared`` if the table's messages have the stamps of the Imu messages, ``own`` if they are
+    times. ``rate_hz``: sampling rate of messages without usable times, which are counted (None: they have times).
+    ``table_clock``: ``shared`` if the table's messages have the stamps of the Imu messages, ``own`` if they are
     to be aligned by the motion. ``sensor_clock``: ``own`` if the two sensors have different stamps and rates of one
     clock. ``clock_difference_s``: largest difference between stamps and recorder's times (None: any). ``reorder_s``:
     largest delay of a message in the file.
@@ -320,6 +328,7 @@ class McapFormat(Section):
     joint: Name = None
     topics: dict[str, dict[str, MappedField]] = Field(default_factory=dict)
     time_source: Literal["header", "log_time"] = Field(default="header", description="header or log_time")
+    rate_hz: Rate | None = Field(default=None, description="a positive number in Hz, or null")
     allow_truncated: bool = Field(default=False, description="true or false")
     table_clock: Literal["shared", "own"] = Field(default="shared", description="shared or own")
     sensor_clock: Literal["shared", "own"] = Field(default="shared", description="shared or own")
@@ -327,22 +336,40 @@ class McapFormat(Section):
     reorder_s: Duration = Field(default=1.0, description="a time in s, 0 or more")
 
 
-def mcap_format(ingest: Mapping[str, Any]) -> McapFormat:
-    """Return how an MCAP file is read."""
-    section = dict(ingest.get("mcap") or {})
+def mcap_formats(ingest: Mapping[str, Any]) -> list[McapFormat]:
+    """Return how each message log of a recording is read: one, or one for each part in the profile's ``parts``."""
+    parts = (ingest.get("mcap") or {}).get("parts")
+    if not parts:
+        return [mcap_format(ingest)]
+    if ingest["mcap"].get("topics") or (ingest.get("csv") or {}).get("parts"):
+        message = "ingest.mcap.parts: topics stand in each part, and ingest.csv.parts is null beside them"
+        raise ConfigurationError(message)
+    places = {f"ingest.mcap.parts[{index}]": part for index, part in enumerate(parts)}
+    checked = [(where, validated(_LogPart, part, where)) for where, part in places.items()]
+    formats = [mcap_format({"mcap": {**ingest["mcap"], "topics": part.topics}}, where) for where, part in checked]
+    _once("ingest.mcap.parts", ([c for topic in f.topics.values() for c in topic] for f in formats), "parts")
+    return formats
+
+
+def mcap_format(ingest: Mapping[str, Any], place: str = "ingest.mcap") -> McapFormat:
+    """Return how a message log is read; ``place``: of its topics, in errors."""
+    section = {key: value for key, value in (ingest.get("mcap") or {}).items() if key != "parts"}
     topics = section.pop("topics", None) or {}
     settings = validated(McapFormat, section, "ingest.mcap")
     if not isinstance(topics, Mapping):
-        raise ConfigurationError(f"ingest.mcap.topics is {topics!r}; it maps topics to channels")
+        raise ConfigurationError(f"{place}.topics is {topics!r}; it maps topics to channels")
     found = {}
     for topic, entries in topics.items():
-        where = f"ingest.mcap.topics.{topic}"
+        where = f"{place}.topics.{topic}"
         found[str(topic).removesuffix(FIRST)] = fields = _channels(MappedField, where, entries or {})
-        if TIME not in fields and settings.time_source == HEADER:
-            raise ConfigurationError(f"{where}.time is missing: the field of the moment, or time_source=log_time")
-    seen = _once("ingest.mcap.topics", found.values(), "topics")
+        if TIME not in fields and settings.time_source == HEADER and settings.rate_hz is None:
+            raise ConfigurationError(
+                f"{where}.time is missing: the field of the moment, time_source=log_time, or the sampling rate "
+                "(ingest.mcap.rate_hz)"
+            )
+    seen = _once(f"{place}.topics", found.values(), "topics")
     for triad in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in triad if c not in seen]
         if 0 < len(missing) < len(triad):
-            raise ConfigurationError(f"ingest.mcap.topics: {', '.join(missing)} is not described")
+            raise ConfigurationError(f"{place}.topics: {', '.join(missing)} is not described")
     return settings.model_copy(update={"topics": found})

@@ -1,8 +1,10 @@
 """Read logs of messages to channels: MCAP files, and the formats of ``pipeline.io.message_logs``.
 
-Times are the stamps in the messages' headers, integer ns: the sensor's clock, not the recorder's. The rows are the Imu
-messages, or the messages of the first topic of ``ingest.mcap.topics`` with an accelerometer or a gyroscope. Table
-messages are matched by equal stamps. A temperature with other stamps is interpolated.
+Times are the stamps in the messages' headers, integer ns: the sensor's clock, not the recorder's. Messages without
+usable times are counted at a stated rate (``ingest.mcap.rate_hz``). The rows are the Imu messages, or the messages of
+the first topic of ``ingest.mcap.topics`` with an accelerometer or a gyroscope. Table messages are matched by equal
+stamps. A temperature with other stamps is interpolated. Several logs of one recording (``ingest.mcap.parts``) are
+joined row by row.
 """
 
 from __future__ import annotations
@@ -13,17 +15,18 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.channel_table import ChannelTable
+from pipeline.io.channel_table import ChannelTable, joined
 from pipeline.io.files import unchanged
-from pipeline.io.ingest_settings import HEADER, OWN
+from pipeline.io.ingest_settings import HEADER, OWN, mcap_format, mcap_formats
 from pipeline.io.message_decoder import MAPPED, TopicDecoder, Topics, listed_topics, topic_of
 from pipeline.io.message_logs import open_reader
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.io.timestamps import averaged, check_fine, check_plausible, in_order, rows_covered
+from pipeline.io.timestamps import averaged, check_fine, check_plausible, counted, in_order, rows_covered
 from pipeline.io.units import ACCELEROMETER, COUNTS, GYROSCOPE, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -34,6 +37,14 @@ if TYPE_CHECKING:
     from pipeline.records import Integers
 
     Columns = dict[str, NDArray[Any]]
+
+
+def read_logs(paths: Sequence[Path], ingest: Mapping[str, Any]) -> ChannelTable:
+    """Read the log or, if the profile joins several, all logs of one recording; errors as of ``read_log``."""
+    formats = mcap_formats(ingest)
+    if len(paths) != len(formats):  # in place of the parts, a log that is a whole recording
+        formats = [mcap_format(ingest)]
+    return joined([read_log(path, settings) for path, settings in zip(paths, formats, strict=True)])
 
 
 def read_log(path: Path, settings: McapFormat) -> ChannelTable:
@@ -83,9 +94,12 @@ class _Topic:
         values = {n: np.concatenate(self.values.pop(n)) for n in list(self.values)}
         recorded = np.concatenate(self.recorded)
         time = np.concatenate(self.times) if self.times else recorded
-        if not self.times and not recorder:
+        if settings.rate_hz is not None:
+            time = counted(len(recorded), settings.rate_hz)
+        elif not self.times and not recorder:
             message = f"topic {topic}: the format has no recorder's times, which ingest.mcap.time_source=log_time needs"
-            raise IngestError(message, path, code="bad_time", hint="name the field of the time")
+            hint = "name the field of the time, or state the sampling rate (ingest.mcap.rate_hz)"
+            raise IngestError(message, path, code="bad_time", hint=hint)
         if self.times:
             if not time.any() and len(time) > 1:
                 message = f"topic {topic}: all header stamps are 0; the sensor's own times are needed"
@@ -125,6 +139,7 @@ class _Log:
         self._note_container()
         recorder = self.reader.has_recorder
         base, *others = (t.series(self.settings, self.notes, recorder=recorder) for t in self._chosen())
+        self._require_counted(base, others)
         if self.settings.sensor_clock == OWN:
             base, others = self._slower_first(base, others)
         values, counts = dict(base.values), dict(base.count_sizes)
@@ -153,6 +168,20 @@ class _Log:
             for log in self.table_logs:
                 table = align(table, replace(log, source=table.source))  # of the same file
         return table
+
+    def _require_counted(self, base: ChannelTable, others: Sequence[ChannelTable]) -> None:
+        """Refuse topics of different length whose messages are counted: which of them belong together is unknown."""
+        rate_hz, count = self.settings.rate_hz, len(base.time_ns)
+        if rate_hz is None:
+            return
+        for other in others:
+            if len(other.time_ns) != count:
+                message = (
+                    f"{other.source['topic']} has {len(other.time_ns)} messages, and {base.source['topic']} {count}: "
+                    "ingest.mcap.rate_hz counts the messages of topics of one length"
+                )
+                raise IngestError(message, self.path, code="bad_time", hint="name the field of the time of each topic")
+        self.notes.append(Note("N-SYNTHTIME", count, 0, 0, f"no times are read: messages counted at {rate_hz:g} Hz"))
 
     def _only(self, kind: str, *, required: bool) -> list[_Topic]:
         """Return the named topic, or the only topic of a type; none if there is none and none is required."""

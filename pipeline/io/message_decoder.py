@@ -156,7 +156,7 @@ class TopicDecoder:
         self._paths = {c: f.field for c, f in self.fields.items()}
         if kind == IMU:
             self._paths |= {vector: FieldPath.parse(f"{vector}_covariance[0]") for vector in VECTORS}
-        time = fields.get(TIME) if settings.time_source == HEADER else None
+        time = fields.get(TIME) if settings.time_source == HEADER and settings.rate_hz is None else None
         self._time = time.field if time else None
         self._time_unit = time.unit if time else "ns"
         self.count = self.varying = 0

@@ -23,7 +23,7 @@ from pipeline.io.channel_table import STRAIGHT, axis_maps, axis_matrix, in_body_
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.io.encoder_log import unwrapped
 from pipeline.io.files import MESSAGE_FORMATS, candidate_files
-from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_format
+from pipeline.io.ingest_settings import checks_of, csv_formats
 from pipeline.io.quality_flags import examine
 from pipeline.io.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording, files_of_readings, rate_of_attitude
@@ -107,9 +107,9 @@ def read_table(
     ``session``: which part, from 1, of a text log that was restarted.
     """
     if paths[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS):
-        from pipeline.io.mcap import read_log  # noqa: PLC0415  (the decoder costs what a text log need not pay)
+        from pipeline.io.mcap import read_logs  # noqa: PLC0415  (the decoder costs what a text log need not pay)
 
-        return read_log(paths[0], mcap_format(ingest))
+        return read_logs(paths, ingest)
     from pipeline.io.csv_read import read_csv, read_gcsv  # noqa: PLC0415  (a log of messages needs no parser of text)
 
     if paths[0].suffix == ".gcsv":

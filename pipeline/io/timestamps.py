@@ -82,6 +82,11 @@ def of_number(values: NDArray[Any], unit: str) -> Integers:
     return parts
 
 
+def counted(rows: int, rate_hz: float, before: int = 0) -> Integers:
+    """Return the times of rows that are counted at a rate, ns; ``before``: rows that were counted before them."""
+    return np.asarray(np.rint(np.arange(before, before + rows) * (1e9 / rate_hz)).astype(np.int64))
+
+
 def check_plausible(topic: str, time: Integers, log_time: Integers, difference_s: float | None, path: str) -> None:
     """Raise ``IngestError`` for impossible stamps ``time``; ``log_time``: times of the recorder.
 

@@ -92,8 +92,13 @@ class Columns:
 
     def free(self) -> list[int]:
         """Return the columns of numbers that are assigned to no channel."""
-        used = {self.time, self.counter, self.arrival, *self.others.values(), *sum(self.triads.values(), ())}
+        used = {*self.of_time(), *self.others.values(), *sum(self.triads.values(), ())}
         return [i for i in self.log.numbers if i not in used]
+
+    def of_time(self) -> set[int]:
+        """Return the columns of the time, of a counter, and those that repeat it, as arrays of one recording may."""
+        numbers, taken = self.log.numbers, {self.time, self.counter, self.arrival} - {None}
+        return {i for i in numbers if any(np.array_equal(numbers[i], numbers[t]) for t in taken if t is not None)}
 
 
 def whole(values: Values) -> bool:
@@ -134,19 +139,21 @@ def find_columns(log: Log) -> Columns:
     columns = Columns(log)
     words = {i: words_of(log.names[i]) if log.named else [] for i in log.numbers}
     _find_time(columns, words)
+    times = columns.of_time()
     for sensor in (*TRIADS, "?"):
-        named = {i: w for i, w in words.items() if _sensor_of(w) == sensor}
+        named = {i: w for i, w in words.items() if i not in times and _sensor_of(w) == sensor}
         triad = _triad(named)
         if triad is not None:
             columns.triads[sensor] = triad
             _remark_on_other_triads(columns, sensor, named)
     for sensor, triad in _triads_by_one_letter(log).items():
-        columns.triads.setdefault(sensor, triad)
+        if not times & set(triad):
+            columns.triads.setdefault(sensor, triad)
     axes_only = columns.triads.pop("?", None)
     if axes_only is not None and not columns.triads:
         columns.triads[_sensor_of_file(log, axes_only)] = axes_only
         columns.remarks.append(f"taken as the {next(iter(columns.triads))} by the file's name and numbers; check it")
-    if not log.named:
+    if not log.named or (log.arrays and not columns.triads):
         _find_triads_without_names(columns)
     for i, w in words.items():
         channel = _other_channel(log.names[i], w)
@@ -210,7 +217,8 @@ def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
     of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
     named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
     unnamed = [i for i in rising if i not in counters and (not columns.log.named or i in of_sensor)]
-    unnamed = unnamed if not columns.log.named or len(unnamed) == 1 else []
+    alike = all(np.array_equal(numbers[i], numbers[unnamed[0]]) for i in unnamed[1:])  # of each array of a recording
+    unnamed = unnamed if not columns.log.named or (unnamed and alike) else []
     candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
     steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
@@ -288,20 +296,24 @@ def _spread(log: Log, triad: Triad, offset: float) -> float:
 def _find_triads_without_names(columns: Columns) -> None:
     """Find the triads of a log without names: the length of the accelerometer's vector varies least."""
     log = columns.log
-    free = [i for i, v in log.numbers.items() if i not in (columns.time, columns.counter) and np.ptp(v) > 0]
+    free = [i for i, v in log.numbers.items() if i not in columns.of_time() and np.ptp(v) > 0]
     groups = list(zip(free[::3], free[1::3], free[2::3], strict=False))
+
+    def called(triad: Triad) -> str:
+        return f"columns {triad}" if not log.named else ", ".join(log.names[i] for i in triad)
+
     if len(groups) == 1:
         sensor = _sensor_of_file(log, groups[0])
         columns.triads[sensor] = groups[0]
-        columns.remarks.append(f"no names: columns {groups[0]} are taken as the {sensor}'s x, y, z; check it")
+        columns.remarks.append(f"no names: {called(groups[0])} are taken as the {sensor}'s x, y, z; check it")
     elif groups:
         offset = _offset(log, groups)
         force = min(groups, key=lambda group: _spread(log, group, offset))
         rate = next(group for group in groups if group != force)
         columns.triads |= {"accelerometer": force, "gyroscope": rate}
         columns.remarks.append(
-            f"no names: columns {force} are taken as the accelerometer's x, y, z, because their length varies by only "
-            f"{_spread(log, force, offset):.1%}, and {rate} as the gyroscope's; check it"
+            f"no names: {called(force)} are taken as the accelerometer's x, y, z, because their length varies by only "
+            f"{_spread(log, force, offset):.1%}, and {called(rate)} as the gyroscope's; check it"
         )
 
 
@@ -318,6 +330,7 @@ class Log:
     remarks: list[str] = field(default_factory=list)
     texts: dict[int, tuple[str, ...]] = field(default_factory=dict)  # the other columns
     topic: str | None = None
+    arrays: bool = False  # the columns are those of arrays, acc[0], whose names need not say what they hold
 
     @property
     def named(self) -> bool:

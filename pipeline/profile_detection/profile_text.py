@@ -29,8 +29,7 @@ def as_yaml(proposal: Proposal, name: str) -> str:
         lines += ["defaults:", "  - canonical_csv", "  - _self_", ""]
     lines += [f"name: {_scalar(name)} # name of the profile, for the report", ""]
     if proposal.topic is not None:
-        lines += ["mcap: # logs of messages of every format", "  topics:", f"    {_scalar(proposal.topic)}:"]
-        return "\n".join(lines + _entries(proposal, 0, "      ")) + "\n"
+        return "\n".join(lines + _topics(proposal)) + "\n"
     lines += ["csv:"]
     for key, value in proposal.csv.items():
         if key in proposal.evidence:
@@ -45,6 +44,20 @@ def as_yaml(proposal: Proposal, name: str) -> str:
         lines += ["  columns: # channel: the column's name (or index from 0) and its unit"]
         lines += _entries(proposal, 0, "    ")
     return "\n".join(lines) + "\n"
+
+
+def _topics(proposal: Proposal) -> list[str]:
+    """Return the section of a profile for logs of messages."""
+    lines = ["mcap: # logs of messages of every format"]
+    if proposal.csv["rate_hz"] is not None:
+        lines += [*_comment(proposal.evidence["rate_hz"], "  "), f"  rate_hz: {_scalar(proposal.csv['rate_hz'])}"]
+    if not proposal.parts:
+        return [*lines, "  topics:", f"    {_scalar(proposal.topic)}:", *_entries(proposal, 0, "      ")]
+    lines.append("  parts: # files of one recording, joined on equal time")
+    for part, file in enumerate(proposal.parts):
+        lines += [f"    - file: {_scalar(file)}", "      topics:", f"        {_scalar(proposal.logs[part].topic)}:"]
+        lines += _entries(proposal, part, "          ")
+    return lines
 
 
 def _entries(proposal: Proposal, part: int, indent: str) -> list[str]:

@@ -96,7 +96,13 @@ class Proposal:
             for entries in self.columns
         ]
         if self.topic is not None:
-            return {"name": name, "csv": {}, "mcap": {"topics": {self.topic: fields_of(columns[0])}}}
+            topics = [{log.topic: fields_of(entries)} for log, entries in zip(self.logs, columns, strict=True)]
+            parts = [{"file": f, "topics": topic} for f, topic in zip(self.parts, topics, strict=False)]
+            return {
+                "name": name,
+                "csv": {},
+                "mcap": {"rate_hz": self.csv["rate_hz"], **({"parts": parts} if parts else {"topics": topics[0]})},
+            }
         if not self.parts:
             return {"name": name, "csv": {**self.csv, "columns": columns[0]}, "mcap": {}}
         parts = [{"file": f, "columns": c} for f, c in zip(self.parts, columns, strict=True)]
@@ -191,8 +197,6 @@ def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
     for columns, entries in zip(parts, proposal.columns, strict=True):
         _others(columns, entries, proposal, str(sensor.get("name", "")))
         proposal.remarks += columns.remarks
-        if proposal.topic is not None and columns.time is None:
-            proposal.remarks.append("no field of the topic is a time, which each topic needs")
         proposal.remarks += columns.log.remarks + _labels(columns.log)
     if force is not None or rate is not None:
         return proposal
@@ -270,7 +274,7 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
     if first.csv["rate_hz"] is not None:
         return np.arange(len(next(iter(first.numbers.values())))) / float(first.csv["rate_hz"])
     proposal.csv["rate_hz"] = UNKNOWN
-    proposal.evidence["rate_hz"] = "there is no time column: the sampling rate in Hz"
+    proposal.evidence["rate_hz"] = "there is no time: the sampling rate in Hz"
     return None
 
 

@@ -16,7 +16,7 @@ from pipeline.io.field_path import STAMPS
 from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.io.gravity_rotation import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
 from pipeline.io.mcap_reader import McapReader
-from pipeline.io.message_decoder import KINDS, STATED, object_decoder, ros_layouts
+from pipeline.io.message_decoder import ARRAYS, KINDS, STATED, object_decoder, ros_layouts
 from pipeline.io.message_layout import short_name
 from pipeline.io.message_logs import open_reader
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
@@ -47,6 +47,7 @@ WIDTH = 118  # characters of a line
 LISTED_NOTES = 20  # fit one screen; the others are counted
 LONGEST_ARRAY = 16  # elements of a field that may be readings
 LONGEST_LIST = 4  # elements of an array that are listed
+OF_ARRAYS = ("HDF5", "MATLAB")  # formats whose arrays a user names
 MOST_FIELDS = 24  # of a message that are listed
 MOST_TOPICS = 20  # with a line each
 
@@ -287,8 +288,9 @@ def topics_of(path: Path) -> list[Log]:
 def _topic(reader: MessageReader, rows: Rows) -> Log | None:
     """Return the messages of a topic as columns; None if they are too few, vary in length or have no numbers."""
     channel = reader.channels[rows.channel]
+    schema = reader.schemas.get(channel.schema_id)
     try:
-        find = ros_layouts(channel, reader.schemas.get(channel.schema_id))
+        find = ros_layouts(channel, schema)
         layout = find(rows.payload(0)) if find is not None and len(rows.starts) >= FEWEST_ROWS else None
     except (ValueError, KeyError):  # an invalid definition, or a message that contradicts it
         return None
@@ -305,7 +307,9 @@ def _topic(reader: MessageReader, rows: Rows) -> Log | None:
     names = [f"{f} [{unit}]" if unit else f for f, unit in zip(fields, stated, strict=True)]
     numbers = {i: columns[f] for i, f in enumerate(fields) if np.isfinite(columns[f]).all()}
     section = {"header": True, "rate_hz": None}
-    return Log(reader.path, section, [*fields], names, numbers, topic=channel.topic) if numbers else None
+    named_by_user = schema is not None and schema.name in OF_ARRAYS
+    log = Log(reader.path, section, [*fields], names, numbers, topic=channel.topic, arrays=named_by_user)
+    return log if numbers else None
 
 
 def topic_lines(path: Path, *, fields: bool) -> list[Line]:
@@ -350,7 +354,8 @@ def _fields(channel: Channel, schema: Schema | None, payload: bytes) -> str:
     """Return the paths of the numbers in a message, for the fields of a profile."""
     try:
         find_layout, decode = ros_layouts(channel, schema), object_decoder(channel, schema)
-        names = find_layout(payload).elements(LONGEST_LIST) if find_layout else _numbers(decode and decode(payload), "")
+        longest = LONGEST_ARRAY if schema is not None and schema.encoding == ARRAYS else LONGEST_LIST
+        names = find_layout(payload).elements(longest) if find_layout else _numbers(decode and decode(payload), "")
         paths = list(islice(names, MOST_FIELDS + 1))
     except Exception:  # noqa: BLE001  (a decoder may raise anything for an unknown message: nothing is listed)
         return ""

@@ -327,6 +327,11 @@ def test_readings_mapped_from_json_give_imu_messages(calibration: Path, tmp_path
     np.testing.assert_allclose(numbers(found)[0] / G0, expected.accelerometer, atol=1e-12)
     np.testing.assert_allclose(np.degrees(numbers(found)[1]), expected.gyroscope, atol=1e-10)
     assert found[7].header.stamp.nanosec == 70_000_000
+    counted = LogProfile({"mcap": {"topics": {"/raw": fields}, "rate_hz": 250.0}})
+    again = compensate_log(load(calibration), log, out, counted)
+    assert again.samples == 300
+    times = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in decoded(out, "/raw_calibrated")]
+    assert times == (int(stamps[0]) + 4_000_000 * np.arange(300)).tolist()
 
 
 def test_the_sensors_axes_are_turned_to_the_bodys(calibration: Path, tmp_path: Path) -> None:

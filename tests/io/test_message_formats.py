@@ -25,13 +25,14 @@ from pymavlink.DFReader import DFReader_binary
 from pyulog import ULog
 from rosbags import rosbag2
 from sample_logs import SENSOR, procedure, profile
+from scipy.io import savemat
 
 from pipeline.commands.apply import main as apply
 from pipeline.commands.check import main as check
-from pipeline.errors import IngestError
+from pipeline.errors import ConfigurationError, IngestError, InputError
 from pipeline.files import CONFIGS
 from pipeline.io.files import MESSAGE_FORMATS
-from pipeline.io.ingest_settings import mcap_format
+from pipeline.io.ingest_settings import check_ingest, mcap_format
 from pipeline.io.mcap import read_log
 from pipeline.io.read import read_recordings
 from pipeline.records import SensorCalibration
@@ -250,6 +251,93 @@ def test_check_proposes_a_profile_that_reads_the_log(
     assert saved["mcap"]["topics"][topic]["time"] == {"field": time, "unit": unit}
     assert_is(read_log(log, mcap_format(saved)), truth)
     assert "PROPOSED PROFILE" in capsys.readouterr().out
+
+
+def in_columns(truth: Truth, *parts: str) -> np.ndarray:
+    """Return an array as users save it, one row a sample: t, f and w are time (s), force and rate."""
+    columns = {"t": truth.time_us[:, None] / 1e6, "f": truth.force, "w": truth.rate}
+    return np.hstack([columns[part] for part in parts])
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [{"acc": "tf", "gyr": "tw"}, {"data": "tfw"}, {"imu_log": "twf"}, {"acc": "f", "gyr": "w", "t": "t"}],
+)
+@pytest.mark.parametrize("suffix", [".mat", ".h5"])
+def test_the_time_in_the_first_column_of_an_array_is_no_reading(
+    arrays: dict[str, str], suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth, log, profile_file = Truth(1200), tmp_path / f"log{suffix}", tmp_path / "own.yaml"
+    found = {name: in_columns(truth, *parts) for name, parts in arrays.items()}
+    if suffix == ".mat":
+        savemat(log, found)
+    else:
+        with h5py.File(log, "w") as file:
+            for name, array in found.items():
+                file[name] = array
+    assert check([str(log), "--save", str(profile_file)]) == 2
+    assert "100 Hz (median interval 10 ms)" in capsys.readouterr().out
+    assert_is(read_log(log, mcap_format(yaml.safe_load(profile_file.read_text()))), truth)
+
+
+def test_two_files_of_arrays_are_one_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth, profile_file = Truth(1200), tmp_path / "own.yaml"
+    files = [tmp_path / "IMU0x2Dalpha.mat", tmp_path / "IMU0x2Domega.mat"]  # as imu_tk_matlab names them
+    savemat(files[0], {files[0].stem: in_columns(truth, "t", "f")})
+    savemat(files[1], {files[1].stem: in_columns(truth, "t", "w")})
+    assert check([*map(str, files), "--save", str(profile_file)]) == 2
+    out = capsys.readouterr().out
+    assert out.count("PROPOSED PROFILE") == 1
+    assert "are one recording: place both in raw/<unit>/ under these names" in out
+    ingest = yaml.safe_load(profile_file.read_text())
+    assert [part["file"] for part in ingest["mcap"]["parts"]] == [file.name for file in files]
+    recording = read_recordings(procedure("recording"), ingest, SENSOR, tmp_path)[0]
+    assert recording.time_ns.tolist() == (truth.time_us * 1000).tolist()
+    np.testing.assert_allclose(recording.accelerometer, truth.force / GRAVITY, rtol=1e-15)
+    np.testing.assert_allclose(recording.gyroscope, np.degrees(truth.rate), rtol=1e-15)
+    assert [other["file"] for other in recording.source["joined"]] == [str(files[1])]
+    assert check([*map(str, files), "--ingest", str(profile_file)]) == 0
+    fits = {s: SensorCalibration(s, np.zeros(3), 2.0 * np.eye(3)).to_json() for s in ("accelerometer", "gyroscope")}
+    head = {"schema_version": 1, "unit": "U1", "status": "ok", "error": None, "sensor": "generic"}
+    (tmp_path / "U1.json").write_text(json.dumps({**head, **fits}))
+    arguments = ["--calibration", str(tmp_path / "U1.json"), "-o", str(tmp_path / "out.csv")]
+    assert apply([*map(str, files), *arguments, "--ingest", str(profile_file)]) == 0
+    written = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(written["gyro_y_dps"], 2.0 * np.degrees(truth.rate[:, 1]), rtol=0, atol=1e-9)
+    savemat(files[1], {files[1].stem: in_columns(truth, "t", "w")[:-3]})
+    with pytest.raises(InputError, match=r"1197 rows, but .* has 1200; parts of one recording need the same times"):
+        read_recordings(procedure("recording"), ingest, SENSOR, tmp_path)
+    ingest["mcap"]["topics"] = {"/": ingest["mcap"]["parts"][0]["topics"]["/"]}
+    with pytest.raises(ConfigurationError, match=r"ingest\.mcap\.parts: topics stand in each part"):
+        check_ingest(ingest)
+
+
+def test_arrays_without_a_time_are_counted_at_the_stated_rate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth, log, profile_file = Truth(1200), tmp_path / "log.mat", tmp_path / "own.yaml"
+    savemat(log, {"acc": truth.force, "gyr": truth.rate})
+    assert check([str(log), "--save", str(profile_file)]) == 2
+    assert "Fill in ??? for rate_hz" in capsys.readouterr().out
+    text = profile_file.read_text()
+    assert 'rate_hz: "???"' in text
+    unit = {f"gyro_{a}": "rad/s" for a in "xyz"}
+    saved = yaml.safe_load(text.replace('rate_hz: "???"', "rate_hz: 100"))
+    for channel, entry in saved["mcap"]["topics"]["/"].items():
+        entry["unit"] = unit.get(channel, entry["unit"])
+    table = read_log(log, mcap_format(saved))
+    assert table.time_ns.tolist() == (truth.time_us * 1000 - 2_000_000_000).tolist()
+    np.testing.assert_allclose(table.values["gyro_x"], np.degrees(truth.rate[:, 0]), rtol=1e-15)
+    (note,) = (n for n in table.notes if n.code == "N-SYNTHTIME")
+    assert note.detail == "no times are read: messages counted at 100 Hz"
+    saved["mcap"]["rate_hz"] = None
+    with pytest.raises(ConfigurationError, match=r"time is missing: .* the sampling rate \(ingest\.mcap\.rate_hz\)"):
+        mcap_format(saved)
+    savemat(log, {"acc": truth.force, "gyr": truth.rate[:-2]})
+    fields = saved["mcap"]["topics"]["/"]
+    apart = {f"/{s}": {c: e for c, e in fields.items() if c[:3] == s} for s in ("acc", "gyr")}
+    with pytest.raises(IngestError, match="counts the messages of topics of one length"):
+        read_log(log, mcap_format({"mcap": {"rate_hz": 100.0, "topics": apart}}))
 
 
 def test_a_log_without_readings_is_told_what_it_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
