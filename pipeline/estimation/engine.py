@@ -273,9 +273,9 @@ def assess_noise(
     have separate lines in the budget. The directions in which these errors exceed white noise are then projected out
     of all channels.
 
-    ``residuals``: (n, 3). ``design``: (n, p), the fitted columns of all channels. ``disturbance``: (3 m, 3 m), channel
-    by channel: covariance of the sums over the blocks by the stated errors of the table. Raises ``NotObservableError``
-    if there are no more samples than parameters.
+    ``residuals``: (n, 3). ``design``: (n, p), the fitted columns of all channels. ``disturbance``: (3 m, r), channel by
+    channel: change of the sums over the blocks by r independent errors of the table, each of standard uncertainty 1.
+    Raises ``NotObservableError`` if there are no more samples than parameters.
     """
     count = blocks.weight[:, None]
     spare = len(count) - design.shape[1]
@@ -317,31 +317,44 @@ def noise_outside_known_errors(  # noqa: PLR0917  (what a restricted likelihood 
     ``assess_noise``; directions in which it exceeds white noise are not used. ``row_weight``: (n,), samples of each
     row.
     """
-    count = blocks.weight[:, None]
-    scale = np.outer(white, np.sqrt(count)).ravel()
-    U, s, _ = np.linalg.svd(columns.reshape(len(scale), -1))
-    basis = U[:, int(np.sum(s > AVERAGED_OUT * s[0])) :]
-    variances, directions = np.linalg.eigh(basis.T @ (disturbance / np.outer(scale, scale)) @ basis)
-    basis = basis @ directions[:, : max(int(np.sum(variances <= 1.0)), 1)]
-    z = basis.T @ (np.sqrt(count) * means / white).T.ravel()
-    logarithm, squares = _in_subspace(basis, z, blocks, settings)
-    variance = np.maximum(squares / len(z), np.finfo(float).tiny)[:, None]
-    noise = ResidualNoise.of(blocks, settings, logarithm, variance, len(z), row_weight)
+    root = np.sqrt(blocks.weight)
+    scale = np.outer(white, root).ravel()
+    U, s, _ = np.linalg.svd(columns.reshape(len(scale), -1), full_matrices=False)
+    X = U[:, s > AVERAGED_OUT * s[0]]
+    errors = disturbance / scale[:, None]
+    errors -= X @ (X.T @ errors)
+    directions, sizes, _ = np.linalg.svd(errors, full_matrices=False)
+    known = min(int(np.sum(sizes > 1.0)), len(scale) - X.shape[1] - 1)  # at least one direction is used
+    X = np.column_stack([X, directions[:, :known]])
+    y = (root * (means / white).T).ravel()
+    logarithm, squares = _outside(X, y - X @ (X.T @ y), blocks, settings)
+    free = len(scale) - X.shape[1]
+    variance = np.maximum(squares / free, np.finfo(float).tiny)[:, None]
+    noise = ResidualNoise.of(blocks, settings, logarithm, variance, free, row_weight)
     return replace(noise, white_variance=noise.white_variance * white**2)
 
 
-def _in_subspace(basis: Values, z: Values, blocks: Blocks, settings: Sequence[Setting]) -> tuple[Values, Values]:
-    """Return log det and weighted squares of ``z ~ N(0, I + q E)`` in a subspace that mixes the channels, dense."""
+def _outside(X: Values, y: Values, blocks: Blocks, settings: Sequence[Setting]) -> tuple[Values, Values]:
+    """Return log det and weighted squares of ``y ~ N(0, I + q E)`` in the directions orthogonal to X.
+
+    They are ``log det C + log det(X^T C^-1 X)`` and ``y^T P y``, of all channels together. E, the covariance of the
+    bias, is the same for each channel, so that one decomposition of a correlation time serves all channels and ratios.
+    ``X``: (3 m, k), orthonormal. ``y``: (3 m,), orthogonal to X.
+    """
     root = np.sqrt(blocks.weight)
     logarithm, squares = np.empty(len(settings)), np.empty(len(settings))
-    channels = basis.reshape(3, len(root), -1)
+    channels = np.column_stack([X, y]).reshape(3, len(root), -1)
     for tau in {s.time for s in settings}:
-        R = root[:, None] * blocks.covariance(tau) * root
-        e, U = np.linalg.eigh(np.einsum("cbi,cbj->ij", channels, R @ channels, optimize=True))
+        e, V = np.linalg.eigh(root[:, None] * blocks.covariance(tau) * root)
+        columns = np.ascontiguousarray((V.T @ channels).transpose(2, 0, 1))
         chosen = [k for k, s in enumerate(settings) if s.time == tau]
         spectrum = 1.0 + np.outer([settings[k].ratio ** 2 for k in chosen], np.clip(e, 0.0, None))
-        logarithm[chosen] = np.log(spectrum).sum(axis=1)
-        squares[chosen] = (1.0 / spectrum) @ (U.T @ z) ** 2
+        whitened = (columns / np.sqrt(spectrum)[:, None, None, :]).reshape(len(chosen), len(columns), -1)
+        products = whitened @ whitened.transpose(0, 2, 1)
+        products[:, -1, -1] += np.finfo(float).tiny  # readings without noise
+        pivots = np.einsum("gkk->gk", np.linalg.cholesky(products))
+        logarithm[chosen] = 3.0 * np.log(spectrum).sum(axis=1) + 2.0 * np.log(pivots[:, :-1]).sum(axis=1)
+        squares[chosen] = pivots[:, -1] ** 2
     return logarithm, squares
 
 

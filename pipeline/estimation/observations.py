@@ -122,7 +122,7 @@ class Observations:
 
     @cached_property
     def long_blocks(self) -> Blocks:
-        """Longer stretches, so few that all three axes can have one dense covariance."""
+        """Longer stretches, so few that the covariance of their bias can be dense."""
         return self._blocks(float("inf"))
 
     def _blocks(self, longest: float) -> Blocks:

@@ -62,7 +62,7 @@ class Reference:
     K: Values  # (3, 3)
     table: Mapping[str, Any]
 
-    def summed(self, fit: LinearMap, change: Callable[[Motion], Values | None], inputs: int) -> Values:
+    def summed(self, fit: LinearMap | BlockSums, change: Callable[[Motion], Values | None], inputs: int) -> Values:
         """Return the change of the parameters by inputs that change the truth: (p, inputs) array.
 
         ``change``: motion to the derivative of the truth, (n, 3, inputs), or None if it does not change.
@@ -76,29 +76,73 @@ class Reference:
                 total += np.stack([rows.of(du[:, :, j] @ self.K.T) for j in range(inputs)], axis=1)
         return total
 
-    def of_one(self, fit: LinearMap, motion: Motion, du: Values) -> Values:
+    def of_one(self, fit: LinearMap | BlockSums, motion: Motion, du: Values) -> Values:
         """Return the change of the parameters by inputs of one recording; ``du``: (n, 3, inputs), as in ``summed``."""
         return self.summed(fit, lambda other: du if other is motion else None, du.shape[2])
+
+
+@dataclass(frozen=True)
+class BlockSums:
+    """The linear map from changes of the readings to the sums over blocks of consecutive rows, channel by channel."""
+
+    label: Index  # (n,); block of each row
+    blocks: int  # m
+    weight: Values  # (n,); samples of each row
+
+    @property
+    def parameters(self) -> int:
+        """Number of sums of all channels."""
+        return 3 * self.blocks
+
+    def rows(self, rows: slice) -> BlockSums:
+        """Return the map from some consecutive readings."""
+        return BlockSums(self.label[rows], self.blocks, self.weight[rows])
+
+    def of(self, change: Values) -> Values:
+        """Return the change of the sums by a change of the readings, (n, 3): (3 m,) array."""
+        return self.of_groups(change, np.zeros(len(change), np.intp), 1)[:, 0]
+
+    def of_groups(self, change: Values, group: Index, count: int) -> Values:
+        """Return the change of the sums by the change of each of ``count`` groups of readings: (3 m, count) array."""
+        place = self.label * count + group
+        sums = [np.bincount(place, self.weight * dy, self.blocks * count) for dy in change.T]
+        return np.asarray(np.concatenate(sums), np.float64).reshape(-1, count)
 
 
 def type_b(  # noqa: PLR0917  (the columns of a budget's line)
     source: str, distribution: str, u: float, unit: str, effect: Values, remark: str = ""
 ) -> Contribution:
     """Return the contribution of m independent inputs of standard uncertainty u; ``effect``: (p, m) array."""
-    effect = np.where(np.abs(effect) > ROUNDING * np.abs(effect).max(initial=0.0), effect, 0.0)
+    effect = _without_rounding(effect)
     covariance = u**2 * effect @ effect.T
     freedom = np.full(len(effect), np.inf)
     return Contribution(source, "B", distribution, covariance, freedom, u, unit, effect.shape[1], remark=remark)
 
 
+def _without_rounding(effect: Values) -> Values:
+    """Return the effect of inputs on parameters with zeros in place of values that are rounding."""
+    return np.where(np.abs(effect) > ROUNDING * np.abs(effect).max(initial=0.0), effect, 0.0)
+
+
 def table_errors(
-    reference: Reference, fit: LinearMap, estimated: Sequence[str] = ()
+    reference: Reference, fit: LinearMap | BlockSums, estimated: Sequence[str] = ()
 ) -> tuple[list[Contribution], dict[str, str]]:
     """Return the contribution of each stated accuracy to the parameters of a fit, and reasons for those not included.
 
     ``estimated``: effects of the fit; an error that one of them estimates is not an input any more.
     """
-    lines, missing = [], {}
+    stated, missing = _stated_errors(reference, fit, estimated)
+    return [type_b(source, NORMAL, u, unit, effect) for source, u, unit, effect in stated], missing
+
+
+def _stated_errors(
+    reference: Reference, fit: LinearMap | BlockSums, estimated: Sequence[str] = ()
+) -> tuple[list[tuple[str, float, str, Values]], dict[str, str]]:
+    """Return source, accuracy, its unit and the change of the parameters, (p, inputs), of each stated accuracy.
+
+    And reasons for those not included.
+    """
+    stated, missing = [], {}
     setups = {motion.setup for motion in reference.motions}
     for source, key, unit, sensors, replaced_by, inputs, change in ACCURACIES:
         if reference.sensor not in sensors:
@@ -115,26 +159,27 @@ def table_errors(
                 by_input = _rate_of_each(reference, fit)
             else:
                 by_input = reference.summed(fit, partial(change, reference), inputs)
-            lines.append(type_b(source, NORMAL, float(u), unit, by_input))
-    return lines, missing
+            stated.append((source, float(u), unit, by_input))
+    return stated, missing
 
 
 def disturbance(
     reference: Reference, residuals: Values, blocks: Blocks, weight: Values | None = None, white: Values | None = None
 ) -> Values | None:
-    """Return the covariance of sums over blocks by the stated accuracies, or None if it is small against the noise.
+    """Return the change of sums over blocks by the errors of the table, or None if it is small against the noise.
 
     ``residuals``: (n, 3). ``weight``: (n,), samples of each row; None: rows are samples. ``white``: (3,), noise of a
-    sample; None: from the residuals. The covariance is (3 b, 3 b), channel by channel.
+    sample; None: from the residuals. Returns F, (3 m, r), channel by channel, for r independent errors of standard
+    uncertainty 1: the sums have the covariance ``F F^T``.
     """
     if white is None:
         white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
     if not 0.0 < white.min() < _largest(reference) * np.sqrt(blocks.weight.max()):
         return None
-    sums = np.zeros((len(blocks.weight), len(residuals)))
-    sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0 if weight is None else weight
-    lines, _ = table_errors(reference, LinearMap((sums, sums, sums), ()).first())
-    return np.sum([line.covariance for line in lines], axis=0) if lines else None
+    rows = len(residuals)
+    sums = BlockSums(blocks.label(rows), len(blocks.weight), np.ones(rows) if weight is None else weight)
+    stated, _ = _stated_errors(reference, sums)
+    return np.column_stack([u * _without_rounding(effect) for _, u, _, effect in stated]) if stated else None
 
 
 def noise_on_table(
@@ -173,7 +218,7 @@ def _without(source: str, key: str, reference: Reference) -> str:
     return f"table.{key} is not stated" if table.get(key) is None else ""
 
 
-def _angle(reference: Reference, fit: LinearMap) -> Values:
+def _angle(reference: Reference, fit: LinearMap | BlockSums) -> Values:
     """Return the change of the parameters by an error of each stop's angle: (p, stops) array."""
     before, after, stop, count = errors_of_stops(reference.sensor, reference.motions, reference.K)
     at_stops = fit.of_groups(before, stop, count + 1) + fit.of_groups(after, stop + 1, count + 1)
@@ -227,7 +272,7 @@ def between_stops(angle: Values, rate: Values) -> tuple[Index, Values, Values, i
     return stop, (angle - stops[stop]) * slope, slope, len(stops)
 
 
-def _turned(reference: Reference, fit: LinearMap, motion: Motion) -> Values:
+def _turned(reference: Reference, fit: LinearMap | BlockSums, motion: Motion) -> Values:
     """Return the change of the parameters by a rotation of one recording about each axis, per deg: (p, 3) array."""
     u = truth(reference.sensor, motion)
     du = np.stack([-np.radians(u @ about.T) for about in ABOUT], axis=2)
@@ -247,7 +292,7 @@ def _rate(reference: Reference, motion: Motion) -> Values | None:
     return du
 
 
-def _rate_of_each(reference: Reference, fit: LinearMap) -> Values:
+def _rate_of_each(reference: Reference, fit: LinearMap | BlockSums) -> Values:
     """Return the change of the parameters by a relative error of the rate in each recording: (p, recordings) array.
 
     A motor without an encoder loses steps in fast turns, so that recordings about one axis have different errors.

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
 from scipy.special import ndtr, stdtrit
+from scipy.stats import multivariate_normal
 
-from pipeline.estimation.engine import Posterior, assess_noise
-from pipeline.estimation.gauss_markov import Blocks, Prior
+from pipeline.estimation.engine import Posterior, assess_noise, noise_outside_known_errors
+from pipeline.estimation.gauss_markov import Blocks, Prior, Setting
 
 
 def test_one_candidate_keeps_its_covariance_and_its_degrees_of_freedom() -> None:
@@ -59,3 +61,48 @@ def test_white_noise_is_not_underestimated_where_most_blocks_are_used_up_by_para
         seen.append(float(np.mean(noise.white**2)))
     # four contrasts a channel: the relative standard deviation of a mean of 180 is sqrt(2 / 4 / 180), 5 %
     assert np.mean(seen) == pytest.approx(sigma**2, rel=0.2)
+
+
+@pytest.mark.parametrize(("size", "hidden"), [(1e4, 5), (30.0, 5), (0.3, 4), (0.03, 0)])
+def test_hypotheses_have_the_weight_of_the_density_in_directions_without_known_errors(size: float, hidden: int) -> None:
+    """Against the normal density of the readings in an explicit basis of those directions."""
+    rng, m = np.random.default_rng(5), 9
+    count, start = rng.integers(3, 9, m).astype(float), 20.0 * np.arange(m)
+    blocks = Blocks(np.zeros(m, np.intp), count, start, np.full(m, 15.0), np.repeat([0, 1], [5, 4]))
+    settings = [Setting(r, tau, p) for tau in (5.0, 60.0) for r, p in ((0.0, -1.0), (0.3, 0.0), (2.0, 0.5))]
+    white, root = np.array([1.0, 2.0, 0.5]), np.sqrt(count)
+    scale = np.outer(white, root).ravel()
+    columns = rng.standard_normal((3, m, 4))
+    columns[:, :, 3] = columns[:, :, 0]  # a column that others explain
+    errors = size * scale[:, None] * rng.standard_normal((3 * m, 5))
+    means = rng.standard_normal((m, 3)) * white + (errors @ rng.standard_normal(5) / scale**2).reshape(3, m).T * white
+    noise = noise_outside_known_errors(columns, means, blocks, settings, white, errors)
+
+    basis = null_space(columns.reshape(3 * m, 4)[:, :3].T)
+    inside = np.linalg.svd(basis.T @ (errors / scale[:, None]))
+    assert np.count_nonzero(inside[1] > 1.0) == hidden
+    basis = basis @ inside[0][:, hidden:]
+    z = basis.T @ (means.T / white[:, None] * root).ravel()
+    score = []
+    for setting in settings:
+        one = np.eye(m) + setting.ratio**2 * np.outer(root, root) * blocks.covariance(setting.time)
+        covariance = basis.T @ np.kron(np.eye(3), one) @ basis
+        variance = float(z @ np.linalg.solve(covariance, z)) / len(z)
+        score.append((multivariate_normal(cov=variance * covariance).logpdf(z) + setting.prior, variance))
+    density, variances = np.array(score).T
+    weight = np.exp(density - density.max())
+    assert noise.settings == settings
+    np.testing.assert_allclose(noise.weight, weight / weight.sum(), rtol=1e-9)
+    np.testing.assert_allclose(noise.white_variance, np.outer(variances, white**2), rtol=1e-9)
+    assert noise.spare == len(z)
+
+
+def test_one_direction_is_left_where_known_errors_exceed_the_noise_in_all() -> None:
+    m = 4
+    blocks = Blocks(np.arange(m), np.ones(m), np.arange(m, dtype=float), np.zeros(m), np.zeros(m, int))
+    means = np.random.default_rng(2).standard_normal((m, 3))
+    columns = np.eye(3 * m)[:, :2].reshape(3, m, 2)
+    errors = np.diag(np.arange(2.0, 2.0 + 3 * m))
+    noise = noise_outside_known_errors(columns, means, blocks, [Setting(0.0, 1.0)], np.ones(3), errors)
+    assert noise.spare == 1
+    np.testing.assert_allclose(noise.white_variance, means[2, 0] ** 2)  # the third reading has the smallest known error

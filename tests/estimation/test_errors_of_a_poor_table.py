@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.engine import LinearMap
+from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.reference_least_squares import fit
 from pipeline.estimation.stages import fit_stage
+from pipeline.estimation.table_errors import Reference, disturbance, table_errors
+from pipeline.model.kinematics import table_motion
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 
@@ -85,3 +89,21 @@ def test_an_accuracy_that_does_not_touch_the_gyroscope_changes_nothing() -> None
     level = {**SETTINGS, "table": {"gravity_g": 1.0, "levelling_deg": 5.0}}
     first, second = (fit("gyroscope", _unit(0)[0], None, settings) for settings in (plain, level))
     np.testing.assert_array_equal(np.asarray(first.covariance), np.asarray(second.covariance))
+
+
+@pytest.mark.parametrize("sensor", ["accelerometer", "gyroscope"])
+def test_the_errors_of_block_sums_have_the_covariance_that_an_explicit_matrix_of_the_sums_gives(sensor: str) -> None:
+    motions = [m for r in _unit(0)[0][:4] if (m := table_motion(r, SETTINGS["table"])) is not None]
+    rows, rng = sum(len(motion.time) for motion in motions), np.random.default_rng(3)
+    weight, each = rng.uniform(1.0, 4.0, rows), 331
+    first = np.arange(0, rows, each)
+    blocks = Blocks(first, np.add.reduceat(weight, first), first * 0.1, np.full(len(first), 30.0), first * 0)
+    sums = np.zeros((len(first), rows))
+    sums[np.arange(rows) // each, np.arange(rows)] = weight
+    K = np.eye(3) + 0.02 * rng.standard_normal((3, 3))
+    reference = Reference(sensor, motions, K, SETTINGS["table"] | {"rate_accuracy": 0.01, "wobble_deg": 0.3})
+    lines, _ = table_errors(reference, LinearMap((sums, sums, sums), ()).first())
+    errors = disturbance(reference, np.zeros((rows, 3)), blocks, weight, np.full(3, 1e-6))
+    assert errors is not None
+    expected = np.sum([line.covariance for line in lines], axis=0)
+    np.testing.assert_allclose(errors @ errors.T, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
