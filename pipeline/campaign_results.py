@@ -91,9 +91,9 @@ class CampaignResults:
         Columns: ``unit, serial, lot, date, status`` ("ok", "failed"), ``error, sensor, method``; for each sensor
         ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
         (g or deg/s), ``_verdict``, ``_selected`` (missing effects, joined by ";"), ``_reason``, ``_answers`` (number of
-        answers in the answer set), ``_implausible``, ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held
-        out); ``pass``; ``left_out`` (rows that no fit uses); ``incomplete`` (stages after the fit that failed, and
-        why); and other columns of ``units.csv``.
+        answers in the answer set), ``_beyond_limits`` (parameters beyond the sensor file's limits), ``_implausible``,
+        ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held out); ``pass``; ``left_out`` (rows that no
+        fit uses); ``incomplete`` (stages after the fit that failed, and why); and other columns of ``units.csv``.
         """
         kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}
         return pd.read_csv(self.folder / "summary.csv", dtype=kinds, keep_default_na=False, na_values=[""])
@@ -106,7 +106,7 @@ class CampaignResults:
         and ``coverage_factor`` (k; the standard uncertainty is expanded_uncertainty / k).
 
         Parameters of ``truth = matrix (reading - bias - effects)``: ``bias_x``, ``matrix_xy``, ``<effect>.<symbol>``.
-        Elements of ``K = matrix^-1``, which a sensor file states: ``scale_factor_error_x`` (``K_xx - 1``) and
+        Elements of ``K = matrix^-1``: ``scale_factor_error_x`` (``K_xx - 1``) and
         ``cross_axis_xy`` (what axis x reads of a truth along y).
         """
         rows = (

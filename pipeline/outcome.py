@@ -125,6 +125,12 @@ def verdict_groups(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
     return [(what, units) for (_, what), units in sorted(groups.items())]
 
 
+def beyond_limits_groups(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
+    """Return the units with a parameter beyond the sensor file's limit, by sensor; ``rows``: of ``summary.csv``."""
+    by_sensor = [(s, [row["unit"] for row in rows if row.get(f"{s}_beyond_limits")]) for s in SENSORS]
+    return [(f"{sensor}, beyond the sensor file's limits", units) for sensor, units in by_sensor if units]
+
+
 def place(verdict: str | None) -> int:
     """Return the index of a verdict in ``Verdict``; an unknown verdict comes last."""
     return [*Verdict, verdict].index(verdict)
@@ -191,6 +197,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         *lines_of(verdict_groups(findings)),
     ]
     lines += _reasons(results, [row["unit"] for row in rows])
+    lines += lines_of(beyond_limits_groups(rows))
     lines += lines_of(_not_in_uncertainty(rows).items())
     for column, words in (("left_out", "left out"), ("incomplete", "not complete")):
         lines += first([f"{r['unit']}, {words}: {what}" for r in rows if (what := r.get(column))], NAMED, "units")

@@ -16,7 +16,7 @@ from pipeline.exports.conversion import explain_board, explain_calibration
 from pipeline.exports.reading import counts_of, read_any
 from pipeline.files import read_json
 from pipeline.history import read_history
-from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
+from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, left_out, sentences
 from pipeline.outcome import (
     DIAGNOSIS_FAILED,
     NOT_CONVERGED,
@@ -116,6 +116,11 @@ def explain(folder: Path, diagnoses: dict[str, JSON], failures: dict[str, JSON])
             "commands": {s: commands_of(document.get(s) or {}, s, name, settings, results) for s in SENSORS},
             "notes": [
                 *(line for s in SENSORS for line in sentences(s, calibration.get(s))),
+                *(
+                    f"{s.capitalize()}, beyond the sensor file's limits: {names}."
+                    for s in SENSORS
+                    if (names := beyond_words(calibration.get(s)))
+                ),
                 *(
                     f"U of the {s} does not include {source}: {reason}."
                     for s in SENSORS

@@ -16,6 +16,9 @@ A parameter p with the expanded uncertainty U and the sensor file's limit L is i
 
     |p| - 2 U > max(4 L, F)
 
+and beyond the sensor file's limit where ``|p| > L``: one list, ``beyond_limits``, which the run stores and all pages,
+the summary, the certificate and the terminal show.
+
 A data sheet states L as a bound, or as one standard deviation. Four of these are exceeded by a good sensor's 12
 parameters in 12 * 6.3e-5 = 0.08 % of units; 2 U are four standard uncertainties. F is what a low-cost sensor is allowed
 (MPU-6000/6050 product specification 3.4, relative to its range): the sheet of a better one holds for its own mounting
@@ -30,7 +33,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.errors import ConfigurationError, InputError, MissingInputError, first
 from pipeline.io.files import not_regular
 from pipeline.model.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.model.effects import effect_of
@@ -263,6 +266,7 @@ FACTORS = {
         1.0 / 6.0: "in revolutions a minute, and read as deg/s",
     },
 }
+NAMED = 5  # parameters beyond the limits that a line names
 RANGES = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
 OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
 OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
@@ -280,21 +284,49 @@ def implausible(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str
     ``likely_cause``.
     """
     entries = [
-        {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit,
-         "likely_cause": cause}
-        for name, value, uncertainty, unit, limit, floor, cause in (
-            *_of_bias_and_matrix(sensor, part, sensor_config), *_of_effects(sensor, part, sensor_config["effects"])
-        )
-        if abs(value) - 2.0 * uncertainty > max(MULTIPLE * limit, floor)
-    ]  # fmt: skip
+        _entry(row) | {"likely_cause": row[-1]}
+        for row in _limited(sensor, part, sensor_config)
+        if abs(row[1]) - 2.0 * row[2] > max(MULTIPLE * row[4], row[5])
+    ]
     return sorted(entries, key=lambda entry: -entry["ratio"])
+
+
+def beyond_limits(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> list[Entry]:
+    """Return the fitted parameters whose absolute value exceeds the sensor file's limit, the largest ratio first.
+
+    Parameters as of ``implausible``; an entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
+    """
+    entries = [_entry(row) for row in _limited(sensor, part, sensor_config) if abs(row[1]) > row[4]]
+    return sorted(entries, key=lambda entry: -entry["ratio"])
+
+
+def beyond_words(part: Mapping[str, Any] | None) -> str:
+    """Return the entries of ``beyond_limits`` in a calibration in words: ``bias y (250 %), ...``; empty for none."""
+    entries = (part or {}).get("beyond_limits") or []
+    return ", ".join(first([f"{_plain(e)} ({100.0 * e['ratio']:.3g} %)" for e in entries], NAMED))
+
+
+def _entry(row: Row) -> Entry:
+    name, value, _, unit, limit, *_ = row
+    return {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit}
+
+
+def _limited(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> Iterator[Row]:
+    """Yield the rows of all parameters that the sensor file limits."""
+    yield from _of_bias_and_matrix(sensor, part, sensor_config)
+    yield from limited_effects(sensor, part, sensor_config["effects"])
+
+
+def without_rotation(matrix: Values) -> Values:
+    """Return P of ``matrix^-1 = P R``: (3, 3) symmetric array."""
+    K = np.linalg.inv(matrix)
+    squares, axes = np.linalg.eigh(K @ K.T)
+    return np.asarray((axes * np.sqrt(squares)) @ axes.T)
 
 
 def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> Iterator[Row]:
     """Yield the rows of biases, scale factors and cross-axis sensitivities."""
-    K = np.linalg.inv(np.array(part["matrix"], float))
-    squares, axes = np.linalg.eigh(K @ K.T)
-    P = (axes * np.sqrt(squares)) @ axes.T
+    K, P = np.linalg.inv(np.array(part["matrix"], float)), without_rotation(np.array(part["matrix"], float))
     spread = part["expanded_uncertainty"]
     of_matrix = np.abs(K) @ np.array(spread["matrix"], float) @ np.abs(K)  # dK = -K dM K
     floor, unit = LOW_COST_BIAS[sensor] * sensor_config["full_scale"], SENSOR_UNITS[sensor]
@@ -308,9 +340,9 @@ def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], sensor_config: Map
         yield name, float(P[i, j]), float(of_matrix[i, j]), "1", limit, LOW_COST_CROSS, OF_CROSS_AXIS
 
 
-def _of_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, float]) -> Iterator[Row]:
-    """Yield the rows of the effects' parameters that have an uncertainty and a limit."""
-    for entry in part["effects"]:
+def limited_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, float]) -> Iterator[Row]:
+    """Yield the rows of the effects' parameters that have an uncertainty and a limit; ``limits``: of the effects."""
+    for entry in part.get("effects") or []:
         try:
             effect = effect_of(FittedEffect(entry["name"], entry["parameters"], entry.get("definition")))
         except ConfigurationError:

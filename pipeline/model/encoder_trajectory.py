@@ -120,9 +120,9 @@ class EncoderTrajectory:
     def _rounding(self) -> Values:
         """Return the largest errors of each interval by the printed digits, or the counts, of angle and rate.
 
-        With the steps A and r, dA is wrong by up to A, its value by the rates by r dt / 2 and the acceleration by r / dt.
-        At a constant rate the errors may all be equal, so that the median excess does not show them. An exact log has
-        steps too if all stretches last multiples of a time g: r = a g and A = a g^2 / 2 = r^2 / (2 a).
+        With the steps A and r, dA is wrong by up to A, its value by the rates by r dt / 2, and the acceleration by
+        r / dt. At a constant rate the errors may all be equal, so that the median excess does not show them. An exact
+        log has steps too if all stretches last multiples of a time g: r = a g and A = a g^2 / 2 = r^2 / (2 a).
 
         (2, n - 1) array: of the excess, deg, and of the acceleration, deg/s^2; zeros for a log that is not rounded.
         """

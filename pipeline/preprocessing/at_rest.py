@@ -312,26 +312,30 @@ def _check_spans(recording: Recording) -> None:
     rate, axis = recording.logged_rate, axis_index(recording)
     if rate is None:
         return
-    stuck: list[tuple[str, float, float, str]] = []  # channel, its span, the required one, unit
+    stuck: list[tuple[str, float, str, str]] = []  # channel, its span, the required one with its unit, the rows
     if recording.gyroscope is not None:
         required, spans = _span(rate), [_span(w) for w in recording.gyroscope.T]
         turned_other = max(spans) >= SPANNED * required and int(np.argmax(spans)) != axis  # see check_mounting
         if required > LEAST_RATE_DPS and spans[axis] < SPANNED * required and not turned_other:
-            stuck.append((TRIADS["gyroscope"][axis], spans[axis], required, "deg/s"))
+            stuck.append((TRIADS["gyroscope"][axis], spans[axis], f"{required:.3g} deg/s", "the rows"))
     angle = recording.table_angle
     if angle is None:
         angle = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))
     if recording.accelerometer is not None and np.ptp(angle) >= HALF_TURN_DEG:
-        spans, across = [_span(f) for f in recording.accelerometer.T], [(axis + 1) % 3, (axis + 2) % 3]
+        turns = np.abs(np.diff(angle, prepend=angle[0])) > RATE_AT_REST_DPS * recording.interval
+        rows = turns if turns.sum() >= FEWEST else np.ones(len(angle), bool)  # rests may be most of the time
+        spans = [_span(f) for f in recording.accelerometer[-len(angle) :][rows].T]
+        across = [(axis + 1) % 3, (axis + 2) % 3]
         # Not in a turn about the vertical or about another axis: see check_mounting.
         if max(spans[i] for i in across) >= LEVEL_G >= spans[axis]:
-            stuck += [(TRIADS["accelerometer"][i], spans[i], 1.0, "g") for i in across if spans[i] < SPANNED]
-    for channel, span, required, unit in stuck:
+            which = "the rows in which the table turns"
+            stuck += [(TRIADS["accelerometer"][i], spans[i], "1 g", which) for i in across if spans[i] < SPANNED]
+    for channel, span, required, which in stuck:
         raise refusal(
             recording,
             "stuck",
-            f"{channel} stays within {span:.3g} {unit} in nine tenths of the rows, while the table's motion about "
-            f"{recording.axis} makes it vary by {required:.3g} {unit}",
+            f"{channel} stays within {span:.3g} {required.partition(' ')[2]} in nine tenths of {which}, while the "
+            f"table's motion about {recording.axis} makes it vary by {required}",
             "is the column right, and does this axis of the sensor work?",
         )
 

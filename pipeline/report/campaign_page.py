@@ -2,7 +2,7 @@
 
 Strip plots show fitted parameters as a share of the sensor file's limit, ``value / limit``, with one dot for each of
 the siblings: units of one sensor model that were calibrated by one method. A row is a parameter of the measurement:
-bias, error of a scale factor, or cross-axis sensitivity.
+bias, error of a scale factor, or cross-axis sensitivity. Which are beyond the limit is counted by the calibrations.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.outcome import findings_of, next_commands, verdict_groups
+from pipeline.outcome import beyond_limits_groups, findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart, sentences
 from pipeline.report.fleet import parameter_table, wide
 from pipeline.report.held_out_section import FAR
 from pipeline.report.numbers import number, percent, plain, unit_text
 from pipeline.report.pages import script_data, template
-from pipeline.report.parameters import COLUMNS, CROSS_AXIS
+from pipeline.report.parameters import COLUMNS
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def render(
         far_shown=FAR_SHOWN,
         far=FAR,
         causes=sorted(causes.items(), key=lambda cause: -len(cause[1])),
-        found=verdict_groups(findings) + _beyond_limits(fitted) + _not_held_out(rows),
+        found=verdict_groups(findings) + beyond_limits_groups(rows) + _not_held_out(rows),
         commands=next_commands(findings, settings or {"campaign": campaign}),
         history=history,
         history_data=script_data({"units": history["units"]}) if history else None,
@@ -110,16 +110,6 @@ def render(
         page=page,
     )
     return text
-
-
-def _beyond_limits(parameters: pd.DataFrame) -> list[tuple[str, list[str]]]:
-    """Return the units with a parameter beyond a limit of the sensor file, by sensor.
-
-    Cross-axis terms are left out, because they may contain the mounting of a unit on a table.
-    """
-    others = parameters[~parameters["parameter"].str.contains(CROSS_AXIS)]
-    beyond = others[others["value"].abs() > others["limit"]].groupby("sensor")["unit"].unique()
-    return [(f"{sensor}, beyond the sensor file's limits", list(units)) for sensor, units in beyond.items()]
 
 
 def _not_held_out(rows: Sequence[JSON]) -> list[tuple[str, list[str]]]:
@@ -259,8 +249,8 @@ def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[UnitChart]:
 
 def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.DataFrame) -> UnitChart:
     """Return the plot of some siblings and the text of each dot; ``table``: their parameters with limits."""
-    frames = wide(table, [units[i] for i in numbers], "label", "value", "limit")
-    labels, (value, limit) = [*frames[0]], (frame.to_numpy(float) for frame in frames)
+    frames = wide(table, [units[i] for i in numbers], "label", "value", "limit", "beyond")
+    labels, (value, limit, marked) = [*frames[0]], (frame.to_numpy(float) for frame in frames)
     measures = dict(zip(table["label"], map(unit_text, table["measure"]), strict=True))
     share = value / limit
     height = len(labels) - np.arange(len(labels), dtype=float)  # the first row on top
@@ -272,7 +262,7 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
         drawn &= (rank < ENDS) | (rank >= drawn.sum(axis=0) - ENDS)
         ends = np.nanquantile(share, [0.05, 0.95], axis=0).T
         layers += [_bar(each, row - HALF, row + HALF, 3) for row, each in zip(height, ends, strict=True)]
-    beyond, values, legend = np.abs(share) > 1.0, {}, []
+    beyond, values, legend = marked == 1.0, {}, []
     dots: list[Layer] = []
     for chosen, colour, words in ((drawn & ~beyond, 2, "within the limit"), (drawn & beyond, 0, "beyond the limit")):
         i, j = np.nonzero(chosen)

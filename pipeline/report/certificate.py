@@ -161,6 +161,7 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
             "laboratory": stated["environment"],
         },
         "results": _quantities(part),
+        "beyondLimits": part.get("beyond_limits") or [],
         "uncertaintyBudget": part.get("uncertainty_budget"),
         "beforeAdjustment": {k: first.get(k) for k in ERRORS} if first else None,
         "afterAdjustment": {k: last.get(k) for k in ERRORS} if last else None,

@@ -386,7 +386,7 @@ def _sensor_with_prior(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSO
         "probability": prior.probability,
     }
     return replace(after, budget=budget).to_json() | {
-        key: value for key, value in part.items() if key.startswith("implausible")
+        key: value for key, value in part.items() if key.startswith(("implausible", "beyond"))
     }, added
 
 

@@ -135,7 +135,7 @@ def _evidence(entry: JSON) -> float:
 def _ranking_row(entry: JSON, selected: Sequence[str]) -> Point:
     value, alike, chosen = _evidence(entry), entry.get("look_alikes") or [], entry["effect"] in selected
     beyond = value > GATE and not entry.get("plausible", True)
-    label = plain(entry["effect"]) + ", selected" * chosen + ", beyond the sensor file's limits" * beyond
+    label = plain(entry["effect"]) + ", selected" * chosen + ", departs from the data sheet" * beyond
     note = "like " + ", ".join(f"{plain(a['effect'])} {percent(a['share'])}" for a in alike) if alike else ""
     return Point(label, value, 2 if chosen else 4 if value > GATE else 3, note=note)
 

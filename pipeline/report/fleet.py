@@ -53,7 +53,7 @@ SIBLINGS = ["sensor", "method"]
 def parameter_table(units: Mapping[str, Sequence[Sequence[Any]]]) -> pd.DataFrame:
     """Return the parameters of some units (``unit_parameters``) as one table: ``unit`` and ``PARAMETERS``."""
     rows = [(unit, *row) for unit, of_unit in units.items() for row in of_unit]
-    kinds = dict.fromkeys(("value", "u", "U", "limit"), float) | {"fitted": bool}
+    kinds = dict.fromkeys(("value", "u", "U", "limit"), float) | {"beyond": bool, "fitted": bool}
     return pd.DataFrame(rows, columns=["unit", *PARAMETERS]).astype(kinds)
 
 

@@ -1,10 +1,13 @@
 """The fitted parameters of a sensor with their uncertainties, and the row of a unit in the tables of the campaign.
 
-The calibration file contains the matrix M of ``truth = M (reading - bias - effects)``. A sensor file states scale
-factor errors and cross-axis sensitivities, which are elements of ``K = M^-1`` in ``reading = bias + K truth +
-effects``:
+The calibration file contains the matrix M of ``truth = M (reading - bias - effects)``. Scale factor errors and
+cross-axis terms are elements of ``K = M^-1`` in ``reading = bias + K truth + effects``:
 
     dK = -K dM K,    cov(K) = J cov(M) J^T,    J = K (x) K^T    (rows of M one after the other)
+
+A sensor file limits those of ``K = P R`` without the rotation R of the unit: P is symmetric, ``P P = K K^T``, and
+
+    P dP + dP P = dK K^T + K dK^T
 
 In a row of the tables, the columns of every campaign (``COLUMNS``) come first, then the other columns of ``units.csv``.
 If such a column has the name of one in ``COLUMNS``, it gets the prefix ``sheet_``.
@@ -16,29 +19,27 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.errors import first
 from pipeline.estimation.candidates import is_held
-from pipeline.model.calibration_file import beyond_uncertainty, left_out
+from pipeline.model.calibration_file import beyond_uncertainty, left_out, limited_effects, without_rotation
 from pipeline.records import AXES, SENSORS
 from pipeline.report.held_out_section import first_and_last_step, passes
-from pipeline.report.numbers import percent, plain
+from pipeline.report.numbers import plain
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable
 
 JSON = dict[str, Any]
-CROSS_AXIS = "cross_axis"  # elements of K outside its diagonal, as a sensor file limits them
-NAMED = 5  # parameters beyond the limits of the sensor file that a page lists at its top
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
 SENSOR_COLUMNS = (
     "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
     "answers",
 )  # fmt: skip
-OF_CALIBRATION = tuple(f"{s}_{c}" for c in ("implausible", "not_in_uncertainty", "not_held_out") for s in SENSORS)
+KINDS = ("beyond_limits", "implausible", "not_in_uncertainty", "not_held_out")
+OF_CALIBRATION = tuple(f"{s}_{c}" for c in KINDS for s in SENSORS)
 OF_UNIT = ("left_out", "incomplete")  # ``incomplete``: written by ``gather``, which knows what no stage could make
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT)
-PARAMETERS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "fitted")
+PARAMETERS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "beyond", "fitted")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
 
@@ -93,61 +94,73 @@ def fitted_parameters(part: JSON) -> list[Parameter]:
 
 
 def reading_errors(part: JSON) -> list[Parameter]:
-    """Return the elements of K that a sensor file limits, from a sensor's part of a calibration.
+    """Return the elements of K, from a sensor's part of a calibration.
 
     ``scale_factor_error_x`` is ``K_xx - 1``; ``cross_axis_xy`` is ``K_xy``, the reading of axis x for a truth along y.
     Each has the coverage factor of the same element of the matrix.
     """
     K = np.linalg.inv(np.array(part["matrix"], float))
+    element = _elements(part, K, np.kron(K, K.T))
+    scale = [element(f"scale_factor_error_{a}", i, i) for i, a in enumerate(AXES)]
+    return scale + [
+        element(f"cross_axis_{a}{b}", i, j) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
+    ]
+
+
+def sensor_errors(part: JSON) -> list[Parameter]:
+    """Return the elements of P, which a sensor file limits, named as in ``beyond_limits`` of a calibration."""
+    M = np.array(part["matrix"], float)
+    K, P = np.linalg.inv(M), without_rotation(M)
+    sizes, axes = np.linalg.eigh(P)
+    of_K = -np.einsum("ia,bj->abij", K, K).reshape(9, 3, 3)  # dK for each element of dM
+    changes = axes.T @ (of_K @ K.T + K @ of_K.transpose(0, 2, 1)) @ axes
+    J = (axes @ (changes / np.add.outer(sizes, sizes)) @ axes.T).reshape(9, 9).T
+    element = _elements(part, P, J)
+    scale = [element(f"scale_factor_{a}", i, i) for i, a in enumerate(AXES)]
+    return scale + [element(f"cross_axis_{AXES[i]}{AXES[j]}", i, j) for i, j in ((0, 1), (0, 2), (1, 2))]
+
+
+def _elements(part: JSON, matrix: np.ndarray, J: np.ndarray) -> Callable[[str, int, int], Parameter]:
+    """Return a function for the elements of a matrix, less 1 on the diagonal; ``J``: its derivative to M, (9, 9)."""
     k = (part.get("coverage_factor") or NO_UNCERTAINTY)["matrix"]
     covariance = (part.get("covariance") or {}).get("values")
     u: np.ndarray | None = None
     if covariance is not None and k[0][0] is not None:
-        J = np.kron(K, K.T)
         u = np.sqrt(np.clip(np.diag(J @ np.array(covariance, float)[3:12, 3:12] @ J.T), 0.0, None)).reshape(3, 3)
 
-    def element(name: str, value: float, i: int, j: int) -> Parameter:
-        return Parameter(name, float(value), "1", None if u is None else float(k[i][j] * u[i, j]), k[i][j])
+    def element(name: str, i: int, j: int) -> Parameter:
+        U = None if u is None else float(k[i][j] * u[i, j])
+        return Parameter(name, float(matrix[i, j] - (i == j)), "1", U, k[i][j])
 
-    scale = [element(f"scale_factor_error_{a}", K[i, i] - 1.0, i, i) for i, a in enumerate(AXES)]
-    return scale + [
-        element(f"{CROSS_AXIS}_{a}{b}", K[i, j], i, j) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
-    ]
+    return element
 
 
-def parameter_rows(part: JSON, sensor_config: JSON) -> list[JSON]:
+def parameter_rows(sensor: str, part: JSON, sensor_config: JSON) -> list[JSON]:
     """Return bias, scale factor errors, cross-axis terms and effects.
 
-    A row has ``p``, ``name``, ``limit`` (or None) and ``share`` of the limit. ``part``: the sensor's part of the
-    calibration; ``sensor_config``: the sensor's section of the configuration, with the limits.
+    A row has ``p``, ``name``, ``limit`` (or None), ``share`` of the limit, and ``beyond``: whether the calibration
+    counts it as beyond the sensor file's limit. ``part``: the sensor's part of the calibration; ``sensor_config``: the
+    sensor's section of the configuration, with the limits.
     """
-    fitted, effects = fitted_parameters(part), sensor_config.get("effects") or {}
+    fitted = fitted_parameters(part)
+    beyond = {entry["parameter"] for entry in part.get("beyond_limits") or []}
+    limits = {
+        name: limit for name, _, _, _, limit, *_ in limited_effects(sensor, part, sensor_config.get("effects") or {})
+    }
     found = [(p, p.words.capitalize(), sensor_config.get("bias")) for p in fitted[:3]]
-    for p in reading_errors(part):
+    for p in sensor_errors(part):
         kind, _, axes = p.name.rpartition("_")
-        if kind == CROSS_AXIS:
-            found.append((p, f"{axes[0]} reads of {axes[1]}", sensor_config.get(CROSS_AXIS)))
-        else:
-            found.append((p, f"Scale factor error {axes}", sensor_config.get("scale_factor")))
+        name = f"Cross-axis sensitivity {axes}" if kind == "cross_axis" else f"Scale factor error {axes}"
+        found.append((p, name, sensor_config.get(kind)))
     for p in fitted[12:]:
         held = is_held(p.name, {"value": p.value, "unit": p.unit, "standard_uncertainty": p.standard_uncertainty})
         name = f"{p.words} (not determined, fixed at 0)" if held else p.words
-        found.append((p, name, effects.get(p.name.partition(".")[0])))
-    bounds = (limit if isinstance(limit, int | float) and limit > 0 else None for *_, limit in found)
+        found.append((p, name, limits.get(p.name)))
     return [
-        {"p": p, "name": name, "limit": bound, "share": abs(p.value) / bound if bound else 0.0}
-        for (p, name, _), bound in zip(found, bounds, strict=True)
-    ]
-
-
-def beyond_limits(rows: Sequence[JSON], *, mounted: bool) -> list[str]:
-    """Return the parameters beyond the limits of the sensor file with their shares of them, the largest first.
-
-    ``rows``: of ``parameter_rows``; ``mounted``: cross-axis terms contain the mounting on a table, and are left out.
-    """
-    beyond = (row for row in rows if row["share"] > 1.0 and not (mounted and row["p"].name.startswith(CROSS_AXIS)))
-    largest = sorted(beyond, key=lambda row: -row["share"])
-    return first([f"{row['name'].lower()} ({percent(row['share'])})" for row in largest], NAMED)
+        {"p": p, "name": name, "limit": limit or None, "share": abs(p.value) / limit if limit else 0.0,
+         "beyond": p.name in beyond}
+        for p, name, limit in found
+    ]  # fmt: skip
 
 
 def summary_row(
@@ -180,6 +193,8 @@ def summary_row(
         row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
         part = calibration.get(sensor)
         implausible = (part or {}).get("implausible") or []
+        beyond = (part or {}).get("beyond_limits") or []
+        row[f"{sensor}_beyond_limits"] = ";".join(e["parameter"] for e in beyond) or None
         row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
         row[f"{sensor}_not_held_out"] = held_out.get("reason")
         row[f"{sensor}_not_in_uncertainty"] = "; ".join(source for source, _ in beyond_uncertainty(part)) or None
@@ -197,17 +212,19 @@ def sheet_columns(row: JSON) -> dict[str, str]:
 def unit_parameters(calibration: JSON, sensor_configs: JSON) -> list[tuple[Any, ...]]:
     """Return a row with the columns ``PARAMETERS`` for each parameter of a unit; none for a failed unit.
 
-    These are the fitted parameters, and the elements of K that a sensor file limits. ``sensor_configs``: the section
+    These are the fitted parameters, and the elements of P that a sensor file limits. ``sensor_configs``: the section
     ``sensor`` of the configuration.
     """
     rows = []
     for sensor in [s for s in SENSORS if calibration.get(s)]:
         fitted = fitted_parameters(calibration[sensor])
-        limits = {row["p"]: row for row in parameter_rows(calibration[sensor], sensor_configs.get(sensor) or {})}
+        limits = {
+            row["p"]: row for row in parameter_rows(sensor, calibration[sensor], sensor_configs.get(sensor) or {})
+        }
         limits = {p: row for p, row in limits.items() if row["limit"]}
         for p in dict.fromkeys([*fitted, *limits]):
-            label, limit = (limits[p]["name"], limits[p]["limit"]) if p in limits else (None, None)
+            row = limits.get(p) or {"name": None, "limit": None, "beyond": False}
             name = f"{sensor}_{p.name.replace('.', '_')}"
-            figures = p.value, p.standard_uncertainty, p.expanded_uncertainty, limit
-            rows.append((sensor, name, label, p.unit, *figures, p in fitted))
+            figures = p.value, p.standard_uncertainty, p.expanded_uncertainty, row["limit"]
+            rows.append((sensor, name, row["name"], p.unit, *figures, row["beyond"], p in fitted))
     return rows

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.files import json_text
-from pipeline.model.calibration_file import beyond_uncertainty, left_out, sentences
+from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, left_out, sentences
 from pipeline.outcome import as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, Line, Panel, chart
@@ -35,7 +35,7 @@ from pipeline.report.held_out_section import (
 from pipeline.report.noise_section import allan, remarks, term_rows
 from pipeline.report.numbers import NOTHING, number
 from pipeline.report.pages import template
-from pipeline.report.parameters import beyond_limits, fitted_parameters, parameter_rows
+from pipeline.report.parameters import fitted_parameters, parameter_rows
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
 from pipeline.signal.rests import Rest, rests_from_table
 from pipeline.verdicts import css_class
@@ -139,7 +139,7 @@ def _sensor(
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
-    parameters = parameter_rows(part, sensor_config)
+    parameters = parameter_rows(sensor, part, sensor_config)
     return {
         "held_out": held_out,
         "before": first.get("rms_error"),
@@ -155,7 +155,7 @@ def _sensor(
         "noise_remarks": remarks(at_rest),
         "matrix": fitted_parameters(part)[3:12],
         "parameters": parameters,
-        "beyond_limits": beyond_limits(parameters, mounted=table.get("motion", "none") != "none"),
+        "beyond_limits": beyond_words(part),
         "rests": rest_rows(part),
         "diagnosis": found,
         "ranking": ranking_rows(found),

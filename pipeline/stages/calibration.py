@@ -19,7 +19,7 @@ from pipeline.estimation.chips import chip_document
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.channel_table import axis_maps
 from pipeline.io.quality_flags import GAP
-from pipeline.model.calibration_file import implausible, not_determined
+from pipeline.model.calibration_file import beyond_limits, implausible, not_determined
 from pipeline.pack import FAILED
 from pipeline.records import SCHEMA_VERSION, SENSORS, NotCalibrated, Recording, calibrated
 from pipeline.stages.unit_files import StoredUnit
@@ -125,10 +125,14 @@ def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def judged(sensor: str, fit: dict[str, Any], sensor_config: dict[str, Any]) -> dict[str, Any]:
-    """Add to a fit the parameters beyond the sensor file's limits, and those that only the limits determine."""
+    """Add to a fit the parameters beyond the sensor file's limits, and those that only the limits determine.
+
+    Which of those beyond are implausible depends on their uncertainty, and on what the configuration accepts.
+    """
     found = implausible(sensor, fit, sensor_config)
     accepted = sensor_config["accept_implausible"]
     lists = {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
+    lists |= {"beyond_limits": beyond_limits(sensor, fit, sensor_config)}
     return fit | lists | {"not_determined": not_determined(fit)}
 
 

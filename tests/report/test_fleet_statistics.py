@@ -31,7 +31,9 @@ def fleet(values: NDArray[np.float64], model: str = "mpu6050", lots: int = 5) ->
         for i in range(len(values))
     ]  # fmt: skip
     about = ("gyroscope", "gyroscope_bias_x", None, "deg/s")
-    found = {row["unit"]: [(*about, float(v), 0.05, 0.1, None, True)] for row, v in zip(rows, values, strict=True)}
+    found = {
+        row["unit"]: [(*about, float(v), 0.05, 0.1, None, False, True)] for row, v in zip(rows, values, strict=True)
+    }
     return rows, parameter_table(found)
 
 
@@ -148,7 +150,7 @@ def test_missing_effects_are_counted_with_the_lot_that_they_come_from() -> None:
 def test_the_table_holds_every_parameter_with_its_uncertainty_and_unit(tmp_path: Path) -> None:
     fit = {"unit": "g", "bias": [1.0, 2.0, 3.0], "matrix": np.eye(3).tolist()}
     fit |= {"expanded_uncertainty": {"bias": [0.1, 0.2, 0.3], "matrix": np.full((3, 3), 0.01).tolist()}}
-    p = {"b_x": {"value": 0.5, "unit": "g/degC", "expanded_uncertainty": 0.05}}
+    p = {f"b_{a}": {"value": 0.5, "unit": "g/degC", "expanded_uncertainty": 0.05} for a in "xyz"}
     document = {"accelerometer": fit | {"effects": [{"name": "bias_temperature", "parameters": p}]}, "gyroscope": None}
     rows = [{"unit": "U1", "lot": None, "pass": True, "accelerometer_error_after": 0.5}, {"unit": "U2"}]
     write_parameters(tmp_path / "p.parquet", rows, parameter_table({"U1": unit_parameters(document, {}), "U2": []}))
@@ -159,4 +161,4 @@ def test_the_table_holds_every_parameter_with_its_uncertainty_and_unit(tmp_path:
     assert first["accelerometer_bias_temperature_b_x"] == 0.5
     assert second["accelerometer_bias_y"] is None
     assert table.schema.field("accelerometer_bias_temperature_b_x").metadata == {b"unit": b"g/degC"}
-    assert table.num_columns == 4 + 2 * 13
+    assert table.num_columns == 4 + 2 * 15

@@ -12,11 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.commands.explain import explain
+from pipeline.config.schema import Certificate
+from pipeline.files import write_json
+from pipeline.outcome import outcome, read_summary
 from pipeline.report import campaign_page
+from pipeline.report.certificate import certificate, certificate_page
 from pipeline.report.chart import Figure, Panel, Samples, chart
 from pipeline.report.fleet import parameter_table, write_summary
 from pipeline.report.parameters import COLUMNS, summary_row, unit_parameters
 from pipeline.report.unit_page import render
+from pipeline.stages.calibration import judged
 
 from .conftest import SHEET, Unit, build_unit
 
@@ -189,23 +195,51 @@ def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_sum
     row = summary_row("U", calibration, unit.validation, unit.diagnosis, {})
     assert (row["accelerometer_implausible"], row["gyroscope_implausible"]) == (None, "scale_factor_x")
     page = Text(campaign_page.render("bench", [row], []))
-    assert "1 sensor far beyond the sensor file's limits" in page.text
+    assert "1 sensor with implausible parameters" in page.text
     assert "U , gyroscope: scale factor x" in page.text
     assert "beyond the sensor file's limits" not in Text(campaign_page.render("bench", rows(unit, 2), [])).text
 
 
-def test_a_parameter_beyond_a_limit_is_named_at_the_top_of_both_pages(unit: Unit) -> None:
-    bias = abs(np.array(unit.calibration["accelerometer"]["bias"]))
-    x, y, _ = np.argsort(-bias)
-    limit = float(bias[[x, y]].mean())  # the largest bias exceeds it, the others do not
-    sheet = {**unit.settings["sensor"]["accelerometer"], "bias": limit, "scale_factor": 1.0, "cross_axis": 1e-9}
+def test_every_place_counts_the_same_units_beyond_the_sensor_files_limits(unit: Unit, tmp_path: Path) -> None:
+    """Two of four units: one by its bias, one by a cross-axis sensitivity; one is turned on the table, one is sound."""
+    sheet = {**SHEET, "bias": 0.1, "scale_factor": 0.1, "cross_axis": 0.02, "accept_implausible": 0}
     settings = {**unit.settings, "sensor": {**unit.settings["sensor"], "accelerometer": sheet}}
-    settings["table"] = {**unit.settings["table"], "motion": "logged"}  # cross-axis terms include how the unit sits
-    top = Text(render(unit.calibration, unit.validation, unit.diagnosis, [], settings)).text.partition("Diagnosis")[0]
-    assert f"Beyond the sensor file's limits: bias {'xyz'[x]} ({100.0 * bias[x] / limit:.0f} %)." in top
-    own = {"U0": unit_parameters(unit.calibration, {"accelerometer": sheet})}
-    page = campaign_page.render("bench", rows(unit, 2), [], parameters=parameter_table(own))
-    assert "accelerometer, beyond the sensor file's limits: U0 " in Text(page.partition('<h2 id="units">')[0]).text
+    settings |= {"certificate": Certificate(name="blank").model_dump()}
+    turned = np.array([[0.995, -0.0998749, 0.0], [0.0998749, 0.995, 0.0], [0.0, 0.0, 1.0]])
+    skew = np.eye(3) + 0.06 * (np.eye(3)[[1, 0, 2]] - np.diag([0.0, 0.0, 1.0]))
+    given = {"turned": (0.0, turned), "biased": (-0.25, np.eye(3)), "sound": (0.0, np.eye(3)), "skew": (0.0, skew)}
+    folder, found, counted = tmp_path / "bench", {}, ["biased", "skew"]
+    for name, (bias, matrix) in given.items():
+        fit = {**unit.calibration["accelerometer"], "bias": [0.0, bias, 0.0], "matrix": matrix.tolist()}
+        document = {**unit.calibration, "unit": name, "accelerometer": judged("accelerometer", fit, sheet)}
+        found[name] = document
+        for kind, of in (("calibrations", document), ("diagnoses", unit.diagnosis), ("validations", unit.validation)):
+            write_json(folder / kind / f"{name}.json", {**of, "unit": name})
+    words = {"biased": "bias y (250 %)", "skew": "cross axis xy (301 %)"}
+    summaries = [summary_row(name, c, unit.validation, unit.diagnosis, {}) for name, c in found.items()]
+    write_summary(folder / "summary.csv", summaries)
+    read = read_summary(folder)
+    assert [row["unit"] for row in read if row["accelerometer_beyond_limits"]] == counted
+    fitted = parameter_table({name: unit_parameters(c, {"accelerometer": sheet}) for name, c in found.items()})
+    index = Text(campaign_page.render("bench", summaries, [], parameters=fitted)).text
+    assert "accelerometer, beyond the sensor file's limits: biased , skew " in index
+    ((chart_of_units, _),) = campaign_page.strips(summaries, fitted)
+    assert "2 of 4 units are beyond the sensor file's limits; farthest: skew" in chart_of_units.finding
+    told = outcome(folder, {}, of_this_run=False)
+    assert "accelerometer, beyond the sensor file's limits: biased, skew\n" in told
+    for name, document in found.items():
+        page = Text(render(document, unit.validation, unit.diagnosis, [], settings)).text
+        report = certificate(document, unit.validation, settings, None)
+        explained = explain(folder, {name: unit.diagnosis | {"unit": name}}, {})
+        if name in counted:
+            assert f"Beyond the sensor file's limits: {words[name]}." in page.partition("Diagnosis")[0]
+            assert page.count("beyond it") == 1
+            assert f"Accelerometer, beyond the sensor file's limits: {words[name]}." in explained
+            assert len(report["measurementResults"][0]["beyondLimits"]) == 1
+            assert "Beyond the sensor file's limits" in Text(certificate_page(name, report)).text
+        else:
+            assert "eyond the sensor file's limits" not in page + explained + certificate_page(name, report)
+            assert "beyond it" not in page
 
 
 def test_a_page_states_one_uncertainty_of_a_parameter(unit: Unit) -> None:

@@ -1,11 +1,15 @@
 """Parameters with their uncertainties, read from a sensor's part of a calibration."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+from scipy.linalg import polar
 
+from pipeline.model.calibration_file import beyond_limits, beyond_words
 from pipeline.records import FittedEffect, SensorCalibration
 from pipeline.report.comparison import unit_figures
-from pipeline.report.parameters import beyond_limits, fitted_parameters, parameter_rows, reading_errors
+from pipeline.report.parameters import fitted_parameters, parameter_rows, reading_errors, sensor_errors
 
 
 def part_with_unequal_freedom() -> dict:
@@ -47,18 +51,31 @@ def test_the_uncertainty_of_the_inverse_is_that_of_drawn_matrices() -> None:
     part = SensorCalibration("gyroscope", matrix=matrix, covariance=covariance).to_json()
     drawn = matrix + (root @ rng.standard_normal((9, 20_000))).T.reshape(-1, 3, 3)
     K = np.linalg.inv(drawn)
-    for p in reading_errors(part):
-        kind, axes = p.name.rsplit("_", 1)
+    P = np.array([polar(each, side="left")[1] for each in K[:5000]])
+    for p, of in [*((p, K) for p in reading_errors(part)), *((p, P) for p in sensor_errors(part))]:
+        axes = p.name.rpartition("_")[2]
         i, j = "xyz".index(axes[0]), "xyz".index(axes[-1])
-        assert p.value == pytest.approx(np.linalg.inv(matrix)[i, j] - (kind == "scale_factor_error"))
-        assert p.standard_uncertainty == pytest.approx(K[:, i, j].std(), rel=0.03)
+        true = np.linalg.inv(matrix) if of is K else polar(np.linalg.inv(matrix), side="left")[1]
+        assert p.value == pytest.approx(true[i, j] - (i == j))
+        assert p.standard_uncertainty == pytest.approx(of[:, i, j].std(), rel=0.05)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_parameter_far_to_either_side_is_beyond_its_limit(sign: float) -> None:
-    K = np.eye(3) + sign * np.diag([0.06, 0.0, 0.0])
-    fit = SensorCalibration("gyroscope", np.array([0.0, sign * 5.0, 0.0]), np.linalg.inv(K), covariance=np.eye(12))
-    rows = parameter_rows(fit.to_json(), {"bias": 2.0, "scale_factor": 0.03, "cross_axis": 0.02})
-    shares = {row["p"].name: row["share"] for row in rows if row["share"] > 1e-9}
-    assert shares == pytest.approx({"bias_y": 2.5, "scale_factor_error_x": 2.0})
-    assert beyond_limits(rows, mounted=False) == ["bias y (250 %)", "scale factor error x (200 %)"]
+def test_a_parameter_far_to_either_side_is_beyond_its_limit_and_the_position_of_the_unit_is_not(sign: float) -> None:
+    turned = np.array([[np.cos(0.1), -np.sin(0.1), 0.0], [np.sin(0.1), np.cos(0.1), 0.0], [0.0, 0.0, 1.0]])
+    K = (np.eye(3) + sign * np.diag([0.06, 0.0, 0.0])) @ turned
+    time_constant = {"T": {"value": 500.0, "unit": "s", "expanded_uncertainty": None}}
+    bias = {f"b_{a}": {"value": 0.1, "unit": "deg/s", "expanded_uncertainty": 0.01} for a in "xyz"}
+    warm_up = FittedEffect("warm_up", {**bias, **time_constant})
+    matrix, covariance = np.linalg.inv(K), np.eye(16)
+    fit = SensorCalibration("gyroscope", np.array([0.0, sign * 5.0, 0.0]), matrix, (), (warm_up,), covariance)
+    limits = {"bias": 2.0, "scale_factor": 0.03, "cross_axis": 0.02, "full_scale": 250.0}
+    config: dict[str, Any] = limits | {"effects": {"warm_up": 0.6, "warm_up_T": 600.0}}
+    part = fit.to_json()
+    part |= {"beyond_limits": beyond_limits("gyroscope", part, config)}
+    rows = parameter_rows("gyroscope", part, config)
+    assert {row["p"].name: row["share"] for row in rows if row["share"] > 1.0} == pytest.approx(
+        {"bias_y": 2.5, "scale_factor_x": 2.0}
+    )
+    assert [row["p"].name for row in rows if row["beyond"]] == ["bias_y", "scale_factor_x"]
+    assert beyond_words(part) == "bias y (250 %), scale factor x (200 %)"

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from scipy.linalg import polar
 
+from pipeline.model.calibration_file import beyond_limits
 from pipeline.report.campaign_page import ENDS, strips
 from pipeline.report.fleet import parameter_table
 from pipeline.report.parameters import unit_parameters
@@ -15,9 +17,11 @@ from pipeline.report.parameters import unit_parameters
 if TYPE_CHECKING:
     import pandas as pd
 
-SHEET = {"accelerometer": {"bias": 0.08, "scale_factor": 0.03, "cross_axis": 0.02}}
+SHEET: dict[str, Any] = {
+    "accelerometer": {"bias": 0.08, "scale_factor": 0.03, "cross_axis": 0.02, "full_scale": 2.0, "effects": {}}
+}
 NAMES = ["Bias x", "Bias y", "Bias z", *(f"Scale factor error {a}" for a in "xyz")]
-NAMES += [f"{a} reads of {b}" for a in "xyz" for b in "xyz" if a != b]
+NAMES += [f"Cross-axis sensitivity {axes}" for axes in ("xy", "xz", "yz")]
 
 
 def campaign(count: int) -> tuple[list[dict[str, Any]], pd.DataFrame, np.ndarray]:
@@ -26,11 +30,13 @@ def campaign(count: int) -> tuple[list[dict[str, Any]], pd.DataFrame, np.ndarray
     rows, placed, shares = [], {}, []
     for i in range(count):
         bias, K = rng.normal(0.0, 0.06, 3), np.eye(3) + rng.normal(0.0, 0.01, (3, 3))
-        part = {"unit": "g", "bias": bias.tolist(), "matrix": np.linalg.inv(K).tolist()}
+        part: dict[str, Any] = {"unit": "g", "bias": bias.tolist(), "matrix": np.linalg.inv(K).tolist(), "effects": []}
+        part |= {"expanded_uncertainty": {"bias": [0.0] * 3, "matrix": [[0.0] * 3] * 3}}
+        part |= {"beyond_limits": beyond_limits("accelerometer", part, SHEET["accelerometer"])}
         rows.append({"unit": f"U{i}", "status": "ok", "sensor": "mpu6050", "method": "staged"})
         placed[f"U{i}"] = unit_parameters({"accelerometer": part, "gyroscope": None}, SHEET)
-        beside = K[~np.eye(3, dtype=bool)]
-        shares.append([*bias / 0.08, *(np.diag(K) - 1.0) / 0.03, *beside / 0.02])
+        P = polar(K, side="left")[1]
+        shares.append([*bias / 0.08, *(np.diag(P) - 1.0) / 0.03, *P[np.triu_indices(3, 1)] / 0.02])
     return rows, parameter_table(placed), np.array(shares)
 
 
@@ -44,7 +50,7 @@ def drawn(svg: str) -> list[tuple[str, int, str, float]]:
         x, y = np.cumsum(np.array(re.findall(r"[Mm](-?\d+) (-?\d+)", path), float), axis=0).T / 10.0
         row = bottom + (y - y_start) / (y_stop - y_start) * (top - bottom)
         share = low + (x - start) / (stop - start) * (high - low)
-        names = [NAMES[12 - round(v)] for v in row]
+        names = [NAMES[9 - round(v)] for v in row]
         found += zip([colour] * len(x), map(int, units.split()), names, share, strict=True)
     return found
 
@@ -54,7 +60,7 @@ def test_each_dot_stands_at_its_share_of_the_limit_and_tells_its_value() -> None
     rows[2]["status"] = "failed"
     ((figure, texts),) = strips(rows, placed)  # no gyroscope
     dots = drawn(figure.svg)
-    assert len(dots) == 6 * 12
+    assert len(dots) == 6 * 9
     assert {unit for _, unit, _, _ in dots} == {1, 2, 4, 5, 6, 7}
     told = [text for of_colour in texts.values() for text in of_colour]
     for (colour, unit, name, share), text in zip(dots, told, strict=True):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ import pytest
 
 from pipeline.commands.simulate import main
 from pipeline.config import load_campaign
-from pipeline.errors import ConfigurationError, MissingInputError
+from pipeline.errors import ConfigurationError, IngestError, MissingInputError
 from pipeline.io.read import read_recordings
 from pipeline.model.kinematics import reference_motion
+from pipeline.preprocessing.at_rest import check_axes
 from pipeline.records import SENSORS, Recording
 from pipeline.simulation.campaign import simulate_unit, write_campaign
 from pipeline.simulation.description import UnitDescription, description_from, read_config, read_description
@@ -48,6 +50,22 @@ def residual(recording: Recording, truth: dict[str, Any], sensor: str) -> np.nda
 
 def files_of(folder: Path) -> dict[str, bytes]:
     return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def test_long_rests_before_a_turn_are_no_stuck_axis_and_a_stuck_axis_is_one() -> None:
+    """In 100,000 samples at 0.12 s, rests of 9 minutes stand before turns of 6 s: less than a tenth of the rows."""
+    recordings, _ = simulate_unit(UnitDescription("U", samples=100_000), 0, 0)
+    turns = [r for r in recordings if r.role == "gyroscope"]
+    rests = np.concatenate([r.table_rate == 0.0 for r in turns if r.table_rate is not None])
+    assert rests.mean() > 0.95
+    check_axes(recordings)
+    last = turns[-1]
+    assert last.accelerometer is not None
+    for axis in (0, 1):
+        readings = last.accelerometer.copy()
+        readings[:, axis] = 0.4 + 0.001 * np.random.default_rng(0).standard_normal(last.samples)
+        with pytest.raises(IngestError, match=f"accel_{'xy'[axis]} stays within .* the rows in which the table turns"):
+            check_axes([replace(last, accelerometer=readings)])
 
 
 def test_the_written_log_implies_the_motion_that_the_sensors_felt(tmp_path: Path) -> None:
