@@ -48,7 +48,8 @@ WIDTH = 118  # characters of a line
 EPILOG = """\
 Recordings of a campaign are checked as a run would do it: with the settings of their unit, compared with the other
 recordings of the unit, and fitted. --campaign without files checks every unit of a campaign, with its effects and its
-held-out motion. What check refuses, a run refuses, and the other way round, but for the diagnosis.
+held-out motion. What check refuses, a run refuses. A run alone makes the diagnosis, the exports and the pages, and
+check does not see what fails there.
 
 Any other file is read alone: as the units of --campaign, or by the profile --ingest (default: canonical_csv); with
 --sensor, the readings are compared with the full scale of that sensor, or with --range. Only --save writes a file.
@@ -357,7 +358,7 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
             for (place, detail), (name, *others) in found.items()
         ]
         lines += [("notes" if i == 0 else "", note) for i, note in enumerate(notes)]
-        head = f"unit {unit}: {counted(len(checked), 'recording')}, no refusal"
+        head = f"unit {unit}: {counted(len(checked), 'recording')}, no refusal up to the calibration"
         texts.append("\n".join([head, *([as_text(lines)] if lines else [])]))
     mounted = {r.name: n.settings for r in checked for n in r.notes if n.settings}
     return Outcome("\n\n".join([*texts, *([missing] if missing else [])]), refused, unit, mounted)

@@ -2,6 +2,8 @@
 
     temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
     repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
+    bursts        : dM = M e of a gyroscope, e the relative uncertainty of the interval of samples that arrive in bursts
+                    (``pipeline.io.bursts``), where the time base is a source
     time base     : dM = M e of a gyroscope whose time is a count of rows at the sensor's stated rate (note
                     N-SYNTHTIME), or on a table whose rate is 1 + e times the change of its angle over the log's time
 
@@ -15,6 +17,7 @@ elements of the matrix, in the sensor's unit for the bias.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
 
 FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
 ACCURACY = "temperature_accuracy_degc"
+BURSTS = "interval of bursts"
 GRAVITY_ON_EARTH = 0.0044  # relative: 9.7639 to 9.8337 m/s^2 (Hirt et al. 2013, GRL 40, 4279) against 9.80665 m/s^2
 IN_LOCAL_GRAVITY = (
     "table.gravity_g is 1 and table.gravity_accuracy_g is not stated, so that U holds in units of local gravity, which "
@@ -61,6 +65,7 @@ def with_stated(
     limits = sensor_config.get("effects") or {}
     lines += _counted_time(calibration, recordings, limits.get("clock_rate"))
     lines += _rate_off_angle(calibration, recordings, settings.get("table") or {})
+    lines += _of_bursts(calibration, recordings)
     known = {line.source.partition(" (")[0] for line in lines} | set(missing)
     entries = [entry for entry in budget["not_included"] if entry["source"] not in known]
     not_included = [_bounded(entry, settings.get("table") or {}, limits.get("clock_rate")) for entry in entries]
@@ -84,6 +89,19 @@ def _counted_time(
         return []
     remark = f"rows counted at the stated rate, by the sensor file's limit of clock_rate, {limit_ppm:g} ppm"
     return [clock_contribution(calibration, limit_ppm / np.sqrt(3.0), RECTANGULAR, remark)]
+
+
+def _of_bursts(calibration: SensorCalibration, recordings: Sequence[Recording]) -> list[Contribution]:
+    """Return the line of samples in bursts, whose interval follows from their number and the duration."""
+    budget = calibration.budget or {}
+    timed = any(map(_clock_unstated, budget["not_included"]))
+    timed |= any(entry["source"] == TIME_BASE for entry in budget["contributions"])
+    used = [r.source["bursts"] for r in recordings if r.role in (calibration.sensor, "rests") and "bursts" in r.source]
+    if not used or not timed:
+        return []
+    ppm = max(1e6 * clock["uncertainty_ns"] / clock["interval_ns"] for clock in used) / 2.0
+    remark = "the interval of samples in bursts, by their number and the duration (N-BURSTS)"
+    return [replace(clock_contribution(calibration, ppm, NORMAL, remark), source=BURSTS)]
 
 
 def _rate_off_angle(

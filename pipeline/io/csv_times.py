@@ -5,8 +5,9 @@
 A counter that overflows restarts at 0: a time that falls from within 2.5 intervals of M to within 2.5 intervals of 0
 continues at M, where M is 2^32 us or ms, or 2^16, 2^24 or 2^32 of the column's unit. A block of rows that directly
 follows an exact copy of it is dropped. Rows displaced by at most five rows are sorted, and rows that repeat the row
-before them are dropped, within the limit of ``ingest.checks.repaired_rows``. Any other time that goes back begins
-another session of the logger.
+before them are dropped, within the limit of ``ingest.checks.repaired_rows``. Rows that arrive in bursts without times
+of their own get a regular clock (``pipeline.io.bursts``). Any other time that goes back begins another session of the
+logger.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import IngestError
+from pipeline.io.bursts import bursts_error, with_regular_clock
 from pipeline.io.csv_layout import PARTS
 from pipeline.io.quality_flags import REPAIRED
-from pipeline.io.timestamps import blocks_error, counted, sorted_once
+from pipeline.io.timestamps import counted, sorted_once
 from pipeline.io.units import UNITS
 
 if TYPE_CHECKING:
@@ -131,8 +133,8 @@ def in_order(table: ChannelTable, rows: Rows, checks: Checks) -> ChannelTable:
         table = table.select(index, replace(note, count=count - index.size, detail=detail))
         restarts = []
     if bool(np.all(np.diff(table.time_ns) > 0)):
-        return table
-    table = _once(_counted_on(table, tick_ns))
+        return with_regular_clock(table)
+    table = _once(with_regular_clock(_counted_on(table, tick_ns)))
     time_ns = table.time_ns
     back = np.flatnonzero(np.diff(time_ns) <= 0)
     if back.size == 0:
@@ -151,7 +153,7 @@ def in_order(table: ChannelTable, rows: Rows, checks: Checks) -> ChannelTable:
         message = f"time repeats {time_ns[row] / 1e9:.9g} s in rows that differ ({twice.size} such times)"
         hint = "time has to increase; has the time enough digits, or were two logs merged?"
         repeated = IngestError(message, table.place(row), code="duplicate_time", hint=hint)
-        raise blocks_error(table, repeated.code) or repeated from error
+        raise bursts_error(table) or repeated from error
     touched = rows.repaired + moved.size + twice.size
     if touched > checks.repaired_rows * len(time_ns):
         raise over_budget(error, touched, len(time_ns), checks)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from pipeline.errors import IngestError
+from pipeline.io.bursts import find_bursts
 from pipeline.io.channel_table import ChannelTable, joined
 from pipeline.io.files import unchanged
 from pipeline.io.ingest_settings import HEADER, OWN, mcap_format, mcap_formats
@@ -106,10 +107,8 @@ class _Topic:
                 hint = "if the recorder's times are good enough, set ingest.mcap.time_source=log_time"
                 raise IngestError(message, path, code="bad_time", hint=hint)
             check_plausible(topic, time, recorded, settings.clock_difference_s if recorder else None, path)
-        order, found = in_order(topic, time, list(values.values()), settings.reorder_s, path)
+        time, values, bursts, found = _ordered(topic, time, values, settings.reorder_s, path)
         notes += found
-        if order is not None:
-            time, values = time[order], {n: column[order] for n, column in values.items()}
         if self.decoder.coarse_time:
             check_fine(topic, time, path)
         if self.decoder.varying:
@@ -117,7 +116,26 @@ class _Topic:
             notes.append(Note("N-FALLBACK", self.decoder.varying, 0, 0, detail))
         fields = self.decoder.fields.items()
         counts = {c: 1.0 / abs(f.counts_per_unit) for c, f in fields if f.unit == COUNTS}
-        return ChannelTable(path, time, values, {"topic": topic, "rows": len(time)}, count_sizes=counts)
+        source = {"topic": topic, "rows": len(time), **bursts}
+        return ChannelTable(path, time, values, source, count_sizes=counts)
+
+
+def _ordered(
+    topic: str, time: Integers, values: Columns, reorder_s: float, path: str
+) -> tuple[Integers, Columns, dict[str, Any], list[Note]]:
+    """Return messages in order of time, each once; those that arrive in bursts by a regular clock, the third result."""
+    bursts = find_bursts(time, values)
+    if bursts is not None and bursts.times is not None:
+        detail = f"{topic}: {bursts.described(len(time))}"
+        note = Note("N-BURSTS", bursts.untimed.size, 0, 0, detail)
+        return bursts.times, values, {"bursts": bursts.clock}, [note]
+    try:
+        order, notes = in_order(topic, time, list(values.values()), reorder_s, path)
+    except IngestError as error:
+        raise (bursts.error(path, path) if bursts else error) from None
+    if order is None:
+        return time, values, {}, notes
+    return time[order], {name: column[order] for name, column in values.items()}, {}, notes
 
 
 class _Log:
@@ -161,6 +179,7 @@ class _Log:
         time = base.time_ns[base.time_ns <= self.end_ns]
         values = {c: v[: len(time)] for c, v in values.items()}
         source = {"file": self.path, "sha256": self.reader.sha256, "rows": len(time)}
+        source |= {key: base.source[key] for key in ("bursts",) if key in base.source}
         table = ChannelTable(self.path, time, values, source, None, counts, tuple(self.notes))
         if self.table_logs:
             from pipeline.io.encoder_log import align  # noqa: PLC0415  (few logs need it)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.timestamps import blocks_error
+from pipeline.io.bursts import bursts_error, rounded_error
 from pipeline.io.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.records import SENSOR_UNITS
 
@@ -77,7 +77,7 @@ def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) ->
         message = f"{rows.size} {detail}"
         hint = f"ingest.checks.missing_time allows a share of {checks.missing_time:g}"
         error = IngestError(message, table.place(int(rows[np.argmax(lengths)])), code="missing_time", hint=hint)
-        raise blocks_error(table, error.code) or error
+        raise bursts_error(table) or rounded_error(table, error) or error
     return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], usual)]
 
 

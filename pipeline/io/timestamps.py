@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.channel_table import ChannelTable
     from pipeline.records import Index, Integers, Mask, Values
 
 
@@ -37,8 +36,6 @@ LARGEST = np.iinfo(np.int64).max
 YEAR_2000, YEAR_2100 = 946_684_800 * SECOND_NS, 4_102_444_800 * SECOND_NS
 FEWEST = 3  # messages of a sensor: a row has a neighbour on both sides
 LONGEST_GAP = 1.5  # times the median interval, as of a recording's rows
-IN_BLOCK = 0.5  # of the mean interval: the median interval is below it where rows come in blocks
-SAME_SIZE = 0.8  # share of the blocks whose size differs from the usual one by at most one row
 COARSEST = 0.01  # of the median interval: coarsest resolution of a time in floating-point numbers
 
 
@@ -187,33 +184,6 @@ def check_fine(topic: str, time: Integers, path: str) -> None:
             f"the interval of {interval:.3g} ns"
         )
         raise IngestError(message, path, code="bad_time", hint="log integer times")
-
-
-def blocks_error(table: ChannelTable, code: str) -> IngestError | None:
-    """Return the error for rows in blocks of one size, each block with almost one time; None for other rows.
-
-    Such times are the times at which a sensor's FIFO was read. None also where a block is missing.
-    """
-    steps = np.diff(table.time_ns)
-    first = np.flatnonzero(steps > steps.mean()) + 1
-    sizes, apart = np.diff(first), np.diff(table.time_ns[first])
-    if len(sizes) < FEWEST or np.median(steps) > IN_BLOCK * steps.mean():
-        return None
-    size = int(np.median(sizes))
-    if np.mean(np.abs(sizes - size) <= 1) < SAME_SIZE or apart.max() > LONGEST_GAP * np.median(apart):
-        return None
-    rate = (first[-1] - first[0]) / (table.time_ns[first[-1]] - table.time_ns[first[0]]) * 1e9
-    message = (
-        f"the rows come in blocks of {size}, {np.median(apart) / 1e6:.4g} ms apart and with almost one time each: the "
-        "times of a FIFO's readout, not those of the samples"
-    )
-    hint = "log the times of the samples"
-    if table.lines is not None:
-        hint = (
-            f"count the rows: ingest.csv.columns.time=null and ingest.csv.rate_hz={rate:.6g}, the mean of this log; "
-            "table.clock_accuracy_ppm states how exact it is"
-        )
-    return IngestError(message, table.place(int(first[0])), code=code, hint=hint)
 
 
 def rows_covered(slow: Integers, fast: Integers, topic: str, path: str) -> Index:

@@ -216,7 +216,9 @@ def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
     counters = [i for i, v in numbers.items() if len(v) > 2 and bool(np.mean(np.diff(v) == 1.0) > COUNTING)]
     of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
     named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
-    unnamed = [i for i in rising if i not in counters and (not columns.log.named or i in of_sensor)]
+    of_arrays = [i for i, v in numbers.items() if columns.log.arrays and _never_falls(v)]
+    first = [i for i in of_arrays if columns.log.names[i].partition(" [")[0].endswith("[0]")]
+    unnamed = [i for i in sorted({*rising, *first}) if i not in counters and (not columns.log.named or i in of_sensor)]
     alike = all(np.array_equal(numbers[i], numbers[unnamed[0]]) for i in unnamed[1:])  # of each array of a recording
     unnamed = unnamed if not columns.log.named or (unnamed and alike) else []
     candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
@@ -229,13 +231,18 @@ def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
     elif counters:
         columns.counter = counters[0]
     index = columns.counter if columns.time is None else columns.time
-    columns.steady = index is None or index in rising
-    if index is not None and index not in rising:
-        falls = int(np.count_nonzero(np.diff(numbers[index]) <= 0))
+    falls = 0 if index is None else int(np.count_nonzero(np.diff(numbers[index]) < 0))
+    columns.steady = falls == 0  # a time that repeats is of samples in bursts
+    if index is not None and falls:
         columns.remarks.append(
             f"{columns.log.names[index]} does not increase at {falls} rows: several sessions (session: 1, "
             "2 .. reads one of them), or a counter that overflows"
         )
+
+
+def _never_falls(values: Values) -> bool:
+    """Return whether numbers rise, or repeat the one before, like the times of samples in bursts."""
+    return len(values) > FEWEST_ROWS and bool(np.all(np.diff(values) >= 0)) and bool(values[-1] > values[0])
 
 
 def _advances(values: Values) -> bool:

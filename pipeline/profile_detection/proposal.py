@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.io.bursts import find_bursts
 from pipeline.io.csv_times import SHORTEST_PART
 from pipeline.io.gravity_rotation import Move, interval_of, moves_of
 from pipeline.io.ingest_settings import AUTO
@@ -268,7 +269,7 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
         for columns, entries in zip(parts, proposal.columns, strict=True):
             assert columns.time is not None  # noqa: S101  (parts are joined by their times)
             entries["time"] = {"column": columns.log.keys[columns.time], **guess.entry}
-        return None if guess.second_s is None else values * guess.second_s
+        return None if guess.second_s is None else _regular(values * guess.second_s, parts)
     if parts[0].counter is not None and first.csv["rate_hz"] is None:
         return _counted(parts[0], parts[0].counter, proposal)
     if first.csv["rate_hz"] is not None:
@@ -276,6 +277,18 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
     proposal.csv["rate_hz"] = UNKNOWN
     proposal.evidence["rate_hz"] = "there is no time: the sampling rate in Hz"
     return None
+
+
+def _regular(time_s: Values, parts: list[Columns]) -> Values:
+    """Return times, s; of samples that arrive in bursts those by their regular clock, as ingest reads them."""
+    readings = {
+        c: p.log.numbers[i]
+        for p in parts
+        for s, triad in p.triads.items()
+        for c, i in zip(TRIADS[s], triad, strict=True)
+    }
+    bursts = find_bursts(np.rint((time_s - time_s[0]) * 1e9).astype(np.int64), readings)
+    return time_s if bursts is None or bursts.times is None else bursts.times / 1e9
 
 
 def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | None:

@@ -404,7 +404,7 @@ def test_a_profile_that_the_campaign_holds_is_named_where_its_settings_do_not_na
     assert "ingest=my_logger" in checked.words
     (linked / "campaign.yaml").write_text(checked.out[checked.out.index("overrides:") :])
     used = Checked(capsys, "--campaign", linked)
-    assert (used.code, used.out) == (0, "unit U: 8 recordings, no refusal\n\n")
+    assert (used.code, used.out) == (0, "unit U: 8 recordings, no refusal up to the calibration\n\n")
 
 
 def test_slow_full_turns_of_a_table_are_no_rests_and_no_contradiction(

@@ -136,6 +136,28 @@ def test_rows_counted_at_a_stated_rate_have_the_error_of_the_sensors_clock() -> 
     assert "time base" not in {source.partition(",")[0] for source, _ in beyond_uncertainty(stated.to_json())}
 
 
+def test_the_interval_of_samples_in_bursts_is_as_uncertain_as_their_number_leaves_it() -> None:
+    bench = Bench("gyroscope", [0.03, -0.02, 0.05], K, white=0.001)
+    plain = [replace(r, table_rate=None) for r in bench.turns_at([60.0, -60.0])]
+    config = settings() | {"sensor": {"gyroscope": SHEETS["gyroscope"]}}
+    fit = reference_least_squares.fit("gyroscope", plain, None, config)
+    clocks = ({"interval_ns": 1e7, "uncertainty_ns": u} for u in (4e3, 6e3, 2e3))
+    turns = [replace(r, source={**r.source, "bursts": clock}) for r, clock in zip(plain, clocks, strict=False)]
+    found = with_stated(fit, turns, config)
+    own = line(found, "interval of bursts")
+    assert own["standard_uncertainty"] == pytest.approx(300.0)  # ppm: half of 6 us in 10 ms
+    added = found.covariance - with_stated(fit, plain, config).covariance
+    m = fit.matrix.ravel()
+    assert added[3:12, 3:12] == pytest.approx(3e-4**2 * np.outer(m, m), rel=1e-6, abs=1e-12)
+    assert any(entry["source"] == "time base" for entry in found.budget["not_included"])
+    stated = settings(clock_accuracy_ppm=20.0) | {"sensor": config["sensor"]}
+    both = with_stated(reference_least_squares.fit("gyroscope", turns, None, stated), turns, stated)
+    assert line(both, "interval of bursts")["standard_uncertainty"] == pytest.approx(300.0)
+    rated = [replace(r, source=t.source) for r, t in zip(bench.turns_at([60.0, -60.0]), turns, strict=False)]
+    by_rate = with_stated(reference_least_squares.fit("gyroscope", rated, None, config), rated, config)
+    assert "interval of bursts" not in {entry["source"] for entry in by_rate.budget["contributions"]}
+
+
 def test_a_rate_that_is_not_the_change_of_its_angle_is_in_the_uncertainty() -> None:
     turns, off = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.001).turns_at([60.0, -60.0]), 1.5e-4
     turns = [replace(r, table_rate=(1.0 + off) * r.table_rate) for r in turns]

@@ -111,6 +111,13 @@ def times(cells: list[str]) -> bytes:
     return text([c + "," + r.partition(",")[2] for c, r in zip(cells, ROWS, strict=True)])
 
 
+def two_logs() -> bytes:
+    """Return the rows of two sensors with one clock, in turn; their biases differ by 1 mg, as their noise."""
+    other = np.where(np.arange(SAMPLES) % 2 == 1, 1e-3, 0.0)[:, None] * np.array([0, 1, 0, 0, 0, 0, 0])
+    rows = rows_of(VALUES + other)
+    return text([f"{0.02 * (i // 2):.2f},{row.partition(',')[2]}" for i, row in enumerate(rows)])
+
+
 ALL = np.arange(SAMPLES)
 RATE = np.round(VALUES[:, 4])
 TABLE_ANGLE = np.concatenate([[0.0], np.cumsum(RATE[1:] + RATE[:-1]) / 2 * INTERVAL_S])
@@ -422,17 +429,36 @@ def cases() -> dict[str, Case]:
         "36 too long": one(
             text([*ROWS[:600], *ROWS[700:]]), fault="missing_time", says="3.334% of the time is missing", line=602
         ),
-        "36 blocks": one(
+        "36 bursts": one(
             times([f"{0.08 * (i // 8) + 0.0002 * (i % 8):.4f}" for i in range(SAMPLES)]),
-            fault="missing_time",
-            says=r"blocks of 8, 80 ms apart .* ingest.csv.columns.time=null and ingest.csv.rate_hz=100,",
+            fault="bursts",
+            says=r"bursts of 8, 80 ms apart, with times 0.2 ms apart: .* ingest.csv.columns.time=null and "
+            r"ingest.csv.rate_hz=100,",
             line=10,
         ),
-        "35 blocks": one(
-            times([f"{0.08 * (i // 8):.2f}" for i in range(SAMPLES)]),
-            fault="duplicate_time",
-            says=r"blocks of 8, 80 ms apart .* ingest.csv.columns.time=null and ingest.csv.rate_hz=100,",
+        "36 burst lost": one(
+            text([f"{0.08 * (i // 8):.2f},{r.partition(',')[2]}" for i, r in enumerate(ROWS) if i // 8 != 100]),
+            fault="bursts",
+            says=r"bursts of 8, 80 ms apart: they depart from a regular clock .* as if rows were missing; if no row is "
+            r"missing, count the rows: ingest.csv.columns.time=null and ingest.csv.rate_hz=100,",
             line=10,
+        ),
+        "36 rounded": one(
+            times([f"{int(i / 0.833) / 1000:.3f}" for i in range(SAMPLES)]),
+            fault="missing_time",
+            says=r"16.694% of the time is missing; the times are multiples of 1 ms; if they are rounded and no row is "
+            r"missing, count the rows: .*ingest.csv.rate_hz=833.056",
+        ),
+        "35 bursts": one(
+            times([f"{0.08 * (i // 8):.2f}" for i in range(SAMPLES)]),
+            notes=("N-BURSTS",),
+            kept=ALL,
+        ),
+        "35 two logs": one(
+            two_logs(),
+            fault="bursts",
+            says="their rows differ as those of two sensors or of two merged logs do",
+            line=4,
         ),
         "37": one(
             times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]),

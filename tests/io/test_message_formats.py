@@ -280,6 +280,20 @@ def test_the_time_in_the_first_column_of_an_array_is_no_reading(
     assert_is(read_log(log, mcap_format(yaml.safe_load(profile_file.read_text()))), truth)
 
 
+def test_a_time_in_bursts_in_the_first_column_of_an_array_is_a_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth, log, profile_file = Truth(3200), tmp_path / "log.mat", tmp_path / "own.yaml"
+    data = in_columns(truth, "t", "f", "w")
+    data[:, 0] = np.repeat(data[15::16, 0], 16)
+    savemat(log, {"data": data})
+    assert check([str(log), "--save", str(profile_file)]) == 2
+    assert "samples arrive in bursts of 16, 160 ms apart" in capsys.readouterr().out
+    fields = yaml.safe_load(profile_file.read_text())["mcap"]["topics"]["/"]
+    assert fields["time"] == {"field": "data[0]", "unit": "s"}
+    assert fields["gyro_z"] == {"field": "data[6]", "unit": "rad/s"}
+
+
 def test_two_files_of_arrays_are_one_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth, profile_file = Truth(1200), tmp_path / "own.yaml"
     files = [tmp_path / "IMU0x2Dalpha.mat", tmp_path / "IMU0x2Domega.mat"]  # as imu_tk_matlab names them

@@ -240,6 +240,20 @@ def test_times_that_most_rows_share_with_the_row_before_are_proposed() -> None:
     assert proposal.columns[0]["accel_x"]["unit"] == "g"
 
 
+def test_units_of_samples_in_bursts_are_found_by_their_regular_clock(tmp_path: Path) -> None:
+    data = motion().copy()
+    data[:, 0] = 0.08 * np.floor(data[:, 0] / 0.08 + 1e-6)  # eight rows of one time
+    file = tmp_path / "log.csv"
+    np.savetxt(file, data, "%.6g", ",", header="t,ax,ay,az,gx,gy,gz", comments="")
+    proposal = proposed(file)
+    assert proposal.complete, proposal.evidence
+    assert proposal.columns[0]["gyro_x"]["unit"] == "deg/s"
+    assert "rows in bursts" in proposal.evidence["time"]
+    table = read_csv([file], csv_formats(proposal.ingest("mine", {})))
+    assert [n.code for n in table.notes] == ["N-BURSTS"]
+    assert np.diff(table.time_ns) == pytest.approx(np.full(len(data) - 1, 1e7), rel=1e-3)
+
+
 def test_a_log_without_known_names_gives_a_template() -> None:
     text = "t_us,p,q,r,s\n" + "".join(f"{10_000 * i},1,2,{i % 3},4\n" for i in range(100))
     (proposal,) = propose([find_layout(text.encode(), "log.csv")])
