@@ -30,12 +30,14 @@ The measurement equation
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from pipeline.errors import PipelineError
 from pipeline.version import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from os import PathLike
     from pathlib import Path
 
     import pandas as pd
@@ -45,17 +47,18 @@ if TYPE_CHECKING:
     from pipeline.result import UnitResult
 
 __version__ = VERSION
-__all__ = ["__version__", "calibrate", "calibrate_unit", "load_calibration", "load_campaign"]
+__all__ = ["PipelineError", "__version__", "calibrate", "calibrate_unit", "load_calibration", "load_campaign"]
 
 
 def calibrate(
-    recordings: str | Path | Mapping[str, str | Path | pd.DataFrame],
+    recordings: str | PathLike[str] | Mapping[str, str | PathLike[str] | pd.DataFrame],
     *,
     sensor: str,
     table: str = "hand",
     procedure: str | None = None,
     method: str | None = None,
     overrides: Sequence[str] = (),
+    python_effects: Sequence[str | PathLike[str]] = (),
 ) -> UnitResult:
     """Calibrate a unit from its recordings, in memory; no file is written.
 
@@ -64,11 +67,14 @@ def calibrate(
     recordings : str, Path or mapping
         A folder with the files that the procedure names, or the file or DataFrame of each recording by its name, for
         example ``{"accel_x": frame}``. A DataFrame has the columns of the canonical CSV (``time_s``, ``accel_x_g``,
-        ``gyro_x_dps``, ``table_angle_deg`` ...).
+        ``gyro_x_dps``, ``table_angle_deg`` ...), in its units; its index is not used. Messages count its rows as lines
+        of that CSV: row 0 is line 2.
     sensor, table, procedure, method : str
         Options of these groups, with the defaults of ``units.csv``.
     overrides : sequence of str
         Further settings, as in ``overrides=`` of a run, for example ``["effects.gyroscope=[g_sensitivity]"]``.
+    python_effects : sequence of str or Path
+        Files of effects in Python. They are run.
 
     Raises
     ------
@@ -79,12 +85,18 @@ def calibrate(
     from pipeline.result import UnitResult  # noqa: PLC0415
 
     chosen = {"sensor": sensor, "table": table, "procedure": procedure, "method": method}
-    layers = [f"{group}={option}" for group, option in chosen.items() if option is not None]
-    configured = unit_without_campaign(recordings, [*layers, *overrides])
-    return UnitResult.of(configured, configured.run_to("calibration"))
+    configured = unit_without_campaign(recordings, chosen, overrides, python_effects)
+    return UnitResult.of(configured, configured.calibrated())
 
 
-def calibrate_unit(campaign: str | Path, unit: str, *, overrides: Sequence[str] = ()) -> UnitResult:
+def calibrate_unit(
+    campaign: str | PathLike[str],
+    unit: str,
+    *,
+    overrides: Sequence[str] = (),
+    python_effects: Sequence[str | PathLike[str]] = (),
+    results: str | PathLike[str] = "results",
+) -> UnitResult:
     """Calibrate one unit of a campaign as a run does, in memory; no file is written.
 
     Parameters
@@ -95,22 +107,39 @@ def calibrate_unit(campaign: str | Path, unit: str, *, overrides: Sequence[str] 
         A unit of its ``units.csv``.
     overrides : sequence of str
         Hydra overrides for this unit, as in ``overrides=`` of a run.
+    python_effects : sequence of str or Path
+        Files of effects in Python. They are run.
+    results : str or Path
+        Folder of the results of runs. Only a campaign with ``simulate: true`` needs it: its recordings are those that
+        a run has simulated.
 
     Raises
     ------
-    ConfigurationError
-        If the campaign, the unit or a setting is not valid.
     PipelineError
-        The error whose code, message and file a run publishes for a failed unit.
+        ``ConfigurationError`` if the campaign, the unit or a setting is not valid; else the error whose code, message
+        and file a run publishes for a failed unit.
     """
     from pipeline.config import load_campaign as load  # noqa: PLC0415  (Hydra is imported only where needed)
-    from pipeline.one_unit import notes_of_campaign, unit_of_campaign  # noqa: PLC0415
+    from pipeline.config.layers import as_list  # noqa: PLC0415
+    from pipeline.one_unit import (  # noqa: PLC0415
+        files_of_effects,
+        notes_of_campaign,
+        require_simulated,
+        unit_of_campaign,
+    )
+    from pipeline.outcome import RESULTS  # noqa: PLC0415
     from pipeline.result import UnitResult  # noqa: PLC0415
 
-    settings = {"campaign": str(campaign)} | ({"overrides": list(overrides)} if overrides else {})
-    loaded = load(settings)
+    settings: dict[str, Any] = {
+        "campaign": str(campaign),
+        "results": "" if str(results) == RESULTS else str(results),
+        "overrides": as_list(overrides, "overrides"),
+        "python_effects": files_of_effects(python_effects),
+    }
+    loaded = load({key: value for key, value in settings.items() if value})
     configured = unit_of_campaign(loaded, unit)
-    return UnitResult.of(configured, configured.run_to("calibration"), notes_of_campaign(loaded, unit))
+    require_simulated(loaded)
+    return UnitResult.of(configured, configured.calibrated(), notes_of_campaign(loaded, unit))
 
 
 def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:

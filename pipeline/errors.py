@@ -108,19 +108,30 @@ class CannotCalibrateError(PipelineError):
     code = "cannot_calibrate"
 
 
+class InternalError(PipelineError):
+    """A bug of the package; the exception is its cause."""
+
+    code = "internal_error"
+
+
+def as_published(error: Exception) -> PipelineError:
+    """Return the error with the code, message and file that a run publishes for an exception."""
+    if isinstance(error, PipelineError):
+        return error
+    if isinstance(error, OSError) and error.filename is not None:
+        return InputError(error.strerror or str(error), str(error.filename))
+    return InternalError(f"{type(error).__name__}: {error} (a bug; see the log)")
+
+
 def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
     """Return the record of a unit's failure; print the traceback of an exception that is a bug."""
-    code, message, file = "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)", None
     if isinstance(error, DamagedFileError):
         with suppress(OSError), Path(str(error.file)).open("ab") as stream:
             stream.write(b"\0")  # changes the size: the next run detects that the file was changed
-    if isinstance(error, PipelineError):
-        code, message, file = error.code, error.message, error.file
-    elif isinstance(error, OSError) and error.filename is not None:
-        code, message, file = "bad_input", error.strerror or str(error), str(error.filename)
-    else:
+    known = as_published(error)
+    if isinstance(known, InternalError):
         traceback.print_exc()
-    return {"unit": unit, "stage": stage, "code": code, "message": message, "file": file}
+    return {"unit": unit, "stage": stage, "code": known.code, "message": known.message, "file": known.file}
 
 
 def omission(error: Exception, unit: str, stage: str) -> dict[str, Any]:

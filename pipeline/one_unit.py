@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import scipy.linalg  # noqa: F401  (loads its library of linear algebra, so that ``environment`` limits its threads)
 from threadpoolctl import threadpool_limits
 
-from pipeline.config.campaign import Campaign, UnitRow, cut_batches, run_settings
+from pipeline.config.campaign import Campaign, UnitRow, cut_batches
 from pipeline.config.compose import Composer
+from pipeline.config.layers import as_list, key_of
 from pipeline.config.options import RUN_SETTINGS, Problem, nearest, parse
 from pipeline.config.stage_settings import as_job_reads, settings_of_unit
-from pipeline.errors import ConfigurationError, InputError, MissingInputError, failure_of
-from pipeline.io.files import UNIT_NAME
+from pipeline.config.user_effects import PYTHON
+from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError, as_published, failure_of
+from pipeline.io.files import candidate_files, wrong_name
+from pipeline.io.read import IN_MEMORY, canonical, of_one_sensor, tried
 from pipeline.model.effects import registered
+from pipeline.outcome import run_command
 from pipeline.unit import Task, UnitFiles, UnitState, run_steps, tasks_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     import pandas as pd
+
+    Paths = Sequence[str | os.PathLike[str]]
+    Recordings = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str] | pd.DataFrame]
 
 NO_CAMPAIGN = Path(__file__).with_name("no_campaign")  # does not exist: no options or effects of a campaign
 
@@ -61,6 +71,17 @@ class ConfiguredUnit:
         stages = self.stages if fits else {s: [n for n in names if n != "effects"] for s, names in self.stages.items()}
         with self.environment():
             return run_steps(state or self.state(), tasks_of(stages, until), self.settings)
+
+    def calibrated(self) -> UnitState:
+        """Return the unit after the calibration; an error is that whose code, message and file a run publishes."""
+        try:
+            return self.run_to("calibration")
+        except PipelineError:
+            raise
+        except Exception as error:
+            if isinstance(error, OSError) and error.filename is None:
+                raise  # an error of the machine, not of the unit: a full disk
+            raise as_published(error) from error
 
     @contextmanager
     def environment(self) -> Iterator[None]:
@@ -110,36 +131,83 @@ def notes_of_campaign(campaign: Campaign, unit: str) -> list[str]:
     return notes
 
 
-def unit_without_campaign(
-    recordings: str | Path | Mapping[str, str | Path | pd.DataFrame], layers: Sequence[str]
-) -> ConfiguredUnit:
-    """Return recordings as a unit, configured by overrides, weakest first; raises ``ConfigurationError``.
+def require_simulated(campaign: Campaign) -> None:
+    """Raise ``MissingInputError`` if the recordings of a campaign are those that its run simulates, and are not there.
 
-    ``recordings``: a folder with the files that the procedure names, or the files or DataFrames (columns of the
-    canonical CSV) of the recordings by their names.
+    They are not there, either, if the description has changed since: a run then simulates them again.
     """
-    run = [text for text in layers if text.partition("=")[0].strip() in RUN_SETTINGS]
-    run_settings(run)  # refuses values that no run accepts
-    folder = Path() if not isinstance(recordings, str | Path) else Path(recordings).resolve()
-    name = folder.name if folder.name and UNIT_NAME.fullmatch(folder.name) else "unit"
-    composer = Composer(NO_CAMPAIGN)
+    if campaign.simulation is None:
+        return
+    mark = campaign.recorded / ".snakemake_timestamp"
+    made = next((file.stat().st_mtime for file in (mark, campaign.recorded) if file.exists()), None)
+    if made is None or made < campaign.simulation.stat().st_mtime:
+        reason = "they do not exist" if made is None else f"{campaign.simulation.name} has changed since"
+        message = f"the recordings of campaign {campaign.name} are simulated by its run, and {reason}"
+        results = f"run it: {run_command(campaign.settings)}; a run with other results is named by results=FOLDER"
+        raise MissingInputError(f"{message}; {results}", str(campaign.recorded))
+
+
+def unit_without_campaign(
+    recordings: Recordings, chosen: Mapping[str, str | None], overrides: Sequence[str], python_effects: Paths
+) -> ConfiguredUnit:
+    """Return recordings as a unit; parameters and errors as of ``pipeline.calibrate``.
+
+    ``chosen``: the option of each group, None for its default.
+    """
+    for group, option in chosen.items():
+        if not isinstance(option, str) and (option is not None or group == "sensor"):
+            raise ConfigurationError(f"{group}={option!r}: a name is expected, of a file in configs/{group}")
+    texts = as_list(overrides, "overrides")
+    for text in texts:
+        if key_of(text) in RUN_SETTINGS:
+            raise ConfigurationError(f"{text}: a setting of a run, which one unit does not have; leave it out")
+    files = files_of_effects(python_effects)
+    name, folder = "unit", NO_CAMPAIGN
+    if isinstance(recordings, str | os.PathLike):
+        folder = Path(recordings).resolve()
+        name = name if wrong_name(folder.name) else folder.name
     try:
-        texts = [text for text in layers if text not in run]
-        values = dict(map(parse, texts))
-        row = UnitRow(name, {"unit": name}, composer.unit(name, texts), {k: str(v) for k, v in values.items()})
+        composer = Composer(NO_CAMPAIGN, files, below=Path())
+        layers = [*(f"{group}={option}" for group, option in chosen.items() if option is not None), *texts]
+        config = composer.unit(name, layers)
     except Problem as problem:
         raise ConfigurationError(f"the configuration is refused: {problem}") from problem
-    files = UnitFiles(folder, folder)
-    if not isinstance(recordings, str | Path):
-        row, files = _of_mapping(row, recordings)
-    elif not folder.is_dir():
-        raise InputError("is no folder; a folder of recordings is expected, or a mapping of names to them", str(folder))
+    row = UnitRow(name, {"unit": name}, config, {key: str(value) for key, value in map(parse, layers)})
+    if folder != NO_CAMPAIGN:
+        _require_recordings(folder)
+        found = UnitFiles(folder, folder)
+    else:
+        row, found = _of_mapping(row, recordings)
     batches, chains = cut_batches({name: row}, 1)
-    return ConfiguredUnit(row, files, chains[next(iter(batches))])
+    return ConfiguredUnit(row, found, chains[next(iter(batches))])
 
 
-def _of_mapping(row: UnitRow, recordings: Mapping[str, str | Path | pd.DataFrame]) -> tuple[UnitRow, UnitFiles]:
+def files_of_effects(python_effects: Paths) -> list[str]:
+    """Return the paths of Python effects as texts."""
+    one = isinstance(python_effects, str | os.PathLike)
+    texts = [os.fspath(p) if isinstance(p, os.PathLike) else p for p in ([python_effects] if one else python_effects)]
+    return as_list(texts, PYTHON, "a list of paths of Python files")
+
+
+def _require_recordings(folder: Path) -> None:
+    """Raise ``InputError`` for a path that is no folder, or is a campaign."""
+    expected = "a folder of recordings is expected, or a mapping of their names to files or DataFrames"
+    if not folder.exists():
+        raise MissingInputError(f"does not exist; {expected}", str(folder))
+    if not folder.is_dir():
+        raise InputError(f"is no folder; {expected}", str(folder))
+    if (folder / "units.csv").is_file():
+        raise InputError("is a campaign; pipeline.calibrate_unit(campaign, unit) calibrates a unit of it", str(folder))
+
+
+def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # noqa: ANN401  (the user's)
     """Return the unit and its files for recordings that are named one by one; those that are not named are absent."""
+    if not isinstance(recordings, Mapping):
+        kind = type(recordings).__name__
+        raise InputError(
+            "recordings: a folder is expected, or a mapping of names to files or DataFrames, for example "
+            f"{{'recording': frame}}; got {kind}"
+        )
     procedure = row.config["procedure"]
     known = procedure["recordings"]
     for name in recordings:
@@ -149,10 +217,36 @@ def _of_mapping(row: UnitRow, recordings: Mapping[str, str | Path | pd.DataFrame
             )
     lacking = [n for n, entry in known.items() if n not in recordings and not entry.get("optional", False)]
     if lacking:
-        raise MissingInputError(f"missing recordings: {', '.join(lacking)}; procedure {procedure['name']} needs them")
-    paths = {n: Path(r).resolve() for n, r in recordings.items() if isinstance(r, str | Path)}
-    # A float is written by its shortest text that reads back as the same float.
-    texts = {n: r.to_csv(index=False).encode() for n, r in recordings.items() if not isinstance(r, str | Path)}
-    entries = {n: {**known[n], "file": str(paths[n])} if n in paths else known[n] for n in known if n in recordings}
-    config = {**row.config, "procedure": {**procedure, "recordings": entries}}
-    return replace(row, config=config), UnitFiles(NO_CAMPAIGN, NO_CAMPAIGN, in_memory=texts)
+        raise MissingInputError(
+            f"missing recordings: {', '.join(lacking)}; procedure {procedure['name']} needs them"
+            f"{of_one_sensor(procedure, recordings)}"
+        )
+    frames = {n: _text_of(n, r) for n, r in recordings.items() if not isinstance(r, str | os.PathLike)}
+    paths = {n: str(Path(r).resolve()) for n, r in recordings.items() if n not in frames}
+    columns = (row.config["ingest"].get("csv") or {}).get("columns")
+    if frames and not paths and columns and columns != canonical()["csv"]["columns"]:
+        message = "describes columns of files; a DataFrame has those of the canonical CSV: leave out the setting"
+        raise ConfigurationError(f"ingest={row.config['ingest']['name']} {message} of ingest")
+    entries = {n: known[n] | ({"file": paths[n]} if n in paths else {}) for n in known if n in recordings}
+    of_unit = {**procedure, "recordings": entries}
+    for name, candidates in candidate_files(of_unit, row.config["ingest"]).items():
+        if name not in paths or any(os.path.exists(file) for files in candidates for file in files):  # noqa: PTH110
+            continue
+        if Path(paths[name]).is_dir():
+            raise InputError(f"recording {name}: is a folder; a file is expected", paths[name])
+        message = f"recording {name}: there is no such file (tried {tried(candidates)})"
+        raise MissingInputError(message, paths[name])
+    files = UnitFiles(NO_CAMPAIGN, NO_CAMPAIGN, in_memory=frames)
+    return replace(row, config={**row.config, "procedure": of_unit}), files
+
+
+def _text_of(name: str, recording: Any) -> bytes:  # noqa: ANN401  (the user's)
+    """Return a DataFrame as canonical CSV; raises ``InputError`` for any other object."""
+    import pandas as pd  # noqa: PLC0415  (0.4 s, for DataFrames only)
+
+    from pipeline.io.data_frame import canonical_csv  # noqa: PLC0415  (likewise)
+
+    if not isinstance(recording, pd.DataFrame):
+        kind = type(recording).__name__
+        raise InputError(f"recording {name}: the path of a file or a pandas DataFrame is expected; got {kind}")
+    return canonical_csv(f"{name} {IN_MEMORY}", recording)

@@ -12,7 +12,8 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.files import write_atomically
-from pipeline.io.units import CANONICAL, TRIADS
+from pipeline.io.channel_table import in_body_axes, maps_of_log
+from pipeline.io.units import CANONICAL, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.compensation import Compensation, compensation_of
 from pipeline.pack import as_bytes
 from pipeline.records import SENSOR_UNITS, SENSORS, Values
@@ -26,9 +27,10 @@ if TYPE_CHECKING:
     from pipeline.one_unit import ConfiguredUnit
 
 DIGITS = 5  # significant, of the figures that are printed
+WIDTH = 120  # characters of a printed line
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SensorResult:
     """The calibration of one sensor: ``truth = matrix @ (reading - bias - effects)``."""
 
@@ -50,7 +52,7 @@ class SensorResult:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class UnitResult:
     """A calibrated unit.
 
@@ -99,27 +101,56 @@ class UnitResult:
         return compensation_of(self.calibration)
 
     def apply(self, log: pd.DataFrame) -> pd.DataFrame:
-        """Return a log with calibrated readings: the same columns and index.
+        """Return a log with calibrated readings: the same columns, in the same order, and the same index.
 
-        Columns are those of the canonical CSV; a sensor without all three columns, or without a calibration, and all
-        other columns are unchanged. Raises ``InputError`` where a fitted effect needs a column that is absent.
+        Columns are those of the canonical CSV, with the axes of the recordings (``sensor.axis_map``); calibrated
+        readings are in body axes. A sensor that the log does not contain, or that is not calibrated, and all other
+        columns are unchanged. Raises ``InputError`` where an effect needs a column that is absent, and where nothing
+        would be calibrated.
         """
-        columns = {s: [CANONICAL[channel] for channel in TRIADS[s]] for s in SENSORS}
-        present = {s: names for s, names in columns.items() if set(names) <= set(log.columns)}
-        if not present:
-            names = ", ".join(name for names in columns.values() for name in names)
-            raise InputError(f"the log has none of the sensors' columns; the three of a sensor are expected: {names}")
-        signals: dict[str, Any] = {s: log[names].to_numpy(float) for s, names in present.items()}
-        for signal in ("temperature", "time"):
-            if CANONICAL[signal] in log:
-                signals[signal] = log[CANONICAL[signal]].to_numpy(float)
+        signals = self._signals(log)
         with self._configured.environment():
-            found = self._compensation.apply(**signals)
+            stream = self._compensation.stream()
+            try:
+                found = stream.apply(**signals)
+            except InputError as error:
+                lacking = {**{s: TRIADS[s] for s in SENSORS}, "temperature": ["temperature"], "time": ["time"]}
+                names = [CANONICAL[c] for s in sorted(stream.needs - set(signals)) for c in lacking[s]]
+                raise InputError(f"{error.message}; the log has no column {', '.join(names)}") from None
         out = log.copy()
-        for sensor, columns_of_sensor in present.items():
-            if self.calibration[sensor]:
-                out[columns_of_sensor] = getattr(found, sensor)
+        for sensor in (s for s in SENSORS if s in signals and self.calibration[s]):
+            out[[CANONICAL[channel] for channel in TRIADS[sensor]]] = getattr(found, sensor)
         return out
+
+    def _signals(self, log: pd.DataFrame) -> dict[str, Any]:
+        """Return the signals of a log: (n, 3) readings in body axes, (n,) temperature and time."""
+        import pandas as pd  # noqa: PLC0415  (who calls this has imported it)
+
+        if not isinstance(log, pd.DataFrame):
+            raise InputError(f"a pandas DataFrame is expected; got {type(log).__name__}")
+        columns = {s: [CANONICAL[channel] for channel in TRIADS[s]] for s in SENSORS}
+        known = {s: names for s, names in columns.items() if set(names) & set(log.columns)}
+        scalars = [CANONICAL[signal] for signal in ("temperature", "time")]
+        if lacking := [n for names in known.values() for n in names if n not in log]:
+            raise InputError(f"the log has no column {', '.join(lacking)}; the three of a sensor are expected")
+        used = [n for n in (*columns["accelerometer"], *columns["gyroscope"], *scalars) if n in log]
+        for name in used:
+            if log.columns.get_loc(name).__class__ is not int:
+                raise InputError(f"the log has more than one column {name}")
+            if log[name].dtype.kind not in "iuf":
+                raise InputError(f"column {name} of the log has the dtype {log[name].dtype}; numbers are expected")
+        reasons = [f"{s}: {self.calibration['not_calibrated'].get(s, '')}" for s in known if not self.calibration[s]]
+        if len(reasons) == len(known):
+            expected = ", ".join(name for s in SENSORS if self.calibration[s] for name in columns[s])
+            why = f" (not calibrated: {'; '.join(reasons)})" if reasons else ""
+            raise InputError(f"the log has no column of a calibrated sensor; expected {expected}{why}")
+        maps = maps_of_log(self.calibration["log"])
+        values = {n: log[n].to_numpy(np.float64, na_value=np.nan) for n in used}
+        signals = {s: in_body_axes(maps[s], np.column_stack([values[n] for n in names])) for s, names in known.items()}
+        temperature, time = (values.get(name) for name in scalars)
+        if time is not None and len(time) and time[0] * SECOND_NS > SINCE_1970_NS:
+            time = time - time[0]  # as the command apply counts it
+        return signals | {k: v for k, v in (("temperature", temperature), ("time", time)) if v is not None}
 
     def _files(self) -> dict[str, Any]:
         """Return the files that a run publishes of the unit, by their path in a results folder."""
@@ -152,23 +183,23 @@ class UnitResult:
         write_atomically(Path(path), as_bytes(page))
 
     def __repr__(self) -> str:
-        """Return bias, matrix, held-out error and verdict of each sensor, in at most 16 lines."""
+        """Return bias, matrix, effects, held-out error and verdict of each sensor, in at most 16 lines."""
         document = self.calibration
         lines = [f"{document['unit']}: {document['sensor']}, {document['procedure']}, {document['method']}"]
         for sensor in SENSORS:
             part = self._part(sensor)
             if part is None:
-                lines.append(f"{sensor}: null, {document['not_calibrated'].get(sensor, '')}"[:150])
+                lines.append(f"{sensor}: null, {document['not_calibrated'].get(sensor, '')}")
                 continue
-            lines.append(f"{sensor}: {self.verdict.get(sensor, '')}{self._missing(sensor)}")
+            missing = self.diagnosis[sensor]["selected"] if self.diagnosis[sensor] else []
+            missing = [name for name in missing if name not in part.effects]
+            told = f" ({', '.join(missing)})" if missing else ""
+            lines.append(f"{sensor}: {self.verdict.get(sensor, '')}{told}")
             lines.append(f"  bias {_row(part.bias)} {SENSOR_UNITS[sensor]}")
             lines += [f"  {'matrix' if i == 0 else '      '} {_row(row)}" for i, row in enumerate(part.matrix)]
+            lines += [f"  effects {', '.join(part.effects)}"] if part.effects else []
             lines.append(f"  held-out rms error {self._held_out(sensor)}")
-        return "\n".join(lines)
-
-    def _missing(self, sensor: str) -> str:
-        selected = self.diagnosis[sensor]["selected"] if self.diagnosis[sensor] else []
-        return f" ({', '.join(selected)})" if selected else ""
+        return "\n".join(line if len(line) <= WIDTH else f"{line[: WIDTH - 3]}..." for line in lines)
 
     def _held_out(self, sensor: str) -> str:
         held_out, unit = self.validation[sensor], SENSOR_UNITS[sensor]

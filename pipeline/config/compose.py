@@ -65,11 +65,12 @@ class Composer:
     """Composes the configurations of the units of one campaign.
 
     Options include the files ``configs/<group>/*.yaml`` of the campaign. Effects include its files ``effects/*.yaml``
-    and the Python files that the command line names. Raises ``ConfigurationError`` if one of the files is not valid.
+    and the Python files that the user names. ``below``: folder of relative paths in settings, by default the campaign.
+    Raises ``ConfigurationError`` if one of the files is not valid.
     """
 
-    def __init__(self, campaign: Path, python_effects: Sequence[str] = ()) -> None:
-        self.campaign = campaign
+    def __init__(self, campaign: Path, python_effects: Sequence[str] = (), below: Path | None = None) -> None:
+        self.campaign, self.below = campaign, below or campaign
         configs = campaign / "configs"
         self.searchpath = [configs.resolve()] if configs.is_dir() else []
         for file in sorted(configs.rglob("*.yaml")):  # checks each file before Hydra opens it
@@ -97,7 +98,7 @@ class Composer:
         resolved = self._resolved[key]
         procedure = resolved["procedure"]
         folder = procedure["folder"].replace("{unit}", name)
-        given = with_given(resolved, self.campaign, name) if GIVEN in resolved["method"].values() else {}
+        given = with_given(resolved, self.below, name) if GIVEN in resolved["method"].values() else {}
         return {**resolved, **given, "unit": name, "procedure": {**procedure, "folder": folder}}
 
     def split(self, layers: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, Any]]]:
@@ -271,9 +272,13 @@ def _compose(groups: Groups, folders: Sequence[Path] = ()) -> DictConfig:
     overrides = [f"{group}={option}" for group, option in groups]
     if folders:
         overrides.append(f"hydra.searchpath=[{','.join(map(_quoted, folders))}]")
+    before = GlobalHydra.instance().hydra  # of a program that uses Hydra and calls this package
     GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return compose("config", overrides)
+    try:
+        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+            return compose("config", overrides)
+    finally:
+        GlobalHydra.instance().hydra = before
 
 
 _compose_shipped = cache(_compose)  # these files do not change; commands load a campaign several times

@@ -30,7 +30,7 @@ GIVEN = "given"  # name of the method
 BUILT_IN = r"(?m)^built_in: true"  # marks an effect of the package
 ONLY_FROM_THE_COMMAND_LINE = (
     "an effect in Python is code, and is loaded only where the command line names it: "
-    "--config 'python_effects=[path/to/my_effect.py]'"
+    "--config 'python_effects=[path/to/my_effect.py]', or the argument python_effects of a Python function"
 )
 
 

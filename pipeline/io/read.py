@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 
 MOST_NAMED = 5  # further files that an error lists
+IN_MEMORY = "(DataFrame)"  # after the name of a recording that has no file
 
 
 def read_recordings(
@@ -62,7 +63,7 @@ def read_recordings(
         entry = procedure["recordings"][name]
         files, wanted, unread = _existing(candidates, folder) if name not in in_memory else ([name], [name], [])
         if not files:
-            missing += [] if entry.get("optional", False) else [f"{name} (tried {_tried(candidates)})"]
+            missing += [] if entry.get("optional", False) else [f"{name} (tried {tried(candidates)})"]
             continue
         found.add(name)
         if files != wanted:
@@ -83,7 +84,7 @@ def read_recordings(
         recordings.append(recording)
     if missing:
         reason = "" if folder.is_dir() else "; the folder does not exist"
-        message = f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, found)}"
+        message = f"missing recordings: {'; '.join(missing)}{reason}{of_one_sensor(procedure, found)}"
         refused.insert(0, MissingInputError(message, str(folder)))
     if refused:
         first, *others = refused
@@ -122,12 +123,24 @@ def read_table(
 
 
 def read_canonical(name: str, text: bytes, checks: Checks) -> ChannelTable:
-    """Read a canonical CSV that is in memory."""
+    """Read a canonical CSV that is in memory (``pipeline.io.data_frame``)."""
     from pipeline.io.csv_read import read_stream  # noqa: PLC0415  (a log of messages needs no parser of text)
-    from pipeline.io.yaml_file import read_yaml  # noqa: PLC0415
 
-    (layout,) = csv_formats(read_yaml(CONFIGS / "ingest" / "canonical_csv.yaml"))
-    return read_stream(io.BytesIO(text), f"{name} (DataFrame)", layout, checks)
+    (layout,) = csv_formats(canonical())
+    try:
+        return read_stream(io.BytesIO(text), f"{name} {IN_MEMORY}", layout, checks)
+    except IngestError as error:
+        if error.code != "missing_column":
+            raise
+        hint = "name the columns of the DataFrame as in the canonical CSV"
+        raise IngestError(error.fact, error.file, code=error.code, hint=hint) from None
+
+
+def canonical() -> dict[str, Any]:
+    """Return the ingest profile of the canonical CSV."""
+    from pipeline.io.yaml_file import read_yaml  # noqa: PLC0415  (a run reads profiles as settings)
+
+    return dict(read_yaml(CONFIGS / "ingest" / "canonical_csv.yaml"))
 
 
 def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[str], list[str], list[str]]:
@@ -138,7 +151,7 @@ def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[s
     return files, wanted, [f for existing in present for f in existing if f not in files]
 
 
-def _tried(candidates: Sequence[Sequence[str]]) -> str:
+def tried(candidates: Sequence[Sequence[str]]) -> str:
     """List the possible file names of a recording; names that differ in the suffix only are shortened to it."""
     stems: set[str] = set()
     texts = []
@@ -149,7 +162,7 @@ def _tried(candidates: Sequence[Sequence[str]]) -> str:
     return ", ".join(texts)
 
 
-def _of_one_sensor(procedure: Mapping[str, Any], files: Collection[str]) -> str:
+def of_one_sensor(procedure: Mapping[str, Any], files: Collection[str]) -> str:
     """Return advice for a unit with one sensor, if all recordings of one sensor are missing; else empty."""
     entries = procedure["recordings"].items()
     there = {sensor: [n in files for n, e in entries if e["role"] == sensor] for sensor in TRIADS}

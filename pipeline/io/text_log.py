@@ -203,7 +203,8 @@ class TextLog:
 
     def _chunks(self) -> Iterator[bytes]:
         """Yield the bytes of the file without byte order mark and without NUL bytes at its end."""
-        position, remaining = 0, os.fstat(self.stream.fileno()).st_size  # a file that grows is not followed
+        position, remaining = 0, self.stream.seek(0, os.SEEK_END)  # a file that grows is not followed
+        self.stream.seek(0)
         while chunk := self.stream.read(min(self.size, remaining)):
             remaining -= len(chunk)
             self.digest.update(chunk)

@@ -330,12 +330,12 @@ def _check_spans(recording: Recording) -> None:
         if max(spans[i] for i in across) >= LEVEL_G >= spans[axis]:
             which = "the rows in which the table turns"
             stuck += [(TRIADS["accelerometer"][i], spans[i], "1 g", which) for i in across if spans[i] < SPANNED]
-    for channel, span, required, which in stuck:
+    for channel, span, expected, which in stuck:
         raise refusal(
             recording,
             "stuck",
-            f"{channel} stays within {span:.3g} {required.partition(' ')[2]} in nine tenths of {which}, while the "
-            f"table's motion about {recording.axis} makes it vary by {required}",
+            f"{channel} stays within {span:.3g} {expected.partition(' ')[2]} in nine tenths of {which}, while the "
+            f"table's motion about {recording.axis} makes it vary by {expected}",
             "is the column right, and does this axis of the sensor work?",
         )
 

@@ -139,6 +139,10 @@ class Recording:
         found: Computed = self._computed[key]
         return found
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is copied to another process: not the quantities of ``once``, which contain functions."""
+        return {name: value for name, value in vars(self).items() if name != "_computed"}
+
     def with_readings(self, **fields: Any) -> Self:  # noqa: ANN401  (of the dataclass)
         """Return the recording with other readings, flags or role, and the motions that are already computed."""
         changed = replace(self, **fields)

@@ -139,7 +139,7 @@ def _sensor(
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
-    parameters = parameter_rows(sensor, part, sensor_config)
+    parameters, run = parameter_rows(sensor, part, sensor_config), settings.get("run")
     return {
         "held_out": held_out,
         "before": first.get("rms_error"),
@@ -171,7 +171,9 @@ def _sensor(
         "kind": "warn" if not held_out.get("held_out", True) else "" if (far or likely) and kind == "good" else kind,
         "of_rests": table.get("motion") == "none" and not logged,
         "far": far,
-        "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),
+        "commands": commands_of(found, sensor, str(calibration.get("unit")), run)
+        if (run := settings.get("run"))
+        else {},
     }
 
 

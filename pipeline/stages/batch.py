@@ -172,7 +172,10 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
 
 
 def merge_common(content: dict[str, Any]) -> dict[str, Any]:
-    """Merge the common settings into the settings of each unit."""
+    """Merge the common settings into the settings of each unit.
+
+    The order of keys, and with it of recordings, is alphabetical, whatever other units of the batch have in common.
+    """
     content["units"] = {unit: _merged(content.get("common", {}), own) for unit, own in content.get("units", {}).items()}
     content.pop("common", None)
     return content
@@ -180,7 +183,7 @@ def merge_common(content: dict[str, Any]) -> dict[str, Any]:
 
 def _merged(common: dict[str, Any], unit_settings: dict[str, Any]) -> dict[str, Any]:
     below = {k: _merged(common[k], v) for k, v in unit_settings.items() if isinstance(v, dict) and k in common}
-    return {**common, **unit_settings, **below}
+    return dict(sorted({**common, **unit_settings, **below}.items()))
 
 
 def record_output(job: Job, output: Path, names: Sequence[str] = ("",)) -> None:
