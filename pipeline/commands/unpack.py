@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,10 +10,10 @@ from pipeline.commands import parser_of
 from pipeline.errors import MissingInputError
 from pipeline.files import flushed_together, write_atomically
 from pipeline.history import read_history
-from pipeline.pack import batches_of
+from pipeline.pack import PACKS, batches_of
 from pipeline.report.pages import linked
-from pipeline.results_folder import PUBLISHED, record_written, repetitions, take_run
-from pipeline.stages.gather import publish_histories
+from pipeline.results_folder import BusyError, finish_publishing, jobs_running, publish, repetitions, take_run
+from pipeline.stages.gather import NEW, publish_histories
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,22 +34,27 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     campaign, units = arguments.campaign, arguments.units
     results = campaign if (campaign / "summary.csv").is_file() else Path(arguments.results) / campaign.name
-    batches = batches_of(results)
-    if not batches:
+    if not any((results / PACKS).glob("*/*")):
         raise MissingInputError("holds no packs: run the campaign first, or its units have files already", str(results))
+    take_run(results)
+    if jobs_running(results):
+        raise BusyError("jobs of a killed run are still running; wait until they have ended", str(results))
+    finish_publishing(results)
+    batches = batches_of(results)
     if absent := [unit for unit in units if unit not in batches]:
         raise MissingInputError(
             f"no unit {', '.join(absent)}; there are {', '.join(sorted(batches)[:12])}", str(results)
         )
-    take_run(results)
-    again, _ = repetitions(results, "")
+    again, new, paths = repetitions(results, "")[0], results / NEW, ["index.html"]
+    shutil.rmtree(new, ignore_errors=True)
     with flushed_together(results):
         for unit in units:
             for name, content in batches[unit].files(unit):
-                write_atomically(results / name, content)
-        publish_histories(results, read_history(results), units)
-        index = results / "index.html"
-        write_atomically(index, linked(index.read_text(encoding="utf-8"), units))
-    record_written(results, "", again, PUBLISHED)
+                write_atomically(new / name, content)
+                paths.append(name)
+        publish_histories(new, read_history(results), units)
+        index = (results / "index.html").read_text(encoding="utf-8")
+        write_atomically(new / "index.html", linked(index, units))
+    publish(new, results, again=again, paths=paths)
     print("\n".join(str(results / "reports" / f"{unit}.html") for unit in units))
     return 0

@@ -16,14 +16,14 @@ import pandas as pd
 
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record
-from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes
+from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison import against_truth, section
 from pipeline.report.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
 from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
-from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
-from pipeline.stages.batch import failure_of, record_output
+from pipeline.results_folder import PUBLISHED, finish_publishing, publish
+from pipeline.stages.batch import failure_of
 from pipeline.stages.summary import failed_files, failed_summary
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def gather_batch(job: Job) -> None:
         if "." not in name:
             (new / name).mkdir(parents=True)
     packed = len(run["order"]) > run["publish_limit"]
-    known = (results / "calibrations").glob("*.json") if any((results / PACKS).glob("*")) else ()
+    known = (results / "calibrations").glob("*.json") if any((results / PACKS).glob("*/*")) else ()
     asked = {file.stem for file in known}  # by ``unpack``
     found: dict[str, JSON] = {}
     parts: list[pd.DataFrame] = []
@@ -66,8 +66,7 @@ def gather_batch(job: Job) -> None:
         units = {unit: found[unit] for unit in run["order"]}
         parameters = pd.DataFrame({"unit": run["order"]}).merge(pd.concat(parts), on="unit")
         _write_campaign(job, units, parameters, new, packed=packed)
-    publish_all(new, results)
-    record_output(job, results, PUBLISHED)
+    publish(new, results, again=run.get("again", 0), keep=_without_successor(results, units))
     write_json(job.output, [u["failure"] for u in units.values() if u["failure"]])
 
 
@@ -89,6 +88,18 @@ def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
     for name, content in files.items():
         write_atomically(new / name, content)
     return found
+
+
+def _without_successor(results: Path, units: Mapping[str, JSON]) -> set[str]:
+    """Return the units and serials whose published results no new ones replace.
+
+    They left the campaign, or were calibrated before and fail now.
+    """
+    before = {file.stem for file in (results / "calibrations").glob("*.json")} | set(batches_of(results))
+    failed = {u for u in units if units[u]["failure"] and is_published(results / "validations" / f"{u}.json")}
+    serials = {found["row"].get("serial") for found in units.values()}
+    joint = {file.stem for file in (results / "combined").glob("*.json")} - serials
+    return failed | (before | joint) - set(units)
 
 
 def _shared(value: Any) -> Any:  # noqa: ANN401  (a JSON value)
