@@ -30,12 +30,13 @@ import shutil
 import signal
 import socket
 import stat
+from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import chain, count
 from pathlib import PurePath
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
-from pipeline.errors import PipelineError
+from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.files import exchange, flush_file_system, write_atomically
 from pipeline.pack import PACKS, Batch, directory_of
 
@@ -47,7 +48,12 @@ PUBLISHED = (
     "calibrations", "validations", "diagnoses", "reports", "certificates", "exports", "combined", "packs",
     "index.html", "summary.csv", "failures.json", "parameters.parquet", "fleet.json",
 )  # fmt: skip
-RUN_LOCK, JOBS_LOCK = ".run.lock", ".jobs.lock"
+BESIDE = (  # not published as a set
+    "batches", "configs", "history", "logs", "simulated", "complete.json", "thesis.html",
+)  # fmt: skip
+OF_A_RUN = ("calibrations/*.json", f"{PACKS}/*/*.zip", "batches/*/*.zip", "history/*.json", "simulated/truth/*.json")
+RUN_LOCK, JOBS_LOCK, OWNER = ".run.lock", ".jobs.lock", ".owner.json"
+NEW = ".new"  # folder of a new set of files, below the results
 COMPLETE, PLAN, EXCHANGED = ".published", ".plan.json", ".exchanged.json"
 REPLACED = "replaced-"  # and the date: folder of the results for what a run replaced and did not write anew
 UNKNOWN = "_unknown.yaml"  # end of the name of a suggested formula: <unit>_<sensor>_unknown.yaml
@@ -163,7 +169,7 @@ def _keep_others(old: Path, results: Path, plan: Mapping[str, Any]) -> None:
     """
     before, keep = plan.get("before", {}), set(plan.get("keep", ()))
     aside: dict[str, Path] = {}
-    batches: dict[str, bool] = {}  # of the former packs: whether they hold units that are kept
+    batches: dict[str, bool] = {}  # of the former packs: whether they are kept
     for path, state in _states(old).items():
         published, file = results / path, old / path
         folder, batch, *_ = [*path.split("/"), ""]
@@ -171,7 +177,7 @@ def _keep_others(old: Path, results: Path, plan: Mapping[str, Any]) -> None:
             continue
         if before.get(path) == state:
             if folder == PACKS and batch not in batches:
-                batches[batch] = bool(keep) and not keep.isdisjoint(Batch(old / PACKS / batch).units())
+                batches[batch] = _holds(old / PACKS / batch, keep)
             if batches[batch] if folder == PACKS else unit_of(path) in keep:
                 aside[path] = file
         elif path in before and folder == PACKS:
@@ -179,6 +185,14 @@ def _keep_others(old: Path, results: Path, plan: Mapping[str, Any]) -> None:
         elif not (path not in before and _put_back(file, published)) and not _same_bytes(file, published):
             aside[path] = file
     set_aside(aside, results)
+
+
+def _holds(packs: Path, units: set[str]) -> bool:
+    """Return whether the packs of a batch hold some of the units, or cannot be read."""
+    try:
+        return bool(units) and not units.isdisjoint(Batch(packs).units())
+    except DamagedFileError:
+        return True
 
 
 def _put_back(file: Path, place: Path) -> bool:
@@ -209,6 +223,11 @@ def set_aside(items: Mapping[str, Path], results: Path) -> Path | None:
     return folder
 
 
+def replaced_folders(results: Path) -> list[Path]:
+    """Return the folders of older files."""
+    return sorted(results.glob(f"{REPLACED}*"))
+
+
 def unit_of(path: str) -> str:
     """Return the unit, or the serial in ``combined``, to which a published file belongs; empty for other files."""
     folder, _, name = path.partition("/")
@@ -221,6 +240,50 @@ def unit_of(path: str) -> str:
 
 def _same_bytes(one: Path, other: Path) -> bool:
     return all(p.is_file() and not p.is_symlink() for p in (one, other)) and filecmp.cmp(one, other, shallow=False)
+
+
+class Owner(NamedTuple):
+    """The campaign to which a results folder belongs, in ``.owner.json``.
+
+    ``campaign``: its path; ``simulation``: SHA-256 of the description, if the run simulates the recordings; ``units``:
+    unit to the SHA-256 of its recordings.
+    """
+
+    campaign: str
+    simulation: str | None
+    units: dict[str, list[str]]
+
+
+def read_owner(results: Path) -> Owner | None:
+    """Return the owner of a results folder; None where the file is missing or damaged."""
+    try:
+        found = json.loads((results / OWNER).read_text(encoding="utf-8"))
+        units = {str(unit): [str(digest) for digest in digests] for unit, digests in found["units"].items()}
+        return Owner(str(found["campaign"]), found["simulation"], units)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def is_owner(results: Path, directory: Path) -> bool:
+    """Return whether the campaign in a directory owns the results by its path, or because no run has written any."""
+    owner = read_owner(results)
+    if owner is None:
+        return not any(any(results.glob(pattern)) for pattern in OF_A_RUN)
+    with suppress(OSError):
+        return os.path.samefile(owner.campaign, directory)  # noqa: PTH121  (texts)
+    return owner.campaign == str(directory)
+
+
+def write_owner(results: Path, owner: Owner) -> None:
+    """Record the owner of a results folder, unless the record says so already."""
+    if owner != read_owner(results):
+        write_atomically(results / OWNER, json.dumps(owner._asdict()))
+
+
+def record_units(results: Path, units: Mapping[str, list[str]]) -> None:
+    """Record the SHA-256 of the recordings of each unit, where the owner is recorded."""
+    if owner := read_owner(results):
+        write_owner(results, owner._replace(units=dict(units)))
 
 
 def record_written(results: Path, output: str, again: int) -> None:

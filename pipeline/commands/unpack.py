@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.commands import parser_of
-from pipeline.errors import MissingInputError
+from pipeline.config.campaign import find_campaign
+from pipeline.config.owner import require_own_results
+from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import flushed_together, write_atomically
 from pipeline.history import read_history
 from pipeline.pack import PACKS, batches_of
 from pipeline.report.pages import linked
-from pipeline.results_folder import BusyError, finish_publishing, jobs_running, publish, repetitions, take_run
-from pipeline.stages.gather import NEW, publish_histories
+from pipeline.results_folder import NEW, BusyError, finish_publishing, jobs_running, publish, repetitions, take_run
+from pipeline.stages.gather import publish_histories
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("units", metavar="UNIT", nargs="+", help="units whose files are published")
     arguments = parser.parse_args(argv)
     campaign, units = arguments.campaign, arguments.units
-    results = campaign if (campaign / "summary.csv").is_file() else Path(arguments.results) / campaign.name
+    results = campaign if (campaign / "summary.csv").is_file() else _results_of(campaign, Path(arguments.results))
     if not any((results / PACKS).glob("*/*")):
         raise MissingInputError("holds no packs: run the campaign first, or its units have files already", str(results))
     take_run(results)
@@ -58,3 +60,13 @@ def main(argv: Sequence[str]) -> int:
     publish(new, results, again=again, paths=paths)
     print("\n".join(str(results / "reports" / f"{unit}.html") for unit in units))
     return 0
+
+
+def _results_of(campaign: Path, results: Path) -> Path:
+    """Return the folder of a campaign's results; where there is no such campaign, its name says whose are meant."""
+    try:
+        directory = find_campaign(str(campaign))
+    except ConfigurationError:
+        return results / campaign.name
+    require_own_results(directory, results, {})
+    return results / directory.name
