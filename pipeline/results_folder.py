@@ -34,6 +34,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import chain, count
 from pathlib import PurePath
+from types import MappingProxyType
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.errors import DamagedFileError, PipelineError
@@ -113,12 +114,19 @@ def _locked(stream: IO[str], kind: int) -> bool:
 
 
 def publish(
-    new: Path, results: Path, *, again: int = 0, keep: Collection[str] = (), paths: Sequence[str] | None = None
+    new: Path,
+    results: Path,
+    *,
+    again: int = 0,
+    keep: Collection[str] = (),
+    paths: Sequence[str] | None = None,
+    written: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """Replace published files by those in ``new``, a folder below ``results``; remove ``new``.
 
     ``paths``: the files and folders of ``new`` to exchange; default: each of its items, which is the complete set.
-    ``keep``: units whose former files move to ``replaced-<date>/``. ``again``: as for ``record_written``.
+    ``keep``: units whose former files move to ``replaced-<date>/``. ``again``: as for ``record_written``. ``written``:
+    states of former files that a run wrote, beside those that are recorded.
     """
     finish_publishing(results)
     paths = [item.name for item in new.iterdir()] if paths is None else paths
@@ -126,13 +134,32 @@ def publish(
         "inodes": {path: (new / path).lstat().st_ino for path in paths},
         "again": again,
         "keep": sorted(keep),
-        "before": _last_written(results),
+        "before": {**_last_written(results), **written},
         "written": _states(new),
     }
     write_atomically(new / PLAN, json.dumps(plan))
     flush_file_system(results)
     new.rename(results / COMPLETE)
     finish_publishing(results)
+
+
+def new_simulated(folder: Path) -> Path:
+    """Return the empty folder for the recordings that ``publish_simulated`` exchanges with ``<results>/simulated``."""
+    new = folder.parent / NEW
+    shutil.rmtree(new, ignore_errors=True)
+    (new / folder.name).mkdir(parents=True)
+    return new / folder.name
+
+
+def publish_simulated(folder: Path) -> None:
+    """Replace the simulated recordings in the folder ``simulated`` of the results by new ones, as a whole."""
+    results, stamp = folder.parent, folder / SNAKEMAKE_TIMESTAMP
+    written: dict[str, str] = {}
+    if stamp.exists():  # of the version before: Snakemake made this file after the recordings
+        before = stamp.stat().st_mtime_ns
+        states = _states(folder, folder.name)
+        written = {path: s for path, s in states.items() if (results / path).lstat().st_mtime_ns <= before}
+    publish(results / NEW, results, again=_read_record(results, "")[0], paths=[folder.name], written=written)
 
 
 def finish_publishing(results: Path) -> None:
@@ -324,7 +351,8 @@ def repetitions(results: Path, output: str) -> tuple[int, list[str]]:
     if not (results / output).exists():
         return again, []  # Snakemake writes a missing output in any case
     changed = [name for name, digest in record.get("files", {}).items() if _digest(results / output / name) != digest]
-    changed += [path.partition("/")[0] for path, s in record.get("written", {}).items() if _state(results / path) != s]
+    published = {path: s for path, s in record.get("written", {}).items() if path.partition("/")[0] in PUBLISHED}
+    changed += [path.partition("/")[0] for path, state in published.items() if _state(results / path) != state]
     edited = [os.path.normpath(results / output / name) for name in dict.fromkeys(changed)]
     return again + bool(edited), edited
 

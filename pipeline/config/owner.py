@@ -100,6 +100,19 @@ def claim(campaign: Campaign, checked: Checked) -> None:
     write_owner(campaign.results, Owner(str(campaign.directory), _description(campaign), units))
 
 
+def complete_record(campaign: Campaign) -> None:
+    """Record the digests of the units that no stage states, because ingest refused their recordings."""
+    owner = read_owner(campaign.results)
+    unknown = [unit for unit in campaign.units if owner and unit not in owner.units]
+    if owner and unknown:
+        write_owner(campaign.results, owner._replace(units=owner.units | {u: _digests(campaign, u) for u in unknown}))
+
+
+def _digests(campaign: Campaign, unit: str) -> list[str]:
+    config = campaign.units[unit].config
+    return digests_of_files(config["procedure"], config["ingest"], campaign.folder(unit))
+
+
 def _refusal(campaign: Campaign, reason: str) -> OtherCampaignError:
     results, owner = campaign.results, read_owner(campaign.results)
     known = f"the campaign {owner.campaign}" if owner else f"another campaign{_earlier(results)}"
@@ -137,8 +150,7 @@ def _difference(campaign: Campaign) -> str:
     countdown, files = Countdown(len(both)), 0
     for number, unit in enumerate(both):
         countdown(number, f"recordings of {unit}: compared with those of the results in {campaign.results}")
-        config = campaign.units[unit].config
-        digests = digests_of_files(config["procedure"], config["ingest"], campaign.folder(unit))
+        digests = _digests(campaign, unit)
         if digests != known[unit]:
             countdown.end()
             return f"the recordings of unit {unit} are others"

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from pipeline.pack import Pack
 
-OF_FAILED = ".sha256.json"  # member of the output of ingest: the digests of a unit that failed there
-
 
 def digests_of_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], folder: Path) -> list[str]:
     """Return the digests of the existing files of a unit's recordings; a file that cannot be read is left out."""
@@ -42,9 +40,7 @@ def digests_of_entries(entries: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def digests_in_pack(ingested: Pack, unit: str) -> list[str] | None:
-    """Return the digests of a unit in the output of ingest; None if it does not state them."""
-    if unit + OF_FAILED in ingested:
-        return [str(digest) for digest in ingested.json(unit + OF_FAILED)]
+    """Return the digests of a unit in the output of ingest; None if the unit failed there."""
     if f"{unit}.parquet" not in ingested:
         return None
     from pipeline.io.arrow import from_parquet  # noqa: PLC0415  (pyarrow, where a unit has failed)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import IngestError, PipelineError
 from pipeline.io.arrow import to_parquet
-from pipeline.io.digests import OF_FAILED, digests_of_files
 from pipeline.io.files import candidate_files, recording_files, unchanged
 from pipeline.io.read import read_recordings
 from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
@@ -88,14 +87,6 @@ def ingest_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
             raise
         named = [replace(r, source=_named(r.source, lambda file: file.removeprefix(root))) for r in ingested]
         return {f"{unit}.parquet": to_parquet(named)}
-
-
-def ingest_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:  # noqa: ARG001
-    """Return the digests of the recordings of a unit that failed, which its other files do not state."""
-    if "recordings" in job.inputs:
-        return {}
-    folder = Path(job.run["directory"]) / settings["procedure"]["folder"]
-    return {unit + OF_FAILED: digests_of_files(settings["procedure"], settings["ingest"], folder)}
 
 
 def _ingested(directory: Path, folder: Path, settings: dict[str, Any]) -> list[Recording]:

@@ -23,6 +23,7 @@ from pipeline.config import (
     check_owner,
     claim,
     code_digest,
+    complete_record,
     load_campaign,
     settings_of_jobs,
 )
@@ -239,6 +240,8 @@ def print_outcome(failures=""):
     if not os.path.exists(f"{RESULTS}/summary.csv"):
         return
     try:
+        if RUNNING:
+            complete_record(CAMPAIGN)
         recorded = max(Path(RESULTS, "history").glob("*.json"), default="")
         text = outcome(
             CAMPAIGN.results,
