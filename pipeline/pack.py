@@ -156,6 +156,11 @@ class Batch:
             return failed, f"{unit}.calibration.json" if folder == "calibrations" else f"{unit}.html"
         return self.packs[STAGE_OF.get(folder, "report")], path if folder == "certificates" else name
 
+    def units(self) -> list[str]:
+        """Return the units of the batch: each has a page."""
+        names = self.packs["report"].names()
+        return [name.removesuffix(".html") for name in names if "/" not in name and name.endswith(".html")]
+
     def document(self, folder: str, unit: str) -> Any:  # noqa: ANN401  (a JSON document)
         """Return the published document ``<folder>/<unit>.json``."""
         pack, name = self.member(f"{folder}/{unit}.json", unit)
@@ -222,8 +227,7 @@ def is_published(path: Path) -> bool:
 def _batches(packs: Path, *_: int) -> dict[str, Batch]:
     """Return ``batches_of``, cached; the other arguments change if the folder is replaced."""
     batches: dict[str, Batch] = {}
-    for folder in sorted(packs.glob("*")):
-        batch = Batch(folder)
-        pages = [name for name in batch.packs["report"].names() if "/" not in name]
-        batches |= {name.removesuffix(".html"): batch for name in pages if name.endswith(".html")}
+    for file in sorted(packs.glob("*/report.zip")):
+        batch = Batch(file.parent)
+        batches |= dict.fromkeys(batch.units(), batch)
     return batches

@@ -6,39 +6,58 @@ Locks
 Publishing
     A new set of files is written to a separate folder, which is renamed to ``.published`` when it is complete. Each of
     its files and folders is then exchanged with the published one of the same name. The next run completes an
-    interrupted exchange.
+    interrupted publication.
+Files that are kept
+    Of the former files, only those are deleted that the last publication wrote and nobody has changed since. A file
+    that no run wrote stays in its place. A changed file moves to ``replaced-<date>/``, as do the files of units that
+    have no new results.
 Edited files
     Snakemake does not repeat a job whose output was edited. Each job therefore records in ``logs/written/`` a digest of
     its output and the number of repetitions because the output was edited:
-    ``{"again": 0, "files": {"": "5f70bf18..."}}``. ``again`` is part of the settings of the job, so a larger number
-    makes Snakemake repeat it. A folder without a record is accepted.
+    ``{"again": 0, "files": {"": "5f70bf18..."}}``; of the published files, the size and time of each:
+    ``{"again": 0, "written": {"index.html": "1234 1700000000000000000"}}``. ``again`` is part of the settings of
+    the job, so a larger number makes Snakemake repeat it. A folder without a record is accepted.
 """
 
 from __future__ import annotations
 
 import fcntl
+import filecmp
 import hashlib
 import json
 import os
 import shutil
 import signal
 import socket
-from typing import IO, TYPE_CHECKING
+import stat
+from contextlib import suppress
+from datetime import UTC, datetime
+from itertools import chain, count
+from pathlib import PurePath
+from types import MappingProxyType
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
-from pipeline.errors import PipelineError
+from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.files import exchange, flush_file_system, write_atomically
-from pipeline.pack import directory_of
+from pipeline.pack import PACKS, Batch, directory_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
 PUBLISHED = (
     "calibrations", "validations", "diagnoses", "reports", "certificates", "exports", "combined", "packs",
     "index.html", "summary.csv", "failures.json", "parameters.parquet", "fleet.json",
 )  # fmt: skip
-RUN_LOCK, JOBS_LOCK = ".run.lock", ".jobs.lock"
-COMPLETE, PLAN = ".published", ".plan.json"
+BESIDE = (  # not published as a set
+    "batches", "configs", "history", "logs", "simulated", "complete.json", "thesis.html",
+)  # fmt: skip
+OF_A_RUN = ("calibrations/*.json", f"{PACKS}/*/*.zip", "batches/*/*.zip", "history/*.json", "simulated/truth/*.json")
+RUN_LOCK, JOBS_LOCK, OWNER = ".run.lock", ".jobs.lock", ".owner.json"
+NEW = ".new"  # folder of a new set of files, below the results
+COMPLETE, PLAN, EXCHANGED = ".published", ".plan.json", ".exchanged.json"
+REPLACED = "replaced-"  # and the date: folder of the results for what a run replaced and did not write anew
+UNKNOWN = "_unknown.yaml"  # end of the name of a suggested formula: <unit>_<sensor>_unknown.yaml
 DELAYED_SIGNALS = {signal.SIGINT, signal.SIGTERM}  # blocked during the exchange, which takes milliseconds
 SNAKEMAKE_TIMESTAMP = ".snakemake_timestamp"  # Snakemake writes it into every output folder
 HELD: list[IO[str]] = []  # locks, open until the process ends
@@ -94,79 +113,288 @@ def _locked(stream: IO[str], kind: int) -> bool:
     return True
 
 
-def publish_all(new: Path, results: Path) -> None:
-    """Replace the published files by the complete set in ``new``, a folder below ``results``; remove ``new``."""
-    inodes = {item.name: item.lstat().st_ino for item in new.iterdir()}
-    write_atomically(new / PLAN, json.dumps(inodes))
+def publish(
+    new: Path,
+    results: Path,
+    *,
+    again: int = 0,
+    keep: Collection[str] = (),
+    paths: Sequence[str] | None = None,
+    written: Mapping[str, str] = MappingProxyType({}),
+) -> None:
+    """Replace published files by those in ``new``, a folder below ``results``; remove ``new``.
+
+    ``paths``: the files and folders of ``new`` to exchange; default: each of its items, which is the complete set.
+    ``keep``: units whose former files move to ``replaced-<date>/``. ``again``: as for ``record_written``. ``written``:
+    states of former files that a run wrote, beside those that are recorded.
+    """
+    finish_publishing(results)
+    paths = [item.name for item in new.iterdir()] if paths is None else paths
+    plan = {
+        "inodes": {path: (new / path).lstat().st_ino for path in paths},
+        "again": again,
+        "keep": sorted(keep),
+        "before": {**_last_written(results), **written},
+        "written": _states(new),
+    }
+    write_atomically(new / PLAN, json.dumps(plan))
     flush_file_system(results)
     new.rename(results / COMPLETE)
     finish_publishing(results)
 
 
+def new_simulated(folder: Path) -> Path:
+    """Return the empty folder for the recordings that ``publish_simulated`` exchanges with ``<results>/simulated``."""
+    new = folder.parent / NEW
+    shutil.rmtree(new, ignore_errors=True)
+    (new / folder.name).mkdir(parents=True)
+    return new / folder.name
+
+
+def publish_simulated(folder: Path) -> None:
+    """Replace the simulated recordings in the folder ``simulated`` of the results by new ones, as a whole."""
+    results, stamp = folder.parent, folder / SNAKEMAKE_TIMESTAMP
+    written: dict[str, str] = {}
+    if stamp.exists():  # of the version before: Snakemake made this file after the recordings
+        before = stamp.stat().st_mtime_ns
+        states = _states(folder, folder.name)
+        written = {path: s for path, s in states.items() if (results / path).lstat().st_mtime_ns <= before}
+    publish(results / NEW, results, again=_read_record(results, "")[0], paths=[folder.name], written=written)
+
+
 def finish_publishing(results: Path) -> None:
-    """Complete an interrupted exchange, if there is one."""
+    """Complete an interrupted publication, if there is one."""
     complete = results / COMPLETE
-    if not (complete / PLAN).is_file():
-        shutil.rmtree(complete, ignore_errors=True)
-        return
-    inodes = json.loads((complete / PLAN).read_text(encoding="utf-8"))
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, DELAYED_SIGNALS)
-    try:
-        for name, inode in inodes.items():
-            published = results / name
-            if not os.path.lexists(published):
-                (complete / name).rename(published)
-            elif published.lstat().st_ino != inode:
-                exchange(complete / name, published)
-        (complete / PLAN).unlink()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    shutil.rmtree(complete)
+    if (complete / PLAN).is_file():
+        plan = json.loads((complete / PLAN).read_text(encoding="utf-8"))
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, DELAYED_SIGNALS)
+        try:
+            for path, inode in plan.get("inodes", plan).items():  # 0.1.0 before schema_version 2 wrote the inodes alone
+                published = results / path
+                if not os.path.lexists(published):
+                    published.parent.mkdir(parents=True, exist_ok=True)
+                    (complete / path).rename(published)
+                elif published.lstat().st_ino != inode:
+                    exchange(complete / path, published)
+            (complete / PLAN).rename(complete / EXCHANGED)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    if (complete / EXCHANGED).is_file():
+        plan = json.loads((complete / EXCHANGED).read_text(encoding="utf-8"))
+        _keep_others(complete, results, plan)
+        if "written" in plan:
+            _record_published(results, plan)
+        (complete / EXCHANGED).unlink()
+    shutil.rmtree(complete, ignore_errors=True)
 
 
-def record_written(results: Path, output: str, again: int, names: Sequence[str] = ("",)) -> None:
-    """Record the digests of the files that a job wrote to ``output``, below ``results``.
+def _keep_others(old: Path, results: Path, plan: Mapping[str, Any]) -> None:
+    """Move what must not be deleted out of the former files in ``old``.
 
-    ``again``: the number that ``repetitions`` returned at the start of the run; ``names``: files and folders below
-    ``output``, or ``""`` for the whole output.
+    A file that the last publication did not write moves back to its place, unless a new file is there. Changed files
+    and those of the units ``keep`` move to ``replaced-<date>/``.
     """
-    files = {name: _digest(results / output / name) for name in names}
-    write_atomically(_record(results, output), json.dumps({"again": again, "files": files}, sort_keys=True))
+    before, keep = plan.get("before", {}), set(plan.get("keep", ()))
+    aside: dict[str, Path] = {}
+    batches: dict[str, bool] = {}  # of the former packs: whether they are kept
+    for path, state in _states(old).items():
+        published, file = results / path, old / path
+        folder, batch, *_ = [*path.split("/"), ""]
+        if path in (PLAN, EXCHANGED):
+            continue
+        if before.get(path) == state:
+            if folder == PACKS and batch not in batches:
+                batches[batch] = _holds(old / PACKS / batch, keep)
+            if batches[batch] if folder == PACKS else unit_of(path) in keep:
+                aside[path] = file
+        elif path in before and folder == PACKS:
+            continue  # a damaged pack, which is a link to the output of a job
+        elif not (path not in before and _put_back(file, published)) and not _same_bytes(file, published):
+            aside[path] = file
+    set_aside(aside, results)
+
+
+def _holds(packs: Path, units: set[str]) -> bool:
+    """Return whether the packs of a batch hold some of the units, or cannot be read."""
+    try:
+        return bool(units) and not units.isdisjoint(Batch(packs).units())
+    except DamagedFileError:
+        return True
+
+
+def _put_back(file: Path, place: Path) -> bool:
+    """Move a file to its former place and return True; return False if something else is there."""
+    if os.path.lexists(place):
+        return False
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False  # a file has the name of the folder
+    file.rename(place)
+    return True
+
+
+def set_aside(items: Mapping[str, Path], results: Path) -> Path | None:
+    """Move files and folders to a new folder ``replaced-<date>`` of the results; return it, or None without items.
+
+    ``items``: path below the new folder, and where the file or folder is now.
+    """
+    if not items:
+        return None
+    day = datetime.now(UTC).date().isoformat()
+    names = chain([f"{REPLACED}{day}"], (f"{REPLACED}{day}-{k}" for k in count(2)))
+    folder = next(folder for folder in map(results.joinpath, names) if not os.path.lexists(folder))
+    for path, place in items.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        place.rename(folder / path)
+    return folder
+
+
+def replaced_folders(results: Path) -> list[Path]:
+    """Return the folders of older files."""
+    return sorted(results.glob(f"{REPLACED}*"))
+
+
+def unit_of(path: str) -> str:
+    """Return the unit, or the serial in ``combined``, to which a published file belongs; empty for other files."""
+    folder, _, name = path.partition("/")
+    if folder == "exports":
+        return name.partition("/")[0]
+    if folder == "diagnoses" and name.endswith(UNKNOWN):
+        return name.removesuffix(UNKNOWN).rpartition("_")[0]
+    return name.rpartition(".")[0]
+
+
+def _same_bytes(one: Path, other: Path) -> bool:
+    return all(p.is_file() and not p.is_symlink() for p in (one, other)) and filecmp.cmp(one, other, shallow=False)
+
+
+class Owner(NamedTuple):
+    """The campaign to which a results folder belongs, in ``.owner.json``.
+
+    ``campaign``: its path; ``simulation``: SHA-256 of the description, if the run simulates the recordings; ``units``:
+    unit to the SHA-256 of its recordings.
+    """
+
+    campaign: str
+    simulation: str | None
+    units: dict[str, list[str]]
+
+
+def read_owner(results: Path) -> Owner | None:
+    """Return the owner of a results folder; None where the file is missing or damaged."""
+    try:
+        found = json.loads((results / OWNER).read_text(encoding="utf-8"))
+        units = {str(unit): [str(digest) for digest in digests] for unit, digests in found["units"].items()}
+        return Owner(str(found["campaign"]), found["simulation"], units)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def is_owner(results: Path, directory: Path) -> bool:
+    """Return whether the campaign in a directory owns the results by its path, or because no run has written any."""
+    owner = read_owner(results)
+    if owner is None:
+        return not any(any(results.glob(pattern)) for pattern in OF_A_RUN)
+    with suppress(OSError):
+        return os.path.samefile(owner.campaign, directory)  # noqa: PTH121  (texts)
+    return owner.campaign == str(directory)
+
+
+def write_owner(results: Path, owner: Owner) -> None:
+    """Record the owner of a results folder, unless the record says so already."""
+    if owner != read_owner(results):
+        write_atomically(results / OWNER, json.dumps(owner._asdict()))
+
+
+def record_units(results: Path, units: Mapping[str, list[str]]) -> None:
+    """Record the SHA-256 of the recordings of each unit, where the owner is recorded."""
+    if owner := read_owner(results):
+        write_owner(results, owner._replace(units=dict(units)))
+
+
+def record_written(results: Path, output: str, again: int) -> None:
+    """Record the digest of an output of a job, a path below ``results``.
+
+    ``again``: the number that ``repetitions`` returned at the start of the run.
+    """
+    record = {"again": again, "files": {"": _digest(results / output)}}
+    write_atomically(_record(results, output), json.dumps(record, sort_keys=True))
+
+
+def _record_published(results: Path, plan: Mapping[str, Any]) -> None:
+    """Record the published files and the number of repetitions after a publication, which may be of some files only."""
+    exchanged = {*plan["inodes"]}
+    others = {p: s for p, s in plan["before"].items() if exchanged.isdisjoint((p, *map(str, PurePath(p).parents)))}
+    record = {"again": plan["again"], "written": others | plan["written"]}
+    write_atomically(_record(results, ""), json.dumps(record, sort_keys=True))
+
+
+def _last_written(results: Path) -> dict[str, str]:
+    """Return the state of each file that the last publication wrote, by its path below the results.
+
+    A record of the version before has a digest of each folder: its files count as written while the digest agrees.
+    """
+    _, record = _read_record(results, "")
+    if "written" in record:
+        return dict(record["written"])
+    names = [name for name, digest in record.get("files", {}).items() if _digest(results / name) == digest]
+    return {path: state for name in names for path, state in _states(results / name, name).items()}
 
 
 def repetitions(results: Path, output: str) -> tuple[int, list[str]]:
-    """Return the number of repetitions of an output because of edits, and its files that are edited now."""
-    try:
-        record = json.loads(_record(results, output).read_text(encoding="utf-8"))
-        again, files = int(record["again"]), dict(record["files"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return 0, []
+    """Return the number of repetitions of an output because of edits, and its files that are edited now.
+
+    ``output``: a path below the results; empty for the published files.
+    """
+    again, record = _read_record(results, output)
     if not (results / output).exists():
         return again, []  # Snakemake writes a missing output in any case
-    paths = {results / output / name: digest for name, digest in files.items()}
-    edited = [os.path.normpath(path) for path, digest in paths.items() if _digest(path) != digest]
+    changed = [name for name, digest in record.get("files", {}).items() if _digest(results / output / name) != digest]
+    published = {path: s for path, s in record.get("written", {}).items() if path.partition("/")[0] in PUBLISHED}
+    changed += [path.partition("/")[0] for path, state in published.items() if _state(results / path) != state]
+    edited = [os.path.normpath(results / output / name) for name in dict.fromkeys(changed)]
     return again + bool(edited), edited
+
+
+def _read_record(results: Path, output: str) -> tuple[int, dict[str, Any]]:
+    """Return the number of repetitions of an output and its record; 0 and an empty record if it cannot be read."""
+    try:
+        record = json.loads(_record(results, output).read_text(encoding="utf-8"))
+        return int(record["again"]), {key: dict(value) for key, value in record.items() if key != "again"}
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0, {}
 
 
 def _record(results: Path, output: str) -> Path:
     return results / "logs" / "written" / f"{output.replace('/', '+') or 'published'}.json"
 
 
-def _digest(path: Path) -> str:
-    """Return a digest of the names, sizes and times of a file, or of all files below a folder.
+def _state(file: Path | str) -> str:
+    """Return size and time of a file.
 
     Snakemake sets the time of a pack after its job, so the checksums of its members replace the time.
     """
-    files = [f"{folder}/{name}" for folder, _, names in os.walk(path) for name in names]
-    lines = []
-    for file in files if path.is_dir() else [str(path)]:
-        if not file.endswith(SNAKEMAKE_TIMESTAMP):
-            try:
-                status = os.lstat(file)
-                version = directory_of(file) if file.endswith(".zip") else status.st_mtime_ns
-                state = f"{status.st_size}\0{version}"
-            except FileNotFoundError:
-                state = "absent"
-            lines.append(f"{file}\0{state}")
-    text = "\n".join(sorted(lines)).replace(str(path), "")  # results may be moved
+    try:
+        status = os.lstat(file)
+    except (FileNotFoundError, NotADirectoryError):
+        return "absent"
+    is_pack = str(file).endswith(".zip") and stat.S_ISREG(status.st_mode)
+    return f"{status.st_size} {directory_of(str(file)) if is_pack else status.st_mtime_ns}"
+
+
+def _states(path: Path, name: str = "") -> dict[str, str]:
+    """Return the state of each file below a folder, or of a file; ``name`` stands for the path itself."""
+    files = [str(path)] if path.is_symlink() or not path.is_dir() else []
+    for folder, folders, names in [] if files else os.walk(path):
+        links = [f for f in folders if os.path.islink(f"{folder}/{f}")]  # noqa: PTH114  (fast)
+        files += [f"{folder}/{n}" for n in (*names, *links) if n != SNAKEMAKE_TIMESTAMP]
+    start = len(str(path))
+    return {f"{name}{file[start:]}".removeprefix("/"): _state(file) for file in files}
+
+
+def _digest(path: Path) -> str:
+    """Return a digest of the names, sizes and times of a file, or of all files below a folder."""
+    lines = ["\0".join((f"/{name}" if name else "", *state.split())) for name, state in _states(path).items()]
+    text = "\n".join(sorted(lines))
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:32]

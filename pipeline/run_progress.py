@@ -219,6 +219,13 @@ class Countdown:
             self.drawn = False
 
 
+def wait_for_jobs(results: Path, stream: TextIO) -> None:
+    """Wait until no job of a killed run is running."""
+    while jobs_running(results):
+        print("Waiting for jobs of a killed run that are still running ...", file=stream, flush=True)
+        time.sleep(2)
+
+
 class Monitor(logging.Handler):
     """Follows the log records of Snakemake and prints the progress of a run in ``results``.
 
@@ -270,9 +277,7 @@ class Monitor(logging.Handler):
         Raises ``BusyError`` if another run has locked the results.
         """
         take_run(self.results)
-        while jobs_running(self.results):
-            print("Waiting for jobs of a killed run that are still running ...", file=self.stream, flush=True)
-            time.sleep(2)
+        wait_for_jobs(self.results, self.stream)
         terminal = self.stream.isatty() and not plain
         if quiet or not plain:
             self._filter_job_blocks(CLEAR_LINE if terminal and not quiet else "")

@@ -12,8 +12,9 @@ import yaml
 
 from pipeline.commands import add_run_options, parser_of
 from pipeline.commands.run import run_snakemake
-from pipeline.config.campaign import find_campaign, read_layers
+from pipeline.config.campaign import TAKE_OVER, find_campaign, read_layers
 from pipeline.config.devices import edit_effects, sensor_and_effect
+from pipeline.config.owner import require_own_results
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.files import write_atomically
 from pipeline.model.effects import catalogue
@@ -53,6 +54,7 @@ def main(argv: Sequence[str]) -> int:
     words = "write the formulas that the last run suggests for the unit to effects/, and add them"
     parser.add_argument("--suggested", action="store_true", help=words)
     arguments = parser.parse_args(argv)
+    _require_own_results(arguments, reads=arguments.suggested or arguments.missing is not None)
     if not arguments.suggested:
         return _change(arguments)
     written, arguments.effects = _write_suggested(arguments)
@@ -66,7 +68,16 @@ def main(argv: Sequence[str]) -> int:
 
 def remove(argv: Sequence[str]) -> int:
     """Remove effects from <campaign>/devices/<unit>.yaml, and run the campaign: undoes add."""
-    return _change(_parser("remove", remove.__doc__).parse_args(argv), undo=True)
+    arguments = _parser("remove", remove.__doc__).parse_args(argv)
+    _require_own_results(arguments, reads=False)
+    return _change(arguments, undo=True)
+
+
+def _require_own_results(arguments: argparse.Namespace, *, reads: bool) -> None:
+    """Refuse results of another campaign before any file is changed; a command that reads them takes none over."""
+    if reads or not arguments.no_run:
+        settings = {k: v for k, v in _settings(arguments.config).items() if k != TAKE_OVER or not reads}
+        require_own_results(find_campaign(arguments.campaign), Path(arguments.results), settings)
 
 
 def _write_suggested(arguments: argparse.Namespace) -> tuple[list[Path], list[str]]:

@@ -31,6 +31,7 @@ from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import FAR
 from pipeline.report.pages import template
+from pipeline.results_folder import is_owner, read_owner
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -78,6 +79,10 @@ def find(campaign: str, units: Sequence[str], results: Path) -> tuple[Path, dict
         if not folders:
             raise MissingInputError(f"no diagnoses in {path} or {results / path.name}; run the campaign first")
         folder = folders[0]
+        if (path / "units.csv").exists() and read_owner(folder) and not is_owner(folder, path):
+            from pipeline.config.owner import require_own_results  # noqa: PLC0415  (Hydra, where the path has changed)
+
+            require_own_results(path.resolve(), results, {})
         failed = folder / "failures.json"
         failures = {failure["unit"]: failure for failure in (read_json(failed) if failed.is_file() else [])}
         files = {file.stem: file for file in sorted((folder / "diagnoses").glob("*.json"))}

@@ -37,6 +37,8 @@ def main(argv: Sequence[str]) -> int:
     )
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="settings for every unit (Hydra overrides)")
     add_run_options(parser)
+    words = "move results of another campaign of the same name to replaced-<date>/, and write those of this one"
+    parser.add_argument("--take-over", action="store_true", help=words)
     end = list(argv).index("--") if "--" in argv else len(argv)
     arguments = parser.parse_args(argv[:end])
     config = list(arguments.config)
@@ -44,6 +46,7 @@ def main(argv: Sequence[str]) -> int:
         if any(word.startswith("overrides=") for word in config):
             raise ConfigurationError("overrides are given twice, as KEY=VALUE and by --config; give them once")
         config.append(f"overrides={json.dumps(arguments.overrides)}")
+    config += ["take_over=true"] * arguments.take_over
     return run_snakemake(arguments, config, argv[end + 1 :])
 
 

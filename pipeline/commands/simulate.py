@@ -14,6 +14,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.model.effects import read_effect_files, register
 from pipeline.model.sensor_file import assumed_figures
 from pipeline.outcome import run_command
+from pipeline.results_folder import new_simulated, publish_simulated
 from pipeline.run_progress import Countdown
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import (
@@ -56,6 +57,7 @@ def main(argv: Sequence[str]) -> int:
     source: Path | None = arguments.pop("source")
     quiet: bool = arguments.pop("quiet")
     sheet_only: bool = arguments.pop("sheet_only")
+    replace: bool = arguments.pop("replace")
     if source is None and not arguments and (directory / FILE).is_file():
         source = directory / FILE
     if source is not None and arguments:
@@ -84,7 +86,10 @@ def main(argv: Sequence[str]) -> int:
     for sensor in sorted({unit.sensor for unit in description.units}):
         assumed = assumed_figures(sensor, read_config("sensor", sensor))
         print(f"note: {assumed}\n" if assumed else "", end="")
-    write_campaign(description, directory, (lambda _: None) if quiet else print_unit, sheet_only=sheet_only)
+    target = new_simulated(directory) if replace else directory
+    write_campaign(description, target, (lambda _: None) if quiet else print_unit, sheet_only=sheet_only)
+    if replace:
+        publish_simulated(directory)
     print(f"then: {run_command({'campaign': str(directory)})}")
     return 0
 
@@ -96,6 +101,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--from", dest="source", type=Path, default=None, metavar="FILE", help="description of the simulation (YAML)")
     add("--quiet", action="store_true", default=False, help="print no line for each unit")
     add("--sheet-only", action="store_true", default=False, help="write only units.csv; the run writes the recordings")
+    # DIR is the folder ``simulated`` of results, and is replaced as a whole; files that no run wrote are kept.
+    add("--replace", action="store_true", default=False, help=argparse.SUPPRESS)
     add("--units", type=int, metavar="N", help="number of units (default: 1)")
     add("--prefix", metavar="NAME", help="names of the units: NAME001, NAME002 ... (default: U)")
     add("--seed", type=int, help="seed of all random numbers (default: 0)")

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.commands import parser_of
-from pipeline.errors import MissingInputError
+from pipeline.config.campaign import find_campaign
+from pipeline.config.owner import require_own_results
+from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import flushed_together, write_atomically
 from pipeline.history import read_history
-from pipeline.pack import batches_of
+from pipeline.pack import PACKS, batches_of
 from pipeline.report.pages import linked
-from pipeline.results_folder import PUBLISHED, record_written, repetitions, take_run
+from pipeline.results_folder import NEW, BusyError, finish_publishing, jobs_running, publish, repetitions, take_run
 from pipeline.stages.gather import publish_histories
 
 if TYPE_CHECKING:
@@ -32,23 +35,38 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("units", metavar="UNIT", nargs="+", help="units whose files are published")
     arguments = parser.parse_args(argv)
     campaign, units = arguments.campaign, arguments.units
-    results = campaign if (campaign / "summary.csv").is_file() else Path(arguments.results) / campaign.name
-    batches = batches_of(results)
-    if not batches:
+    results = campaign if (campaign / "summary.csv").is_file() else _results_of(campaign, Path(arguments.results))
+    if not any((results / PACKS).glob("*/*")):
         raise MissingInputError("holds no packs: run the campaign first, or its units have files already", str(results))
+    take_run(results)
+    if jobs_running(results):
+        raise BusyError("jobs of a killed run are still running; wait until they have ended", str(results))
+    finish_publishing(results)
+    batches = batches_of(results)
     if absent := [unit for unit in units if unit not in batches]:
         raise MissingInputError(
             f"no unit {', '.join(absent)}; there are {', '.join(sorted(batches)[:12])}", str(results)
         )
-    take_run(results)
-    again, _ = repetitions(results, "")
+    again, new, paths = repetitions(results, "")[0], results / NEW, ["index.html"]
+    shutil.rmtree(new, ignore_errors=True)
     with flushed_together(results):
         for unit in units:
             for name, content in batches[unit].files(unit):
-                write_atomically(results / name, content)
-        publish_histories(results, read_history(results), units)
-        index = results / "index.html"
-        write_atomically(index, linked(index.read_text(encoding="utf-8"), units))
-    record_written(results, "", again, PUBLISHED)
+                write_atomically(new / name, content)
+                paths.append(name)
+        publish_histories(new, read_history(results), units)
+        index = (results / "index.html").read_text(encoding="utf-8")
+        write_atomically(new / "index.html", linked(index, units))
+    publish(new, results, again=again, paths=paths)
     print("\n".join(str(results / "reports" / f"{unit}.html") for unit in units))
     return 0
+
+
+def _results_of(campaign: Path, results: Path) -> Path:
+    """Return the folder of a campaign's results; where there is no such campaign, its name says whose are meant."""
+    try:
+        directory = find_campaign(str(campaign))
+    except ConfigurationError:
+        return results / campaign.name
+    require_own_results(directory, results, {})
+    return results / directory.name

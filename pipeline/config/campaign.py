@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     Rows = Mapping[str, Mapping[str, str]]  # unit to its cells by column
 
 JSON = dict[str, Any]
+TAKE_OVER = "take_over"
 SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: a job takes some seconds, as its start does; a minute, to fill cores
 
 
@@ -88,6 +89,7 @@ class Campaign:
     page: str | None  # page in addition to the campaign's page
     combine: str | None = None
     publish_limit: int = 0  # largest number of units whose files are published one by one
+    take_over: bool = False  # whether results of another campaign of the same name are moved aside
 
     @cached_property
     def boards(self) -> dict[str, list[str]]:
@@ -100,14 +102,14 @@ class Campaign:
         return self.directory if self.simulation is None else self.results.absolute() / "simulated"
 
     def run_settings(self, unit: str | None = None) -> dict[str, Any]:
-        """Return the settings of ``--config`` without ``results``, and with the ``unit_overrides`` of this unit only.
+        """Return the settings of ``--config`` that results depend on, with the ``unit_overrides`` of this unit only.
 
         A campaign that is part of the package is stated by its name, even if the user gave its path: equal runs then
         have equal settings.
         """
         ships = self.directory.parent == (SHIPPED / "data")
         stated: dict[str, Any] = {"campaign": self.name if ships else str(self.settings.get("campaign", self.name))}
-        stated |= {k: v for k, v in self.settings.items() if k not in ("campaign", "results") and v}
+        stated |= {k: v for k, v in self.settings.items() if k not in ("campaign", "results", TAKE_OVER) and v}
         if unit is not None and "unit_overrides" in stated:
             overrides = stated.pop("unit_overrides").get(unit)
             stated |= {"unit_overrides": {unit: overrides}} if overrides else {}
@@ -128,7 +130,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
 
     ``settings``: those of ``snakemake --config``, as named below.
     """
-    valid = ("campaign", "results", "overrides", "unit_overrides", PYTHON)
+    valid = ("campaign", "results", "overrides", "unit_overrides", TAKE_OVER, PYTHON)
     unknown = sorted(set(settings) - set(valid))
     if unknown:
         raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
@@ -164,8 +166,15 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
     return Campaign(
         directory.name, directory, results, units, batches, chains, compare, layers.simulation, settings,
-        layers.campaign.page, of_run.combine, of_run.publish_limit,
+        layers.campaign.page, of_run.combine, of_run.publish_limit, _flag(settings.get(TAKE_OVER, False), TAKE_OVER),
     )  # fmt: skip
+
+
+def _flag(value: Any, name: str) -> bool:  # noqa: ANN401  (the user's)
+    """Return a setting that is true or false."""
+    if str(value).lower() not in ("true", "false"):
+        raise ConfigurationError(f"{name}: true or false is expected, got {value!r}")
+    return str(value).lower() == "true"
 
 
 def read_layers(directory: Path, settings: Mapping[str, Any]) -> tuple[Composer, Layers]:

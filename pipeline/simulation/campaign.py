@@ -115,6 +115,35 @@ def simulate_unit(
     those of the procedure.
     """
     streams, course = Streams(seed, number), course_of(unit)
+    benches, effects = _drawn(unit, streams)
+    by_hand = benches[""].table["angle_accuracy_deg"] if benches[""].table["motion"] == "none" else 0.0
+    mover = streams["motion"] if unit.motion is None else Streams(seed, unit.motion)["motion"]
+    planned = [*_selected(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
+    total = sum(p.trajectory.duration + course.pause_s for p in planned)
+    ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
+    of_ramp = {"ramp": ramp, "ramp_period": total / 1.5}
+    environment = replace(random_environment(streams["room"]), **{**of_ramp, **unit.temperature})
+    pause = unit.interval_s if unit.procedure == ONE_RECORDING else course.pause_s
+    truth = true_parameters(unit, seed, number)
+    made = record(planned, benches, effects, environment=environment, unit=unit, pause=pause, streams=streams)
+    recordings, clock = with_table_log(unit, planned, made, streams["link"])
+    return recordings, truth | ({"table_clock": clock} if clock else {})
+
+
+def true_parameters(unit: UnitDescription, seed: int, number: int) -> dict[str, Any]:
+    """Return the true parameters of one unit, without its recordings."""
+    benches, effects = _drawn(unit, Streams(seed, number))
+    bench = benches[""]
+    return {
+        "seed": [seed, number],
+        **{name: getattr(unit, name) for name in ("sensor", "table", "procedure", "interval_s", "lost")},
+        **{s: _truth(bench.sensors[s], effects[s], unit.interval_s) for s in SENSORS},
+        "imperfections": {k: np.asarray(v).tolist() for k, v in bench.imperfections.items()},
+    }
+
+
+def _drawn(unit: UnitDescription, streams: Streams) -> tuple[dict[str, Bench], dict[str, Hidden]]:
+    """Return the bench of each recording (``""``: of all others), and the effects of each sensor."""
     sensor_configs = read_config("sensor", unit.sensor)
     effects = drawn_effects(unit.effects, sensor_configs, streams["effects"])
 
@@ -131,28 +160,8 @@ def simulate_unit(
         given = {s: {**getattr(unit, s), **other.get(s, {})} for s in SENSORS}
         return Bench(table, imperfections, drawn_sensors(sensor_configs, given, effects, streams["unit"]))
 
-    bench = bench_of({})
-    benches = {"": bench}
-    if unit.held_out:
-        benches |= dict.fromkeys(("validation", "static"), bench_of(unit.held_out))
-    table = bench.table
-    by_hand = table["angle_accuracy_deg"] if table["motion"] == "none" else 0.0
-    mover = streams["motion"] if unit.motion is None else Streams(seed, unit.motion)["motion"]
-    planned = [*_selected(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
-    total = sum(p.trajectory.duration + course.pause_s for p in planned)
-    ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
-    of_ramp = {"ramp": ramp, "ramp_period": total / 1.5}
-    environment = replace(random_environment(streams["room"]), **{**of_ramp, **unit.temperature})
-    pause = unit.interval_s if unit.procedure == ONE_RECORDING else course.pause_s
-    truth = {
-        "seed": [seed, number],
-        **{name: getattr(unit, name) for name in ("sensor", "table", "procedure", "interval_s", "lost")},
-        **{s: _truth(bench.sensors[s], effects[s], unit.interval_s) for s in SENSORS},
-        "imperfections": {k: np.asarray(v).tolist() for k, v in bench.imperfections.items()},
-    }
-    made = record(planned, benches, effects, environment=environment, unit=unit, pause=pause, streams=streams)
-    recordings, clock = with_table_log(unit, planned, made, streams["link"])
-    return recordings, truth | ({"table_clock": clock} if clock else {})
+    held_out = dict.fromkeys(("validation", "static"), bench_of(unit.held_out)) if unit.held_out else {}
+    return {"": bench_of({}), **held_out}, effects
 
 
 def _selected(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:

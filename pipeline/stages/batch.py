@@ -186,10 +186,10 @@ def _merged(common: dict[str, Any], unit_settings: dict[str, Any]) -> dict[str, 
     return dict(sorted({**common, **unit_settings, **below}.items()))
 
 
-def record_output(job: Job, output: Path, names: Sequence[str] = ("",)) -> None:
+def record_output(job: Job, output: Path) -> None:
     """Record the output of a job, so that the next run detects edited files."""
     if output.is_relative_to(job.results):
-        record_written(job.results, _below(job, output), job.run.get("again", 0), names)
+        record_written(job.results, _below(job, output), job.run.get("again", 0))
 
 
 def _below(job: Job, output: Path) -> str:

@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from pipeline.errors import failure_of
+from pipeline.errors import PipelineError, failure_of
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record
-from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes
+from pipeline.io.digests import digests_in_pack
+from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison import against_truth, section
 from pipeline.report.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
 from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
-from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
-from pipeline.stages.batch import record_output
+from pipeline.results_folder import NEW, PUBLISHED, finish_publishing, publish, record_units
 from pipeline.stages.summary import failed_files, failed_summary
 
 if TYPE_CHECKING:
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from pipeline.stages.batch import Job
 
 JSON = dict[str, Any]
-NEW = ".new"  # folder of the new set, below the results
 
 
 def gather_batch(job: Job) -> None:
@@ -49,10 +48,11 @@ def gather_batch(job: Job) -> None:
         if "." not in name:
             (new / name).mkdir(parents=True)
     packed = len(run["order"]) > run["publish_limit"]
-    known = (results / "calibrations").glob("*.json") if any((results / PACKS).glob("*")) else ()
+    known = (results / "calibrations").glob("*.json") if any((results / PACKS).glob("*/*")) else ()
     asked = {file.stem for file in known}  # by ``unpack``
     found: dict[str, JSON] = {}
     parts: list[pd.DataFrame] = []
+    digests: dict[str, list[str] | None] = {}
     with flushed_together(results):
         for name, units in run["batches"].items():
             folder = job.output.parent / name
@@ -61,14 +61,15 @@ def gather_batch(job: Job) -> None:
             batch = Batch(folder)
             for unit in units:
                 found[unit] = _gather_unit(batch, unit, new, publish=not packed or unit in asked)
+            digests |= {unit: found[unit].pop("sha256", []) or _digests_of_failed(folder, unit) for unit in units}
             parts.append(parameter_table({unit: found[unit].pop("parameters") for unit in units}))
             for stage in (*STAGES, *([WITH_PRIOR] if batch.combined else [])) if packed else ():
                 _link(folder / f"{stage}.zip", new / PACKS / name / f"{stage}.zip")
         units = {unit: found[unit] for unit in run["order"]}
         parameters = pd.DataFrame({"unit": run["order"]}).merge(pd.concat(parts), on="unit")
         _write_campaign(job, units, parameters, new, packed=packed)
-    publish_all(new, results)
-    record_output(job, results, PUBLISHED)
+    publish(new, results, again=run.get("again", 0), keep=_without_successor(results, units))
+    record_units(results, {unit: sha256 for unit in units if (sha256 := digests[unit]) is not None})
     write_json(job.output, [u["failure"] for u in units.values() if u["failure"]])
 
 
@@ -92,6 +93,26 @@ def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
     for name, content in files.items():
         write_atomically(new / name, content)
     return found
+
+
+def _digests_of_failed(batch: Path, unit: str) -> list[str] | None:
+    """Return the digests of the recordings of a unit whose document states none; None where nothing states them."""
+    try:
+        return digests_in_pack(Pack(batch / "ingest.zip"), unit)
+    except PipelineError:
+        return None
+
+
+def _without_successor(results: Path, units: Mapping[str, JSON]) -> set[str]:
+    """Return the units and serials whose published results no new ones replace.
+
+    They left the campaign, or were calibrated before and fail now.
+    """
+    before = {file.stem for file in (results / "calibrations").glob("*.json")} | set(batches_of(results))
+    failed = {u for u in units if units[u]["failure"] and is_published(results / "validations" / f"{u}.json")}
+    serials = {found["row"].get("serial") for found in units.values()}
+    joint = {file.stem for file in (results / "combined").glob("*.json")} - serials
+    return failed | (before | joint) - set(units)
 
 
 def _shared(value: Any) -> Any:  # noqa: ANN401  (a JSON value)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import PipelineError
 from pipeline.history import unit_state
+from pipeline.io.digests import digests_of_entries
 from pipeline.report.pages import failure_page
 from pipeline.report.parameters import sheet_columns, summary_row, unit_parameters
 
@@ -67,6 +68,7 @@ def summary(
         "failure": failure,
         "state": unit_state(*documents, settings["overrides"], settings["config"]),
         "parameters": unit_parameters(calibration, settings.get("sensor", {})),
+        "sha256": digests_of_entries(calibration.get("inputs") or ()),
     }
 
 

@@ -215,7 +215,7 @@ def test_the_published_files_are_those_of_one_run_wherever_it_is_stopped(
             patch.setattr(Path, "rename", stopping(Path.rename))
             patch.setattr(Path, "unlink", stopping(Path.unlink))
             try:
-                results_folder.publish_all(results / ".new", results)
+                results_folder.publish(results / ".new", results)
                 break
             except StoppedError:
                 pass
@@ -345,4 +345,8 @@ def run_gather(campaign: Campaign) -> None:
     file = settings_of_jobs(campaign)["campaign"]["gather"]
     part = campaign.results / "configs" / file.name
     part.write_bytes(file.content)
-    batch.main("gather", ["--config", str(part), "--output", str(campaign.results / "batches" / "gathered.json")])
+    try:
+        batch.main("gather", ["--config", str(part), "--output", str(campaign.results / "batches" / "gathered.json")])
+    finally:
+        while HELD:
+            HELD.pop().close()  # a job is a process of its own

@@ -19,18 +19,26 @@ if Path(workflow.basedir, "pipeline").is_dir():
     paths = [workflow.basedir, os.getenv("PYTHONPATH", "")]
     os.environ.update(PYTHONPATH=os.pathsep.join(filter(None, paths)))
 
-from pipeline.config import code_digest, load_campaign, settings_of_jobs
+from pipeline.config import (
+    check_owner,
+    claim,
+    code_digest,
+    complete_record,
+    load_campaign,
+    settings_of_jobs,
+)
 from pipeline.errors import PipelineError
 from pipeline.files import write_atomically
 from pipeline.estimation.stages import stage_module
 from pipeline.outcome import outcome
 from pipeline.pack import STAGES as PUBLISHED_STAGES
-from pipeline.results_folder import finish_publishing, repetitions
+from pipeline.results_folder import finish_publishing, repetitions, replaced_folders
 from pipeline.run_progress import Monitor
 from pipeline.stages.batch import forget_last_outputs
 from pipeline.stages.job_server import COMMAND, start_server
 
 RUNNING = not workflow.is_main_process
+NO_RUN = {"-n", "-np", "-pn", "--dry-run", "--dryrun", "--unlock", "--report"}
 
 
 def without_braces(path):
@@ -64,6 +72,8 @@ if RUNNING:
 else:
     try:
         CAMPAIGN = load_campaign(config)
+        KEPT_BEFORE = set(replaced_folders(CAMPAIGN.results))
+        CHECKED = check_owner(CAMPAIGN, move=NO_RUN.isdisjoint(sys.argv))
     except PipelineError as error:
         raise WorkflowError(str(error)) from None
     gc.freeze()  # the campaign stays in memory: garbage collection of thousands of configurations takes seconds
@@ -157,6 +167,7 @@ def begin_run():
             plain=output.verbose or output.printshellcmds,
         )
         RUNNING = True
+        claim(CAMPAIGN, CHECKED)
         if workflow.dag_settings.forceall or workflow.dag_settings.forcerun:
             forget_last_outputs(CAMPAIGN.results)
         finish_publishing(CAMPAIGN.results)
@@ -229,12 +240,17 @@ def print_outcome(failures=""):
     if not os.path.exists(f"{RESULTS}/summary.csv"):
         return
     try:
+        if RUNNING:
+            complete_record(CAMPAIGN)
         recorded = max(Path(RESULTS, "history").glob("*.json"), default="")
         text = outcome(
             CAMPAIGN.results,
             CAMPAIGN.run_settings(),
             of_this_run=written_in_this_run(recorded),
         )
+        for folder in replaced_folders(CAMPAIGN.results):
+            if folder not in KEPT_BEFORE:
+                text += f"older files that this run replaced: {folder}\n"
     except (OSError, PipelineError) as error:
         text = f"the results cannot be summed up: {error}\n"
     print_at_the_end(text + failures)

@@ -1,5 +1,6 @@
 # Simulates the recordings of a campaign (simulate: true in its campaign.yaml).
-SIMULATED = f"{RESULTS}/simulated"
+# Its sheet stands for the folder: Snakemake would delete a whole folder before the job, with files that no run wrote.
+SIMULATED = f"{RESULTS}/simulated/units.csv"
 
 if PLAN["simulation"]:
 
@@ -7,7 +8,7 @@ if PLAN["simulation"]:
         input:
             local(PLAN["simulation"]),
         output:
-            local(directory(SIMULATED)),
+            local(SIMULATED),
         log:
             f"{RESULTS}/logs/simulate.log",
         threads: 1
@@ -15,6 +16,7 @@ if PLAN["simulation"]:
             mem_mb=1000,
             runtime=10,
         params:
+            folder=f"{RESULTS}/simulated",
             code=code_digest("pipeline.commands.simulate"),
         shell:
-            "{RUN} simulate {output:q} --from {input:q} > {log:q} 2>&1"
+            "{RUN} simulate {params.folder:q} --from {input:q} --replace > {log:q} 2>&1"
