@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from pipeline.records import Recording
+
 NO_CAMPAIGN = Path(__file__).with_name("no_campaign")  # does not exist: no options or effects of a campaign
 
 
@@ -48,19 +50,26 @@ class ConfiguredUnit:
         config = {**self.row.config, "procedure": {**procedure, "recordings": optional}}
         return replace(self, row=replace(self.row, config=config))
 
+    def with_effects(self, sensor: str, names: Sequence[str]) -> ConfiguredUnit:
+        """Return the unit with effects in the model of a sensor, instead of those that are configured."""
+        effects = {**self.row.config["effects"], sensor: list(names)}
+        return _configured(replace(self.row, config={**self.row.config, "effects": effects}), self.files)
+
     def state(self) -> UnitState:
         """Return the unit before its first step."""
         return UnitState(self.row.name, self.files)
 
-    def run_to(self, until: str = "calibration", *, fits: bool = True, state: UnitState | None = None) -> UnitState:
-        """Run the steps in memory, up to ``until``.
+    def run_to(
+        self, until: str = "calibration", *, first: str = "ingest", fits: bool = True, state: UnitState | None = None
+    ) -> UnitState:
+        """Run the steps in memory, from ``first`` to ``until``.
 
         ``fits``: whether to include the stage ``effects``, the slowest of a fit. ``state``: filled by each step, so
-        that it holds what was reached before an error.
+        that it holds what was reached before an error; it holds what the steps before ``first`` returned.
         """
         stages = self.stages if fits else {s: [n for n in names if n != "effects"] for s, names in self.stages.items()}
         with self.environment():
-            return run_steps(state or self.state(), tasks_of(stages, until), self.settings)
+            return run_steps(state or self.state(), tasks_of(stages, until, first=first), self.settings)
 
     @contextmanager
     def environment(self) -> Iterator[None]:
@@ -118,24 +127,37 @@ def unit_without_campaign(
     ``recordings``: a folder with the files that the procedure names, or the files or DataFrames (columns of the
     canonical CSV) of the recordings by their names.
     """
-    run = [text for text in layers if text.partition("=")[0].strip() in RUN_SETTINGS]
-    run_settings(run)  # refuses values that no run accepts
     folder = Path() if not isinstance(recordings, str | Path) else Path(recordings).resolve()
     name = folder.name if folder.name and UNIT_NAME.fullmatch(folder.name) else "unit"
-    composer = Composer(NO_CAMPAIGN)
-    try:
-        texts = [text for text in layers if text not in run]
-        values = dict(map(parse, texts))
-        row = UnitRow(name, {"unit": name}, composer.unit(name, texts), {k: str(v) for k, v in values.items()})
-    except Problem as problem:
-        raise ConfigurationError(f"the configuration is refused: {problem}") from problem
-    files = UnitFiles(folder, folder)
+    row, files = unit_row(layers, name), UnitFiles(folder, folder)
     if not isinstance(recordings, str | Path):
         row, files = _of_mapping(row, recordings)
     elif not folder.is_dir():
         raise InputError("is no folder; a folder of recordings is expected, or a mapping of names to them", str(folder))
-    batches, chains = cut_batches({name: row}, 1)
-    return ConfiguredUnit(row, files, chains[next(iter(batches))])
+    return _configured(row, files)
+
+
+def unit_of_recordings(recordings: Sequence[Recording], layers: Sequence[str]) -> ConfiguredUnit:
+    """Return the recordings of a simulation as a unit, configured by overrides; raises ``ConfigurationError``."""
+    return _configured(unit_row(layers), UnitFiles(NO_CAMPAIGN, NO_CAMPAIGN, recordings=tuple(recordings)))
+
+
+def unit_row(layers: Sequence[str], name: str = "unit") -> UnitRow:
+    """Return a unit without a campaign, as a run composes and checks its configuration from overrides."""
+    run = [text for text in layers if text.partition("=")[0].strip() in RUN_SETTINGS]
+    run_settings(run)  # refuses values that no run accepts
+    texts = [text for text in layers if text not in run]
+    try:
+        values = dict(map(parse, texts))
+        config = Composer(NO_CAMPAIGN).unit(name, texts)
+    except Problem as problem:
+        raise ConfigurationError(f"the configuration is refused: {problem}") from problem
+    return UnitRow(name, {"unit": name}, config, {k: str(v) for k, v in values.items()})
+
+
+def _configured(row: UnitRow, files: UnitFiles) -> ConfiguredUnit:
+    _, chains = cut_batches({row.name: row}, 1)
+    return ConfiguredUnit(row, files, next(iter(chains.values())))
 
 
 def _of_mapping(row: UnitRow, recordings: Mapping[str, str | Path | pd.DataFrame]) -> tuple[UnitRow, UnitFiles]:
