@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from pipeline.records import Recording
+
     Paths = Sequence[str | os.PathLike[str]]
     Recordings = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str] | pd.DataFrame]
 
@@ -58,19 +60,26 @@ class ConfiguredUnit:
         config = {**self.row.config, "procedure": {**procedure, "recordings": optional}}
         return replace(self, row=replace(self.row, config=config))
 
+    def with_effects(self, sensor: str, names: Sequence[str]) -> ConfiguredUnit:
+        """Return the unit with effects in the model of a sensor, instead of those that are configured."""
+        effects = {**self.row.config["effects"], sensor: list(names)}
+        return _configured(replace(self.row, config={**self.row.config, "effects": effects}), self.files)
+
     def state(self) -> UnitState:
         """Return the unit before its first step."""
         return UnitState(self.row.name, self.files)
 
-    def run_to(self, until: str = "calibration", *, fits: bool = True, state: UnitState | None = None) -> UnitState:
-        """Run the steps in memory, up to ``until``.
+    def run_to(
+        self, until: str = "calibration", *, first: str = "ingest", fits: bool = True, state: UnitState | None = None
+    ) -> UnitState:
+        """Run the steps in memory, from ``first`` to ``until``.
 
         ``fits``: whether to include the stage ``effects``, the slowest of a fit. ``state``: filled by each step, so
-        that it holds what was reached before an error.
+        that it holds what was reached before an error; it holds what the steps before ``first`` returned.
         """
         stages = self.stages if fits else {s: [n for n in names if n != "effects"] for s, names in self.stages.items()}
         with self.environment():
-            return run_steps(state or self.state(), tasks_of(stages, until), self.settings)
+            return run_steps(state or self.state(), tasks_of(stages, until, first=first), self.settings)
 
     def calibrated(self) -> UnitState:
         """Return the unit after the calibration; an error is that whose code, message and file a run publishes."""
@@ -166,20 +175,33 @@ def unit_without_campaign(
     if isinstance(recordings, str | os.PathLike):
         folder = Path(recordings).resolve()
         name = name if wrong_name(folder.name) else folder.name
-    try:
-        composer = Composer(NO_CAMPAIGN, files, below=Path())
-        layers = [*(f"{group}={option}" for group, option in chosen.items() if option is not None), *texts]
-        config = composer.unit(name, layers)
-    except Problem as problem:
-        raise ConfigurationError(f"the configuration is refused: {problem}") from problem
-    row = UnitRow(name, {"unit": name}, config, {key: str(value) for key, value in map(parse, layers)})
+    layers = [*(f"{group}={option}" for group, option in chosen.items() if option is not None), *texts]
+    row = unit_row(layers, name, files)
     if folder != NO_CAMPAIGN:
         _require_recordings(folder)
         found = UnitFiles(folder, folder)
     else:
         row, found = _of_mapping(row, recordings)
-    batches, chains = cut_batches({name: row}, 1)
-    return ConfiguredUnit(row, found, chains[next(iter(batches))])
+    return _configured(row, found)
+
+
+def unit_of_recordings(recordings: Sequence[Recording], layers: Sequence[str]) -> ConfiguredUnit:
+    """Return the recordings of a simulation as a unit, configured by overrides; raises ``ConfigurationError``."""
+    return _configured(unit_row(layers), UnitFiles(NO_CAMPAIGN, NO_CAMPAIGN, recordings=tuple(recordings)))
+
+
+def unit_row(layers: Sequence[str], name: str = "unit", python_effects: Sequence[str] = ()) -> UnitRow:
+    """Return a unit without a campaign, as a run composes and checks its configuration from overrides."""
+    try:
+        config = Composer(NO_CAMPAIGN, python_effects, below=Path()).unit(name, layers)
+    except Problem as problem:
+        raise ConfigurationError(f"the configuration is refused: {problem}") from problem
+    return UnitRow(name, {"unit": name}, config, {key: str(value) for key, value in map(parse, layers)})
+
+
+def _configured(row: UnitRow, files: UnitFiles) -> ConfiguredUnit:
+    _, chains = cut_batches({row.name: row}, 1)
+    return ConfiguredUnit(row, files, next(iter(chains.values())))
 
 
 def files_of_effects(python_effects: Paths) -> list[str]:

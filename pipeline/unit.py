@@ -94,9 +94,13 @@ class Task(NamedTuple):
         return "/".join(filter(None, (self.step, self.sensor, self.stage)))
 
 
-def tasks_of(stages: Mapping[str, Sequence[str]], until: str = "diagnose") -> Iterator[Task]:
-    """Yield the tasks of a unit in their order, up to the step ``until``; ``stages``: of the fit of each sensor."""
-    for step in STEPS:
+def tasks_of(stages: Mapping[str, Sequence[str]], until: str = "diagnose", *, first: str = "ingest") -> Iterator[Task]:
+    """Yield the tasks of a unit in their order, from the step ``first`` to ``until``.
+
+    ``stages``: of the fit of each sensor.
+    """
+    steps = list(STEPS)
+    for step in steps[steps.index(first) :]:
         if step == "fit":
             for sensor, names in stages.items():
                 yield from (Task(step, sensor, name, name == names[-1]) for name in names)

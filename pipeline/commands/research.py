@@ -33,7 +33,7 @@ def study(argv: Sequence[str]) -> int:
     from pipeline.study.cases import FAMILIES  # noqa: PLC0415  (not needed for a comparison with the thesis)
     from pipeline.study.page import DIAGRAM, page  # noqa: PLC0415
     from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study  # noqa: PLC0415
-    from pipeline.study.scores import answer_scores, cases_of, family_scores, reliability_diagram  # noqa: PLC0415
+    from pipeline.study.scores import accepted, answer_scores, cases_of, family_scores, reliability_diagram  # noqa: PLC0415
 
     parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder for the truth and the results")
@@ -57,7 +57,7 @@ def study(argv: Sequence[str]) -> int:
     )
     countdown.end()
     cases = cases_of(read_lines(arguments.directory / TRUTH), read_lines(arguments.directory / RESULTS))
-    for score in [*family_scores(cases), *answer_scores(cases)]:
+    for score in [*accepted(cases), *family_scores(cases), *answer_scores(cases)]:
         name, n, value, interval, goal = score.cells
         print(f"{name:<92} {n:>5} {value:>8} {interval:<16} {goal:<9} {' '.join(score.misses[:8])}".rstrip())
     if arguments.table:

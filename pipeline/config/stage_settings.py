@@ -277,14 +277,14 @@ def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
 
 
 @cache
-def code_digest(module: str) -> str:
-    """Return a digest of the source of a module and of every module of the package that it imports, at any depth.
+def code_digest(*modules: str) -> str:
+    """Return a digest of the source of modules and of every module of the package that they import, at any depth.
 
     It includes all files of a package that imports its modules by name, the folder ``templates`` of a module that
     imports jinja2, and ``configs/effect/`` with the effects.
     """
-    files = _closure(module)
-    if module.startswith("pipeline.stages."):
+    files = frozenset[Path]().union(*map(_closure, modules))
+    if any(module.startswith("pipeline.stages.") for module in modules):
         files |= _closure("pipeline.stages.unit_files")  # loads and stores what the step reads and returns
     digest = hashlib.sha256()
     for file in sorted(files):

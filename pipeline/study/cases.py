@@ -55,7 +55,7 @@ ALTERNATIVES = [  # not hidden together: their signals are nearly alike
 FACTOR = {"small": 0.3, "tiny": 0.1}  # of the sensor file's size
 WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the sensor file's
 STIM_SHARE = 0.25  # of the units of the families that have both models
-REFERENCE = "reference_least_squares"
+METHODS = REFERENCE, STAGED = "reference_least_squares", "staged"  # by which a base is calibrated
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 
 
@@ -123,7 +123,7 @@ def draw(family: str, number: int, seed: int) -> Case:
         wander=5.0 if detail == "wander" else 1.0,
         noise=family if family in ("lost", "coarse", "cold") else "normal",
         left_out=tuple(names) if kind == "removed" else (),
-        method="staged" if kind == "staged" else REFERENCE,
+        method=STAGED if kind == "staged" else REFERENCE,
     )
 
 

@@ -13,6 +13,7 @@ from pipeline.report.pages import template
 from pipeline.study.cases import FAINT, SIZES
 from pipeline.study.scores import (
     Score,
+    accepted,
     answer_scores,
     family_scores,
     first_is_right,
@@ -40,7 +41,7 @@ DIAGRAM = "reliability.svg"
 
 def page(cases: Sequence[JSON], command: str) -> str:
     """Return the page; ``command``: the command that reproduces it."""
-    answers, families = table_of(cases), family_scores(cases)
+    answers, families = table_of(cases), [*accepted(cases), *family_scores(cases)]
     text: str = template("study.md").render(
         command=command,
         code=" and ".join(sorted({f"`{case['code']}`" for case in cases if "code" in case})) or "unknown",

@@ -5,9 +5,10 @@
 
 A case that has a result is not run again, so that a study can be interrupted and extended.
 
-A result has the diagnosis and the held-out error after the selected effects are added. The diagnosis gets the
-recordings and the composed configuration of a unit, never the truth. Every step calls the same function as the stage of
-a run.
+A case goes through the steps of a run (``pipeline.unit``): its recordings are checked and filtered, both sensors are
+fitted, validated and diagnosed. The steps get the recordings and the composed configuration of a unit, never the truth.
+A result has the diagnosis and the held-out error after the selected effects are added. A case that a step refuses has
+the refusal as its result.
 """
 
 from __future__ import annotations
@@ -16,27 +17,26 @@ import json
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
-from functools import cache
+from dataclasses import replace
 from multiprocessing import get_context
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import code_digest, load_campaign
-from pipeline.diagnosis.diagnose import diagnose
-from pipeline.errors import ConfigurationError
-from pipeline.estimation.effects import fit as fit_effects
-from pipeline.estimation.noise import estimate_noise
-from pipeline.estimation.stages import fit_stage
+from pipeline.config import code_digest
+from pipeline.errors import CannotCalibrateError, ConfigurationError, PipelineError
+from pipeline.estimation.stages import stage_module
 from pipeline.model.effects import leaving_out
-from pipeline.preprocessing.coarse_temperature import refined
-from pipeline.records import SENSORS, Recording, SensorCalibration
+from pipeline.one_unit import unit_of_recordings, unit_row
+from pipeline.records import SENSORS, NotCalibrated
 from pipeline.study.bench import at_detection, recordings_of, signals_left
-from pipeline.study.cases import REFERENCE, Case, draw
-from pipeline.validation.heldout import validate
+from pipeline.study.cases import METHODS, Case, draw
+from pipeline.unit import STEPS, tasks_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from pipeline.one_unit import ConfiguredUnit
+    from pipeline.unit import UnitState
 
 
 TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
@@ -66,7 +66,7 @@ def run_study(
             str(directory / TRUTH),
         )
     done = {line["key"] for line in read_lines(directory / RESULTS)}
-    code = code_digest("pipeline.study.run")
+    code = code_digest(*code_of_study())
     planned = [(family, number, seed) for number in range(count) for family in families]
     planned = [item for item in planned if draw(*item).key not in done]
     with (
@@ -79,6 +79,14 @@ def run_study(
             truth.flush()
             results.flush()
             progress(number, len(planned))
+
+
+def code_of_study() -> list[str]:
+    """Return the modules that determine a result: this one, and those that the steps of a run import by name."""
+    methods = [unit_row([f"method={method}"]).config["method"]["stages"] for method in METHODS]
+    tasks = [task for stages in methods for task in tasks_of({s: [*stages[s], "effects"] for s in SENSORS})]
+    steps = {f"pipeline.stages.{STEPS[task.step].function.partition('.')[0]}" for task in tasks}
+    return [__name__, *sorted(steps | {stage_module(t.sensor, t.stage) for t in tasks if t.sensor})]
 
 
 def _judged(planned: Sequence[tuple[str, int, int]], processes: int) -> Iterator[tuple[JSON, list[JSON]]]:
@@ -98,7 +106,8 @@ def _judged_or_fault(planned: tuple[str, int, int]) -> tuple[JSON, list[JSON]]:
     try:
         return hidden, judge(case)
     except Exception as error:  # noqa: BLE001  (any exception is a result of the case)
-        return hidden, [{"key": case.key, "sensor": case.sensor, "error": f"{type(error).__name__}: {error}"}]
+        result = {"key": case.key, "sensor": case.sensor, "error": f"{type(error).__name__}: {error}"}
+        return hidden, [result | ({"refused": error.code} if isinstance(error, PipelineError) else {})]
 
 
 def read_lines(path: Path) -> list[JSON]:
@@ -110,32 +119,34 @@ def read_lines(path: Path) -> list[JSON]:
 
 def judge(case: Case) -> list[JSON]:
     """Return the results of a case: one entry, or one for each sensor where nothing is hidden."""
-    recordings = refined(recordings_of(case))
+    began = time.process_time()
+    unit, state = diagnose_case(case)
+    whole = unit.run_to("diagnose", first="diagnose", state=replace(state)) if case.left_out else None
     out = []
     for sensor in SENSORS if case.kind == "null" else (case.sensor,):
-        began = time.process_time()
-        result = say(recordings, case.model, sensor, case.left_out, case.method)
-        result |= {"key": case.key, "sensor": sensor, "cpu_s": time.process_time() - began}
-        if case.left_out:
-            result["whole"] = say(recordings, case.model, sensor, method=case.method)
+        result: JSON = {"key": case.key, "sensor": sensor} | scored(state, sensor)
+        if whole:
+            result["whole"] = scored(whole, sensor)
         if case.kind in HELD_OUT:
-            result["held_out"] = _held_out(recordings, case.model, sensor, result["selected"], case.method)
+            result["held_out"] = held_out_errors(unit, state, sensor, result["selected"])
         out.append(result)
-    return out
+    spent = (time.process_time() - began) / len(out)
+    return [result | {"cpu_s": spent} for result in out]
 
 
-def say(
-    recordings: list[Recording], model: str, sensor: str, left_out: Sequence[str] = (), method: str = REFERENCE
-) -> JSON:
-    """Diagnose recordings, and return the part of the diagnosis that a study scores.
+def diagnose_case(case: Case) -> tuple[ConfiguredUnit, UnitState]:
+    """Run the steps up to the diagnosis, without the effects that the case leaves out of the catalogue.
 
-    ``left_out``: effects to remove from the catalogue; ``method``: by which the base is calibrated.
+    Raises ``PipelineError`` if a step refuses the unit.
     """
-    settings = settings_of(model, method)
-    noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
-    calibration = calibrated(recordings, sensor, settings)
-    with leaving_out(left_out):
-        document = diagnose(calibration, recordings, noise, settings)
+    unit = unit_of_recordings(recordings_of(case), [f"sensor={case.model}", f"method={case.method}"])
+    with leaving_out(case.left_out):
+        return unit, unit.run_to("diagnose")
+
+
+def scored(state: UnitState, sensor: str) -> JSON:
+    """Return the part of a sensor's diagnosis that a study scores; raises ``CannotCalibrateError`` without one."""
+    document = _part(state, sensor, state.diagnosis)
     entries = {entry["effect"]: entry for entry in document["ranking"]}
     selected = [entries[name] for name in document["selected"]]
     return {
@@ -154,40 +165,33 @@ def say(
     }
 
 
-def calibrated(recordings: list[Recording], sensor: str, settings: JSON) -> SensorCalibration:
-    """Return the calibration after all stages of the configured method."""
-    found: SensorCalibration | None = None
-    for stage in settings["method"]["stages"][sensor]:
-        found = fit_stage(sensor, stage, recordings, found, settings)
-    assert found is not None  # noqa: S101  (every method has a stage)
-    return found
+def held_out_errors(unit: ConfiguredUnit, state: UnitState, sensor: str, names: Sequence[str]) -> JSON:
+    """Return the held-out error before and after effects are added to a validated unit, and the noise floor.
 
-
-def _held_out(recordings: list[Recording], model: str, sensor: str, names: Sequence[str], method: str) -> JSON:
-    """Return the held-out error before and after the effects are added, and the noise floor.
-
-    It is the error of the vector where the attitude is logged, else of the magnitude.
+    It is the error of the vector where the attitude is logged, else of the magnitude. Raises ``CannotCalibrateError``
+    if the recordings do not determine the effects.
     """
-    settings = settings_of(model, method)
-    noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
-    fits = {"before": (calibrated(recordings, sensor, settings), settings)}
+    before, floor = _error(state, sensor)
+    after = before
     if names:
-        adding = {**settings, "effects": {**settings["effects"], sensor: list(names)}}
-        fits["after"] = fit_effects(sensor, recordings, fits["before"][0], adding), adding
-    errors = {}
-    for when, (calibration, used) in fits.items():
-        found = validate(calibration, recordings, noise, used)
-        last = found["steps"][-1]
-        vector = last["vector_rms_error"] is not None and found["vector_noise_floor"] is not None
-        errors[when] = last["vector_rms_error" if vector else "rms_error"]
-        if when == "before":
-            errors["floor"] = found["vector_noise_floor" if vector else "noise_floor"]
-    return {key: errors.get(key, errors["before"]) for key in ("before", "after", "floor")}
+        others = {other: fit for other, fit in state.fits.items() if other != sensor}
+        adding = unit.with_effects(sensor, names)
+        adding = replace(adding, stages={sensor: adding.stages[sensor]})
+        after, _ = _error(adding.run_to("validate", first="fit", state=replace(state, fits=others)), sensor)
+    return {"before": before, "after": after, "floor": floor}
 
 
-@cache
-def settings_of(model: str, method: str = REFERENCE) -> JSON:
-    """Return the configuration of a unit as a run composes and checks it, with defaults for all other settings."""
-    with TemporaryDirectory() as folder:
-        (Path(folder) / "units.csv").write_text(f"unit,sensor,method\nU1,{model},{method}\n", encoding="utf-8")
-        return load_campaign({"campaign": folder}).units["U1"].config
+def _error(state: UnitState, sensor: str) -> tuple[float, float]:
+    """Return the held-out error of a sensor after its last stage, and the noise floor."""
+    part = _part(state, sensor, state.validation)
+    last = part["steps"][-1]
+    vector = last["vector_rms_error"] is not None and part["vector_noise_floor"] is not None
+    return last["vector_rms_error" if vector else "rms_error"], part["vector_noise_floor" if vector else "noise_floor"]
+
+
+def _part(state: UnitState, sensor: str, document: JSON | None) -> JSON:
+    """Return the part of a sensor in a document of its unit."""
+    fit = state.fits[sensor]
+    if isinstance(fit, NotCalibrated):
+        raise CannotCalibrateError(fit.reason)
+    return dict((document or {})[sensor])

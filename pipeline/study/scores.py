@@ -173,6 +173,12 @@ def family_of(case: JSON) -> str:
     return "null" if str(case["family"]).startswith("null") else str(case["family"])
 
 
+def accepted(cases: Sequence[JSON]) -> list[Score]:
+    """Return the share of the units that no step of a run refused."""
+    taken = pd.Series(["refused" not in case for case in cases], [case["key"] for case in cases], dtype=bool)
+    return share("all families: no step of a run refuses the unit", taken, "100 %")
+
+
 def family_scores(cases: Sequence[JSON]) -> list[Score]:
     """Return the scores of every family that was run, and the share of the held-out excess that was removed."""
     found: list[Score] = []

@@ -2,7 +2,7 @@
 
     python tests/corruption/good_run.py --units 1000 --seed 5 --out good.jsonl [--cores 1]
 
-Each goes through the checks of its recordings, noise, fit, held-out error and diagnosis, as in a run. Where nothing
+Each goes through the steps of a run up to the diagnosis. Where nothing
 is hidden, any verdict but ``nothing_missing`` is wrong; else only a doubt about reference or floor, and about the
 reference only where no error of the table is hidden. A unit that is in the file is not run again.
 """
@@ -15,68 +15,40 @@ import sys
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pipeline.diagnosis.diagnose import diagnose
-from pipeline.errors import CannotCalibrateError, PipelineError
-from pipeline.estimation.noise import noise_of
-from pipeline.estimation.stages import fit_stage
-from pipeline.estimation.stated_lines import with_stated
-from pipeline.model.effects import leaving_out
-from pipeline.preprocessing.checks import check_recordings
+from pipeline.errors import PipelineError
 from pipeline.records import SENSORS
-from pipeline.study.bench import recordings_of
-from pipeline.study.cases import FAMILIES, Case, draw
-from pipeline.study.run import settings_of
+from pipeline.study.cases import FAMILIES, draw
+from pipeline.study.run import diagnose_case
 from pipeline.study.scores import wilson
-from pipeline.validation.heldout import validate
+
+if TYPE_CHECKING:
+    from pipeline.unit import UnitState
 
 DOUBTS = ("reference_in_doubt", "floor_in_doubt")
 
 
 def judged(family: str, number: int, seed: int) -> dict[str, Any]:
-    """Return what is said of one unit, by the functions that the stages of a run call, in their order."""
+    """Return what is said of one unit, by the steps of a run."""
     case = draw(family, number, seed)
-    settings = settings_of(case.model, case.method)
     line: dict[str, Any] = {"family": family, "number": number, "seed": seed, "refused": None, "verdicts": {}}
     try:
-        recordings = check_recordings(recordings_of(case), settings)
-        noises = {sensor: noise_of(sensor, recordings, settings) for sensor in SENSORS}
-        fits = {sensor: fitted(recordings, sensor, settings | {"noise": noises}) for sensor in SENSORS}
+        _, state = diagnose_case(case)
     except PipelineError as error:
         return line | {"refused": error.message}
     for sensor in SENSORS if case.kind == "null" else (case.sensor,):
-        line["verdicts"][sensor] = said(case, recordings, fits, noises, sensor)
+        line["verdicts"][sensor] = said(state, sensor)
     return line
 
 
-def fitted(recordings: Any, sensor: str, settings: Any) -> Any:
-    """Return the calibration after all stages of the method; None where the recordings do not suffice."""
-    found = None
-    try:
-        for stage in settings["method"]["stages"][sensor]:
-            found = fit_stage(sensor, stage, recordings, found, settings)
-            found = with_stated(found, recordings, settings)
-    except CannotCalibrateError:
-        return None
-    return found
-
-
-def said(case: Case, recordings: Any, fits: Any, noises: Any, sensor: str) -> dict[str, Any]:
+def said(state: UnitState, sensor: str) -> dict[str, Any]:
     """Return verdict and held-out error of a sensor."""
-    settings, noise = settings_of(case.model, case.method), noises[sensor]
-    if fits[sensor] is None:
-        return {"verdict": "refused", "message": "not calibrated"}
-    other = next(fit for s, fit in fits.items() if s != sensor)
-    try:
-        held = validate(fits[sensor], recordings, noise, settings, other=other)
-        with leaving_out(case.left_out):
-            found = diagnose(fits[sensor], recordings, noise, settings, fits["accelerometer"], validation=held)
-    except PipelineError as error:
-        return {"verdict": "refused", "message": error.message}
-    interval = held.get("expected_rms_error")
+    held, found = state.validation[sensor], state.diagnosis[sensor]
+    if found is None:
+        return {"verdict": "refused", "message": state.fits[sensor].reason}
     out = {"verdict": found["verdict"], "selected": found["selected"], "error": held["steps"][-1]["rms_error"]}
-    return out | {"floor": held["noise_floor"], "expected": interval}
+    return out | {"floor": held["noise_floor"], "expected": held.get("expected_rms_error")}
 
 
 def wrong(line: dict[str, Any]) -> str:

@@ -15,11 +15,10 @@ from bench_units import drawn, judged
 from pipeline.diagnosis.diagnose import _doubts_of_gravity
 from pipeline.diagnosis.findings import Case
 from pipeline.estimation.effects import mountings_by_gravity
+from pipeline.one_unit import unit_row
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import SensorCalibration
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import read_config
-from pipeline.study.run import settings_of
 
 
 def test_an_effect_of_the_accelerometer_is_not_taken_for_mountings() -> None:
@@ -44,8 +43,7 @@ def test_a_tilt_that_shifts_no_mounting_is_no_doubt_about_the_gyroscope(tilt_deg
     description = replace(description, effects={"accelerometer.table_tilt": [0.0, tilt_deg]})
     recordings, _ = simulate_unit(description, 62, 0)
     recordings = [replace(r, table_attitude=None) for r in recordings]
-    settings = settings_of(description.sensor, "reference_least_squares")
-    settings = {**settings, "table": {"name": description.table, **read_config("table", description.table)}}
+    settings = unit_row([f"sensor={description.sensor}", f"table={description.table}"]).config
     recordings = check_recordings(recordings, settings)
     by_gravity = mountings_by_gravity(recordings, settings)
     case = Case(SensorCalibration("gyroscope"), recordings, None, settings, by_gravity, ["mounting"])

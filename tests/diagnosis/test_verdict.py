@@ -8,15 +8,14 @@ from typing import Any
 import pytest
 from bench_session import Session, record
 
-from pipeline.diagnosis.diagnose import diagnose, doubts_of, held_out_of
+from pipeline.diagnosis.diagnose import doubts_of, held_out_of
 from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged, verdict_of_selection
-from pipeline.estimation.noise import estimate_noise
+from pipeline.one_unit import unit_of_recordings
 from pipeline.outcome import commands_of
 from pipeline.records import Note, Recording
 from pipeline.report.parameters import summary_row
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
-from pipeline.study.run import calibrated, settings_of
 
 INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
 NOTHING = Evidence("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, method="reference_least_squares")
@@ -133,9 +132,7 @@ def test_a_selection_that_leaves_a_residual_is_no_explanation(  # noqa: PLR0917 
 def test_a_recording_of_another_unit_is_unexplained_with_a_reason_and_nothing_is_offered() -> None:
     own, other = (recordings_of(draw("null_normal", number, 31)) for number in (1, 3))
     recordings = [next(o for o in other if o.name == "gyro_y") if r.name == "gyro_y" else r for r in own]
-    settings = settings_of("mpu6050")
-    noise = estimate_noise("accelerometer", recordings, settings["sensor"]["accelerometer"])
-    found = diagnose(calibrated(recordings, "accelerometer", settings), recordings, noise, settings)
+    found = unit_of_recordings(recordings, ["sensor=mpu6050"]).run_to("diagnose").diagnosis["accelerometer"]
     assert found["verdict"] == "unexplained"
     assert "sensor file" in found["reason"]
     assert (found["override"], commands_of(found, "accelerometer", "U1", {"campaign": "c"})) == ("", {})

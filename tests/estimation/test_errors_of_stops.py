@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from pipeline.estimation.design import Design
 from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.observations import Observations, observe, weighted
+from pipeline.one_unit import unit_row
 from pipeline.preprocessing.bench import signed_axis
 from pipeline.records import Noise
-from pipeline.study.run import settings_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "preprocessing"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "study"))
@@ -28,7 +28,7 @@ SETTINGS = [Setting(0.1, 60.0), Setting(1.0, 20.0)]
 
 
 def observed(angle_deg: float) -> Observations:
-    table = {**settings_of("mpu6050", "reference_least_squares")["table"], "angle_accuracy_deg": angle_deg}
+    table = unit_row(["sensor=mpu6050", f"table.angle_accuracy_deg={angle_deg}"]).config["table"]
     turns = [r for r in recordings_of({}) if r.role == "accelerometer"]
     return weighted(observe("accelerometer", turns, table), Noise(SCALE, 0.1 * SCALE, 60.0, "rests"))
 

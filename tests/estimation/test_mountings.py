@@ -15,9 +15,9 @@ from pipeline.estimation.effects import fit
 from pipeline.estimation.reference_least_squares import fit as fit_to_reference
 from pipeline.model.effects import effect, effect_of
 from pipeline.model.kinematics import reference_motion
+from pipeline.one_unit import unit_row
 from pipeline.preprocessing.mounting import check_mounting
 from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration
-from pipeline.study.run import settings_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "preprocessing"))
 from benches import BIAS, K, Setup, recordings_of
@@ -36,11 +36,9 @@ def seated_anew(seed: int, seat_deg: float) -> tuple[list[Recording], np.ndarray
 
 def settings() -> dict[str, Any]:
     """Return settings of a table on which the unit is mounted anew for each turn."""
-    base = settings_of("mpu6050", "reference_least_squares")
-    table = {**base["table"], "angle_accuracy_deg": 0.0, "rate_accuracy": 0.0, "seat_deg": SEAT_DEG}
-    sheets = {s: {**base["sensor"][s], "bias_wander": 0.0} for s in K}  # the turns are made with white noise alone
-    whole = {**base, "sensor": {**base["sensor"], **sheets}, "table": table}
-    whole["effects"] = {"accelerometer": [], "gyroscope": []}
+    table = {"angle_accuracy_deg": 0.0, "rate_accuracy": 0.0, "seat_deg": SEAT_DEG}
+    quiet = [f"sensor.{s}.bias_wander=0" for s in K]  # the turns are made with white noise alone
+    whole = unit_row(["sensor=mpu6050", *(f"table.{key}={value}" for key, value in table.items()), *quiet]).config
     white = {"accelerometer": 8e-4, "gyroscope": 0.01}  # of benches.py
     return {**whole, "noise": {s: Noise(np.full(3, w), np.zeros(3), 100.0, "rests") for s, w in white.items()}}
 

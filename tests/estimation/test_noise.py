@@ -21,9 +21,9 @@ from pipeline.estimation.gauss_markov import (
 from pipeline.estimation.noise import estimate_noise, wander_prior
 from pipeline.estimation.noise_terms import allan_deviation
 from pipeline.estimation.reference_least_squares import fit
+from pipeline.one_unit import unit_row
 from pipeline.records import Noise, Recording
 from pipeline.signal.filters import apply_filter, filter_autocovariance
-from pipeline.study.run import settings_of
 
 SHEET = {"noise_density": 4e-4, "bias_wander": 1e-4, "wander_time_s": 100.0}
 NO_WANDER = {"noise_density": 4e-4, "bias_wander": 0.0, "wander_time_s": 100.0}
@@ -105,8 +105,9 @@ def test_values_held_between_samples_do_not_hide_a_slow_wander_from_the_stated_u
     sampled = [r for r in bench_session.record(session) if r.role != "validation"]
     held = [replace(r, accelerometer=r.accelerometer[np.arange(r.samples) // 5 * 5]) for r in sampled]
     assert estimate_noise("accelerometer", held, SHEET).correlation_time < 25.0
+    config = unit_row(["sensor=mpu6050"]).config
     stated = [
-        np.array(fit("accelerometer", of_unit, None, settings_of("mpu6050")).to_json()["expanded_uncertainty"]["bias"])
+        np.array(fit("accelerometer", of_unit, None, config).to_json()["expanded_uncertainty"]["bias"])
         for of_unit in (sampled, held)
     ]
     assert np.all(stated[1] > 0.7 * stated[0])

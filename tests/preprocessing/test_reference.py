@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.diagnosis.diagnose import doubts_of
 from pipeline.errors import IngestError
+from pipeline.one_unit import unit_row
 from pipeline.preprocessing.at_rest import check_axes, check_static
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.preprocessing.reference import _interval, check_motion
@@ -23,7 +24,6 @@ from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_config, read_description
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, draw
-from pipeline.study.run import settings_of
 
 if TYPE_CHECKING:
     from pipeline.records import Note
@@ -109,7 +109,7 @@ def test_a_static_recording_of_another_unit_is_in_doubt(number: int, doubts: int
     """Case 0 is of a STIM300, which is quieter; case 3 of another MPU-6050, whose gyroscope has another bias."""
     own, other = (recordings_of(draw("null_normal", n, 31)) for n in (1, number))
     static = next(r for r in other if r.role == "static")
-    checked = check_static([static if r.role == "static" else r for r in own], settings_of("mpu6050"))
+    checked = check_static([static if r.role == "static" else r for r in own], unit_row(["sensor=mpu6050"]).config)
     assert len(doubts_of("accelerometer", checked)) == doubts
 
 
@@ -219,6 +219,6 @@ def test_a_copied_axis_is_refused_in_a_log_of_few_digits(sign: float) -> None:
         recording = rounded_rest(seed, 400, 0.5)
         force = np.array(recording.accelerometer)
         force[100:, 2] = sign * force[100:, 1]  # the first quarter is not copied
-        with pytest.raises(IngestError, match="accel_z is (a copy|the negative) of accel_y") as refused:
+        with pytest.raises(IngestError, match=r"accel_z is (a copy|the negative) of accel_y") as refused:
             check_axes([replace(recording, accelerometer=force)])
         assert refused.value.code == "copied_axis"

@@ -2,7 +2,7 @@
 
     python tests/study/bench_units.py --units 1000 --seed 1 --out units.jsonl
 
-Each unit goes through the checks of its recordings, noise, fit, held-out error and diagnosis, as in a run. The line of
+Each unit goes through the steps of a run up to the diagnosis. The line of
 a unit holds the error of each parameter over its expanded uncertainty, in the frame of the mean of the mountings. A
 unit of one number is the same sensor with the same hidden effect on every bench, so that benches compare in pairs. A
 unit that is in the file is not run again. Without --units the table of the file is printed.
@@ -25,21 +25,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import PipelineError
 from pipeline.estimation.gauss_markov import TIME_FACTORS, TIME_PRIOR
-from pipeline.estimation.noise import noise_of, wander_prior
-from pipeline.estimation.stages import fit_stage
-from pipeline.estimation.stated_lines import with_stated
+from pipeline.estimation.noise import wander_prior
 from pipeline.model.effects import built_in
 from pipeline.model.kinematics import reference_motion
-from pipeline.preprocessing.checks import check_recordings
-from pipeline.records import SENSORS, coverage_factor
+from pipeline.one_unit import unit_of_recordings
+from pipeline.records import SENSORS, NotCalibrated, coverage_factor
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
-from pipeline.study.run import settings_of
 from pipeline.study.scores import wilson
-from pipeline.validation.heldout import validate
 
 TURNS = [f"{kind}_{axis}" for kind in ("accel", "gyro") for axis in "xyz"]
 COURSE: dict[str, Any] = {
@@ -111,7 +106,7 @@ def _drawn_wander(model: str, sensor: str, rng: np.random.Generator) -> dict[str
 
 
 def judged(kind: str, seed: int, number: int, hidden: float, coverage: str = "") -> dict[str, Any]:
-    """Return what is said of one unit, by the functions that the stages of a run call, in their order.
+    """Return what is said of one unit, by the steps of a run.
 
     The rate of each turn axis has an error as its table states, without one of the angle, as by a wrong clock of the
     table: the true matrix of the gyroscope is ``diag(1 + error)`` times that of the simulation.
@@ -121,26 +116,19 @@ def judged(kind: str, seed: int, number: int, hidden: float, coverage: str = "")
     nominal = {r.name: _nominal(r, description.imperfections) for r in recordings if r.name in TURNS}
     if bench["face"].magnitude() > 0.0 or "seats" in kind:
         recordings = [_without_attitude(r) for r in recordings]
-    settings = settings_of(description.sensor, "reference_least_squares")
-    settings = {**settings, "table": {"name": description.table, **read_config("table", description.table)}}
-    if kind == "single":
-        settings["table"]["seat_deg"] = None
+    layers = [f"sensor={description.sensor}", f"table={description.table}", "method=reference_least_squares"]
+    unit = unit_of_recordings(recordings, layers + ["table.seat_deg=null"] * (kind == "single"))
     line: dict[str, Any] = {"kind": kind, "seed": seed, "number": number, "model": description.sensor}
     line |= {"hidden": bench["hidden"], "refused": None, "sensors": {}}
     try:
-        recordings = check_recordings(recordings, settings)
-        noises = {s: noise_of(s, recordings, settings) for s in SENSORS}
-        fits = {}
-        for sensor in SENSORS:
-            found = None
-            for stage in ("reference_least_squares", "effects"):
-                found = fit_stage(sensor, stage, recordings, found, settings | {"noise": noises})
-            fits[sensor] = with_stated(found, recordings, settings)
+        state = unit.run_to("fit" if coverage else "diagnose")
     except PipelineError as error:
         return line | {"refused": error.message}
-    mean = _mean_mounting(nominal, recordings, bench) if "seats" in kind else Rotation.identity()
+    if refused := [fit.reason for fit in state.fits.values() if isinstance(fit, NotCalibrated)]:
+        return line | {"refused": refused[0]}
+    mean = _mean_mounting(nominal, state.checked, bench) if "seats" in kind else Rotation.identity()
     for sensor in SENSORS:
-        found = fits[sensor]
+        found = state.fits[sensor]
         matrix = mean.as_matrix() @ np.array(truth[sensor]["matrix"])
         if sensor == "gyroscope":
             matrix = np.diag(1.0 + bench["rate_error"]) @ matrix
@@ -149,11 +137,7 @@ def judged(kind: str, seed: int, number: int, hidden: float, coverage: str = "")
         line["sensors"][sensor] = {"error_over_U": (error / U).tolist()}
         if coverage:
             continue
-        held = validate(found, recordings, noises[sensor], settings)
-        gravity = line["sensors"].get("accelerometer")
-        said = diagnose(
-            found, recordings, noises[sensor], settings, fits["accelerometer"], validation=held, gravity=gravity
-        )
+        held, said = state.validation[sensor], state.diagnosis[sensor]
         inside = held["expected_rms_error"][0] <= held["steps"][-1]["rms_error"] <= held["expected_rms_error"][1]
         line["sensors"][sensor] |= {
             "over_floor": held["steps"][-1]["rms_error"] / held["noise_floor"],

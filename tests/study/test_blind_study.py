@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -16,13 +16,18 @@ from pipeline.model.effects import catalogue
 from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, SIZES, Case, draw
-from pipeline.study.run import judge, read_lines, say
+from pipeline.study.run import diagnose_case, judge, read_lines, scored
 from pipeline.study.scores import exact, first_is_right, in_the_set, not_seen, outside_answered
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 SEED = 2
+
+
+def said(case: Case) -> dict[str, Any]:
+    _, state = diagnose_case(case)
+    return case.to_json() | scored(state, case.sensor)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -89,12 +94,12 @@ def test_correlated_noise_has_its_correlation(noise: str, slope: float) -> None:
 @pytest.mark.parametrize("number", range(5))
 def test_what_is_hidden_alone_is_named_first(number: int) -> None:
     case = draw("single", number, SEED)
-    assert first_is_right(case.to_json() | say(recordings_of(case), case.model, case.sensor))
+    assert first_is_right(said(case))
 
 
 def test_two_hidden_effects_are_found_and_no_third() -> None:
     case = draw("pairs", 0, SEED)
-    assert exact(case.to_json() | say(recordings_of(case), case.model, case.sensor))
+    assert exact(said(case))
 
 
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
@@ -117,7 +122,7 @@ def test_an_effect_that_nobody_knows_of_is_not_named() -> None:
 @pytest.mark.parametrize(("family", "number"), [("shape_saturation", 6), ("single", 20)])
 def test_a_bend_of_the_temperature_is_an_answer_beside_the_warm_up_that_it_looks_like(family: str, number: int) -> None:
     case = draw(family, number, 61)
-    found = say(recordings_of(case), case.model, case.sensor)
+    found = said(case)
     assert found["selected"] == ["warm_up"]
     assert outside_answered(found) if case.shape else found["verdict"] == "missing_effect"
     assert not any(":" in name for name in found["probability"])
