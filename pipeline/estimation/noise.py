@@ -307,7 +307,9 @@ def _blocks_of(rests: Sequence[Rest], shortest: int) -> _RestBlocks:
     place = np.arange(len(rest)) - (np.cumsum(pieces) - pieces)[rest]  # of a block in its rest
     counts = (place + 1) * sizes[rest] // pieces[rest] - place * sizes[rest] // pieces[rest]
     time = np.concatenate([r.time for r in rests])
-    values = np.concatenate([r.reading - r.reading.mean(axis=0) for r in rests])
+    values = np.concatenate([r.reading for r in rests])
+    of = np.repeat(np.arange(len(rests)), sizes)
+    values -= (np.stack([np.bincount(of, v) for v in values.T], axis=1) / sizes[:, None])[of]
     clock = np.array([r.clock for r in rests])[rest]
     first = np.cumsum(counts) - counts
     mean = np.add.reduceat(values, first) / counts[:, None]

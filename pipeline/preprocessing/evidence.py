@@ -113,7 +113,8 @@ def quantiles(values: Values, *shares: float) -> Values:
 
 def gaps(recording: Recording) -> Mask:
     """Return which intervals are longer than 1.5 times the usual one: (n - 1,) array."""
-    return np.asarray(np.diff(recording.time_ns) > GAP_INTERVALS * recording.interval * 1e9)
+    longest = GAP_INTERVALS * recording.interval * 1e9
+    return recording.once("gaps", lambda: np.asarray(np.diff(recording.time_ns) > longest))
 
 
 def of_table(recording: Recording) -> list[Channel]:
@@ -121,6 +122,10 @@ def of_table(recording: Recording) -> list[Channel]:
 
     In held-out motion the rate is a magnitude.
     """
+    return [*recording.once("rotation of the table", lambda: _of_table(recording))]
+
+
+def _of_table(recording: Recording) -> list[Channel]:
     channels, turns = [], recording.axis is not None
     rate, angle, attitude = recording.table_rate, recording.table_angle, recording.table_attitude
     if rate is not None:

@@ -266,7 +266,7 @@ def _applied(turn: Turn, doubt: Note | None, as_found: str, ways: tuple[tuple[st
         detail = f"upward face, turn axis and zero are taken as stated: {turn.fit.unknown}"
         notes.append(Note("N-MOUNTING", 1, 0, 0, detail))
     if bench.conventional and not as_found:
-        return replace(recording, notes=tuple(notes))
+        return replace(recording, notes=tuple(notes)) if len(notes) > len(recording.notes) else recording
     detail = (
         f"{as_found or 'as stated'}, {words(bench)}: the angle used is {bench.sense:+d} times the logged one, "
         f"{bench.offset:+.6g} deg"

@@ -23,6 +23,7 @@ interval contradicts this.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -145,7 +146,8 @@ class _Gyroscope:
             rate = recording.logged_rate
             if rate is None or recording.gyroscope is None:
                 continue
-            gain, bias = self.slopes[recording.name] = _slopes(recording.gyroscope, rate)
+            slopes = partial(_slopes, recording.gyroscope, rate)
+            gain, bias = self.slopes[recording.name] = recording.once("slopes of the gyroscope", slopes)
             if np.all(gain):
                 turned = int(np.argmax(np.abs(gain)))  # not the stated axis: the mounting is checked later
                 found.append((turned, float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
@@ -341,6 +343,8 @@ def _check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> N
 def _of_one_clock(intervals: Values, limits: Limits) -> bool:
     """Return whether one offset and one clock explain (r, 4) first and last times, least and largest delays, s."""
     start, end, low, high = intervals.T
+    if max(low.max(), -limits.late_s) <= min(high.min(), limits.late_s):  # without any drift
+        return True
     drift = np.linspace(-limits.clock, limits.clock, CLOCKS)[:, None, None] * np.stack([start, end])
     least = np.maximum((low - drift.max(axis=1)).max(axis=1), -limits.late_s)
     most = np.minimum((high - drift.min(axis=1)).min(axis=1), limits.late_s)

@@ -50,6 +50,7 @@ class Comparison:
         self.recording, self.channels, self.limits = recording, channels, limits
         self.dt = np.diff(recording.time)
         self.interval = float(median(self.dt))
+        self._summed: dict[tuple[str, int], tuple[Values, Values, Values, Values]] = {}  # by channel and size
         self.known = np.ones(len(self.dt), bool)  # intervals in which every channel is known
         for channel in channels:
             finite = np.isfinite(channel.low)
@@ -117,11 +118,11 @@ class Comparison:
         limits, n = self.limits, len(self.dt)
         for size in sorted({SHORT, max(n // LONG, SHORT)}):
             starts = np.arange(0, max(n - size // 2, 1), size)
-            turned, total, bends, _ = self._sums(claim, starts)
+            turned, total, bends, _ = self._sums(claim, size, starts)
             length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
             excess, sums = [], []
             for other in others:
-                shown, shown_total, shown_bends, swing = self._sums(other, starts)
+                shown, shown_total, shown_bends, swing = self._sums(other, size, starts)
                 most = np.maximum(total, shown_total)
                 allowed = limits.rate * most + BENDS * np.sqrt(bends + shown_bends) + RESOLVED_DEG
                 if claim.of_intervals or other.of_intervals:
@@ -147,8 +148,10 @@ class Comparison:
                 return text, rows.size, first, last
         return None
 
-    def _sums(self, channel: Channel, starts: Index) -> tuple[Values, Values, Values, Values]:
+    def _sums(self, channel: Channel, size: int, starts: Index) -> tuple[Values, Values, Values, Values]:
         """Return for each stretch: angle, sum of its magnitudes, squared error by bends, and range of the rate."""
+        if (channel.name, size) in self._summed:
+            return self._summed[channel.name, size]
         turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
         rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
         if not channel.of_intervals:
@@ -156,6 +159,7 @@ class Comparison:
             bend = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
         swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
         angle, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
+        self._summed[channel.name, size] = angle, total, bends, swing
         return angle, total, bends, swing
 
 

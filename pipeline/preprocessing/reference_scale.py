@@ -84,6 +84,7 @@ QUARTZ = 2e-4  # relative: two quartz clocks of +-100 ppm each
 GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz, errors of its phase by lever arms
 SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, error of gravity's direction by an accelerometer's nonlinearities
 FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, ROUNDS = 200, 24, 4  # samples; blocks of a sandwich estimate; Gauss-Newton steps
+CONVERGED = 1e-12  # relative step, far below the uncertainty of any ratio
 ALIKE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
 
 
@@ -217,15 +218,20 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
         c, s = np.cos(a), np.sin(a)
         columns = [np.ones_like(a), c, s, w * c, w * s, w * w, slope, late, late * late]
         columns += [f(k * a) for k in (2, 3) for f in (np.cos, np.sin)]
-        first = np.linalg.lstsq(np.column_stack(columns[:3]), y, rcond=None)[0]
+        Q, R = np.linalg.qr(np.column_stack(columns))
+        first = np.linalg.solve(R[:3, :3], Q[:, :3].T @ y)
         d, e = a[:, None] * (np.outer(c, first[2]) - np.outer(s, first[1])), y.copy()
         for k in range(2):
             harmonic = first[1, k] * c + first[2, k] * s
-            Q = np.linalg.qr(np.column_stack([*columns, late * harmonic, late * late * harmonic]))[0]
-            d[:, k] -= Q @ (Q.T @ d[:, k])
-            e[:, k] -= Q @ (Q.T @ e[:, k])
+            drifts = np.column_stack([late * harmonic, late * late * harmonic])
+            every = np.column_stack([Q, np.linalg.qr(drifts - Q @ (Q.T @ drifts))[0]])
+            d[:, k] -= every @ (every.T @ d[:, k])
+            e[:, k] -= every @ (every.T @ e[:, k])
         information = float(np.sum(d * d))
-        a = a * (1.0 + float(np.sum(d * e)) / information)
+        step = float(np.sum(d * e)) / information
+        a = a * (1.0 + step)
+        if abs(step) < CONVERGED:
+            break
     starts = np.linspace(0, len(t), BLOCKS_OF_A_GEAR, endpoint=False).astype(int)
     scores = np.add.reduceat(np.sum(d * e, axis=1), starts)
     return float(logged @ logged / (a @ logged)), float(np.linalg.norm(scores)) / information
