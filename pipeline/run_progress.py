@@ -64,10 +64,11 @@ INTERRUPTED = ("Terminating processes on user request", "Shutting down, this mig
 
 @dataclass
 class Job:
-    """A job of Snakemake: rule, displayed name, number of units, log, start time in s, and duration in s."""
+    """A job of Snakemake: rule, displayed name, batch, number of units, log, start time in s, and duration in s."""
 
     rule: str
     name: str
+    batch: str
     units: int
     log: Path
     since: float
@@ -100,12 +101,16 @@ class Progress:
     done: list[Job] = field(default_factory=list)
     lost: float = 0.0
     started: float = 0.0
+    batches_at_work: list[str] = field(default_factory=list)  # in the order in which their first job was started
 
     def start(self, number: int, rule: str, wildcards: Mapping[str, str], log: Path) -> None:
         """Note that a job has been started."""
         self.started = self.started or time.monotonic()
         name = " ".join([rule, *(wildcards[w] for w in ("sensor", "stage") if w in wildcards)]).replace("_", " ")
-        self.running[number] = Job(rule, name, self.batches.get(wildcards.get("batch", ""), 1), log, time.time())
+        batch = wildcards.get("batch", "")
+        if batch in self.batches and batch not in self.batches_at_work:
+            self.batches_at_work.append(batch)
+        self.running[number] = Job(rule, name, batch, self.batches.get(batch, 1), log, time.time())
 
     def finish(self, number: int, *, failed: bool = False) -> None:
         """Note that a job has ended."""
@@ -119,16 +124,25 @@ class Progress:
             self.done.append(job)
 
     def text(self) -> str:
-        """Return the state of the run in one line."""
+        """Return the state of the run in one line; a narrow terminal cuts its end."""
+        left, units = self._seconds_left(), self._units()
+        parts = [f"about {duration(left)} left"] if left else []
+        parts.append(f"{len(self.done)} of {sum(self.wanted.values())} jobs")
         units_done = sum(job.units for job in self.done if job.rule == LAST_STAGE)
-        units = round(self.wanted.get(LAST_STAGE, 0) * self._mean_batch())
-        parts = [f"{len(self.done)} of {sum(self.wanted.values())} jobs"]
         parts += [f"{units_done} of {units} units done"] * bool(units)
         current = [(job, position) for job in self.running.values() if (position := job.current_unit())]
         for job, (unit, number, _) in sorted(current, key=lambda entry: -entry[0].since)[:NAMED_JOBS]:
             parts.append(f"{job.name}: {unit} ({number} of {job.units})")
-        left = self._seconds_left()
-        return " | ".join([*parts, *([f"about {duration(left)} left"] if left else [])])
+        return " | ".join(parts)
+
+    def _units(self) -> int:
+        """Return the number of units of the run: those of the batches whose last stage is wanted.
+
+        Snakemake states how many batches these are. They are those whose last stage was started, then others at work.
+        """
+        last = [job.batch for job in (*self.done, *self.running.values()) if job.rule == LAST_STAGE]
+        batches = list(dict.fromkeys([*last, *self.batches_at_work, *self.batches]))
+        return sum(self.batches.get(batch, 1) for batch in batches[: self.wanted.get(LAST_STAGE, 0)])
 
     def _seconds_left(self) -> float | None:
         """Return the remaining time of the run, s; None until two jobs are done."""
@@ -207,7 +221,7 @@ class Countdown:
         if now - self.printed < INTERVAL[terminal]:
             return
         self.printed, self.drawn = now, terminal
-        text = " | ".join(filter(None, [f"{100.0 * done / max(self.total, 1):.0f} %", words, self.left(done)]))
+        text = " | ".join(filter(None, [f"{100.0 * done / max(self.total, 1):.0f} %", self.left(done), words]))
         sys.stderr.write(f"{CLEAR_LINE}{text}" if terminal else f"{text}\n")
         sys.stderr.flush()
 

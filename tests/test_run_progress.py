@@ -28,7 +28,19 @@ def test_the_line_names_the_unit_at_work_the_units_done_and_the_time_left(tmp_pa
     log.write_text("report: U5 (1 of 4)\nreport: U6 (2 of 4)\n")
     progress.running[4].since -= 10.0
     # 3 units of 9 s are left, one job at a time; and gather, of which 42 s are assumed by the ratio to the others.
-    assert progress.text() == "3 of 5 jobs | 4 of 8 units done | report: U6 (2 of 4) | about 70 s left"
+    assert progress.text() == "about 70 s left | 3 of 5 jobs | 4 of 8 units done | report: U6 (2 of 4)"
+
+
+def test_the_units_are_those_of_the_batches_that_run_and_are_never_fewer_than_the_done_ones(tmp_path: Path) -> None:
+    """An added effect runs one of two batches of unequal size."""
+    progress = Progress({"staged": 4, "other": 6})
+    progress.wanted, told = Counter({"diagnose": 1, "report": 1}), []
+    for number, rule in ((1, "diagnose"), (2, "report")):
+        progress.start(number, rule, {"batch": "other"}, tmp_path / "none")
+        told.append(progress.text())
+        progress.finish(number)
+    assert all("0 of 6 units done" in text for text in told)
+    assert "6 of 6 units done" in progress.text()
 
 
 def test_a_fit_is_named_by_sensor_and_stage(tmp_path: Path) -> None:
@@ -98,10 +110,10 @@ def test_a_command_tells_the_time_left_on_a_terminal_and_each_half_minute_elsewh
             stream.seek(0), stream.truncate()
         assert lines == told
         if terminal:
-            assert text == "\r\x1b[K5 % | 2 of 40 cases | about 40 s left"  # two in two seconds
+            assert text == "\r\x1b[K5 % | about 40 s left | 2 of 40 cases"  # two in two seconds
     now[0] += 40.0
     countdown(20, "20 of 40 cases")
-    assert stream.getvalue() == "50 % | 20 of 40 cases | about 45 s left\n"  # 43 s since it began, to 5 s
+    assert stream.getvalue() == "50 % | about 45 s left | 20 of 40 cases\n"  # 43 s since it began, to 5 s
     assert countdown.left(40) == ""
 
 
@@ -115,7 +127,7 @@ def test_a_job_that_takes_longer_than_earlier_ones_lengthens_the_time_left(tmp_p
     progress.start(3, "fit", {"batch": "a"}, tmp_path / "log")
     progress.running[3].since -= 290.0  # 290 s at the first unit, in place of a millisecond: a tenth of that is left
     os.utime(tmp_path / "log", (progress.running[3].since,) * 2)
-    assert progress.text().endswith("about 30 s left")
+    assert progress.text().startswith("about 30 s left")
 
 
 def test_the_time_left_of_the_demo_does_not_rise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

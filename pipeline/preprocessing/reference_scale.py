@@ -85,6 +85,7 @@ GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz
 SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, error of gravity's direction by an accelerometer's nonlinearities
 FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, ROUNDS = 200, 24, 4  # samples; blocks of a sandwich estimate; Gauss-Newton steps
 CONVERGED = 1e-12  # relative step, far below the uncertainty of any ratio
+SHARES = np.arange(1, BLOCKS_OF_A_GEAR) / BLOCKS_OF_A_GEAR
 ALIKE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
 
 
@@ -232,9 +233,11 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
         a = a * (1.0 + step)
         if abs(step) < CONVERGED:
             break
-    starts = np.linspace(0, len(t), BLOCKS_OF_A_GEAR, endpoint=False).astype(int)
-    scores = np.add.reduceat(np.sum(d * e, axis=1), starts)
-    return float(logged @ logged / (a @ logged)), float(np.linalg.norm(scores)) / information
+    # blocks of equal information: a turn may be a small part of the samples
+    ends = np.searchsorted(np.cumsum(np.sum(d * d, axis=1)) / information, SHARES)
+    scores = np.add.reduceat(np.sum(d * e, axis=1), np.unique([0, *ends]))
+    white = float(np.sqrt(np.mean(e * e) * information))  # of independent errors: the scores of few blocks may cancel
+    return float(logged @ logged / (a @ logged)), max(float(np.linalg.norm(scores)), white) / information
 
 
 def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:

@@ -16,6 +16,8 @@ from pipeline.errors import ConfigurationError, IngestError, MissingInputError
 from pipeline.io.read import read_recordings
 from pipeline.model.kinematics import reference_motion
 from pipeline.preprocessing.at_rest import check_axes
+from pipeline.preprocessing.evidence import Limits
+from pipeline.preprocessing.reference_scale import doubt_of_angle
 from pipeline.records import SENSORS, Recording
 from pipeline.simulation.campaign import simulate_unit, write_campaign
 from pipeline.simulation.description import UnitDescription, description_from, read_config, read_description
@@ -52,13 +54,18 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
-def test_long_rests_before_a_turn_are_no_stuck_axis_and_a_stuck_axis_is_one() -> None:
+def test_long_rests_before_a_turn_give_no_refusal_and_no_doubt_but_faults_do() -> None:
     """In 100,000 samples at 0.12 s, rests of 9 minutes stand before turns of 6 s: less than a tenth of the rows."""
     recordings, _ = simulate_unit(UnitDescription("U", samples=100_000), 0, 0)
     turns = [r for r in recordings if r.role == "gyroscope"]
     rests = np.concatenate([r.table_rate == 0.0 for r in turns if r.table_rate is not None])
     assert rests.mean() > 0.95
     check_axes(recordings)
+    limits = Limits.of({"sensor": read_config("sensor", "mpu6050"), "table": read_config("table", "acutronic")})
+    assert [doubt_of_angle(turn, limits) for turn in turns] == [None] * 3
+    wrong = [replace(r, table_angle=1.005 * r.table_angle) for r in turns if r.table_angle is not None]  # counts a turn
+    told = [str(doubt_of_angle(turn, limits)).partition("turns ")[2].partition(" ")[0] for turn in wrong]
+    assert [float(ratio) for ratio in told] == pytest.approx([1.005] * 3, abs=8e-4)
     last = turns[-1]
     assert last.accelerometer is not None
     for axis in (0, 1):
