@@ -33,7 +33,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from pipeline.errors import first
-from pipeline.results_folder import jobs_running, take_run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -269,6 +268,8 @@ class Monitor(logging.Handler):
 
         Raises ``BusyError`` if another run has locked the results.
         """
+        from pipeline.results_folder import jobs_running, take_run  # noqa: PLC0415  (locks of POSIX, for runs only)
+
         take_run(self.results)
         while jobs_running(self.results):
             print("Waiting for jobs of a killed run that are still running ...", file=self.stream, flush=True)
