@@ -93,7 +93,8 @@ class ConfiguredUnit:
 
         The order of summation, and so the last digits, depend on the number of threads.
         """
-        with registered(self.row.config.get("user_effects", {})), threadpool_limits(1, "blas"):
+        effects = as_job_reads(self.row.config.get("user_effects", {}))
+        with registered(effects), threadpool_limits(1, "blas"):
             yield
 
 
