@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from contextlib import contextmanager
+from ctypes import CDLL
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import scipy.linalg  # noqa: F401  (loads its library of linear algebra, so that ``environment`` limits its threads)
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from pipeline.config.campaign import Campaign, UnitRow, cut_batches
 from pipeline.config.compose import Composer
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
     Paths = Sequence[str | os.PathLike[str]]
     Recordings = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str] | pd.DataFrame]
 
+if sys.platform == "linux":  # else threadpoolctl starts the program ldconfig to find the library, which is loaded
+    getattr(ThreadpoolController, "_system_libraries", {}).setdefault("libc", CDLL(None))
 NO_CAMPAIGN = Path(__file__).with_name("no_campaign")  # does not exist: no options or effects of a campaign
 
 
@@ -98,7 +102,8 @@ class ConfiguredUnit:
 
         The order of summation, and so the last digits, depend on the number of threads.
         """
-        with registered(self.row.config.get("user_effects", {})), threadpool_limits(1, "blas"):
+        effects = as_job_reads(self.row.config.get("user_effects", {}))
+        with registered(effects), threadpool_limits(1, "blas"):
             yield
 
 
@@ -122,7 +127,7 @@ def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> Trial:
 def unit_of_campaign(campaign: Campaign, unit: str) -> ConfiguredUnit:
     """Return a unit of a campaign, as a run of the campaign configures it."""
     if unit not in campaign.units:
-        message = f"no unit {unit!r}{nearest(unit, campaign.units)}"
+        message = f"no unit {unit!r}{nearest(str(unit), campaign.units)}"
         raise ConfigurationError(message, str(campaign.directory / "units.csv"))
     batch = next(name for name, units in campaign.batches.items() if unit in units)
     files = UnitFiles(campaign.recorded, campaign.folder(unit))

@@ -33,7 +33,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from pipeline.errors import first
-from pipeline.results_folder import jobs_running, take_run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -290,6 +289,8 @@ class Monitor(logging.Handler):
 
         Raises ``BusyError`` if another run has locked the results.
         """
+        from pipeline.results_folder import take_run  # noqa: PLC0415  (locks of POSIX, for runs only)
+
         take_run(self.results)
         wait_for_jobs(self.results, self.stream)
         terminal = self.stream.isatty() and not plain

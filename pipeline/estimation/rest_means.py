@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.turns import stop_and_go
 from pipeline.model.kinematics import table_motion
-from pipeline.signal.filters import filter_autocovariance, smooth_temperature, variance_of_mean
+from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
 from pipeline.signal.quiet_motion import creep_of_rest, posterior_creep_rates
 from pipeline.signal.rests import Rest, find_rests, rests_from_table, usable
 
@@ -61,7 +61,7 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
     ``every``: the middle one of so many accepted rests is held out, so that the first and the last rest are in the fit;
     0 holds out none.
     """
-    rests = recording.once("rests", lambda: rests_from_table(recording) or find_rests(recording))
+    rests = rests_from_table(recording) or find_rests(recording)
     accepted = [rest for rest in rests if rest.accepted]
     held = range(every // 2, len(accepted), every) if every else range(0)
     return RestSplit(
@@ -320,9 +320,7 @@ def _of_recording(sensor: str, index: int, recording: Recording, rests: Sequence
     )
     if sensor == "accelerometer" and by_hand:  # without the tilt of a unit that creeps
         scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
-    warmth = np.full(recording.samples, np.nan)
-    if recording.temperature is not None:
-        warmth = smooth_temperature(time, recording.temperature)
+    warmth = np.full(recording.samples, np.nan) if recording.temperature is None else temperature_of(recording)
     start = time[span[:, 0]]
     return {
         "reading": means,

@@ -100,7 +100,7 @@ def _ingested(files: UnitFiles, settings: dict[str, Any]) -> list[Recording]:
     directory = files.directory
 
     def below(file: str) -> str:
-        return str(Path(file).relative_to(directory)) if Path(file).is_relative_to(directory) else file
+        return Path(file).relative_to(directory).as_posix() if Path(file).is_relative_to(directory) else file
 
     return [replace(r, source=_named(r.source, below)) for r in check_recordings(recordings, settings)]
 

@@ -161,6 +161,31 @@ def test_a_diagnosis_of_one_sensor_that_fails_does_not_stop_the_other(
         run_step(Task("diagnose"), stored, settings)
 
 
+def test_calibrate_unit_raises_the_error_that_a_run_publishes(tmp_path: Path, simulated: Path) -> None:
+    """Of units that fail in ingest and in a fit: code, message and file are the same."""
+    directory = tmp_path / "bench"
+    for unit in ("text", "folder", "still"):
+        shutil.copytree(simulated, directory / "raw" / unit)
+    (directory / "raw" / "text" / "accel_x.csv").write_text("time_s,accel_x_g\n0,none\n")
+    (directory / "raw" / "folder" / "accel_y.csv").unlink()
+    (directory / "raw" / "folder" / "accel_y.csv").mkdir()
+    (directory / "raw" / "still" / "static.csv").rename(directory / "raw" / "still" / "recording.csv")
+    rows = ["absent,,", "text,,", "folder,,", "still,multi_position,"]
+    (directory / "units.csv").write_text("unit,procedure,overrides\n" + "\n".join(rows) + "\n")
+    (directory / "campaign.yaml").write_text("overrides: [sensor=mpu6050]\n")
+    campaign = load_campaign({"campaign": str(directory), "results": str(tmp_path / "results")})
+    assert run_jobs(campaign) == 1
+    failures = {f["unit"]: f for f in json.loads((campaign.results / "failures.json").read_text())}
+    assert set(failures) == {"absent", "text", "folder", "still"}
+    for unit, published in failures.items():
+        with pytest.raises(pipeline.PipelineError) as raised:
+            pipeline.calibrate_unit(directory, unit)
+        assert [getattr(raised.value, key) for key in ("code", "message", "file")] == [
+            published[key] for key in ("code", "message", "file")
+        ]
+    assert failures["still"]["stage"].startswith("fit/accelerometer")
+
+
 def test_a_run_with_failed_units_ends_with_1_and_names_each(
     published: tuple[Campaign, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from calls import ONCE_A_RECORDING, counted
 from whole_run import run_campaign
 
+import pipeline
 from pipeline.commands import apply, simulate
 from pipeline.config import load_campaign
 from pipeline.errors import ConfigurationError
@@ -76,6 +78,22 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 def document(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((bench.results / kind / f"{unit}.json").read_text())
     return found
+
+
+def test_calibrate_unit_saves_the_files_of_the_run_by_hand(done: Bench, tmp_path: Path) -> None:
+    with counted(ONCE_A_RECORDING) as calls:
+        found = pipeline.calibrate_unit(done.campaign, "whole", results=done.results.parent)
+    found.save(tmp_path)
+    saved = {str(file.relative_to(tmp_path)): file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    assert len(saved) > 10
+    assert saved == {path: (done.results / path).read_bytes() for path in saved}
+    assert calls["_rests_by_hand", "recording"] == calls["_rests_by_table", "recording"] == 1
+    assert set(calls.values()) == {1}
+    alone = pipeline.calibrate({"recording": done.campaign / "raw" / "csv" / "recording.csv"}, sensor="generic",
+                               procedure="multi_position", method="rests_and_moves")  # fmt: skip
+    assert alone.gyroscope is None
+    assert repr(alone).splitlines()[-1].startswith("gyroscope: null, ")
+    assert alone.calibration["accelerometer"] == document(done, "calibrations", "csv")["accelerometer"]
 
 
 @pytest.mark.parametrize("unit", ["csv", "mcap", "null", "table"])

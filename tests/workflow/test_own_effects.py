@@ -7,10 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import OF_STEPS, ONCE_A_RECORDING, Calls, counted, names
 from whole_run import run_campaign
 
-from pipeline.commands import apply, explain, simulate
+import pipeline
+from pipeline.commands import apply, check, explain, simulate
+from pipeline.config import load_campaign
 from pipeline.model.effects import forget
+from pipeline.pack import Batch
 
 from .conftest import Bench
 
@@ -22,8 +26,8 @@ owner: table
 sensors: [gyroscope]
 meaning: The gear of the table pushes five times a turn.
 terms:
-  A: {formula: "cos(5 * radians(angle))", unit: deg/s}
   B: {formula: "sin(5 * radians(angle))", unit: deg/s}
+  A: {formula: "cos(5 * radians(angle))", unit: deg/s}
 limits: {A: 0.1, B: 0.1}
 """
 LOOSE = """\
@@ -61,8 +65,11 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 
 
 @pytest.fixture(scope="module")
-def run(bench: Bench) -> None:
-    assert run_campaign(bench.campaign)[1] == 0
+def run(bench: Bench) -> Calls:
+    """Run the campaign; return the calls of the steps."""
+    with counted(OF_STEPS) as calls:
+        assert run_campaign(bench.campaign)[1] == 0
+    return calls
 
 
 def result(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
@@ -107,6 +114,31 @@ def test_validation_words_page_and_exports_know_it(bench: Bench, capsys: pytest.
     assert len(taken_off) == 3
     np.testing.assert_allclose(np.array(taken_off, float), 0.01, rtol=0.05)
     assert "Of the bench, not of the gyroscope: gear_mesh." in header
+
+
+def test_a_run_calibrate_unit_and_check_are_one_chain(
+    bench: Bench, run: Calls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same functions make the same files, and what a step computes of a recording the next ones need not."""
+    settings = {"campaign": str(bench.campaign), "results": str(bench.results.parent)}
+    with counted((*OF_STEPS, *ONCE_A_RECORDING)) as calls:
+        pipeline.calibrate_unit(bench.campaign, "known", results=bench.results.parent).save(tmp_path)
+    assert names(run) == {name.rpartition(".")[2] for name in OF_STEPS}
+    assert names(calls) >= names(run) - {"summarise"}  # of all units
+    of_unit = [path for path, _ in Batch(*(bench.results / "batches").glob("ref*")).files("known")]
+    saved = {str(file.relative_to(tmp_path)): file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    assert saved == {path: (bench.results / path).read_bytes() for path in of_unit}
+    assert load_campaign(settings).units["known"].config_sha256 in saved["calibrations/known.json"].decode()
+    computed = {name: [n for (f, _), n in calls.items() if f == name] for name in names(calls)}
+    turns = 6
+    assert computed["_motion_of_turn"] == [1] * turns
+    assert computed["_motion_of_attitude"] == [1]  # of the held-out motion
+    assert computed["smooth_temperature"] == [1] * (turns + 2)
+    assert max(computed["_rests_by_table"]) == 2  # as read, and in body axes
+    with counted(OF_STEPS) as calls:
+        assert check.main(["--campaign", str(bench.campaign), "--unit", "known"]) == 0
+    assert "unit known: " in capsys.readouterr().out
+    assert names(calls) == names(run) - {"export", "report", "summarise"}
 
 
 @pytest.mark.usefixtures("run")
