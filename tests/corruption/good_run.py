@@ -15,14 +15,16 @@ import sys
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import PipelineError
 from pipeline.records import SENSORS
 from pipeline.study.cases import FAMILIES, draw
 from pipeline.study.run import diagnose_case
 from pipeline.study.scores import wilson
-from pipeline.unit import UnitState
+
+if TYPE_CHECKING:
+    from pipeline.unit import UnitState
 
 DOUBTS = ("reference_in_doubt", "floor_in_doubt")
 
