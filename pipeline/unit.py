@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from pipeline.pack import Pack
     from pipeline.records import Fit, Recording, UnitRecordings
@@ -129,3 +129,17 @@ def run_steps(state: UnitState, tasks: Iterator[Task], settings_of: Callable[[Ta
         else:
             setattr(state, STEPS[task.step].returns, made)
     return state
+
+
+def run_checked(
+    recordings: Sequence[Recording],
+    stages: Mapping[str, Sequence[str]],
+    settings: Mapping[str, Any],
+    until: str = "fit",
+) -> UnitState:
+    """Run the steps from ``filter`` to ``until`` on recordings that are checked, or simulated without a fault.
+
+    ``stages``: of the fit of each sensor. ``settings``: the sections that these steps read.
+    """
+    state = UnitState("unit", UnitFiles(Path(), Path()), checked=list(recordings))
+    return run_steps(state, tasks_of(stages, until, first="filter"), lambda _: settings)

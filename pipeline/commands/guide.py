@@ -14,9 +14,7 @@ import numpy as np
 from pipeline.commands import parser_of
 from pipeline.commands.readings import campaign_of, complete_rows, config_of_log, grouped, recordings_of_files
 from pipeline.config.campaign import load_campaign
-from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
-from pipeline.estimation import effects
-from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.errors import CannotCalibrateError, ConfigurationError, PipelineError
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.io.files import recording_files
 from pipeline.io.ingest_settings import checks_of
@@ -25,6 +23,7 @@ from pipeline.planning.guide import (
     MOST,
     Turn,
     default_goal,
+    fitted_by_hand,
     in_words,
     most_informative_turn,
     next_face_or_turn,
@@ -32,6 +31,7 @@ from pipeline.planning.guide import (
     propose,
 )
 from pipeline.preprocessing.checks import check_recordings
+from pipeline.records import NotCalibrated
 from pipeline.signal.rests import WINDOW_S, find_rests
 from pipeline.signal.segments import cut
 from pipeline.simulation.description import BY_HAND
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from pipeline.planning.guide import Progress
     from pipeline.records import Recording, Values
     from pipeline.signal.rests import Rest
+    from pipeline.unit import UnitState
 
 POLL_S = 1.0  # between two readings of a growing log: short against a rest
 STILL_RESTING_S = 1.0  # from the end of a rest to that of the log, below which the rest may continue
@@ -232,7 +233,8 @@ def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goal
     if config["procedure"].get("faces"):
         done, words = next_face_or_turn(recordings, config["procedure"], dwell)
         return Advice(done, [], words)
-    progress = progress_of(recordings, config, dwell)
+    unit = fitted_by_hand(recordings, config, gyroscope=goals.gyroscope is not None)
+    progress = progress_of(unit, config, dwell)
     rows = zip(progress.rests, progress.up, progress.held_out, strict=True)
     lines = []
     for k, ((r, rest), up, held) in enumerate(rows, start=1):
@@ -246,7 +248,7 @@ def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goal
     done, words = _next(progress, goals.accelerometer, dwell)
     if goals.gyroscope is None:
         return Advice(done, lines, words)
-    reached, of_gyroscope = _next_turn(recordings, config, progress, goals.gyroscope, dwell)
+    reached, of_gyroscope = _next_turn(unit, config, progress, goals.gyroscope, dwell)
     if done:
         return Advice(reached, lines, of_gyroscope)
     later = "" if reached else "; turns for it are proposed once the accelerometer's goal is reached"
@@ -254,16 +256,15 @@ def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goal
 
 
 def _next_turn(
-    recordings: Sequence[Recording], config: dict[str, Any], progress: Progress, goal: float, dwell: float
+    unit: UnitState, config: dict[str, Any], progress: Progress, goal: float, dwell: float
 ) -> tuple[bool, list[str]]:
     """Return whether the gyroscope's goal is reached, and the next turn in words."""
-    try:
-        found = effects.fit("gyroscope", recordings, rests_and_moves.fit(recordings, None, config), config)
-    except (NotObservableError, CannotCalibrateError) as lack:
-        if not is_multi_position("gyroscope", recordings):
-            raise
-        reason = lack.message.partition(": ")[0]
-        now = f"gyroscope's matrix: not determined yet: {reason} (goal {goal:g} %)"
+    found = unit.fits["gyroscope"]
+    if isinstance(found, NotCalibrated):
+        assert unit.recordings is not None  # noqa: S101
+        if not is_multi_position("gyroscope", unit.recordings.filtered):
+            raise CannotCalibrateError(found.reason)
+        now = f"gyroscope's matrix: not determined yet: {found.reason.partition(': ')[0]} (goal {goal:g} %)"
         return False, [now, f"next: {FIRST.in_words(dwell)}"]
     expanded = 100.0 * float(np.max(found.to_json()["expanded_uncertainty"]["matrix"]))
     now = f"expanded uncertainty of the gyroscope's matrix: {expanded:.2g} % (goal {goal:g} %)"

@@ -49,20 +49,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.errors import NotObservableError
 from pipeline.estimation.accelerometer.nonlinear_least_squares import COLUMNS, IDEAL, PLACE, ROWS, triangle
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, limit_of_misalignment
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.estimation.multi_position.moves import sound_span
 from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
-from pipeline.records import AXES, Recording, SensorCalibration, Values, coverage_factor
+from pipeline.records import AXES, NotCalibrated, Recording, SensorCalibration, Values, coverage_factor
 from pipeline.signal.rests import WINDOW_S, Rest, find_rests
 from pipeline.signal.segments import multiples, turns_by_hand
 from pipeline.simulation.trajectory import rotation_by
+from pipeline.unit import Task, run_checked, run_steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from pipeline.unit import UnitState
 
 
 SHARPNESS = 8  # exponent of a smooth norm for the largest U, within 32 % of it for nine parameters
@@ -147,22 +149,38 @@ class Proposal:
     expected: float  # g; largest U with these rests
 
 
-def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dwell: float) -> Progress:
+def fitted_by_hand(
+    recordings: Sequence[Recording], settings: Mapping[str, Any], *, gyroscope: bool = False
+) -> UnitState:
+    """Return the unit with the fit of the accelerometer, and of the gyroscope where it is asked for.
+
+    ``settings``: sections ``sensor``, ``table``, ``procedure`` and ``filter``; for the gyroscope also ``effects``. The
+    uncertainty is that of the recordings: further rests do not reduce what the configuration states.
+    """
+    unit = run_checked(recordings, {}, settings, "filter")
+    stages = {"accelerometer": ["nonlinear_least_squares"]}
+    stages |= {"gyroscope": ["rests_and_moves", "effects"]} if gyroscope else {}
+    for sensor, names in stages.items():
+        try:
+            run_steps(unit, (Task("fit", sensor, name, last=False) for name in names), lambda _: settings)
+        except NotObservableError as lack:  # ends the unit in a run
+            unit.fits = {**unit.fits, sensor: NotCalibrated(lack.message)}
+    return unit
+
+
+def progress_of(unit: UnitState, settings: Mapping[str, Any], dwell: float) -> Progress:
     """Return the state of the accelerometer's calibration.
 
-    ``settings``: sections ``sensor``, ``table`` and ``procedure``. ``dwell``: s, of a future rest. Raises
+    ``unit``: with the fit of the accelerometer (``fitted_by_hand``). ``dwell``: s, of a future rest. Raises
     ``CannotCalibrateError`` if no recording holds readings of the accelerometer.
     """
+    assert unit.recordings is not None  # noqa: S101
+    recordings, fit = unit.recordings.filtered, unit.fits["accelerometer"]
     orientations = orientations_of(recordings, settings)
-    fitted: SensorCalibration | None = None
-    values, scatter = IDEAL, 0.0
-    try:
-        fitted = nonlinear_least_squares.fit(recordings, None, settings)
-    except (NotObservableError, CannotCalibrateError) as lack:
-        reason = lack.message
-    else:
+    fitted = None if isinstance(fit, NotCalibrated) else fit
+    values, scatter, reason = IDEAL, 0.0, fit.reason if isinstance(fit, NotCalibrated) else _undetermined(fit)
+    if fitted is not None:
         values = np.concatenate([fitted.bias, fitted.matrix.ravel()])[PLACE]
-        reason = _undetermined(fitted)
         scatter = float(fitted.stages[-1].details["scatter_between_rests"])
     sensor_config, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
     rests, white = orientations.rests, _white_of_rest(orientations, sensor_config, dwell)

@@ -13,6 +13,7 @@ Sizes are those that half of the units would show. An effect that needs a size a
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +21,6 @@ import numpy as np
 from pipeline.diagnosis.multi_position import require_model
 from pipeline.diagnosis.observability import at_its_limit, not_observable, not_observable_by_hand
 from pipeline.errors import NotObservableError
-from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
@@ -29,14 +29,16 @@ from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
 from pipeline.model.sensor_file import assumed_figures
 from pipeline.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
-from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
+from pipeline.records import SENSORS, Noise, NotCalibrated, Recording, SensorCalibration
 from pipeline.report.pages import template
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, course_of, read_config
+from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.records import Fit
     from pipeline.simulation.trajectory import Planned
 
 CLEARLY_LARGER = 1.2  # times the smallest size: least size of a named effect that is printed
@@ -109,13 +111,12 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Select
 
     Raises ``NotObservableError`` if bias and matrix cannot be determined, or if there are no rests.
     """
-    sections = {"sensor": simulated.sensor_configs, "table": simulated.table, "procedure": simulated.procedure}
-    settings: dict[str, Any] = {**sections, "effects": {"accelerometer": [], "gyroscope": []}}
-    start = nonlinear_least_squares.fit(simulated.recordings, None, settings)
-    other = None
+    start, other = simulated.accelerometer_by_hand, None
+    if isinstance(start, NotCalibrated):
+        raise NotObservableError(start.reason)
     if sensor == "gyroscope":
         start, other = SensorCalibration(sensor), start
-    model = require_model(simulated.recordings, start, simulated.noise[sensor], settings, other)
+    model = require_model(simulated.recordings, start, simulated.noise[sensor], simulated.settings, other)
     return by_hand.Selection(model, start, [], simulated.noise[sensor], simulated.sensor_configs[sensor])
 
 
@@ -150,6 +151,18 @@ class SimulatedProcedure:
     procedure: Mapping[str, Any]
     noise: dict[str, Noise]
     minutes: float  # from power-on to the end of the last recording
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The sections of a configuration."""
+        sections = {"sensor": self.sensor_configs, "table": self.table, "procedure": self.procedure}
+        return {**sections, "effects": {"accelerometer": [], "gyroscope": []}, "filter": {"name": "none"}}
+
+    @cached_property
+    def accelerometer_by_hand(self) -> Fit:
+        """The fit of the accelerometer to rests."""
+        stages = {"accelerometer": ["nonlinear_least_squares"]}
+        return run_checked(self.recordings, stages, self.settings).fits["accelerometer"]
 
 
 def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> SimulatedProcedure:

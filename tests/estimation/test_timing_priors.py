@@ -9,23 +9,17 @@ import numpy as np
 import pytest
 
 from pipeline.config.schema import OF_BENCH
-from pipeline.diagnosis.diagnose import diagnose
-from pipeline.estimation.noise import noise_of
-from pipeline.estimation.observations import observe
-from pipeline.estimation.selection import select
-from pipeline.estimation.stages import fit_stage
 from pipeline.model.effects import bench_priors
-from pipeline.preprocessing.checks import check_recordings
-from pipeline.preprocessing.coarse_temperature import refined
+from pipeline.one_unit import unit_of_recordings
+from pipeline.records import SensorCalibration
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
-from pipeline.study.run import settings_of
-from pipeline.validation.heldout import validate
+from pipeline.study.run import diagnose_case
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Recording
 
 COURSE: dict[str, Any] = {
     "validation_s": 40.0, "static_s": 30.0, "warm_up_rest_s": 15.0, "step_deg": 30.0, "dwell_s": 1.5,
@@ -43,24 +37,16 @@ def logged(recording: Recording, rate: bool) -> Recording:  # noqa: FBT001  (a c
     return recording if rate or recording.role == "validation" else replace(recording, table_rate=None)
 
 
-def fitted(sensor: str, recordings: list[Recording], settings: dict[str, Any]) -> SensorCalibration:
-    found = None
-    for stage in ("reference_least_squares", "effects"):
-        found = fit_stage(sensor, stage, recordings, found, settings)
-    assert found is not None
-    return found
-
-
 @pytest.mark.parametrize(("sensor", "rate"), [("gyroscope", False), ("accelerometer", True)])
 def test_stated_timing_is_estimated_whatever_the_table_logs(sensor: str, rate: bool) -> None:  # noqa: FBT001
     recordings, truth = simulate_unit(UNIT, 3, 0)
-    base = settings_of("mpu6050", "reference_least_squares")
-    table = {"name": "acutronic", **read_config("table", "acutronic"), **STATED}
-    settings = {**base, "table": table}
-    checked = check_recordings([logged(r, rate) for r in recordings], settings)
-    settings["noise"] = {sensor: noise_of(sensor, checked, settings)}
-    found = fitted(sensor, checked, settings)
+    layers = ["sensor=mpu6050", *(f"table.{key}={value}" for key, value in STATED.items())]
+    state = unit_of_recordings([logged(r, rate) for r in recordings], layers).run_to("diagnose")
+    found = state.fits[sensor]
+    assert isinstance(found, SensorCalibration)
     assert found.covariance is not None
+    assert state.validation is not None
+    assert state.diagnosis is not None
     u = np.sqrt(np.diag(found.covariance))
     assert {e.name for e in found.effects} == set(HIDDEN)
     error = np.concatenate([found.bias - truth[sensor]["bias"], (found.matrix - truth[sensor]["matrix"]).ravel()])
@@ -68,22 +54,22 @@ def test_stated_timing_is_estimated_whatever_the_table_logs(sensor: str, rate: b
     size = np.concatenate([HIDDEN[e.name] for e in found.effects])
     values = np.concatenate([e.values for e in found.effects])
     assert np.abs((values - size) / u[12:]).max() < 4.0
-    held = validate(found, checked, settings["noise"][sensor], settings)
+    held, said = state.validation[sensor], state.diagnosis[sensor]
     low, high = held["expected_rms_error"]
     assert low <= held["steps"][-1]["rms_error"] <= high
-    if sensor == "accelerometer":
-        said = diagnose(found, checked, settings["noise"][sensor], settings, None, validation=held)
-        assert said["verdict"] == "nothing_missing"
-        assert not set(HIDDEN) & {entry["effect"] for entry in said["ranking"]}
+    assert said["verdict"] == "nothing_missing"
+    assert not set(HIDDEN) & {entry["effect"] for entry in said["ranking"]}
 
 
 def test_a_slow_clock_is_found_beside_effects_that_could_take_its_signal() -> None:
     """At 1400 s the clock is wrong by 0.36 s, longer than the ramps of the turns: one linear step is of no use."""
     case = draw("pairs_wander", 5, 84)
     assert set(case.hidden) == {"clock_rate", "table_rate_ripple"}
-    settings = settings_of(case.model, "reference_least_squares")
-    settings["effects"] = {**settings["effects"], "gyroscope": [*case.hidden, "scale_factor_temperature"]}
-    found = {e.name: e.values for e in fitted("gyroscope", recordings_of(case), settings).effects}
+    names = ", ".join([*case.hidden, "scale_factor_temperature"])
+    layers = [f"sensor={case.model}", f"effects.gyroscope=[{names}]"]
+    fit = unit_of_recordings(recordings_of(case), layers).run_to("fit").fits["gyroscope"]
+    assert isinstance(fit, SensorCalibration)
+    found = {e.name: e.values for e in fit.effects}
     assert found["clock_rate"] == pytest.approx(case.hidden["clock_rate"], abs=0.1)
     assert found["table_rate_ripple"][:4] == pytest.approx(case.hidden["table_rate_ripple"][:4], abs=2e-5)
 
@@ -92,27 +78,25 @@ def test_a_slow_clock_alone_is_all_that_is_selected() -> None:
     """The readings at the corners of ramps come 0.48 s late: these rows, not those logged there, are not explained."""
     case = draw("lost", 12, 84)
     assert list(case.hidden) == ["clock_rate"]
-    settings = settings_of(case.model, "reference_least_squares")
-    recordings = refined(recordings_of(case))
-    noise = noise_of("gyroscope", recordings, settings)
-    observations = observe("gyroscope", recordings, settings["table"])
-    assert select(observations, [], noise, settings["sensor"]["gyroscope"]).names == ["clock_rate"]
+    _, state = diagnose_case(case)
+    assert state.diagnosis is not None
+    assert state.diagnosis["gyroscope"]["selected"] == ["clock_rate"]
 
 
 def test_rests_leave_the_offset_as_uncertain_as_its_prior() -> None:
     recordings, _ = simulate_unit(replace(UNIT, effects={}), 3, 0)
-    base = settings_of("mpu6050", "reference_least_squares")
-    table = {"name": "acutronic", **read_config("table", "acutronic"), "time_offset_s": 0.005}
-    settings = {**base, "table": table}
-    checked = check_recordings(recordings, settings)
+    unit = unit_of_recordings(recordings, ["sensor=mpu6050", "table.time_offset_s=0.005"])
+    state = unit.run_to("filter")
+    assert state.recordings is not None
     rests = []
-    for recording in (r for r in checked if r.role == "accelerometer"):
+    for recording in (r for r in state.recordings.filtered if r.role == "accelerometer"):
         assert recording.accelerometer is not None
         assert recording.table_rate is not None
         moving = np.abs(recording.table_rate)[:, None] > 1e-9
         rests.append(replace(recording, accelerometer=np.where(moving, np.nan, recording.accelerometer)))
-    settings["noise"] = {"accelerometer": noise_of("accelerometer", checked, settings)}
-    found = fitted("accelerometer", rests, settings)
+    state.recordings = replace(state.recordings, filtered=rests)
+    found = unit.run_to("fit", first="fit", state=state).fits["accelerometer"]
+    assert isinstance(found, SensorCalibration)
     assert found.covariance is not None
     assert np.sqrt(found.covariance[12, 12]) == pytest.approx(0.005, rel=0.02)
 

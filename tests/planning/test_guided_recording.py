@@ -13,13 +13,17 @@ from scipy.spatial.transform import Rotation
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.planning.guide import (
     TURNS_DEG,
+    Progress,
     Turn,
     attitudes,
     default_goal,
+    fitted_by_hand,
     in_words,
     most_informative_turn,
-    progress_of,
     propose,
+)
+from pipeline.planning.guide import (
+    progress_of as progress_of_unit,
 )
 from pipeline.records import Recording, SensorCalibration
 from pipeline.simulation.description import read_config
@@ -31,6 +35,7 @@ SETTINGS: dict[str, Any] = {
     "sensor": read_config("sensor", "mpu6050"),
     "table": read_config("table", "hand"),
     "procedure": {"holdout_every": 0},
+    "filter": {"name": "none"},
 }
 WHITE, RATE, DWELL = 8e-4, 20.0, 4.0
 AXES = {f"{s}{a}": sign * np.eye(3)[i] for i, a in enumerate("xyz") for s, sign in (("+", 1.0), ("-", -1.0))}
@@ -47,6 +52,10 @@ def recorded(attitudes: Sequence[Any], rng: np.random.Generator, white: float = 
     reading += white * rng.standard_normal(reading.shape)
     time = np.round(np.arange(len(reading)) / RATE * 1e9).astype(np.int64)
     return Recording("recording", "rests", None, time, accelerometer=reading)
+
+
+def progress_of(recordings: list[Recording], settings: dict[str, Any], dwell: float) -> Progress:
+    return progress_of_unit(fitted_by_hand(recordings, settings), settings, dwell)
 
 
 @pytest.mark.parametrize(("first", "side"), [("+z", "+x"), ("-z", "+y"), ("+x", "-z"), ("-y", "-x")])

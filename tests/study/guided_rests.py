@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.planning.guide import progress_of, propose
+from pipeline.planning.guide import fitted_by_hand, progress_of, propose
 from pipeline.records import Recording, coverage_factor
 from pipeline.simulation.description import read_config
 
@@ -94,19 +94,20 @@ def of_unit(seed: int, number: int, dwell: float, held_out: int) -> dict[str, fl
         "sensor": SHEETS,
         "table": read_config("table", "hand"),
         "procedure": {"holdout_every": held_out},
+        "filter": {"name": "none"},
     }
     fixed, guided, random = (Unit((seed, number, k), dwell) for k in range(3))
     angles = np.radians(np.arange(8) * 45.0)
     for axis in range(3):
         for angle in angles:
             fixed.rest(np.roll([0.0, np.cos(angle), np.sin(angle)], axis))
-    of_fixed = progress_of([fixed.recording()], settings, dwell)
+    of_fixed = progress_of(fitted_by_hand([fixed.recording()], settings), settings, dwell)
     goal = of_fixed.expanded
     found = {"goal": goal, "guided": float(MOST), "random": float(MOST), "inside fixed": fixed.inside(of_fixed)}
     wanted = np.array([0.0, 0.0, 1.0])
     for count in range(1, MOST):
         guided.rest(wanted)
-        progress = progress_of([guided.recording()], settings, dwell)
+        progress = progress_of(fitted_by_hand([guided.recording()], settings), settings, dwell)
         if progress.expanded <= goal:
             found |= {"guided": float(count), "inside guided": guided.inside(progress)}
             break
@@ -114,7 +115,7 @@ def of_unit(seed: int, number: int, dwell: float, held_out: int) -> dict[str, fl
     attitudes = np.random.default_rng((seed, number, 3)).standard_normal((MOST, 3))
     for count, wanted in enumerate(attitudes, start=1):
         random.rest(wanted)
-        progress = progress_of([random.recording()], settings, dwell)
+        progress = progress_of(fitted_by_hand([random.recording()], settings), settings, dwell)
         if progress.expanded <= goal:
             found |= {"random": float(count), "inside random": random.inside(progress)}
             break
