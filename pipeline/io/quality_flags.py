@@ -131,8 +131,9 @@ def flag_flat_tops(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) 
     """Flag readings that repeat the largest or the smallest value of their channel more often than noise allows.
 
     The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
-    chance, with p as for stuck readings, of the other values. An end that a sensor may read at rest is none. Logs with the motion of a table are not searched: a table
-    may keep its largest rate, and its log contradicts a clipped reading.
+    chance, with p as for stuck readings, of the other values. An end that a sensor may read at rest is none. Logs with
+    the motion of a table are not searched: a table may keep its largest rate, and its log contradicts a clipped
+    reading.
     """
     notes: list[Note] = []
     if set(TABLE_CHANNELS) & table.values.keys():

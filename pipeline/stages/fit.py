@@ -28,9 +28,9 @@ def fit_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
         return {file: before}
     fitted = SensorCalibration.from_json(sensor, before) if before else None
     recordings = recordings_of(job.inputs, unit)
-    noises = load_noises(job.inputs["filter"], unit)
+    settings = settings | {"noise": load_noises(job.inputs["filter"], unit)}
     try:
-        found = fit_stage(sensor, stage, recordings, fitted, settings | {"noise": noises})
+        found = fit_stage(sensor, stage, recordings, fitted, settings)
         # only after the last stage, or it would be counted twice; a given calibration states its own uncertainty
         if job.run["last"] != NOT_LAST and stage != "given":
             found = with_stated(found, recordings, settings)
