@@ -234,6 +234,8 @@ class Countdown:
 
 def wait_for_jobs(results: Path, stream: TextIO) -> None:
     """Wait until no job of a killed run is running."""
+    from pipeline.results_folder import jobs_running  # noqa: PLC0415  (locks of POSIX, for runs only)
+
     while jobs_running(results):
         print("Waiting for jobs of a killed run that are still running ...", file=stream, flush=True)
         time.sleep(2)

@@ -33,7 +33,7 @@ from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineEr
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import Term
 from pipeline.estimation.gauss_markov import WHITE, Setting
-from pipeline.estimation.least_squares import ScaledColumns
+from pipeline.estimation.least_squares import ScaledColumns, cholesky
 from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.model import NEW, NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
@@ -208,8 +208,9 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
 def _over_noise(model: Model, fit: Fit, expected: NoiseHypothesis) -> float | None:
     """Return the rms residual of the rests over that of noise alone; None without a degree of freedom."""
     equations, rests = model.equations(fit.state), slice(model.rests_equations)
-    L = np.linalg.cholesky(equations.covariance(expected)[rests, rests])
-    columns, readings = (np.linalg.solve(L, v[rests]) for v in (equations.columns, equations.residual))
+    L = cholesky(equations.covariance(expected)[rests, rests])
+    columns = np.asarray(np.linalg.solve(L, equations.columns[rests]), np.float64)
+    readings = np.asarray(np.linalg.solve(L, equations.residual[rests]), np.float64)
     factors = ScaledColumns.of(columns, NEW)
     residual, freedom = readings - columns @ factors.solve(readings), len(readings) - factors.rank
     return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None

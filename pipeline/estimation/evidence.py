@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from pipeline.estimation.least_squares import cholesky
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -33,6 +35,8 @@ SCALE_PRIOR = np.log([0.2375, 0.2375, 0.2375, 0.2375, 0.03, 0.02])
 NEGLIGIBLE = 1e-4  # weight below which a hypothesis or a component of a mixture is not used
 READINGS, ZEROS = -2, -1  # columns of the padded products
 WIDE = 8  # columns of an effect above which LAPACK's factorisation costs less than a vectorised elimination
+FAR_TOO_MUCH = 2.0  # times the sum of squares that columns explain: rounding; at most 1 is possible
+ROUNDING = 1e-9  # of the largest eigenvalue: 1e7 times the rounding of a double, for products of products
 RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
 
 
@@ -149,7 +153,7 @@ class Given:
                 at[row, used] = np.concatenate(each)
                 scale[row, used] = np.repeat([SCALES[s] for _, s in picks.values()], [len(c) for c in each])
         inner = products[:, at[:, :, None], at[:, None, :]] + scale[:, :, None] ** -2.0 * np.eye(shape[1])
-        L = np.linalg.cholesky(inner)
+        L = cholesky(inner)
         self._half = np.linalg.inv(L) @ products[:, at]  # its squares: the part of each column that the sets explain
         self.squares = problem.products[:, None, -1, -1] - np.sum(self._half[..., READINGS] ** 2, axis=2)
         logarithm = 2.0 * np.sum(np.log(np.einsum("tskk->tsk", L)), axis=2) + 2.0 * np.sum(np.log(scale), axis=1)
@@ -229,25 +233,52 @@ def _explained(inner: Values, cross: Values, squares: Values) -> tuple[Values, V
 
     ``inner``: (t, m, k, k), G. ``cross``: (t, m, k), c. ``squares``: (t,), of the readings. Effects of many columns are
     computed by the Cholesky factor of A with c as a further row, others by a vectorised elimination; the pivots of A
-    are at least ``D^-2``.
+    are at least ``D^-2``. Where rounding of products far above the noise leaves no positive definite matrix, the
+    eigenvalues of G are used.
     """
     k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
     log_det = np.broadcast_to(-k * np.log(least), (len(SCALES), *inner.shape[:2])).copy()
-    if k > WIDE:
-        joined = np.zeros((*log_det.shape, k + 1, k + 1))
-        joined[..., :k, :k], joined[..., k, :k], diagonal = inner, cross, np.arange(k)
-        joined[..., diagonal, diagonal] += least[..., None] + RIDGE * np.einsum("tmkk->tmk", inner)
-        joined[..., k, k] = 1.0 + 2.0 * squares[:, None]
-        factor = np.linalg.cholesky(joined)
-        log_det += 2.0 * np.sum(np.log(np.einsum("...kk->...k", factor)[..., :k]), axis=-1)
-        return np.sum(factor[..., k, :k] ** 2, axis=-1), log_det
+    try:
+        return (_by_cholesky if k > WIDE else _by_elimination)(inner, cross, squares, log_det)
+    except np.linalg.LinAlgError:
+        return _by_eigenvalues(inner, cross, squares)
+
+
+def _by_cholesky(inner: Values, cross: Values, squares: Values, log_det: Values) -> tuple[Values, Values]:
+    """Return ``_explained`` by Cholesky factors; ``log_det``: ``log|D^2|``."""
+    k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
+    joined = np.zeros((*log_det.shape, k + 1, k + 1))
+    joined[..., :k, :k], joined[..., k, :k], diagonal = inner, cross, np.arange(k)
+    joined[..., diagonal, diagonal] += least[..., None] + RIDGE * np.einsum("tmkk->tmk", inner)
+    joined[..., k, k] = 1.0 + 2.0 * squares[:, None]
+    factor = np.linalg.cholesky(joined)
+    log_det += 2.0 * np.sum(np.log(np.einsum("...kk->...k", factor)[..., :k]), axis=-1)
+    return np.sum(factor[..., k, :k] ** 2, axis=-1), log_det
+
+
+def _by_elimination(inner: Values, cross: Values, squares: Values, log_det: Values) -> tuple[Values, Values]:
+    """Return ``_explained`` by a vectorised elimination; ``log_det``: ``log|D^2|``."""
+    k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
     matrix = np.concatenate([inner, cross[..., None]], axis=3).transpose(2, 3, 0, 1)[:, :, None]
     matrix = matrix + np.eye(k, k + 1)[:, :, None, None, None] * least
     gain = np.zeros(log_det.shape)
-    for j in range(k):
-        pivot, row = np.maximum(matrix[j, j], least), matrix[j, j + 1 :]
-        ratio = row / pivot
-        gain += row[-1] * ratio[-1]
-        log_det += np.log(pivot)
-        matrix[j + 1 :, j + 1 :] -= row[:-1, None] * ratio
+    with np.errstate(over="ignore", invalid="ignore"):
+        for j in range(k):
+            pivot, row = np.maximum(matrix[j, j], least), matrix[j, j + 1 :]
+            ratio = row / pivot
+            gain += row[-1] * ratio[-1]
+            log_det += np.log(pivot)
+            matrix[j + 1 :, j + 1 :] -= row[:-1, None] * ratio
+    if not np.all(gain <= FAR_TOO_MUCH * (1.0 + squares[:, None])):
+        raise np.linalg.LinAlgError
     return gain, log_det
+
+
+def _by_eigenvalues(inner: Values, cross: Values, squares: Values) -> tuple[Values, Values]:
+    """Return ``_explained`` by the eigenvalues of G; those that are rounding of the largest one count as zero."""
+    values, vectors = np.linalg.eigh(inner)
+    shown = np.where(values > ROUNDING * np.abs(values).max(axis=-1, keepdims=True), values, 0.0)
+    along = np.where(shown > 0.0, (cross[..., None, :] @ vectors)[..., 0, :], 0.0)
+    least = SCALES[:, None, None, None] ** -2.0
+    gain = np.sum(along**2 / (shown + least), axis=-1)
+    return np.minimum(gain, squares[:, None]), np.sum(np.log1p(shown / least), axis=-1)

@@ -51,6 +51,7 @@ RANDOM_WALK = 8.0  # correlation time over the measured one, with the same varia
 # A random walk of the bias: factors on ratio and time of a setting, and its share of that setting's prior. Of 80
 # simulated random walks 17 showed an invented effect without it, and 6 with it.
 WALK_RATIO, WALK_TIME, WALK_SHARE = 8.0, 64.0, 0.3
+LARGEST_SPAN = 1e9  # of variances that a factorisation resolves: 1e7 times the rounding of a double
 SLOW = 0.3  # share of white noise's spectrum, see ``constant_bias_s``: right answers as with 0.05 (docs/blind_study.md)
 FAST_S = 25.0  # correlation time below which ``information`` replaces the model, because its blocks last seconds
 
@@ -254,12 +255,19 @@ class GaussMarkov:
         near = np.where(same, np.exp(-(step - length[:-1]) / tau), 0.0)[at]
         self._phi = phi = np.where(same, np.exp(-step / tau), 0.0)[at]
         self._half = h = of_time[at]
-        own = (v + q * variance_of_average(length, tau)[at]) / h**2
-        diagonal = own.copy()
-        diagonal[:, 1:] += phi * (phi * own[:, :-1] - 2.0 * q * near)
-        neighbour = np.zeros_like(own)
-        neighbour[:, :-1] = q * near - phi * own[:, :-1]
-        self._d, self._e, info = scipy.linalg.lapack.dpttrf(diagonal.ravel(), neighbour.ravel()[:-1])
+        average = variance_of_average(length, tau)[at]
+
+        def factor(v: Values) -> tuple[Values, Values, int]:
+            own = (v + q * average) / h**2
+            diagonal = own.copy()
+            diagonal[:, 1:] += phi * (phi * own[:, :-1] - 2.0 * q * near)
+            neighbour = np.zeros_like(own)
+            neighbour[:, :-1] = q * near - phi * own[:, :-1]
+            return scipy.linalg.lapack.dpttrf(diagonal.ravel(), neighbour.ravel()[:-1])
+
+        self._d, self._e, info = factor(v)
+        if info:  # variances so large that their rounding exceeds the smallest: such blocks tell nothing
+            self._d, self._e, info = factor(np.minimum(v, LARGEST_SPAN * max(v.min(), q.max())))
         assert info == 0  # noqa: S101  (T is a covariance)
         self.log_determinant: Values = np.sum(np.log(self._d.reshape(h.shape)) + 2.0 * np.log(of_time)[at], axis=1)
 

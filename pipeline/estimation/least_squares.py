@@ -34,6 +34,7 @@ RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 tim
 PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
 COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, times a factor for sums over many residuals
 STEP_AT_MINIMUM = 1e-10  # relative; well below any uncertainty, well above rounding
+RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
 ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
 
 
@@ -99,6 +100,19 @@ class ScaledColumns:
                 f"combination with each other: {', '.join(self.undetermined(names))}. Record motion that changes these "
                 "independently, or fix some of them"
             )
+
+
+def cholesky(matrix: Values) -> Values:
+    """Return the lower Cholesky factor of covariance matrices: (..., n, n) array.
+
+    Their elements may differ by more than the digits of a double, as those of stated errors and tiny white noise do.
+    Where rounding leaves no positive definite matrix, the diagonal is increased by the share ``RIDGE`` of itself.
+    """
+    try:
+        return np.asarray(np.linalg.cholesky(matrix), np.float64)
+    except np.linalg.LinAlgError:
+        diagonal = np.einsum("...kk->...k", matrix)[..., None] * np.eye(matrix.shape[-1])
+        return np.asarray(np.linalg.cholesky(matrix + RIDGE * diagonal), np.float64)
 
 
 def gauss_newton(  # noqa: PLR0917  (what an iteration is)

@@ -18,6 +18,10 @@ the noise:
    over a ramp).
 4. ``data_sheet``: the figures of the sensor file, ``white = noise_density sqrt(1 / (2 dt))``.
 
+Readings in steps of d have a rounding error of standard deviation ``d / sqrt(12)`` (GUM F.2.2.1). Where the noise is
+below half a step it does not show: ``white`` is then at least this, and the wander is that of the sensor file. An axis
+whose readings do not change at all in the rests has the white noise of the sensor file.
+
 ``white`` is the noise of a raw sample: the effect of a filter is removed by its exact autocovariance, from its impulse
 response. If the recordings do not show wander, it is the sensor file's figure if they allow it, else 0
 (``Noise.wander_source``). A recording held out for validation is not used.
@@ -65,7 +69,7 @@ from pipeline.estimation.gauss_markov import (
 )
 from pipeline.records import Noise, Recording, WanderLikelihood, median
 from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
-from pipeline.signal.quiet_motion import component_along_gravity, creep_of_readings
+from pipeline.signal.quiet_motion import coarse_steps, component_along_gravity, creep_of_readings
 from pipeline.signal.rests import rest_readings, stretches_of, usable
 
 if TYPE_CHECKING:
@@ -93,6 +97,25 @@ def estimate_noise(sensor: str, recordings: Sequence[Recording], sensor_file: Ma
     Raises ``ConfigurationError`` if neither the recordings nor the sensor file determine the noise.
     """
     fitted = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
+    return _not_below_rounding(_of_recordings(sensor, fitted, sensor_file), sensor, fitted, sensor_file)
+
+
+def _not_below_rounding(
+    noise: Noise, sensor: str, recordings: Sequence[Recording], sensor_file: Mapping[str, Any]
+) -> Noise:
+    """Return the noise with at least the rounding error of coarse readings as white noise."""
+    steps = coarse_steps([values for r in recordings if (values := r.reading(sensor)) is not None])
+    constant = noise.white <= SMALLEST_WHITE
+    if not np.any(constant | (steps > 0.0)):
+        return noise
+    stated = float(sensor_file.get("noise_density") or 0.0) * np.sqrt(0.5 / recordings[0].interval)
+    white = np.maximum(np.where(constant, stated, noise.white), steps / np.sqrt(12.0))
+    found = _with_stated_wander(white, sensor_file, "data_sheet" if constant.all() and stated else noise.source)
+    return replace(found, step=steps if np.any(steps > 0.0) else None)
+
+
+def _of_recordings(sensor: str, fitted: list[Recording], sensor_file: Mapping[str, Any]) -> Noise:
+    """Return the noise as it shows in the recordings, else that of the sensor file."""
     static = [r for r in fitted if r.role == "static"]
     static_rests, rests = (
         [

@@ -1,5 +1,7 @@
 """Add the lines of a budget that do not depend on the method of the fit: temperature, repeatability, counted time.
 
+The rounding error of readings whose noise is below half a step is stated as not included.
+
     temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
     repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
     bursts        : dM = M e of a gyroscope, e the relative uncertainty of the interval of samples that arrive in bursts
@@ -23,11 +25,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.table_errors import TIME_BASE, type_b
-from pipeline.estimation.uncertainty_budget import GRAVITY, NOT_STATED, clock_contribution, with_uncertainty
+from pipeline.estimation.uncertainty_budget import (
+    GRAVITY,
+    NOT_STATED,
+    QUANTISATION,
+    clock_contribution,
+    with_uncertainty,
+)
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.preprocessing.evidence import EXPANDED
 from pipeline.preprocessing.reference_scale import SIGNIFICANT, rate_against_angle
-from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, Recording, SensorCalibration, Values
+from pipeline.records import (
+    NORMAL,
+    RECTANGULAR,
+    SENSOR_UNITS,
+    Contribution,
+    Noise,
+    Recording,
+    SensorCalibration,
+    Values,
+)
 from pipeline.signal.filters import temperature_of
 
 if TYPE_CHECKING:
@@ -48,7 +65,8 @@ def with_stated(
 ) -> SensorCalibration:
     """Add temperature, repeatability and a counted time to a calibration's budget, as far as they are known.
 
-    ``recordings``: of the fit; their temperature and notes are used. ``settings``: sections ``sensor``, ``table``.
+    ``recordings``: of the fit; their temperature and notes are used. ``settings``: sections ``sensor``, ``table``;
+    ``noise``, if it is known.
     """
     before, budget = calibration.covariance, calibration.budget
     if before is None or budget is None:
@@ -63,6 +81,8 @@ def with_stated(
         else:
             lines += warm
     limits = sensor_config.get("effects") or {}
+    noise: Noise | None = (settings.get("noise") or {}).get(calibration.sensor)
+    missing |= _rounding(noise, calibration.sensor)
     lines += _counted_time(calibration, recordings, limits.get("clock_rate"))
     lines += _rate_off_angle(calibration, recordings, settings.get("table") or {})
     lines += _of_bursts(calibration, recordings)
@@ -70,6 +90,8 @@ def with_stated(
     entries = [entry for entry in budget["not_included"] if entry["source"] not in known]
     not_included = [_bounded(entry, settings.get("table") or {}, limits.get("clock_rate")) for entry in entries]
     not_included += [{"source": source, "reason": reason} for source, reason in missing.items()]
+    if QUANTISATION in missing and noise is not None and noise.step is not None:
+        not_included[-1]["up_to"] = {"bias": 0.5 * float(noise.step.max())}
     covariance = before + np.sum([line.covariance for line in lines], axis=0) if lines else before
     old = np.array([np.inf if v is None else v for v in budget["effective_degrees_of_freedom"]])
     share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(before)), where=np.diag(before) > 0.0)
@@ -77,6 +99,17 @@ def with_stated(
     contributions = [*budget["contributions"], *(line.to_json() for line in lines)]
     budget = {**budget, "contributions": contributions}
     return with_uncertainty(calibration, covariance, freedom, budget, not_included)
+
+
+def _rounding(noise: Noise | None, sensor: str) -> dict[str, str]:
+    """Return why the rounding error of a coarse log is not included; empty for other logs."""
+    if noise is None or noise.step is None:
+        return {}
+    reason = (
+        f"the readings have steps of {float(noise.step.max()):.3g} {SENSOR_UNITS[sensor]} and noise of less than "
+        "half a step, so that means are off by up to half a step, however long the recording: log more digits"
+    )
+    return {QUANTISATION: reason}
 
 
 def _counted_time(

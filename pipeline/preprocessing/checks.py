@@ -21,13 +21,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.io.quality_flags import BY_CHANCE
+from pipeline.io.units import TRIADS
 from pipeline.model.kinematics import normal_gravity_g
 from pipeline.preprocessing.at_rest import check_axes, check_static
 from pipeline.preprocessing.coarse_temperature import refined
 from pipeline.preprocessing.evidence import place, refusal
 from pipeline.preprocessing.mounting import check_mounting
 from pipeline.preprocessing.reference import check_motion, check_turns
-from pipeline.records import SENSORS, Note
+from pipeline.records import SENSOR_UNITS, SENSORS, Note
+from pipeline.signal.quiet_motion import coarse_steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Recording
 
 FEWEST, APART = 20, 8  # rows, see above
+STEPS = "N-RESOLUTION"
+SAME_STEP = 1e-6  # relative: rounding of a difference of decimals
 DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
 SAME_GRAVITY_G = 1e-4  # gravity changes by as much over 0.3 km of height
 OF_DECIMALS = 200  # samples that determine the decimals: a finer reading ends in a zero in a tenth of them
@@ -60,9 +64,33 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     """
     _check_shared_rows(recordings)
     check_axes(recordings)
+    recordings = _with_steps(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
     checked = refined(check_motion(check_mounting(turns, settings), delays, settings))
     return _placed(checked, settings.get("table") or {})
+
+
+def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
+    """Note the axes whose readings have steps that hide their noise, with step and decimals (``N-RESOLUTION``)."""
+    noted = list(recordings)
+    for sensor in SENSORS:
+        own = [k for k, r in enumerate(recordings) if r.reading(sensor) is not None]
+        steps = coarse_steps([np.asarray(recordings[k].reading(sensor)) for k in own])
+        for step in np.unique(steps[steps > 0.0]):
+            axes = ", ".join(name for name, s in zip(TRIADS[sensor], steps, strict=True) if s == step)
+            digits = next((f", {d} decimal{'s' * (d != 1)}," for d in range(DIGITS) if _is_whole(step * 10.0**d)), "")
+            detail = (
+                f"{axes}: steps of {step:.3g} {SENSOR_UNITS[sensor]}{digits} and noise of less than half a step: "
+                f"means are off by up to {0.5 * step:.3g} {SENSOR_UNITS[sensor]}, however long the recording, and "
+                "effects of this size cannot be distinguished from rounding. Log more digits, or set a smaller range"
+            )
+            first = noted[own[0]]
+            noted[own[0]] = replace(first, notes=(*first.notes, Note(STEPS, first.samples, 0, 0, detail)))
+    return noted
+
+
+def _is_whole(value: float) -> bool:
+    return abs(value - round(value)) < SAME_STEP * abs(value)
 
 
 def _placed(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recording]:

@@ -200,7 +200,8 @@ class Noise:
     time: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in
     turns about a local polynomial) or ``data_sheet`` (the sensor file). ``length`` is the duration, s, of the static
     rest, or of all rests by hand that show the wander, else 0; the relative uncertainty of the wander is about
-    ``sqrt(correlation_time / length)``. ``likelihood`` is None without a static recording.
+    ``sqrt(correlation_time / length)``. ``likelihood`` is None without a static recording. ``step``: of the readings of
+    each axis, where it hides the noise (``pipeline.signal.quiet_motion.coarse_steps``); else None.
     """
 
     white: Values
@@ -211,6 +212,7 @@ class Noise:
     time_source: str = "data_sheet"
     length: float = 0.0
     likelihood: WanderLikelihood | None = None
+    step: Values | None = None  # (3,), 0 for an axis whose readings are finer than its noise
 
     def to_json(self) -> dict[str, Any]:
         """Return the noise as JSON values."""

@@ -162,6 +162,8 @@ RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests di
 # 1.7 except at the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
 TREMOR_LIMIT_DPS = 2.5
 SAME_DEG = 2.0  # the limit of a rest in ``pipeline.signal.rests``
+COARSE = float(np.sqrt(0.25 + 1.0 / 12.0))  # steps, scatter of readings with noise of half a step
+BLOCK, FEWEST_BLOCKS = 16, 8  # differences of a block; blocks of a recording that show its noise
 ROUNDING = 1e-6  # relative, of a difference of decimals
 
 
@@ -210,6 +212,27 @@ def counts_of(differences: Values) -> Values:
     """
     smallest = np.min(differences, axis=0, where=differences > 0.0, initial=np.inf)
     return np.asarray(np.where(np.isfinite(smallest), smallest, 0.0))
+
+
+def coarse_steps(readings: Sequence[Values]) -> Values:
+    """Return the step of the readings on each axis whose noise is below half a step, 0 on the others: (3,) array.
+
+    ``readings``: (n, 3) of each recording. White noise s in steps of d scatters by ``sqrt(s^2 + d^2 / 12)``, 0.58 d for
+    half a step; with less, the rounding error of a mean is the same however many readings it has. The noise is that of
+    the quietest recording: the first quartile of the white noise of its blocks.
+    """
+    steps, noise = [np.full(3, np.inf)], [np.full(3, np.inf)]
+    for values in readings:
+        differences = np.abs(np.diff(values[np.isfinite(values).all(axis=1)], axis=0))
+        count = len(differences) // BLOCK
+        if count < FEWEST_BLOCKS:
+            continue
+        step = counts_of(differences)
+        blocks = differences[: count * BLOCK].reshape(count, BLOCK, 3)
+        steps.append(np.where(step > 0.0, step, np.inf))
+        noise.append(np.sqrt(0.5 * np.percentile(np.mean(blocks**2, axis=1), 25.0, axis=0)))
+    step = np.min(steps, axis=0)
+    return np.asarray(np.where(np.isfinite(step) & (np.min(noise, axis=0) < COARSE * step), step, 0.0), np.float64)
 
 
 def windows(values: Values, size: int) -> tuple[Values, Values]:

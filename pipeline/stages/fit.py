@@ -32,8 +32,9 @@ def fit(
     previous = fits.get(sensor)
     if isinstance(previous, NotCalibrated):
         return previous
+    settings = {**settings, "noise": recordings.noises}
     try:
-        found = fit_stage(sensor, stage, recordings.filtered, previous, {**settings, "noise": recordings.noises})
+        found = fit_stage(sensor, stage, recordings.filtered, previous, settings)
         # only after the last stage, or it would be counted twice; a given calibration states its own uncertainty
         return with_stated(found, recordings.filtered, settings) if last and stage != GIVEN else found
     except CannotCalibrateError as reason:

@@ -136,3 +136,17 @@ def test_a_bias_counts_as_constant_while_its_spectrum_is_below_that_of_white_noi
     assert spectrum == pytest.approx(SLOW * white**2 * interval, rel=0.01)
     assert constant_bias_s(Noise(np.full(3, white), np.zeros(3), tau, "static"), interval) == np.inf
     assert constant_bias_s(Noise(np.full(3, white), np.full(3, wander), tau, "rests"), interval) == np.inf
+
+
+def test_blocks_far_vaguer_than_the_others_are_as_if_absent() -> None:
+    """Errors of a table at its stops are 1e9 times the noise of readings that hardly have any."""
+    rng = np.random.default_rng(0)
+    sharp = rng.permutation(np.repeat([True, False], 33))
+    weight = np.where(sharp, 80.0, 1e-19)
+    start = np.cumsum(rng.uniform(3.0, 33.0, 66))
+    rows, zero, clock = np.arange(66), np.zeros(66), np.ones(66, int)
+    columns = rng.standard_normal((66, 4)) * sharp[:, None]
+    setting = [Setting(3.0, 60.0)]
+    every = GaussMarkov(Blocks(rows, weight, start, zero, clock), setting).products(columns)
+    some = Blocks(rows[:33], weight[sharp], start[sharp], zero[:33], clock[:33])
+    assert every == pytest.approx(GaussMarkov(some, setting).products(columns[sharp]), rel=1e-6)

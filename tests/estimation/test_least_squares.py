@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.least_squares import ScaledColumns
+from pipeline.estimation.least_squares import ScaledColumns, cholesky
 from tests.estimation.complex_step import jacobian_of, solve_linear, solve_nonlinear
 
 if TYPE_CHECKING:
@@ -106,3 +106,10 @@ def test_the_weights_are_the_pseudo_inverse_and_solve_all_channels() -> None:
     factors = ScaledColumns.of(A)
     assert factors.weights() == pytest.approx(np.linalg.pinv(A), rel=1e-10)
     assert factors.solve(y) == pytest.approx(factors.weights() @ y, rel=1e-10)
+
+
+def test_a_covariance_has_a_factor_whatever_the_size_of_its_common_error() -> None:
+    for size in (1.0, 3e9):
+        C = np.stack([np.eye(30) + size**2, 4.0 * np.eye(30) + size**2])
+        L = cholesky(C)
+        assert np.abs(L @ L.swapaxes(1, 2) / C - 1.0).max() < (1e-12 if size == 1.0 else 1e-8)

@@ -317,3 +317,32 @@ def test_a_clock_that_is_off_by_a_sample_leaves_the_noise_of_the_rests() -> None
     assert estimate_noise("gyroscope", recordings, sheet).white == pytest.approx(
         np.full(3, bench_session.WHITE["gyroscope"]), rel=0.05
     )
+
+
+def in_steps(step: float, white: float, seed: int = 1) -> list[Recording]:
+    """Return a long rest and turns of a gyroscope in steps; the rest lies in the middle of a step."""
+    rng = np.random.default_rng(seed)
+    truth = np.concatenate([np.zeros((600, 3)), 60.0 * np.sin(0.05 * np.arange(300.0))[:, None] * np.ones(3)])
+    rate = step * np.round((truth + white * rng.standard_normal((900, 3))) / step)
+    time = (np.arange(900) * 0.02 * 1e9).astype(np.int64)
+    parts = zip(("static", "gyroscope"), (None, "x"), (slice(0, 600), slice(600, 900)), strict=True)
+    return [Recording(role, role, axis, time[at], gyroscope=rate[at]) for role, axis, at in parts]
+
+
+@pytest.mark.parametrize("white", [0.0, 0.05, 0.3])
+def test_readings_in_steps_have_at_least_the_noise_of_rounding(white: float) -> None:
+    sheet = {"noise_density": 0.005, "bias_wander": 0.003, "wander_time_s": 100.0}
+    coarse = estimate_noise("gyroscope", in_steps(1.0, white), sheet)
+    assert np.all(coarse.white >= (1.0 - 1e-9) / np.sqrt(12.0))
+    if white < 0.2:  # the readings at rest do not change: no wander shows
+        assert coarse.white == pytest.approx(max(1.0 / np.sqrt(12.0), 0.005 * np.sqrt(0.5 / 0.02)))
+        assert (coarse.wander.tolist(), coarse.wander_source, coarse.likelihood) == ([0.003] * 3, "data_sheet", None)
+    fine = estimate_noise("gyroscope", in_steps(0.01, 0.05), sheet)
+    assert fine.white == pytest.approx(0.05, rel=0.1)
+
+
+def test_rests_without_any_noise_leave_the_noise_to_the_sensor_file() -> None:
+    sheet = {"noise_density": 0.005, "bias_wander": 0.003, "wander_time_s": 100.0}
+    found = estimate_noise("gyroscope", in_steps(1e-6, 0.0), sheet)
+    assert found.white == pytest.approx(0.005 * np.sqrt(0.5 / 0.02))
+    assert found.source == "data_sheet"

@@ -12,7 +12,7 @@ from scipy.linalg import null_space
 from scipy.special import logsumexp
 
 from pipeline.estimation.candidates import time_constants
-from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Given, Problem, Version, excited
+from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Given, Problem, Version, _explained, excited
 from pipeline.estimation.free_curves import BEND, free_curves
 from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantiles
 from pipeline.estimation.ranking import without
@@ -217,3 +217,18 @@ def test_a_bend_of_the_temperature_saturates_from_either_end_on() -> None:
             np.std(wanted - (A := np.column_stack([plain[:, 0], c])) @ np.linalg.lstsq(A, wanted)[0]) for c in columns.T
         ]
         assert min(left) < 0.03 * np.std(wanted)
+
+
+@pytest.mark.parametrize("columns", [3, 9])
+@pytest.mark.parametrize("power", [1e6, 1e19])
+def test_one_direction_far_above_the_noise_is_scored_whatever_rounding_adds(columns: int, power: float) -> None:
+    """By hand: ``log|I + D G D| = log(1 + s^2 g)`` for a G of one direction, also if rounding makes it indefinite."""
+    rng = np.random.default_rng(3)
+    u = rng.standard_normal((1, 2, columns))
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    added = rng.standard_normal((1, 2, columns, columns)) * (1e-11 if power > 1e12 else 0.0)
+    inner = power * (u[..., :, None] * u[..., None, :] + added + added.swapaxes(2, 3))
+    gain, log_det = _explained(inner, 0.5 * power * u, np.array([0.25 * power]))
+    shown = SCALES[:, None, None] ** 2 * power
+    assert gain == pytest.approx(np.broadcast_to(0.25 * power * shown / (1.0 + shown), gain.shape), rel=1e-9)
+    assert log_det == pytest.approx(np.broadcast_to(np.log1p(shown), gain.shape), abs=2e-2)

@@ -16,7 +16,7 @@ from pipeline.estimation.stated_lines import with_stated
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.io.arrow import to_parquet
 from pipeline.model.calibration_file import beyond_uncertainty
-from pipeline.records import FittedEffect, Note
+from pipeline.records import FittedEffect, Noise, Note
 from pipeline.stages import batch
 from pipeline.stages.filter import filter_recordings
 from pipeline.stages.unit_files import FILES
@@ -54,6 +54,16 @@ def test_what_is_not_stated_is_named_with_the_key_that_states_it(fitted: Any) ->
     assert "sensor.gyroscope.repeatability_bias" in left["repeatability"]
     assert "no accuracy of the thermometer" in left["temperature"]
     assert np.array_equal(found.covariance, fitted[0].covariance)
+
+
+def test_the_rounding_of_a_coarse_log_is_stated_as_not_included(fitted: Any) -> None:
+    noise = Noise(np.full(3, 0.3), np.zeros(3), 100.0, "static", step=np.array([0.5, 0.0, 1.0]))
+    part = with_stated(*fitted, {**sheet(), "noise": {"gyroscope": noise}}).to_json()
+    (entry,) = [e for e in part["uncertainty_budget"]["not_included"] if e["source"] == "quantisation"]
+    assert (entry["up_to"], "steps of 1 deg/s" in entry["reason"]) == ({"bias": 0.5}, True)
+    assert "quantisation, up to 0.5 deg/s of bias" in dict(beyond_uncertainty(part))
+    fine = with_stated(*fitted, {**sheet(), "noise": {"gyroscope": replace(noise, step=None)}}).to_json()
+    assert not any("quantisation" in source for source, _ in beyond_uncertainty(fine))
 
 
 def test_repeatability_adds_in_quadrature_and_has_infinite_degrees_of_freedom(fitted: Any) -> None:

@@ -222,3 +222,16 @@ def test_a_copied_axis_is_refused_in_a_log_of_few_digits(sign: float) -> None:
         with pytest.raises(IngestError, match=r"accel_z is (a copy|the negative) of accel_y") as refused:
             check_axes([replace(recording, accelerometer=force)])
         assert refused.value.code == "copied_axis"
+
+
+def test_a_step_that_hides_the_noise_is_noted_with_its_digits() -> None:
+    def rounded(recording: Recording) -> Recording:
+        rate = np.array(recording.gyroscope)
+        rate[:, :2] = 0.5 * np.round(rate[:, :2] / 0.5)
+        return replace(recording, gyroscope=rate)
+
+    notes = [n for r in check_recordings([rounded(r) for r in sound()], SETTINGS) for n in r.notes]
+    (detail,) = [n.detail for n in notes if n.code == "N-RESOLUTION"]
+    assert detail.startswith("gyro_x, gyro_y: steps of 0.5 deg/s, 1 decimal, and noise of less than half a step")
+    assert "off by up to 0.25 deg/s" in detail
+    assert not [n for r in check_recordings(list(sound()), SETTINGS) for n in r.notes if n.code == "N-RESOLUTION"]

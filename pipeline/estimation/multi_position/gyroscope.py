@@ -33,6 +33,7 @@ import scipy
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.engine import draw_normal
+from pipeline.estimation.least_squares import cholesky
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import Turns, require_turns, turns_of
 from pipeline.estimation.multi_position.model import Block, Equations, State, effect_readings, motion_of, stacked
@@ -158,7 +159,7 @@ class GyroscopeModel:
         S = S + float(scatter.get("scatter_of_directions") or 0.0) ** 2 * np.asarray(block.direction)
         S = S + ratio**2 * np.einsum("cnk,cmk->nm", H, H)
         rng = np.random.default_rng(0)
-        drawn = rng.standard_normal((DRAWS, n)) @ np.linalg.cholesky(S).T  # continuous in S, as eigenvectors are not
+        drawn = rng.standard_normal((DRAWS, n)) @ cholesky(S).T  # continuous in S, as eigenvectors are not
         errors = draw_normal(rng, covariance[:12, :12], DRAWS)
         for part in (slice(0, 3), slice(3, 12)):  # the wander reduces the degrees of freedom of the bias
             least = min(float(freedom[part].min()), MANY)

@@ -44,6 +44,7 @@ import scipy
 
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import SURE, Prior, Setting, block_covariance, selection_grid
+from pipeline.estimation.least_squares import cholesky
 from pipeline.records import Index, Mask, Motion, Noise, Values
 
 if TYPE_CHECKING:
@@ -162,8 +163,10 @@ class Equations:
         if self.common is None and not noise.direction and not noise.bias.ratio:
             variance = self.variance(noise)
             return values / np.sqrt(variance)[:, None], float(np.sum(np.log(variance)))
-        L, failed = scipy.linalg.lapack.dpotrf(self.covariance(noise), lower=1)
-        assert failed == 0  # noqa: S101
+        C = self.covariance(noise)
+        L, failed = scipy.linalg.lapack.dpotrf(C, lower=1)
+        if failed:
+            L = cholesky(C)
         solved, failed = scipy.linalg.lapack.dtrtrs(L, values, lower=1)
         assert failed == 0  # noqa: S101
         return solved, 2.0 * float(np.sum(np.log(np.diag(L))))
