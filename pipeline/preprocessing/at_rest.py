@@ -305,7 +305,7 @@ def _check_spans(recording: Recording) -> None:
     rate, axis = recording.logged_rate, axis_index(recording)
     if rate is None:
         return
-    stuck: list[tuple[str, float, float, str]] = []  # channel, its span, the required one with its unit, the rows
+    stuck: list[tuple[str, float, str, str]] = []  # channel, its span, the required one with its unit, the rows
     if recording.gyroscope is not None:
         required, spans = _span(rate), [_span(w) for w in recording.gyroscope.T]
         turned_other = max(spans) >= SPANNED * required and int(np.argmax(spans)) != axis  # see check_mounting
@@ -323,12 +323,12 @@ def _check_spans(recording: Recording) -> None:
         if max(spans[i] for i in across) >= LEVEL_G >= spans[axis]:
             which = "the rows in which the table turns"
             stuck += [(TRIADS["accelerometer"][i], spans[i], "1 g", which) for i in across if spans[i] < SPANNED]
-    for channel, span, required, which in stuck:
+    for channel, span, least, which in stuck:
         raise refusal(
             recording,
             "stuck",
-            f"{channel} stays within {span:.3g} {required.partition(' ')[2]} in nine tenths of {which}, while the "
-            f"table's motion about {recording.axis} makes it vary by {required}",
+            f"{channel} stays within {span:.3g} {least.partition(' ')[2]} in nine tenths of {which}, while the "
+            f"table's motion about {recording.axis} makes it vary by {least}",
             "is the column right, and does this axis of the sensor work?",
         )
 
