@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from pipeline.errors import InputError, MissingInputError
-from pipeline.files import read_json
+from pipeline.files import read_json, text_of_cell
 from pipeline.pack import DOCUMENTS, read_published
 from pipeline.records import SENSORS
 from pipeline.report.parameters import COLUMNS, fitted_parameters, reading_errors
@@ -96,7 +96,10 @@ class CampaignResults:
         fit uses); ``incomplete`` (stages after the fit that failed, and why); and other columns of ``units.csv``.
         """
         kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}
-        return pd.read_csv(self.folder / "summary.csv", dtype=kinds, keep_default_na=False, na_values=[""])
+        table = pd.read_csv(self.folder / "summary.csv", dtype=kinds, keep_default_na=False, na_values=[""])
+        texts = [column for column in table if pd.api.types.is_string_dtype(table[column])]
+        table[texts] = table[texts].map(text_of_cell, na_action="ignore")
+        return table.rename(columns=text_of_cell)
 
     @cached_property
     def parameters(self) -> pd.DataFrame:

@@ -10,6 +10,7 @@ import ctypes
 import json
 import math
 import os
+import re
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,10 @@ _PACKAGE = Path(__file__).resolve().parent
 INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"
+# First characters by which spreadsheets take a text as a formula, or split it (OWASP, CSV injection); with a ' in front,
+# the text was escaped, or begins so.
+FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
+NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 WRITE_AGAIN = "run the same command again: snakemake writes the file anew"
 _encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=lambda array: array.tolist())  # numpy arrays
 _flushed_at_end: list[Path] = []  # folders whose files are flushed together
@@ -103,6 +108,19 @@ def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: 
 def write_json(path: Path, value: Any) -> None:  # noqa: ANN401
     """Write a value as a JSON file, atomically."""
     write_atomically(path, json_text(value) + "\n")
+
+
+def spreadsheet_cell(text: str) -> str:
+    """Return a text for a CSV file that people open in a spreadsheet: one that would be a formula gets a ' in front.
+
+    Numbers remain numbers. ``text_of_cell`` is the inverse.
+    """
+    return f"'{text}" if FORMULA.match(text) and not NUMBER.fullmatch(text) else text
+
+
+def text_of_cell(cell: str) -> str:
+    """Return the text of a cell of ``spreadsheet_cell``."""
+    return cell[1:] if cell.startswith("'") and FORMULA.match(cell) else cell
 
 
 def exchange(one: Path, other: Path) -> None:

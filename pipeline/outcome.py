@@ -14,7 +14,7 @@ import shlex
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.errors import first
-from pipeline.files import INSTALLED, read_json
+from pipeline.files import INSTALLED, read_json, text_of_cell
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 from pipeline.verdicts import Verdict
 
@@ -97,7 +97,8 @@ def as_overrides(ways: Ways) -> str:
 def read_summary(results: Path) -> list[dict[str, str]]:
     """Return the rows of a campaign's ``summary.csv``."""
     with (results / "summary.csv").open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
+        rows = csv.DictReader(stream)
+        return [{text_of_cell(key): text_of_cell(value or "") for key, value in row.items()} for row in rows]
 
 
 def findings_of(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:

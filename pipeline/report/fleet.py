@@ -33,7 +33,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.files import write_atomically
+from pipeline.files import spreadsheet_cell, write_atomically
 from pipeline.records import MEDIAN_SIZE, SENSORS
 from pipeline.report.parameters import COLUMNS, PARAMETERS
 
@@ -219,14 +219,20 @@ def write_parameters(path: Path, rows: Sequence[JSON], parameters: pd.DataFrame)
 
 
 def write_summary(path: Path, rows: list[JSON]) -> None:
-    """Write ``summary.csv`` from rows of ``summary_row``; other columns may differ from unit to unit."""
+    """Write ``summary.csv`` from rows of ``summary_row``; other columns may differ from unit to unit.
+
+    Texts of the user that a spreadsheet would take as a formula are escaped.
+    """
     columns = list(dict.fromkeys([*COLUMNS, *(key for row in rows for key in row)]))
     frame = pd.DataFrame([{key: _cell(value) for key, value in row.items()} for row in rows], columns=columns)
+    frame.columns = frame.columns.map(spreadsheet_cell)
     write_atomically(path, frame.to_csv(index=False, lineterminator="\n"))
 
 
 def _cell(value: object) -> object:
-    """Return a number to nine digits, and a truth value in lower case."""
+    """Return a number to nine digits, a truth value in lower case, and a text that is no formula."""
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, str):
+        return spreadsheet_cell(value)
     return f"{value:.9g}" if isinstance(value, float) else value

@@ -15,6 +15,7 @@ import pytest
 import pipeline
 from pipeline.errors import InputError, MissingInputError
 from pipeline.estimation.noise_identification import identify_noise
+from pipeline.outcome import read_summary
 from pipeline.records import Recording
 from pipeline.report.fleet import write_summary
 from pipeline.report.parameters import summary_row
@@ -64,6 +65,26 @@ def test_each_table_holds_the_values_of_the_files(unit: Unit, results: Path) -> 
     verdicts = campaign.diagnosis.set_index("sensor")["verdict"]
     assert verdicts.to_dict() == {s: part["verdict"] for s, part in unit.diagnosis.items()}
     assert campaign.effects.query("selected")["effect"].tolist() == ["quadratic_nonlinearity"]
+
+
+def test_no_cell_of_the_summary_is_a_formula_and_each_is_read_as_it_was(unit: Unit, tmp_path: Path) -> None:
+    """LibreOffice and Excel run =cmd|'/C calc'!A0 and DDE links; a negative number stays one."""
+    texts = ["=cmd|'/C calc'!A0", "+1+1", "@SUM(A1)", "\t=1", "-2+3", "-b", "'=quoted", "''@twice", "'plain", "\uff1dwide"]
+    kept = ["-5", "+4.5e-3", "-.5", "L-1", "a=b", "7"]
+    folder, given = tmp_path / "demo", [*texts, *kept]
+    sheets = [{"serial": s, "lot": s, "depth": str(-1.5 * i), "=head": s} for i, s in enumerate(given)]
+    write_summary(
+        folder / "summary.csv", [summary_row(f"U{i}", *unit.arguments[:3], row) for i, row in enumerate(sheets)]
+    )
+    raw = pd.read_csv(folder / "summary.csv", dtype=str, keep_default_na=False)
+    starts = [cell for column in raw for cell in (column, *raw[column]) if cell[:1] in {*"=+-@\t\r\n\uff1d"} - {""}]
+    assert {cell for cell in starts if not cell.replace("e-3", "").lstrip("+-").replace(".", "").isdigit()} == set()
+    assert raw["serial"].tolist()[len(texts) :] == kept
+    campaign, rows = pipeline.load_campaign(folder), read_summary(folder)
+    for column in ("serial", "lot", "=head"):
+        assert campaign.summary[column].tolist() == given
+        assert [row[column] for row in rows] == given
+    assert campaign.summary["depth"].tolist() == [-1.5 * i for i in range(len(given))]
 
 
 def test_the_table_of_the_noise_has_a_row_for_each_term(unit: Unit, results: Path, tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ function save(blob, svg, ending) {
 }
 function csvOf(figure, svg) {
   const x = scaleOf(svg), names = window.chartNames?.[svg.dataset.names], values = window.chartValues?.[svg.getAttribute("aria-labelledby").split("-t ")[0]];
-  const cell = (v) => /[",\n]/.test(v) ? `"${v.replaceAll('"', '""')}"` : v, read = (axis, v) => told(axis, valueAt(axis, v / SUBDIVISION, axis.full)).replace("\u2212", "-");
+  const plain = (v) => /^'*[=+\-@\t\r\n]/.test(v) && Number.isNaN(Number(v)) ? `'${v}` : v; // no formula of a spreadsheet
+  const cell = (v) => /[",\n]/.test(v) ? `"${plain(v).replaceAll('"', '""')}"` : plain(v), read = (axis, v) => told(axis, valueAt(axis, v / SUBDIVISION, axis.full)).replace("\u2212", "-");
   const rows = [["panel", "series", ...names ? ["unit"] : [], x.label, "value", "low", "high", ...values ? ["stated"] : []]];
   for (const group of svg.querySelectorAll(".panel")) {
     const y = scaleOf(group);
