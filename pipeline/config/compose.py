@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import json
 import re
-from functools import cache
+from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from hydra import compose, initialize_config_dir
@@ -51,7 +52,6 @@ from pipeline.model.sensor_file import completed, range_settings, without_overri
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
     from omegaconf import DictConfig
 
@@ -73,8 +73,10 @@ class Composer:
         self.campaign, self.below = campaign, below or campaign
         configs = campaign / "configs"
         self.searchpath = [configs.resolve()] if configs.is_dir() else []
-        for file in sorted(configs.rglob("*.yaml")):  # checks each file before Hydra opens it
+        files = sorted(configs.rglob("*.yaml"))
+        for file in files:  # checks each file before Hydra opens it
             mapping_of(file)
+        self.state = tuple((status.st_mtime_ns, status.st_size) for status in map(Path.stat, files))
         self.options = {
             group: {f.stem for root in (CONFIGS, *self.searchpath) for f in (root / group).glob("*.yaml")}
             for group in GROUPS
@@ -179,14 +181,14 @@ class Composer:
         return chosen
 
     def _read(self, group: str, option: str) -> dict[str, Any]:
-        return read_option(group, option, tuple(self.searchpath))
+        return read_option(group, option, tuple(self.searchpath), self.state)
 
     def _base(self, groups: dict[str, str]) -> tuple[dict[str, Any], bool]:
         """Return the configuration that Hydra composes from a choice of groups, and whether it contains references."""
         key = tuple(sorted(groups.items()))
         if key not in self._bases:
             try:
-                composed = _compose(key, self.searchpath) if self.searchpath else _compose_shipped(key)
+                composed = _compose(key, tuple(self.searchpath), self.state)
             except (HydraException, OmegaConfBaseException) as error:
                 cause = f" ({error.__cause__})" if error.__cause__ else ""
                 raise Problem(f"{str(error).splitlines()[0]}{cause}") from error
@@ -267,8 +269,12 @@ class Composer:
             )
 
 
-def _compose(groups: Groups, folders: Sequence[Path] = ()) -> DictConfig:
-    """Compose a choice of groups with Hydra, with options from the folders of a campaign."""
+@lru_cache(maxsize=256)  # commands and notebooks load a campaign several times
+def _compose(groups: Groups, folders: Sequence[Path], *_: object) -> DictConfig:
+    """Compose a choice of groups with Hydra, with options from the folders of a campaign.
+
+    The other arguments are those that change with the files in these folders.
+    """
     overrides = [f"{group}={option}" for group, option in groups]
     if folders:
         overrides.append(f"hydra.searchpath=[{','.join(map(_quoted, folders))}]")
@@ -279,9 +285,6 @@ def _compose(groups: Groups, folders: Sequence[Path] = ()) -> DictConfig:
             return compose("config", overrides)
     finally:
         GlobalHydra.instance().hydra = before
-
-
-_compose_shipped = cache(_compose)  # these files do not change; commands load a campaign several times
 
 
 def _with_unused_optional(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str, Any]:

@@ -73,8 +73,11 @@ _hydras_parser = cache(OverridesParser.create)
 
 
 @cache
-def read_option(group: str, option: str, searchpath: tuple[Path, ...]) -> dict[str, Any]:
-    """Return the content of the file of an option; ``{}`` if the file does not exist."""
+def read_option(group: str, option: str, searchpath: tuple[Path, ...], *_: object) -> dict[str, Any]:
+    """Return the content of the file of an option; ``{}`` if the file does not exist.
+
+    The other arguments are those that change with the files in these folders.
+    """
     for root in (*searchpath, CONFIGS):
         file = root / group / f"{option}.yaml"
         if file.is_file():

@@ -55,6 +55,22 @@ def test_a_semicolon_in_quotes_does_not_separate_overrides(tmp_path: Path) -> No
     assert units["U2"].config["ingest"]["csv"]["delimiter"] == "semicolon"
 
 
+def test_an_edited_option_of_the_campaign_is_read_again(tmp_path: Path) -> None:
+    """A notebook loads a campaign several times in one process."""
+    directory = campaign(tmp_path, "unit,procedure\nU1,own\n")
+    file = directory / "configs" / "procedure" / "own.yaml"
+    file.parent.mkdir(parents=True)
+    for table, tolerance, wanted in (
+        ("hand", 5.0, "nonlinear_least_squares"),
+        ("mark2", 17.0, "reference_least_squares"),
+    ):
+        lines = f"table: {table}\nmounting_tolerance_deg: {tolerance}\n"
+        file.write_text(f"defaults: [three_axis_turns, _self_]\n{lines}")
+        unit = load(directory).units["U1"].config
+        assert (unit["table"]["name"], unit["procedure"]["mounting_tolerance_deg"]) == (table, tolerance)
+        assert unit["method"]["name"] == wanted
+
+
 def test_defaults_follow_the_procedure_and_the_table(tmp_path: Path) -> None:
     sheet = "unit,procedure,table\nA,,\nB,multi_position,\nC,,hand\nD,six_positions,acutronic\n"
     units = load(campaign(tmp_path, sheet)).units
