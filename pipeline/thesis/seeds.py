@@ -10,8 +10,8 @@ shorter time constant tau', which gives the gain of the causal filter without it
 
     |H|^2 = 1 - tau (dt + tau) omega^2,   2 tau' (dt + tau') = tau (dt + tau)      for small omega
 
-The estimates are computed by the functions of the methods, without the uncertainties, which would take most of the
-time.
+The estimates are those of the stages of a fit, by the functions that these call. Of the thesis's methods the study does
+not run the steps themselves: the uncertainty would take ten times as long as all the rest.
 
 Each seed adds new noise to the same exact readings:
 
@@ -29,26 +29,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.accelerometer import nonlinear_least_squares, staged
-from pipeline.estimation.accelerometer.turn_extremes import (
-    Turn,
-    extremes_of_samples,
-    extremes_of_sinusoids,
-    samples_of,
-    sinusoids_of,
-)
+from pipeline.estimation.accelerometer import staged as accelerometer
+from pipeline.estimation.gyroscope import cholesky_lu
 from pipeline.estimation.gyroscope import staged as gyroscope
-from pipeline.estimation.gyroscope.cholesky_lu import turns_of
 from pipeline.estimation.stages import apply_correction
-from pipeline.estimation.turns import Part, parts_of
 from pipeline.model.measurement import linear_truth
-from pipeline.records import SENSORS, Mask, Recording, Values
+from pipeline.records import SENSORS, Mask, NotCalibrated, Recording, Values
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import Description, UnitDescription, read_config, read_description
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
 from pipeline.simulation.session import received
 from pipeline.thesis.tables import AXES, DEVICES, SILENT
+from pipeline.unit import run_checked
 from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
@@ -100,11 +93,6 @@ class Set:
         """The same on a vibrating table."""
         shaking = replace(self.unit, imperfections={**self.unit.imperfections, **SHAKING})
         return _exact(shaking, self.campaign_seed, self.number)
-
-    @cached_property
-    def parts(self) -> list[Part]:
-        """The recordings without noise or loss, with the table's motion."""
-        return parts_of(self.still, "accelerometer", read_config("table", self.unit.table), "the study")
 
     def drawn(self, seed: int, cause: str = LOST) -> list[tuple[Recording, Mask]]:
         """Return the complete recordings of one seed, and which of their samples are received.
@@ -167,20 +155,11 @@ class Drawn:
 
     def staged_accelerometer(self, *, as_printed: bool) -> tuple[Row, Row]:
         """Return the parameters from the stages, and the error after them."""
-        turns = []
-        drawn = self.turns_set.drawn(self.seed, self.cause)
-        for part, (recording, kept) in zip(self.turns_set.parts, drawn, strict=True):
-            filtered = self.filtered(recording.select(kept))
-            late = replace(part, recording=replace(part.recording, filter=filtered.filter))
-            used = samples_of(late, as_printed=as_printed)
-            reading = np.asarray(filtered.accelerometer)[used[kept]]
-            turns.append(Turn(np.asarray(part.motion.angle)[kept & used], reading, []))
-        fitted = [[s.coefficients for s in fits] for fits in ([] if as_printed else sinusoids_of(turns))]
-        extremes = extremes_of_samples(turns, 1.0) if as_printed else extremes_of_sinusoids(fitted, 1.0)
+        estimator = accelerometer.Estimator.of(self.turns(), self._settings(as_printed=as_printed))
         found: dict[str, float] = {}
-        chain = staged.Corrected()
-        for name in staged.STAGES:
-            chain = staged.follow(extremes, [name], chain)
+        chain = accelerometer.Corrected()
+        for name in accelerometer.STAGES:
+            chain = estimator.after([name], chain)
             found |= {k: v for k, (v, _) in chain.values.items()}
         row = {f"b_{a}": found[f"b_{a}"] for a in AXES}
         row |= {f"{q}_{a}": (found[f"{q}_P_{a}"] + found[f"{q}_N_{a}"]) / 2.0 for q in "OS" for a in AXES}
@@ -189,10 +168,16 @@ class Drawn:
 
     def least_squares_accelerometer(self) -> Row:
         """Return the error after nonlinear least squares."""
-        table, sensor = (read_config(group, getattr(self.turns_set.unit, group)) for group in ("table", "sensor"))
-        settings = {"table": table, "sensor": sensor, "procedure": {"holdout_every": 0}}
-        fitted = nonlinear_least_squares.fit(self.turns(), None, settings)
+        settings = self._settings() | {"filter": {"name": "none"}}  # the turns are filtered
+        unit = run_checked(self.turns(), {"accelerometer": ["nonlinear_least_squares"]}, settings)
+        fitted = unit.fits["accelerometer"]
+        assert not isinstance(fitted, NotCalibrated)  # noqa: S101  (turns about three axes)
         return self._accelerometer_error(partial(linear_truth, fitted))
+
+    def _settings(self, *, as_printed: bool = False) -> dict[str, Any]:
+        table, sensor = (read_config(group, getattr(self.turns_set.unit, group)) for group in ("table", "sensor"))
+        method = {"as_printed": as_printed}
+        return {"table": table, "sensor": sensor, "procedure": {"holdout_every": 0}, "method": method}
 
     def _accelerometer_error(self, correct: Callable[[Values], Values]) -> Row:
         """Return the mean |e| of the held-out motion, corrected."""
@@ -201,23 +186,19 @@ class Drawn:
 
     def gyroscope(self) -> Iterator[tuple[str, Row]]:
         """Yield method and error of the staged method, and of Cholesky and LU as printed and inverted."""
-        turns, table = self.turns(), read_config("table", self.turns_set.unit.table)
-        parts = parts_of(turns, "gyroscope", table, "the study")
-        samples = gyroscope.samples_of(parts, turns)
-        theta = gyroscope.weights_of(samples.rate, as_printed=False) @ samples.reading
-        chain = gyroscope.follow(gyroscope.Response(theta[0], theta[1:], samples.speed), list(gyroscope.STAGES))
-        integrated = turns_of(parts)
-        U, Y = integrated.integral(integrated.rate), integrated.integral(integrated.reading - theta[0])
-        forward = np.linalg.lstsq(U, Y, rcond=None)[0].T
+        turns, settings = self.turns(), self._settings()
+        found = gyroscope.estimates_of(turns, settings)
+        bias = found.theta[0]
+        A = cholesky_lu.forward_of(turns, bias, settings).A
         matrices = {
-            "staged": chain.contract()[1],
-            "cholesky-printed": forward,
-            "cholesky": np.linalg.solve(forward, np.eye(3)),
+            "staged": gyroscope.follow(found.response, list(gyroscope.STAGES)).contract()[1],
+            "cholesky-printed": cholesky_lu.calibration_matrix(A, as_printed=True),
+            "cholesky": cholesky_lu.calibration_matrix(A, as_printed=False),
         }
-        motion = samples_of_motion("gyroscope", self.filtered(self.held_out), SILENT, table)
+        motion = samples_of_motion("gyroscope", self.filtered(self.held_out), SILENT, settings["table"])
         assert motion is not None  # noqa: S101  (the table logs its rate)
         for method, matrix in matrices.items():
-            error = np.linalg.norm((motion.reading - theta[0]) @ matrix.T, axis=1) - motion.magnitude
+            error = np.linalg.norm((motion.reading - bias) @ matrix.T, axis=1) - motion.magnitude
             yield method, {"error": float(np.mean(np.abs(error)))}
 
 

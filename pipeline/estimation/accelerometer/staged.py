@@ -21,6 +21,7 @@ then follows from synthetic turns, which are the fitted sinusoids with simulated
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -233,28 +234,52 @@ def follow(extremes: Extremes, names: Sequence[str], start: Corrected | None = N
     return found
 
 
+@dataclass(frozen=True)
+class Estimator:
+    """The estimates of the stages, without their uncertainty, from the turns of recordings."""
+
+    turns: list[Turn]
+    gravity_g: float
+    as_printed: bool
+
+    @classmethod
+    def of(cls, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Estimator:
+        """Return the turns of recordings; ``settings``: sections ``table`` and ``method``."""
+        as_printed = bool(settings["method"].get("as_printed", False))
+        parts = parts_of(recordings, "accelerometer", settings["table"], "the staged method")
+        turns = turns_of(parts, as_printed=as_printed)
+        return cls(turns, float(settings["table"].get("gravity_g", 1.0)), as_printed)
+
+    @cached_property
+    def sinusoids(self) -> list[list[Sinusoid]]:
+        """The sinusoid of each channel in each turn."""
+        return sinusoids_of(self.turns)
+
+    def after(self, names: Sequence[str], start: Corrected | None = None) -> Corrected:
+        """Return the output of stages; ``start``: output of the stage before the first."""
+        if self.as_printed:
+            return follow(extremes_of_samples(self.turns, self.gravity_g), names, start)
+        coefficients = [[sinusoid.coefficients for sinusoid in turn] for turn in self.sinusoids]
+        return follow(extremes_of_sinusoids(coefficients, self.gravity_g), names, start)
+
+
 def fit(
     name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Run one stage of the staged method (``pipeline.estimation.stages``); role ``accelerometer``, on a table."""
     before = stages_before("accelerometer", previous, STAGES)
-    as_printed = bool(settings["method"].get("as_printed", False))
-    gravity_g = float(settings["table"].get("gravity_g", 1.0))
-    parts = parts_of(recordings, "accelerometer", settings["table"], "the staged method")
-    turns = turns_of(parts, as_printed=as_printed)
-    sinusoids = sinusoids_of(turns)
+    estimator = Estimator.of(recordings, settings)
+    turns, gravity_g, sinusoids = estimator.turns, estimator.gravity_g, estimator.sinusoids
     prior = prior_of("accelerometer", recordings, settings)
     theta = np.concatenate([s.coefficients for channel in range(3) for s in (turn[channel] for turn in sinusoids)])
 
     def chain(values: Values) -> Values:
         return follow(extremes_of_sinusoids(by_turn(sinusoids, values), gravity_g), [*before, name]).vector()
 
-    by_sinusoids = extremes_of_sinusoids(by_turn(sinusoids, theta), gravity_g)
-    extremes = extremes_of_samples(turns, gravity_g) if as_printed else by_sinusoids
-    found = follow(extremes, [name], Corrected.of(previous))
+    found = estimator.after([name], Corrected.of(previous))
     # A separate sinusoid for each turn and channel would absorb the changes of the bias from turn to turn.
     noise = noise_of_turns([part for turn in turns for part in turn.parts], prior, settings["table"], two_sided=True)
-    if as_printed:
+    if estimator.as_printed:
         scatter = _resampled(turns, sinusoids, noise, gravity_g, [*before, name])
     else:
         map_ = _linear_map(sinusoids, theta, chain)
@@ -280,7 +305,7 @@ def fit(
         convergence=certificate_of(sinusoids),
     )
     kept = slice(0, 15 if last else 12)
-    if as_printed:
+    if estimator.as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
     motions = used_motions([part for turn in turns for part in turn.parts])
     reference = Reference("accelerometer", motions, np.diag(found.k), settings["table"])

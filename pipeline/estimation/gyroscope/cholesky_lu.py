@@ -69,6 +69,25 @@ class Factors(NamedTuple):
     M: Values
 
 
+class Forward(NamedTuple):
+    """The least squares ``Y = U A^T`` of integrated readings and rates."""
+
+    turns: Turns
+    Y: Values  # (t, 3), deg; readings less bias, integrated over each turn
+    U: Values  # (t, 3), deg; rates
+    columns: ScaledColumns  # of U
+    A: Values  # (3, 3)
+
+
+def forward_of(recordings: Sequence[Recording], bias: Values, settings: Mapping[str, Any]) -> Forward:
+    """Return the forward matrix of recordings without its uncertainty; ``settings``: section ``table``."""
+    turns = turns_of(parts_of(recordings, "gyroscope", settings["table"], "the Cholesky and LU method"))
+    Y, U = turns.integral(turns.reading - bias), turns.integral(turns.rate)
+    require_turns(U)
+    columns = ScaledColumns.of(U)
+    return Forward(turns, Y, U, columns, columns.solve(Y).T)
+
+
 def fit(
     recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
@@ -80,11 +99,7 @@ def fit(
         raise ConfigurationError(
             "the stage cholesky_lu needs the bias: let the stage bias run before it (method.stages)"
         )
-    turns = turns_of(parts_of(recordings, "gyroscope", settings["table"], "the Cholesky and LU method"))
-    Y, U = turns.integral(turns.reading - previous.bias), turns.integral(turns.rate)
-    require_turns(U)
-    columns = ScaledColumns.of(U)
-    A = columns.solve(Y).T
+    turns, Y, U, columns, A = forward_of(recordings, previous.bias, settings)
     as_printed = bool(settings["method"].get("as_printed", False))
     factors = factorise(A)
     residuals = turns.reading - previous.bias - turns.rate @ A.T
@@ -94,7 +109,7 @@ def fit(
     reference = Reference("gyroscope", used_motions(turns.parts), A, settings["table"])
     noise = noise_of_fit(turns.parts, reference, residuals, design, prior)
     scatter = noise_contribution(noise, fit, prior)
-    matrix = _matrix(A, as_printed=as_printed)
+    matrix = calibration_matrix(A, as_printed=as_printed)
     # The rms error of the integrated angles: rows are turn axes, columns are sensor axes.
     squares, about = (Y @ matrix.T - U) ** 2, np.argmax(np.abs(U), axis=1)
     angle_errors = [
@@ -146,7 +161,8 @@ def factorise(A: Values) -> Factors:
     return Factors(S, L / S[:, None], np.linalg.solve(L, A))
 
 
-def _matrix(A: Values, *, as_printed: bool) -> Values:
+def calibration_matrix(A: Values, *, as_printed: bool) -> Values:
+    """Return the matrix of the calibration: the inverse of A, or A itself as printed."""
     return A if as_printed else np.asarray(np.linalg.solve(A, np.eye(3)))
 
 
@@ -169,7 +185,9 @@ def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_prin
     def results(values: Values) -> Values:
         channels = values.reshape(3, 4)
         found = [value for value, _ in _values(factorise(channels[:, 1:])).values()]
-        return np.concatenate([channels[:, 0], _matrix(channels[:, 1:], as_printed=as_printed).ravel(), found])
+        return np.concatenate(
+            [channels[:, 0], calibration_matrix(channels[:, 1:], as_printed=as_printed).ravel(), found]
+        )
 
     x, y, z = np.split(derivative(results, theta, np.full(12, STEP)), 3, axis=1)
     if not from_rests and previous.covariance is not None:

@@ -22,7 +22,7 @@ these recordings the bias is from the static recording. As printed, row i is the
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -133,6 +133,24 @@ def follow(response: Response, names: Sequence[str], start: Sequence[Mapping[str
     return found
 
 
+class Estimates(NamedTuple):
+    """The estimates from samples at rest and in steady turns, without their uncertainty."""
+
+    samples: Samples
+    weights: Values  # (4, n); ``theta = weights @ readings``
+    theta: Values  # (4, 3); mean reading at rest, and the response to the rate about each axis
+    response: Response
+
+
+def estimates_of(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Estimates:
+    """Return what the stages read of recordings; ``settings``: sections ``table`` and ``method``."""
+    as_printed = bool(settings["method"].get("as_printed", False))
+    samples = samples_of(parts_of(recordings, "gyroscope", settings["table"], "the staged method"), recordings)
+    weights = weights_of(samples.rate, as_printed=as_printed)
+    theta = weights @ samples.reading
+    return Estimates(samples, weights, theta, Response(theta[0], theta[1:], samples.speed, as_printed))
+
+
 def fit(
     name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
@@ -141,21 +159,18 @@ def fit(
     Role ``gyroscope``, on a table; also role ``static`` if these recordings hold no rest.
     """
     before = stages_before("gyroscope", previous, STAGES)
-    as_printed = bool(settings["method"].get("as_printed", False))
-    samples = samples_of(parts_of(recordings, "gyroscope", settings["table"], "the staged method"), recordings)
-    weights = weights_of(samples.rate, as_printed=as_printed)
-    theta = weights @ samples.reading
+    samples, weights, theta, response = estimates_of(recordings, settings)
     prior = prior_of("gyroscope", recordings, settings)
     design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])
     residuals = samples.reading - theta[0] - samples.rate @ theta[1:]
 
     def chain(values: Values) -> Values:
         b, *slope = values.reshape(3, 4).T
-        return follow(Response(b, np.array(slope), samples.speed, as_printed), [*before, name]).vector()
+        return follow(replace(response, rest=b, slope=np.array(slope)), [*before, name]).vector()
 
     here = theta.T.ravel()
     correction = (previous.stages[-1].correction or {}) if previous and previous.stages else {}
-    found = follow(Response(theta[0], theta[1:], samples.speed, as_printed), [name], correction.get("steps", []))
+    found = follow(response, [name], correction.get("steps", []))
     x, y, z = np.split(derivative(chain, here, np.full(12, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
     reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings["table"])
