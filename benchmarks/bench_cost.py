@@ -14,27 +14,16 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 import numpy as np
 
-from pipeline.diagnosis.diagnose import diagnose
-from pipeline.estimation.noise import noise_of
-from pipeline.estimation.stages import fit_stage
-from pipeline.estimation.stated_lines import with_stated
-from pipeline.preprocessing.checks import check_recordings
-from pipeline.records import SENSORS, coverage_factor
+from pipeline.one_unit import unit_of_recordings
+from pipeline.records import coverage_factor
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import read_config
-from pipeline.study.run import settings_of
-from pipeline.validation.heldout import validate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "study"))
 from bench_units import drawn
-
-if TYPE_CHECKING:
-    from pipeline.records import Recording
 
 BYPASSED = {
     "pipeline.preprocessing.checks.check_mounting": lambda recordings, _: list(recordings),
@@ -54,8 +43,7 @@ def main() -> None:
     largest = 0.0
     for number in range(-2, options.units):  # the first two, one of each sensor model, load modules and are not counted
         description, _ = drawn("plain", options.seed, abs(number), 0.0)
-        settings = settings_of(description.sensor, "reference_least_squares")
-        settings = {**settings, "table": {"name": description.table, **read_config("table", description.table)}}
+        layers = [f"sensor={description.sensor}", f"table={description.table}", "method=reference_least_squares"]
         found = {}
         for with_it in (True, False) if number % 4 < 2 else (False, True):
             recordings, _ = simulate_unit(description, options.seed, abs(number))
@@ -63,7 +51,7 @@ def main() -> None:
                 for name, other in {} if with_it else BYPASSED.items():
                     bypass.enter_context(patch(name, other))
                 begin = time.process_time()
-                found[with_it] = _calibrated(recordings, settings)
+                found[with_it] = [*unit_of_recordings(recordings, layers).run_to("diagnose").fits.values()]
                 if number >= 0:
                     spent[with_it].append(time.process_time() - begin)
         for here, there in zip(found[True], found[False], strict=True):
@@ -74,23 +62,6 @@ def main() -> None:
     error = 1.96 * ratios.std(ddof=1) / np.sqrt(len(ratios))
     print(f"{sum(spent[True]):.1f} s over {sum(spent[False]):.1f} s; ratio {ratios.mean():.3f} +- {error:.3f}")
     print(f"parameters differ by at most {largest:.2g} of their expanded uncertainty")
-
-
-def _calibrated(recordings: list[Recording], settings: dict[str, Any]) -> list[Any]:
-    """Return both fits of a unit, taken through the functions that the stages of a run call."""
-    recordings = check_recordings(recordings, settings)
-    noises: dict[str, Any] = {s: noise_of(s, recordings, settings) for s in SENSORS}
-    fits: dict[str, Any] = {}
-    gravity: dict[str, Any] | None = None
-    for sensor in SENSORS:
-        found: Any = None
-        for stage in ("reference_least_squares", "effects"):
-            found = fit_stage(sensor, stage, recordings, found, settings | {"noise": noises})
-        fits[sensor] = found = with_stated(found, recordings, settings)
-        held = validate(found, recordings, noises[sensor], settings)
-        known = found, recordings, noises[sensor], settings, fits["accelerometer"]
-        gravity = diagnose(*known, validation=held, gravity=gravity)
-    return list(fits.values())
 
 
 if __name__ == "__main__":

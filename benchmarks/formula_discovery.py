@@ -38,20 +38,20 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import PipelineError
 from pipeline.estimation.candidates import candidates_for
-from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.effects.base import Layout, per_axis, truth
 from pipeline.model.formula import parse
 from pipeline.model.kinematics import reference_motion
+from pipeline.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.records import SENSORS, Recording
+from pipeline.simulation.description import read_config
 from pipeline.simulation.session import Streams, random_environment
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import CYCLE_DEGC, NOISES, Case, draw
-from pipeline.study.run import _held_out, calibrated, settings_of
+from pipeline.study.run import held_out_errors
 from pipeline.study.scores import wilson
 
 JSON = dict[str, Any]
@@ -153,7 +153,7 @@ def _span(signal: np.ndarray) -> tuple[float, float]:
 
 
 def _observed(case: Case, recordings: list[Recording]) -> Any:  # noqa: ANN401
-    return observe(case.sensor, recordings, settings_of(MODEL)["table"])
+    return observe(case.sensor, recordings, read_config("table", "acutronic"))
 
 
 def _columns(effect: Any, sensor: str, recordings: list[Recording], used: list[str]) -> np.ndarray:  # noqa: ANN401
@@ -218,16 +218,9 @@ def same(hidden: str, found: list[str], recordings: list[Recording], case: Case)
     return bool(1.0 - (left(want, columns) / left(want, base)) ** 2 > REPRODUCED)
 
 
-def settings_at(depth: str) -> JSON:
-    """Return the configuration of a unit at a depth of the diagnosis."""
-    return {**settings_of(MODEL), "diagnosis": {"depth": depth}}
-
-
-def diagnosed(sensor: str, recordings: list[Recording], depth: str) -> JSON:
-    """Return the diagnosis, as a run makes it."""
-    settings = settings_at(depth)
-    noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
-    return diagnose(calibrated(recordings, sensor, settings), recordings, noise, settings)
+def unit_of(recordings: list[Recording], depth: str) -> ConfiguredUnit:
+    """Return recordings as a unit, at a depth of the diagnosis."""
+    return unit_of_recordings(recordings, [f"sensor={MODEL}", f"diagnosis.depth={depth}"])
 
 
 def hidden(number: int, seed: int, depth: str) -> JSON:
@@ -238,7 +231,9 @@ def hidden(number: int, seed: int, depth: str) -> JSON:
     case = Case("formula", number, seed, MODEL, sensor, way, room_degc=CYCLE_DEGC)
     recordings, text, size = hide(case)
     began = time.process_time()
-    part = diagnosed(sensor, recordings, depth)
+    unit = unit_of(recordings, depth)
+    state = unit.run_to("diagnose")
+    part = state.diagnosis[sensor]
     spent = time.process_time() - began
     effect = part["suggested_effect"]
     texts = [term["formula"] for term in effect["terms"].values()] if effect else []
@@ -248,11 +243,10 @@ def hidden(number: int, seed: int, depth: str) -> JSON:
     truth_of = {"name": "hidden", "owner": "table", "sensors": [sensor], "meaning": "Hidden.",
                 "terms": {"A": {"formula": text, "unit": "1"}}}  # fmt: skip
     register(effect_from(truth_of, "the hidden formula"))
-    method = "reference_least_squares"
 
     def error(names: list[str]) -> JSON:
         try:
-            return _held_out(recordings, MODEL, sensor, names, method)
+            return held_out_errors(unit, state, sensor, names)
         except PipelineError as refused:  # what is proposed is not observable: the floor is not reached
             return {"before": 0.0, "after": None, "floor": 0.0, "error": str(refused)}
 
@@ -271,7 +265,8 @@ def null(number: int, seed: int, depth: str) -> JSON:
     """Return what the diagnosis invents in a unit in which nothing is hidden; both sensors."""
     case = draw(f"null_{NOISES[number % len(NOISES)]}", number, seed)
     recordings = recordings_of(case)
-    parts = {sensor: diagnosed(sensor, recordings, depth) for sensor in SENSORS} if case.model == MODEL else {}
+    document = unit_of(recordings, depth).run_to("diagnose").diagnosis if case.model == MODEL else {}
+    parts = {sensor: document[sensor] for sensor in SENSORS if sensor in document}
     found = {s: list(p["suggested_effect"]["terms"].values()) for s, p in parts.items() if p["suggested_effect"]}
     return {"number": number, "noise": case.noise, "judged": bool(parts), "invented": found,
             "verdicts": [p["verdict"] for p in parts.values()]}  # fmt: skip

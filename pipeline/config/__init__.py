@@ -4,10 +4,6 @@ Only this package imports Hydra. Jobs read the JSON files that it writes.
 """
 
 from pipeline.config.campaign import Campaign, UnitRow, load_campaign
-from pipeline.config.owner import check_owner, claim, complete_record
 from pipeline.config.stage_settings import code_digest, settings_of_jobs
 
-__all__ = [
-    "Campaign", "UnitRow", "check_owner", "claim", "code_digest", "complete_record", "load_campaign",
-    "settings_of_jobs",
-]  # fmt: skip
+__all__ = ["Campaign", "UnitRow", "code_digest", "load_campaign", "settings_of_jobs"]

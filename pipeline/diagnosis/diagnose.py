@@ -19,9 +19,7 @@ from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effe
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.rest_means import is_multi_position
-from pipeline.io.units import TRIADS
 from pipeline.model.effects import catalogue, effect
-from pipeline.preprocessing.checks import STEPS
 from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
 from pipeline.validation.heldout import last_error, static_error
 from pipeline.validation.samples import HeldOutCase
@@ -117,12 +115,6 @@ def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = Tru
     return [f"{r.name}: {note.detail}" for r in relevant for note in r.notes if note.code in codes]
 
 
-def _coarse(sensor: str, recordings: Sequence[Recording]) -> list[str]:
-    """Return the notes on axes of a sensor whose readings have steps that hide their noise."""
-    notes = [note for r in recordings for note in r.notes if note.code == STEPS]
-    return [note.detail for note in notes if note.detail.startswith(TRIADS[sensor])]
-
-
 def evidence_of(
     document: Mapping[str, Any], case: Case, validation: Mapping[str, Any] | None, findings: Findings | None
 ) -> Evidence:
@@ -162,8 +154,6 @@ def evidence_of(
         agreement=(validation or {}).get("agreement"),
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
-        coarse=_coarse(sensor, recordings),
-        step=0.0 if case.noise is None or case.noise.step is None else float(case.noise.step.max()),
         doubts=[
             *doubts_of(sensor, recordings, seats=not _seats_explained(document, sensor, findings)),
             *(findings.departures if findings else ()),

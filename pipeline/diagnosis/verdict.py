@@ -68,8 +68,6 @@ class Evidence:
     full: HeldOut | None = None  # of the free fit with the selected effects
     agreement: Mapping[str, Any] | None = None  # of matrix and held-out motion (``pipeline.validation.heldout``)
     static: HeldOut | None = None  # mean of the static recording, by the unit's calibration
-    coarse: Sequence[str] = ()  # axes whose steps hide their noise, in words
-    step: float = 0.0  # the largest of these steps, g or deg/s; 0: not known, as after a filter
     doubts: Sequence[str] = ()  # contradictions of the reference, from the checks of the recordings
     approximations: Sequence[str] = ()  # errors of the method's bias and matrix (``pipeline.diagnosis.method_errors``)
     unknown: Sequence[str] = ()  # covariates on which the residual with the selected effects depends
@@ -127,12 +125,6 @@ class Evidence:
         """Whether the residual is too small for the noise estimate."""
         small = self.over_noise is not None and self.over_noise < QUIET
         return small and self.on_table and self.found == Verdict.NOTHING_MISSING
-
-    @property
-    def within_a_step(self) -> bool:
-        """Whether the readings are coarse, and the held-out error is not known to be larger than a step."""
-        error = self.published.error if self.published is not None and self.step > 0.0 else 0.0
-        return bool(self.coarse) and error <= self.step
 
     @property
     def disagrees(self) -> bool:
@@ -228,7 +220,6 @@ def _made_worse(held_out: Mapping[str, float] | None) -> bool:
 # calibration is above its interval.
 RULES: tuple[tuple[Verdict, str, Callable[[Evidence], object]], ...] = (
     (Verdict.REFERENCE_IN_DOUBT, "doubts", lambda e: e.doubts),
-    (Verdict.FLOOR_IN_DOUBT, "coarse", lambda e: e.within_a_step),
     (Verdict.MISSING_EFFECT, "beyond", lambda e: e.above and e.missing and not (e.full and e.full.above)),
     (Verdict.UNEXPLAINED, "above_and_unexplained", lambda e: e.above and e.unexplained),
     (Verdict.LEFT_BY_METHOD, "above_by_method", lambda e: e.above and e.of_method),
@@ -303,8 +294,7 @@ def _next_step(verdict: Verdict, document: Mapping[str, Any], e: Evidence) -> st
         check = f"check {suspect} as said above, and record the recordings concerned again"
         return SAME_SESSION if e.static_differs and not e.doubts else check
     if verdict == Verdict.FLOOR_IN_DOUBT:
-        finer = "log the readings with more digits, or set a smaller range of the sensor, and record again"
-        return finer if e.within_a_step else STATIC_AGAIN
+        return STATIC_AGAIN
     if verdict != Verdict.LEFT_BY_METHOD:
         return ""
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []

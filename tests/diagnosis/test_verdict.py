@@ -49,9 +49,6 @@ def held_out(after: float) -> dict[str, float]:
         (replace(NOTHING, agreement=OFF), "reference_in_doubt", "x reads +0.0003 of the truth along y"),
         (replace(NOTHING, agreement={**OFF, "p_value": 1e-3}), "nothing_missing", ""),
         (replace(MISSING, agreement=OFF), "missing_effect", ""),
-        (replace(NOTHING, coarse=("gyro_x: steps",)), "floor_in_doubt", "gyro_x: steps."),
-        (replace(MISSING, coarse=("gyro_x: steps",), step=2.0), "floor_in_doubt", "1 deg/s, not larger than a step"),
-        (replace(MISSING, coarse=("gyro_x: steps",), step=0.5), "missing_effect", ""),
         (replace(NOTHING, over_noise=0.1), "floor_in_doubt", "0.1 times the noise"),
         (replace(MISSING, published=ABOVE, free=ABOVE, full=INSIDE), "missing_effect", ""),
         (

@@ -19,14 +19,8 @@ if Path(workflow.basedir, "pipeline").is_dir():
     paths = [workflow.basedir, os.getenv("PYTHONPATH", "")]
     os.environ.update(PYTHONPATH=os.pathsep.join(filter(None, paths)))
 
-from pipeline.config import (
-    check_owner,
-    claim,
-    code_digest,
-    complete_record,
-    load_campaign,
-    settings_of_jobs,
-)
+from pipeline.config import code_digest, load_campaign, settings_of_jobs
+from pipeline.config.owner import check_owner, claim, complete_record
 from pipeline.errors import PipelineError
 from pipeline.files import write_atomically
 from pipeline.estimation.stages import stage_module
