@@ -69,7 +69,18 @@ def test_each_table_holds_the_values_of_the_files(unit: Unit, results: Path) -> 
 
 def test_no_cell_of_the_summary_is_a_formula_and_each_is_read_as_it_was(unit: Unit, tmp_path: Path) -> None:
     """LibreOffice and Excel run =cmd|'/C calc'!A0 and DDE links; a negative number stays one."""
-    texts = ["=cmd|'/C calc'!A0", "+1+1", "@SUM(A1)", "\t=1", "-2+3", "-b", "'=quoted", "''@twice", "'plain", "\uff1dwide"]
+    texts = [
+        "=cmd|'/C calc'!A0",
+        "+1+1",
+        "@SUM(A1)",
+        "\t=1",
+        "-2+3",
+        "-b",
+        "'=quoted",
+        "''@twice",
+        "'plain",
+        "\uff1dwide",
+    ]
     kept = ["-5", "+4.5e-3", "-.5", "L-1", "a=b", "7"]
     folder, given = tmp_path / "demo", [*texts, *kept]
     sheets = [{"serial": s, "lot": s, "depth": str(-1.5 * i), "=head": s} for i, s in enumerate(given)]
