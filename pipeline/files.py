@@ -24,8 +24,8 @@ _PACKAGE = Path(__file__).resolve().parent
 INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"
-# First characters by which spreadsheets take a text as a formula, or split it (OWASP, CSV injection);
-# with a ' in front, the text was escaped, or begins so.
+# First characters by which spreadsheets take a text as a formula, or split it (OWASP, CSV injection). With ' in front,
+# the text was escaped, or begins so.
 FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 WRITE_AGAIN = "run the same command again: snakemake writes the file anew"

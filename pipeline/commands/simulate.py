@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.model.effects import read_effect_files, register
 from pipeline.model.sensor_file import assumed_figures
 from pipeline.outcome import run_command
+from pipeline.planning.plan import not_shown
 from pipeline.results_folder import new_simulated, publish_simulated
 from pipeline.run_progress import Countdown
 from pipeline.simulation.campaign import write_campaign
@@ -42,7 +44,8 @@ examples:
 
 An effect is hidden in one sensor (accelerometer.NAME) or in both (NAME). Without a size, each parameter is half of its
 limit in the sensor file (or typical_share of the effect) times 0.7 to 1.3, with random signs. One number is the size of
-every parameter, with random signs; several numbers are the values of the parameters.
+every parameter, with random signs; several numbers are the values of the parameters. A warning names each effect that
+the procedure cannot show, whatever its size (python -m pipeline plan); the campaign is written all the same.
 NAME may be an effect of your own, DIR/effects/NAME.yaml (docs/effects_of_your_own.md).
 In simulation.yaml a unit may also have a formula that is no effect of the campaign, to test the diagnosis:
   effects: {gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: 0.03}}
@@ -86,6 +89,9 @@ def main(argv: Sequence[str]) -> int:
     for sensor in sorted({unit.sensor for unit in description.units}):
         assumed = assumed_figures(sensor, read_config("sensor", sensor))
         print(f"note: {assumed}\n" if assumed else "", end="")
+    hidden = [text.partition("=")[0] for text in arguments.get("effect", ())]
+    for key, reason in (not_shown(description.units[0], hidden) if hidden else {}).items():
+        print(f"warning: the recordings cannot show {key}: {reason}", file=sys.stderr)
     target = new_simulated(directory) if replace else directory
     write_campaign(description, target, (lambda _: None) if quiet else print_unit, sheet_only=sheet_only)
     if replace:

@@ -36,7 +36,7 @@ from pipeline.simulation.description import UnitDescription, course_of, read_con
 from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from pipeline.records import Fit
     from pipeline.simulation.trajectory import Planned
@@ -72,8 +72,33 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
     }
 
 
-def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = False) -> Document:
-    """Return the plan of one sensor."""
+def not_shown(unit: UnitDescription, effects: Sequence[str]) -> dict[str, str]:
+    """Return the effects of a simulation that the unit's procedure cannot show, with the reason.
+
+    ``effects``: ``sensor.effect``, or ``effect`` for all its sensors; the latter is shown if one sensor shows it.
+    """
+    wanted: dict[str, dict[str, str]] = {}  # effect as given: its sensors, with the name
+    for key in effects:
+        sensor, _, name = key.rpartition(".")
+        wanted[key] = dict.fromkeys([s for s in effect(name).sensors if sensor in (s, "")], name)
+    simulated, reasons = simulate_procedure(unit), dict[str, dict[str, str]]()
+    for sensor in {sensor for of_key in wanted.values() for sensor in of_key}:
+        names = {of_key[sensor] for of_key in wanted.values() if sensor in of_key}
+        document = of_sensor(sensor, simulated, half_only=True, only=names)
+        hidden = {entry["effect"]: entry["reason"] for entry in document["not_observable"]}
+        reasons[sensor] = dict.fromkeys(names, document["reason"]) if document["reason"] else hidden
+    found = {}
+    for key, of_key in wanted.items():
+        lacking = {sensor: reasons[sensor][name] for sensor, name in of_key.items() if name in reasons[sensor]}
+        if lacking and len(lacking) == len(of_key):
+            found[key] = "; ".join(dict.fromkeys(lacking.values()))
+    return found
+
+
+def of_sensor(
+    sensor: str, simulated: SimulatedProcedure, *, half_only: bool = False, only: Collection[str] | None = None
+) -> Document:
+    """Return the plan of one sensor; ``only``: of some effects."""
     noise = simulated.noise[sensor]
     document: Document = {
         "unit": unit_of(sensor),
@@ -93,7 +118,7 @@ def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = F
             limits, hidden = TurntableLimits(selection, noise), not_observable(selection, [])
     except NotObservableError as error:
         return {**document, "reason": error.message}
-    for name in sorted(set(limits.names) - set(hidden)):
+    for name in sorted(set(limits.names if only is None else only) & set(limits.names) - set(hidden)):
         detection = limits.detection(name, half_only=half_only)
         limited = bool(np.isfinite(limits.limits[name]).any())
         if limited and detection.found > 1.0:

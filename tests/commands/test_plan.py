@@ -122,3 +122,23 @@ def test_wrong_options_are_one_line_and_exit_code_2(
     assert error.startswith("python -m pipeline plan: ")
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_simulate_warns_of_the_hidden_effects_that_the_plan_cannot_show_and_writes_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    course = ["--step", "30", "--validation", "0", "--static", "20"]
+    hidden = ["gyroscope.scale_factor_asymmetry=0.002", "gyroscope.g_sensitivity", "table_tilt", "gyroscope.table_tilt"]
+    words = [word for effect in hidden for word in ("--effect", effect)]
+    assert main(["simulate", str(tmp_path), "--quiet", *course, *words]) == 0
+    warned = dict(
+        line.removeprefix("warning: the recordings cannot show ").split(": ", 1)
+        for line in capsys.readouterr().err.splitlines()
+    )
+    assert list(warned) == ["gyroscope.scale_factor_asymmetry", "gyroscope.table_tilt"]
+    plan = json.loads(_out(capsys, *course, "--no-extra", "--json"))
+    reasons = {entry["effect"]: entry["reason"] for entry in plan["gyroscope"]["not_observable"]}
+    assert warned == {f"gyroscope.{name}": reasons[name] for name in ("scale_factor_asymmetry", "table_tilt")}
+    truth = json.loads((tmp_path / "truth" / "U001.json").read_text(encoding="utf-8"))
+    assert set(truth["gyroscope"]["effects"]) == {"scale_factor_asymmetry", "g_sensitivity", "table_tilt"}
+    assert main(["simulate", str(tmp_path), "--quiet", "--effect", "gyro.table_tilt"]) != 0
