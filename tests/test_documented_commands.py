@@ -30,7 +30,7 @@ PROGRAMS = ("python ", "snakemake ", "imu-calibration ", "pip ", "cp ")
 TO_FILL_IN = re.compile(r"\.\.\.|\bCOMMAND\b|\w\|\w")  # by the reader; the rest of such a line is no command
 CONFIG = {"campaign", "results", "overrides", "unit_overrides", "python_effects"}
 
-NEEDED = ("Snakefile", "configs", "data", "pipeline", "profiles", "workflow", "tests", "README.md")
+NEEDED = ("Snakefile", "configs", "data", "pipeline", "imu_calibration", "profiles", "workflow", "tests", "README.md")
 U1 = "cp data/demo/raw/mpu6050-1/*.csv {0}/raw/U1/"
 BEFORE = {  # what a reader would have at that command
     "README.md": "cp data/demo/raw/mpu6050-1/validation.csv log.csv; snakemake --cores 2; "

@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 import json
 import shutil
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -138,20 +140,35 @@ def run_cell(source: str, names: dict[str, Any]) -> Any:
     return eval(compile(ast.Expression(last.value), "cell", "eval"), names) if last else None  # noqa: S307
 
 
-def test_the_notebook_runs_and_gives_tables_with_the_columns_that_it_shows(
-    results: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_notebook_runs_and_gives_what_it_shows(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the runs' results, which are others here, it shows the columns."""
     work = results.parents[1]
-    (work / "configs").symlink_to(ROOT / "configs")
+    for name in ("configs", "data"):
+        (work / name).symlink_to(ROOT / name)
     monkeypatch.chdir(work)
+    drawn: list[Any] = []
+    for name, attributes in {
+        "plots": {"plot": lambda data, **how: drawn.append((how["kind"], len(data)))},
+        "IPython": {},
+        "IPython.display": {"IFrame": lambda page, **_: drawn.append(Path(page).read_text(encoding="utf-8"))},
+    }.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(__name__=name, __spec__=None, **attributes))
     names: dict[str, Any] = {}
     cells = json.loads((ROOT / "docs" / "notebook.ipynb").read_text())["cells"]
-    frames = 0
+    frames = shown = 0
     for cell in (c for c in cells if c["cell_type"] == "code"):
-        value = run_cell("".join(cell["source"]), names)
+        with pd.option_context("plotting.backend", "plots"):
+            value = run_cell("".join(cell["source"]), names)
+        text = "".join(cell["outputs"][0]["data"]["text/plain"]) if cell["outputs"] else ""
         if isinstance(value, pd.DataFrame):
-            shown = "".join(cell["outputs"][0]["data"]["text/plain"])
-            assert all(str(column) in shown for column in value.columns)
+            assert all(str(column) in text for column in value.columns)
             assert len(value) > 0
             frames += 1
-    assert frames == 4
+        elif "results" not in names and text:
+            assert repr(value) == text
+            shown += 1
+    assert (frames, shown) == (6, 2)
+    (kind, points), page = drawn
+    assert (kind, points) == ("scatter", len(names["log"]))
+    assert "<svg" in page
+    assert str(names["results"]) == "<campaign demo: 2 units, 1 failed>"

@@ -16,7 +16,9 @@ pytestmark = [
     pytest.mark.workflow,
     pytest.mark.skipif(int(version("setuptools").split(".")[0]) < 77, reason="setuptools>=77 builds the wheel"),
 ]
-BUILT_FROM = ("pipeline", "configs", "workflow", "profiles", "data/demo")
+BUILT_FROM = ("pipeline", "imu_calibration", "configs", "workflow", "profiles", "data/demo")
+PACKAGES, SHIPPED = BUILT_FROM[:2], BUILT_FROM[2:]
+PIPELINE = ("-m", "pipeline")
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 
 
@@ -48,25 +50,39 @@ def test_the_wheel_holds_the_package_the_rules_the_configurations_and_the_demo(i
             if f.is_file() and "__pycache__" not in f.parts
         }
 
-    assert files(installed, "pipeline") >= files(ROOT, "pipeline")
+    assert files(installed, *PACKAGES) >= files(ROOT, *PACKAGES)
     shipped = installed / "pipeline" / "shipped"
-    assert files(shipped, *BUILT_FROM[1:]) == files(ROOT, *BUILT_FROM[1:])
+    assert files(shipped, *SHIPPED) == files(ROOT, *SHIPPED)
     (entry_points,) = installed.glob("*.dist-info/entry_points.txt")
     assert "imu-calibration = pipeline.__main__:main" in entry_points.read_text()
     assert not (installed / "tests").exists()
 
 
-def test_the_installed_command_plans_a_run_of_the_shipped_demo(installed: Path, tmp_path: Path) -> None:
-    def run(*words: str) -> str:
-        environment = os.environ | {"PYTHONPATH": str(installed), "PYTHONWARNINGS": "", "NO_COLOR": "1"}
-        command = [sys.executable, "-m", "pipeline", *words]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout + done.stderr
+def run(installed: Path, folder: Path, *words: str) -> str:
+    environment = os.environ | {"PYTHONPATH": str(installed), "PYTHONWARNINGS": "", "NO_COLOR": "1"}
+    command = [sys.executable, *words]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
 
+
+def test_the_installed_package_has_two_names(installed: Path, tmp_path: Path) -> None:
+    for first, second in (("imu_calibration", "pipeline"), ("pipeline", "imu_calibration")):
+        code = f"import {first}, {second}, {second}.errors; from {first}.errors import PipelineError as error; "
+        code += f"print({first} is {second}, error is {second}.errors.PipelineError, {first}.__file__)"
+        assert run(installed, tmp_path, "-c", code).split() == ["True", "True", f"{installed}/pipeline/__init__.py"]
+    by_one, by_other = (run(installed, tmp_path, "-m", name, "--version") for name in ("imu_calibration", "pipeline"))
+    assert by_one == by_other
+
+
+def test_the_installed_command_plans_a_run_of_the_shipped_demo(installed: Path, tmp_path: Path) -> None:
     (metadata,) = installed.glob("*.dist-info")
-    assert run("--version").split()[1] == metadata.name.split("-")[1].removesuffix(".dist")
-    planned = run("run", "demo", "filter=rc_low_pass", "--results", "elsewhere", "--", "--dry-run")
+    assert run(installed, tmp_path, *PIPELINE, "--version").split()[1] == metadata.name.split("-")[1].removesuffix(
+        ".dist"
+    )
+    planned = run(
+        installed, tmp_path, *PIPELINE, "run", "demo", "filter=rc_low_pass", "--results", "elsewhere", "--", "--dry-run"
+    )
     assert "elsewhere/demo/batches" in planned
     assert not (tmp_path / "elsewhere").exists()  # a dry run writes nothing
-    assert "imu-calibration run bench" in run("new", "bench")
+    assert "imu-calibration run bench" in run(installed, tmp_path, *PIPELINE, "new", "bench")
