@@ -19,18 +19,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import pairwise
-from typing import TYPE_CHECKING, TypeVar
+from itertools import groupby, pairwise
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from pipeline.errors import NotObservableError
+from pipeline.errors import InputError, NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.observations import without_rows
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.model.effects.base import Effect, Layout, truth
+from pipeline.records import motion_at_rest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -41,6 +42,10 @@ if TYPE_CHECKING:
 BASE = 12  # parameters: bias and matrix
 REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
 WEAKEST_DIRECTION, PART_OF_IT = 1e-3, 0.1  # singular value of unit columns that is determined; share of its vector
+SIGNALS = (  # fields of ``Motion`` on which formulas depend
+    "time", "specific_force", "angular_rate", "angular_acceleration", "temperature", "angle", "rate", "level",
+    "direction",
+)  # fmt: skip
 BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
 Result = TypeVar("Result")
 
@@ -118,6 +123,30 @@ def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
     return [*(everything if own is None else true_motion(part, terms, own) for own in acting), everything]
 
 
+def _joined(motions: Sequence[Motion]) -> list[tuple[Motion, list[Motion]]]:
+    """Return the motions of successive recordings that hold the same signals as one, each with those that it joins."""
+    joined = []
+    for held, group in groupby(motions, lambda motion: [name for name in SIGNALS if getattr(motion, name) is not None]):
+        members = list(group)
+        if "direction" not in held:  # it is computed from the whole motion
+            joined += [(each, [each]) for each in members]
+            continue
+        signals: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in members]) for name in held}
+        joined.append((replace(motion_at_rest(signals["time"]), **signals), members))
+    return joined
+
+
+def _of_samples(term: Term, sensor: str, joined: Sequence[tuple[Motion, list[Motion]]], K: Values) -> Values:
+    """Return the columns of a term whose regressors at a sample depend on the motion there alone."""
+    columns = []
+    for motion, members in joined:
+        try:
+            columns.append(term.regressors(sensor, motion, K))
+        except InputError:  # of one recording, which the error has to name
+            columns += [term.regressors(sensor, each, K) for each in members]
+    return np.concatenate(columns)
+
+
 @dataclass(frozen=True)
 class Start:
     """The start of a fit: the base by ordinary least squares, or another fit."""
@@ -183,9 +212,7 @@ class Design:
         weight = observations.weight
         A = np.ones((len(weight), self._width))
         A[:, self._readings] = observations.reading if target is None else target
-        edges = np.cumsum([0, *(len(part.weight) for part in observations.parts)]).tolist()
-        for part, edge in zip(observations.parts, pairwise(edges), strict=True):
-            self._fill(A[slice(*edge)], observations.sensor, part, terms, K)
+        self._fill(A, observations, terms, K)
         if base is not None:
             A[:, 1:4] = base
         self.size = np.sqrt(np.einsum("i,ij,ij->j", weight, A, A))
@@ -244,14 +271,22 @@ class Design:
         self._total = [np.array([*index, parameters]) for index in total]
         self.count, self._width = parameters, width + 3
 
-    def _fill(self, A: Values, sensor: str, part: Part, terms: Sequence[Term], K: Values) -> None:
-        """Write the columns of base and terms into the rows of one recording; the first column is 1 already."""
-        *motions, everything = motions_of(part, terms)
-        A[:, 1:4] = truth(sensor, everything)
-        for term, motion, places in zip(terms, motions, self._columns, strict=True):
-            regressors = term.regressors(sensor, motion, K, everything)
+    def _fill(self, A: Values, observations: Observations, terms: Sequence[Term], K: Values) -> None:
+        """Write the columns of base and terms; the first column is 1 already."""
+        sensor = observations.sensor
+        known: dict[tuple[int, ...], list[tuple[Motion, list[Motion]]]] = {}
+        *of_terms, everything = zip(*(motions_of(part, terms) for part in observations.parts), strict=True)
+        A[:, 1:4] = np.concatenate([truth(sensor, motion) for motion in everything])
+        for term, motions, places in zip(terms, of_terms, self._columns, strict=True):
+            if not term.effect.of_samples:
+                pairs = zip(motions, everything, strict=True)
+                columns = np.concatenate([term.regressors(sensor, motion, K, every) for motion, every in pairs])
+            else:
+                key = tuple(map(id, motions))
+                known[key] = known.get(key) or _joined(motions)
+                columns = _of_samples(term, sensor, known[key], K)
             for c, place in enumerate(places):
-                A[:, place] = regressors if term.layout() == Layout.EVERY_AXIS else regressors[:, c]
+                A[:, place] = columns if term.layout() == Layout.EVERY_AXIS else columns[:, c]
 
     def of_axis(self, c: int) -> Values:
         """Return the columns of one axis, the readings last: (n, q + 1) array."""

@@ -70,6 +70,7 @@ class Effect(abc.ABC):
     needs_clock: bool = False  # the time between the recordings must be known
     needs_motion: bool = False  # it adds nothing while the body rests
     needs_both_directions: bool = False  # turns in one direction show it as a part of bias and matrix
+    of_samples: bool = False  # its regressors at a sample depend on the motion at that sample alone
     of_turns: bool = False  # it has separate parameters for each recording of a turn
     nonlinear: tuple[str, ...] = ()  # parameters in which the reading is not linear
     prior: str = ""  # setting of the table that adds it to the model: standard deviation of its parameters

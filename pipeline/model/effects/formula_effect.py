@@ -60,6 +60,8 @@ class DeclaredEffect(Effect):
 class FormulaEffect(DeclaredEffect):
     """An effect whose terms are formulas."""
 
+    of_samples = True
+
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
         super().__init__(declared, definition)
         terms = list(declared.terms.values())
