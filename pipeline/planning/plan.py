@@ -86,7 +86,7 @@ def not_shown(unit: UnitDescription, effects: Sequence[str]) -> dict[str, str]:
         names = {of_key[sensor] for of_key in wanted.values() if sensor in of_key}
         document = of_sensor(sensor, simulated, half_only=True, only=names)
         hidden = {entry["effect"]: entry["reason"] for entry in document["not_observable"]}
-        reasons[sensor] = dict.fromkeys(names, document["reason"]) if document["reason"] else hidden
+        reasons[sensor] = dict.fromkeys(names, str(document["reason"])) if document["reason"] else hidden
     found = {}
     for key, of_key in wanted.items():
         lacking = {sensor: reasons[sensor][name] for sensor, name in of_key.items() if name in reasons[sensor]}
