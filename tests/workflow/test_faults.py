@@ -105,11 +105,11 @@ class Disk:
         return said
 
     def tree(self) -> dict[str, str]:
-        """Return the digest of every file of the results but logs, history, locks and parts of configurations."""
+        """Return the digest of every file of the results but logs, history, locks, configurations and kept files."""
         results = self.directory / "results" / "pair"
         files = [f for f in sorted(results.rglob("*")) if f.is_file()]
         named = {str(f.relative_to(results)): f for f in files}
-        left_out = ("logs/", "configs/", "history/", ".run.lock", ".jobs.lock")
+        left_out = ("logs/", "configs/", "history/", "replaced-", ".run.lock", ".jobs.lock")
         return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in named.items() if not n.startswith(left_out)}
 
     def remount(self, how: str) -> None:
@@ -172,6 +172,9 @@ def test_files_that_were_changed_or_deleted_are_made_again(disk: Disk) -> None:
     told = said[said.index("Changed or deleted since the last run") :].splitlines()[1:8]
     for path in ("calibrations", "reports", "summary.csv", "exports", str(fit.relative_to(results))):
         assert f"  results/pair/{path}" in told
+    (kept,) = results.glob("replaced-*")  # what was changed by hand is not lost
+    assert (kept / "summary.csv").read_text() == "by hand"
+    assert (kept / "calibrations" / "U1.json").read_text() == (results / "calibrations" / "U1.json").read_text() + " "
     assert disk.tree() == disk.trees[disk.place]
     again, code = disk.run(disk.place)
     assert "Nothing to be done" in again
