@@ -26,6 +26,7 @@ import filecmp
 import hashlib
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -38,8 +39,8 @@ from types import MappingProxyType
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.errors import DamagedFileError, PipelineError
-from pipeline.files import exchange, flush_file_system, write_atomically
-from pipeline.pack import PACKS, Batch, directory_of
+from pipeline.files import exchange, flush_file_system, read_json, write_atomically
+from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, directory_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -54,6 +55,7 @@ BESIDE = (  # not published as a set
 )  # fmt: skip
 OF_A_RUN = ("calibrations/*.json", f"{PACKS}/*/*.zip", "batches/*/*.zip", "history/*.json", "simulated/truth/*.json")
 RUN_LOCK, JOBS_LOCK, OWNER = ".run.lock", ".jobs.lock", ".owner.json"
+PACK = re.compile(rf"{PACKS}/([^/]+)/(?:{'|'.join((*STAGES, WITH_PRIOR))})\.zip")
 NEW = ".new"  # folder of a new set of files, below the results
 COMPLETE, PLAN, EXCHANGED = ".published", ".plan.json", ".exchanged.json"
 REPLACED = "replaced-"  # and the date: folder of the results for what a run replaced and did not write anew
@@ -135,6 +137,7 @@ def publish(
         "again": again,
         "keep": sorted(keep),
         "before": {**_last_written(results), **written},
+        "every": "written" in _read_record(results, "")[1],  # whether ``before`` has every file
         "written": _states(new),
     }
     write_atomically(new / PLAN, json.dumps(plan))
@@ -170,12 +173,14 @@ def finish_publishing(results: Path) -> None:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, DELAYED_SIGNALS)
         try:
             for path, inode in plan.get("inodes", plan).items():  # 0.1.0 before schema_version 2 wrote the inodes alone
-                published = results / path
-                if not os.path.lexists(published):
+                new, published = complete / path, results / path
+                if not os.path.lexists(new) or new.lstat().st_ino != inode:
+                    continue  # exchanged before the interruption; somebody may have changed it since
+                if os.path.lexists(published):
+                    exchange(new, published)
+                else:
                     published.parent.mkdir(parents=True, exist_ok=True)
-                    (complete / path).rename(published)
-                elif published.lstat().st_ino != inode:
-                    exchange(complete / path, published)
+                    new.rename(published)
             (complete / PLAN).rename(complete / EXCHANGED)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -199,16 +204,17 @@ def _keep_others(old: Path, results: Path, plan: Mapping[str, Any]) -> None:
     batches: dict[str, bool] = {}  # of the former packs: whether they are kept
     for path, state in _states(old).items():
         published, file = results / path, old / path
-        folder, batch, *_ = [*path.split("/"), ""]
         if path in (PLAN, EXCHANGED):
             continue
-        if before.get(path) == state:
-            if folder == PACKS and batch not in batches:
+        if pack := PACK.fullmatch(path):  # of a run in any state, as it is a link to the output of a job
+            batch = pack[1]
+            if batch not in batches:
                 batches[batch] = _holds(old / PACKS / batch, keep)
-            if batches[batch] if folder == PACKS else unit_of(path) in keep:
-                aside[path] = file
-        elif path in before and folder == PACKS:
-            continue  # a damaged pack, which is a link to the output of a job
+            aside |= {path: file} if batches[batch] else {}
+        elif before.get(path) == state:
+            aside |= {path: file} if unit_of(path) in keep else {}
+        elif not plan.get("every") and unit_of(path) in keep:
+            aside[path] = file  # likely of a run: the version before recorded no names
         elif not (path not in before and _put_back(file, published)) and not _same_bytes(file, published):
             aside[path] = file
     set_aside(aside, results)
@@ -292,13 +298,27 @@ def read_owner(results: Path) -> Owner | None:
 
 
 def is_owner(results: Path, directory: Path) -> bool:
-    """Return whether the campaign in a directory owns the results by its path, or because no run has written any."""
+    """Return whether the campaign in a directory owns the results by its path, or because no run has written any.
+
+    Where no owner is recorded, the settings of all runs must name this directory alone.
+    """
     owner = read_owner(results)
+    if owner is None and not any(any(results.glob(pattern)) for pattern in OF_A_RUN):
+        return True
     if owner is None:
-        return not any(any(results.glob(pattern)) for pattern in OF_A_RUN)
+        return recorded_directories(results) == {str(directory)}
     with suppress(OSError):
         return os.path.samefile(owner.campaign, directory)  # noqa: PTH121  (texts)
     return owner.campaign == str(directory)
+
+
+def recorded_directories(results: Path) -> set[str]:
+    """Return the folders of recordings that the settings of all runs name; a run deletes no settings."""
+    found = set()
+    for file in sorted((results / "configs").glob("ingest-*.json")):
+        with suppress(PipelineError, KeyError, TypeError):
+            found.add(str(read_json(file)["directory"]))
+    return found
 
 
 def write_owner(results: Path, owner: Owner) -> None:
@@ -318,7 +338,7 @@ def record_written(results: Path, output: str, again: int) -> None:
 
     ``again``: the number that ``repetitions`` returned at the start of the run.
     """
-    record = {"again": again, "files": {"": _digest(results / output)}}
+    record = {"again": again, "files": {"": _digest(_states(results / output))}}
     write_atomically(_record(results, output), json.dumps(record, sort_keys=True))
 
 
@@ -338,8 +358,20 @@ def _last_written(results: Path) -> dict[str, str]:
     _, record = _read_record(results, "")
     if "written" in record:
         return dict(record["written"])
-    names = [name for name, digest in record.get("files", {}).items() if _digest(results / name) == digest]
-    return {path: state for name in names for path, state in _states(results / name, name).items()}
+    same = [name for name, digest in record.get("files", {}).items() if _digest(_states(results / name)) == digest]
+    return {path: state for name in same for path, state in _states(results / name, name).items()}
+
+
+def is_as_written(results: Path, path: str) -> bool:
+    """Return whether a published file is as the last publication wrote it."""
+    return _last_written(results).get(path) == _state(results / path)
+
+
+def published_units(results: Path) -> set[str]:
+    """Return the units with published files of their own, of which the calibration is always one."""
+    _, record = _read_record(results, "")
+    paths = record["written"] if "written" in record else _states(results / "calibrations", "calibrations")
+    return {unit_of(path) for path in paths if path.startswith("calibrations/")}
 
 
 def repetitions(results: Path, output: str) -> tuple[int, list[str]]:
@@ -350,7 +382,8 @@ def repetitions(results: Path, output: str) -> tuple[int, list[str]]:
     again, record = _read_record(results, output)
     if not (results / output).exists():
         return again, []  # Snakemake writes a missing output in any case
-    changed = [name for name, digest in record.get("files", {}).items() if _digest(results / output / name) != digest]
+    digests = {name: _digest(_states(results / output / name)) for name in record.get("files", {})}
+    changed = [name for name, digest in digests.items() if digest != record["files"][name]]
     published = {path: s for path, s in record.get("written", {}).items() if path.partition("/")[0] in PUBLISHED}
     changed += [path.partition("/")[0] for path, state in published.items() if _state(results / path) != state]
     edited = [os.path.normpath(results / output / name) for name in dict.fromkeys(changed)]
@@ -393,8 +426,7 @@ def _states(path: Path, name: str = "") -> dict[str, str]:
     return {f"{name}{file[start:]}".removeprefix("/"): _state(file) for file in files}
 
 
-def _digest(path: Path) -> str:
-    """Return a digest of the names, sizes and times of a file, or of all files below a folder."""
-    lines = ["\0".join((f"/{name}" if name else "", *state.split())) for name, state in _states(path).items()]
-    text = "\n".join(sorted(lines))
-    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:32]
+def _digest(states: Mapping[str, str]) -> str:
+    """Return a digest of the names and states of files."""
+    lines = ["\0".join((f"/{name}" if name else "", *state.split())) for name, state in states.items()]
+    return hashlib.sha256("\n".join(sorted(lines)).encode(errors="surrogateescape")).hexdigest()[:32]

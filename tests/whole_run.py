@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import load_campaign, settings_of_jobs
+from pipeline.config import check_owner, claim, complete_record, load_campaign, settings_of_jobs
+from pipeline.io.digests import digests_of_files
 from pipeline.model.effects import forget
-from pipeline.results_folder import HELD
+from pipeline.results_folder import HELD, read_owner
 from pipeline.stages import batch
 
 if TYPE_CHECKING:
@@ -65,4 +66,11 @@ def run_campaign(directory: Path, **settings: Any) -> tuple[Campaign, int]:
     """Run the campaign in a directory, its results beside it; return it and the exit code of the run."""
     results = settings.pop("results", directory.absolute().parent / "results")
     campaign = load_campaign({"campaign": str(directory), "results": str(results), **settings})
-    return campaign, run_jobs(campaign)
+    claim(campaign, check_owner(campaign, move=True))
+    code = run_jobs(campaign)
+    complete_record(campaign)
+    owner, units = read_owner(campaign.results), campaign.units.items()
+    folders = {name: (row.config["procedure"], row.config["ingest"], campaign.folder(name)) for name, row in units}
+    assert owner is not None
+    assert owner.units == {name: digests_of_files(*folder) for name, folder in folders.items()}  # read by ingest
+    return campaign, code

@@ -14,7 +14,16 @@ from pipeline.files import flushed_together, write_atomically
 from pipeline.history import read_history
 from pipeline.pack import PACKS, batches_of
 from pipeline.report.pages import linked
-from pipeline.results_folder import NEW, BusyError, finish_publishing, jobs_running, publish, repetitions, take_run
+from pipeline.results_folder import (
+    NEW,
+    BusyError,
+    finish_publishing,
+    is_as_written,
+    jobs_running,
+    publish,
+    repetitions,
+    take_run,
+)
 from pipeline.stages.gather import publish_histories
 
 if TYPE_CHECKING:
@@ -47,16 +56,20 @@ def main(argv: Sequence[str]) -> int:
         raise MissingInputError(
             f"no unit {', '.join(absent)}; there are {', '.join(sorted(batches)[:12])}", str(results)
         )
-    again, new, paths = repetitions(results, "")[0], results / NEW, ["index.html"]
+    again, new, index = repetitions(results, "")[0], results / NEW, results / "index.html"
     shutil.rmtree(new, ignore_errors=True)
+    paths = []
     with flushed_together(results):
         for unit in units:
             for name, content in batches[unit].files(unit):
                 write_atomically(new / name, content)
                 paths.append(name)
         publish_histories(new, read_history(results), units)
-        index = (results / "index.html").read_text(encoding="utf-8")
-        write_atomically(new / "index.html", linked(index, units))
+        if is_as_written(results, index.name):
+            write_atomically(new / index.name, linked(index.read_text(encoding="utf-8"), units))
+            paths.append(index.name)
+        else:
+            print(f"note: {index} was changed or deleted, so it gets no links to these units until the next run")
     publish(new, results, again=again, paths=paths)
     print("\n".join(str(results / "reports" / f"{unit}.html") for unit in units))
     return 0

@@ -34,6 +34,7 @@ from pipeline.results_folder import (
     finish_publishing,
     is_owner,
     read_owner,
+    recorded_directories,
     set_aside,
     take_run,
     write_owner,
@@ -115,7 +116,8 @@ def _digests(campaign: Campaign, unit: str) -> list[str]:
 
 def _refusal(campaign: Campaign, reason: str) -> OtherCampaignError:
     results, owner = campaign.results, read_owner(campaign.results)
-    known = f"the campaign {owner.campaign}" if owner else f"another campaign{_earlier(results)}"
+    places = ", ".join(first(sorted(recorded_directories(results)), 3))
+    known = f"the campaign {owner.campaign}" if owner else f"another campaign ({places or 'of unknown folder'})"
     message = f"other_campaign: holds the results of {known}; this campaign is {campaign.directory}, and {reason}"
     message += ". Write its results to another folder: results=DIR (--results DIR)"
     if not _is_campaign(results):
@@ -126,15 +128,6 @@ def _refusal(campaign: Campaign, reason: str) -> OtherCampaignError:
 def _is_campaign(results: Path) -> bool:
     """Return whether a results folder is also the directory of a campaign, whose files must not be moved."""
     return (results / "units.csv").exists()
-
-
-def _earlier(results: Path) -> str:
-    """Return, in brackets, the campaigns whose settings are in a results folder without a record."""
-    found = set()
-    for file in sorted((results / "configs").glob("ingest-*.json")):
-        with suppress(PipelineError, KeyError, TypeError):
-            found.add(str(read_json(file)["directory"]))
-    return f" ({', '.join(first(sorted(found), 3))})" if found else ""
 
 
 def _difference(campaign: Campaign) -> str:

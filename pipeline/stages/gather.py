@@ -24,7 +24,7 @@ from pipeline.report.comparison import against_truth, section
 from pipeline.report.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
 from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
-from pipeline.results_folder import NEW, PUBLISHED, finish_publishing, publish, record_units
+from pipeline.results_folder import NEW, PUBLISHED, finish_publishing, publish, published_units, record_units
 from pipeline.stages.summary import failed_files, failed_summary
 
 if TYPE_CHECKING:
@@ -48,8 +48,7 @@ def gather_batch(job: Job) -> None:
         if "." not in name:
             (new / name).mkdir(parents=True)
     packed = len(run["order"]) > run["publish_limit"]
-    known = (results / "calibrations").glob("*.json") if any((results / PACKS).glob("*/*")) else ()
-    asked = {file.stem for file in known}  # by ``unpack``
+    asked = asked_units(results)
     found: dict[str, JSON] = {}
     parts: list[pd.DataFrame] = []
     digests: dict[str, list[str] | None] = {}
@@ -71,6 +70,12 @@ def gather_batch(job: Job) -> None:
     publish(new, results, again=run.get("again", 0), keep=_without_successor(results, units))
     record_units(results, {unit: sha256 for unit in units if (sha256 := digests[unit]) is not None})
     write_json(job.output, [u["failure"] for u in units.values() if u["failure"]])
+
+
+def asked_units(results: Path) -> set[str]:
+    """Return the units beyond ``publish_limit`` whose files ``unpack`` has published."""
+    packed = any((results / PACKS).glob("*/*"))
+    return {file.stem for file in (results / "calibrations").glob("*.json")} if packed else set()
 
 
 def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
@@ -108,7 +113,7 @@ def _without_successor(results: Path, units: Mapping[str, JSON]) -> set[str]:
 
     They left the campaign, or were calibrated before and fail now.
     """
-    before = {file.stem for file in (results / "calibrations").glob("*.json")} | set(batches_of(results))
+    before = published_units(results) | set(batches_of(results))
     failed = {u for u in units if units[u]["failure"] and is_published(results / "validations" / f"{u}.json")}
     serials = {found["row"].get("serial") for found in units.values()}
     joint = {file.stem for file in (results / "combined").glob("*.json")} - serials
