@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -29,10 +30,11 @@ from pipeline.commands import apply, simulate
 from pipeline.config import load_campaign
 from pipeline.errors import InputError, InternalError
 from pipeline.model.effects import catalogue
-from pipeline.one_unit import notes_of_campaign
+from pipeline.one_unit import ConfiguredUnit, notes_of_campaign
 
 if TYPE_CHECKING:
     from pipeline.result import UnitResult
+    from pipeline.unit import UnitState
 
 COURSE = "--units 1 --sensor mpu6050 --quiet --step 45 --dwell 1 --rates 60 --validation 30 --seed 4"
 BENCH: dict[str, Any] = {"sensor": "mpu6050", "table": "acutronic"}
@@ -495,3 +497,33 @@ def test_it_needs_nothing_of_posix_writes_no_file_and_starts_no_process(folder: 
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["{1}", "[] []", "0 True"]
+
+
+def test_the_examples_of_the_document_run(
+    from_folder: UnitResult, frames: dict[str, pd.DataFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each unit is configured as its example says; the steps, which other tests run, are those of another unit."""
+    root = Path(__file__).parents[1]
+    examples = re.findall(
+        r"^```python\n(.*?)^```$", (root / "docs" / "python.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    state = replace(from_folder._state, unit="mpu6050-1")
+    configured: list[str] = []
+
+    def calibrated(unit: ConfiguredUnit) -> UnitState:
+        configured.append(f"{unit.row.name} {unit.row.config['procedure']['name']}")
+        state.calibration = {**from_folder.calibration, "unit": unit.row.name}
+        with_effect = [{"name": e, "parameters": {}} for e in unit.row.config["effects"]["gyroscope"]]
+        state.calibration["gyroscope"] = from_folder.calibration["gyroscope"] | {"effects": with_effect}
+        return replace(state)
+
+    monkeypatch.setattr(ConfiguredUnit, "calibrated", calibrated)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").symlink_to(root / "data")
+    for name in ("rests.csv", "log.csv"):
+        frames["validation"].to_csv(tmp_path / name, index=False)
+    exec("".join(examples), {})  # noqa: S102  (our own document)
+    expected = ["mpu6050-1 three_axis_turns", "unit multi_position", "mpu6050-2-hidden three_axis_turns"]
+    assert (len(examples), configured) == (2, expected)
+    assert pipeline.load_calibration("saved/calibrations/mpu6050-1.json").gyroscope is not None
+    assert (tmp_path / "unit.html").is_file()

@@ -128,7 +128,7 @@ class World:
 
     # What may happen, each with its check.
 
-    def run(self) -> None:
+    def run(self) -> None:  # noqa: C901, PLR0915  (each kind of run and its outcome, in turn)
         campaign, take_over = self.random.choice(self.campaigns()), self.random.random() < 0.15
         settings = self.settings.setdefault(campaign, {})
         options = {"packed": self.random.random() < 0.3, "lot": self.random.random() < 0.3}
@@ -294,7 +294,7 @@ class World:
             self.certain = False  # documents may be interrupted, edited or in packs
 
     def check(self, before: dict[str, str], now: dict[str, str], units: dict[str, str] | None, *, done: bool) -> None:
-        """Check that nothing is lost; ``units``: with new results, None without any; ``done``: the run was not killed."""
+        """Check that nothing is lost; ``units``: with new results, or None; ``done``: the run was not killed."""
         contents = Counter(now.values())
         for content, path in self.mine.items():
             assert contents[content], f"{content} at {path} is lost"
