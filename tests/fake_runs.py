@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from stage_files import write_pack
 
-from pipeline.config import check_owner, claim, complete_record, load_campaign
+from pipeline.config import load_campaign
 from pipeline.config.campaign import UnitRow
+from pipeline.config.owner import check_owner, claim, complete_record
 from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch
 from pipeline.results_folder import (
     HELD,

@@ -28,7 +28,7 @@ INDENTED = re.compile(r"(?:^ {4}.*\n)+", re.MULTILINE)
 INLINE = re.compile(r"`((?:nice )?(?:python|snakemake|imu-calibration) [^`]*)`")
 PROGRAMS = ("python ", "snakemake ", "imu-calibration ", "pip ", "cp ")
 TO_FILL_IN = re.compile(r"\.\.\.|\bCOMMAND\b|\w\|\w")  # by the reader; the rest of such a line is no command
-CONFIG = {"campaign", "results", "overrides", "unit_overrides", "python_effects"}
+CONFIG = {"campaign", "results", "overrides", "unit_overrides", "take_over", "python_effects"}
 
 NEEDED = ("Snakefile", "configs", "data", "pipeline", "imu_calibration", "profiles", "workflow", "tests", "README.md")
 U1 = "cp data/demo/raw/mpu6050-1/*.csv {0}/raw/U1/"

@@ -20,8 +20,7 @@ from fake_runs import as_of_version_1, campaign_of, release, run, sha256, units_
 
 from pipeline import files, results_folder
 from pipeline.commands import unpack
-from pipeline.config import check_owner
-from pipeline.config.owner import OtherCampaignError
+from pipeline.config.owner import OtherCampaignError, check_owner
 from pipeline.errors import MissingInputError
 from pipeline.results_folder import BusyError, finish_publishing, read_owner, take_run, unit_of
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import check_owner, claim, complete_record, load_campaign, settings_of_jobs
+from pipeline.config import load_campaign, settings_of_jobs
+from pipeline.config.owner import check_owner, claim, complete_record
 from pipeline.io.digests import digests_of_files
 from pipeline.model.effects import forget
 from pipeline.results_folder import HELD, read_owner

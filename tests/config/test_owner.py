@@ -11,8 +11,8 @@ from fake_runs import as_of_version_1, campaign_of, release, run, sha256, units_
 
 from pipeline.commands import add, explain, simulate, unpack
 from pipeline.commands import run as run_command
-from pipeline.config import check_owner, claim, load_campaign, owner
-from pipeline.config.owner import OtherCampaignError
+from pipeline.config import load_campaign, owner
+from pipeline.config.owner import OtherCampaignError, check_owner, claim
 from pipeline.errors import ConfigurationError
 from pipeline.results_folder import read_owner
 
