@@ -105,11 +105,11 @@ class Disk:
         return said
 
     def tree(self) -> dict[str, str]:
-        """Return the digest of every file of the results but logs, history, locks, configurations and kept files."""
+        """Return the digest of every file of the results but logs, history, locks, configurations, owner, kept files."""
         results = self.directory / "results" / "pair"
         files = [f for f in sorted(results.rglob("*")) if f.is_file()]
         named = {str(f.relative_to(results)): f for f in files}
-        left_out = ("logs/", "configs/", "history/", "replaced-", ".run.lock", ".jobs.lock")
+        left_out = ("logs/", "configs/", "history/", "replaced-", ".owner.json", ".run.lock", ".jobs.lock")
         return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in named.items() if not n.startswith(left_out)}
 
     def remount(self, how: str) -> None:
