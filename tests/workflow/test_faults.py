@@ -105,7 +105,7 @@ class Disk:
         return said
 
     def tree(self) -> dict[str, str]:
-        """Return the digest of every file of the results but logs, history, locks, configurations, owner, kept files."""
+        """Return the digest of every file of the results but logs, history, locks, configurations, owner, kept."""
         results = self.directory / "results" / "pair"
         files = [f for f in sorted(results.rglob("*")) if f.is_file()]
         named = {str(f.relative_to(results)): f for f in files}
