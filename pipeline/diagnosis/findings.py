@@ -17,8 +17,9 @@ from pipeline.diagnosis.verdict import if_observable
 from pipeline.diagnosis.words import next_experiment, to_distinguish
 from pipeline.estimation.design import Term, placed
 from pipeline.estimation.free_curves import OTHER
+from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.posterior import CERTAIN, Answers
-from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
+from pipeline.estimation.selection import ALIKE, EVIDENCE, INFLATED
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ def _entry(findings: Findings, name: str) -> dict[str, Any]:
         before, after, drop = None, None, findings.drop_alone(name)
     excess = max(findings.excess, drop)
     estimates, plausible = _estimates(findings, score)
-    shares = findings.shares(name) if score.delta_bic > GATE_BIC else {}
+    shares = findings.shares(name) if score.delta_bic > MIN_DELTA_BIC else {}
     alike = sorted(((share, other) for other, share in shares.items() if share > ALIKE), reverse=True)
     return {
         "effect": name,

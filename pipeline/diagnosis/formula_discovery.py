@@ -34,6 +34,7 @@ from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.diagnosis.residual_regression import Gain, ProjectedCurves, Scan
 from pipeline.diagnosis.words import listed
 from pipeline.estimation.design import Term
+from pipeline.estimation.gates import MAX_MIN_DELTA_BIC, MIN_DELTA_BIC
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
@@ -48,8 +49,6 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
-CLEARLY = 10.0  # score of a form, and of a further term: "very strong" (Raftery, Sociological Methodology 25, 1995)
-SLOWLY = 30.0  # the same of a form in time and temperature alone: HIGHEST_GATE of the selection
 MORE = 0.02  # least delta BIC of a further term over that of the first: less may be rounding of the first's constants
 MOST_TERMS = 3
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
@@ -77,8 +76,8 @@ class Scored:
 
     @property
     def clear(self) -> bool:
-        """Whether the evidence is very strong; another wander than the model's looks like a slow form."""
-        return self.score > (SLOWLY if self.form.signals <= {"time", "temperature"} else CLEARLY)
+        """Whether its score passes the gate; a form in time and temperature alone looks like unmodelled wander."""
+        return self.score > (MAX_MIN_DELTA_BIC if self.form.signals <= {"time", "temperature"} else MIN_DELTA_BIC)
 
 
 class Forms:
@@ -247,7 +246,7 @@ def discover(selection: Selection, unknown: list[dict[str, Any]], case: Case) ->
     """
     noise = case.noise
     floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
-    best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + CLEARLY
+    best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + MIN_DELTA_BIC
     alone = replace(selection, steps={}, fit=selection.base)
     for context in [selection, alone] if selection.names else [selection]:
         terms, ranked = search(context)
@@ -352,7 +351,7 @@ def _stability(selection: Selection, finalists: Sequence[Scored]) -> list[float]
     for resample in resamples:
         gains = Forms(replace(selection, observations=resample)).gains([each.form for each in finalists])
         scores = [Scored(each.form, gain).score for each, gain in zip(finalists, gains, strict=True)]
-        if max(scores) > CLEARLY:
+        if max(scores) > MIN_DELTA_BIC:
             wins[int(np.argmax(scores))] += 1
             counted += 1
     return [float(share) for share in wins / max(counted, 1)]

@@ -17,16 +17,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import BASE, Design, Term, placed
+from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import Fit, design_at
 from pipeline.estimation.observations import without_each_recording
 from pipeline.estimation.ranking import projection, without
-from pipeline.estimation.selection import GATE_BIC, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation.observations import Observations
+    from pipeline.estimation.selection import Selection
     from pipeline.records import Index, Values
 
     JSON = dict[str, Any]
@@ -69,7 +70,7 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
                 "effect": name,
                 "recordings": recordings,
                 "seconds": _stretches(observations, shares, of_block),
-                "depends_on": [r["recording"] for r in recordings if (r["delta_bic_without"] or 0.0) < GATE_BIC],
+                "depends_on": [r["recording"] for r in recordings if (r["delta_bic_without"] or 0.0) < MIN_DELTA_BIC],
             }
         )
     return found

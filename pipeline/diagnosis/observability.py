@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.candidates import MOUNTING, ZERO
+from pipeline.estimation.gates import min_gain, passes
 from pipeline.estimation.multi_position.selection import refusal
-from pipeline.estimation.selection import GATE_BIC, Selection
 from pipeline.model.effects import catalogue, effect
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.observations import Observations
     from pipeline.estimation.ranking import Score
+    from pipeline.estimation.selection import Selection
     from pipeline.model.effects.base import Effect
 
 LEAST_SPAN_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
@@ -141,10 +142,10 @@ def _reason(this: Effect, selection: Selection) -> str:
 def _faint(this: Effect, selection: Selection) -> str:
     """Return why turns would not show an effect at its limits; empty if they would, or if it was seen."""
     limits, score = selection.limits.get(this.name), selection.alone.get(this.name)
-    if limits is None or not np.all(np.isfinite(limits)) or score is None or score.delta_bic > GATE_BIC:
+    if limits is None or not np.all(np.isfinite(limits)) or score is None or passes(score, len(selection.candidates)):
         return ""
     ranking, chosen = selection.ranking, selection.chosen()
-    gate = score.parameters * float(np.log(ranking.samples)) + GATE_BIC
+    gate = min_gain(score.parameters, ranking.samples, len(selection.candidates))
     for j in ranking.indices(this.name):
         seen = ranking.visibility(j, limits)[1:] >= gate
         if seen.any():
@@ -182,13 +183,13 @@ def _reason_by_hand(this: Effect, selection: by_hand.Selection) -> str:
     if score is None:
         seen = "rests and moves by hand" if model.kinds > 1 else "rests"
         return f"in {seen} bias and matrix explain all that it would add"
-    return "" if score.delta_bic > GATE_BIC else _faint_by_hand(this, score, selection)
+    return "" if passes(score, len(selection.candidates)) else _faint_by_hand(this, score, selection)
 
 
 def _faint_by_hand(this: Effect, score: Score, selection: by_hand.Selection) -> str:
     """Return why rests and moves would not show an effect at its limits; empty if they would."""
     n, rests = len(selection.fits[0].residual), selection.model.rests
-    gate = score.parameters * float(np.log(n)) + GATE_BIC
+    gate = min_gain(score.parameters, n, len(selection.candidates))
     scored = selection.last if this.name in selection.last.visible else selection.first
     if scored.visible[this.name] >= gate:
         return ""

@@ -30,8 +30,8 @@ from numpy.polynomial.chebyshev import chebvander
 
 from pipeline.diagnosis.functional_forms import Span, available_signals, signals_of
 from pipeline.diagnosis.residual_regression import Curves, ProjectedCurves, Scan, each_explains
+from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import GaussMarkov, selection_grid
-from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     Basis = tuple[str, Callable[[Motion], Values], list[Block]]  # covariate, its curves by motion: (n, q), and blocks
     Tests = tuple[list[str], Values, Index]  # covariate, delta BIC and number of parameters of each test
 
-GATE_P = 1e-3  # probability of a false dependence of a complete model, over all tests (Bonferroni)
 DEGREE = 5  # up to four turning points over the span; faster changes are steps
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # periods a turn; the catalogue contains one
@@ -80,7 +79,7 @@ def significant(tests: Iterable[tuple[str, float, float]]) -> dict[str, tuple[fl
     tests = sorted(tests, key=lambda test: -test[1])
     best: dict[str, tuple[float, float]] = {}
     for covariate, delta, p in tests:
-        if delta > GATE_BIC and p * len(tests) < GATE_P:
+        if delta > MIN_DELTA_BIC and p * len(tests) < MAX_FALSE_DEPENDENCE:
             best.setdefault(covariate, (delta, p))
     return best
 

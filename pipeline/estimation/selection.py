@@ -30,6 +30,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
 from pipeline.estimation.design import Start, Term, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
+from pipeline.estimation.gates import MAX_FALSE_PROBABILITY, MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import Setting, selection_grid
 from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms, require_observable
 from pipeline.estimation.observations import Observations, weighted
@@ -42,9 +43,6 @@ if TYPE_CHECKING:
     from pipeline.records import Noise, SensorCalibration, Values
 
 
-GATE_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
-SLOW_GATE_BIC = 16.0  # for a bias that follows time or temperature, see above
-GATE_P = 0.01  # of a false selection, over all candidates (Bonferroni)
 MOST = 5  # effects that one selection adds
 INFLATED = 3.0  # times the expected wander, see above
 EVIDENCE = 5.0  # difference in log L: a Bayes factor of 150, "very strong" (Kass and Raftery, JASA 90, 1995)
@@ -54,8 +52,6 @@ CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is selected unless the second is clearly better
 CLEARLY = 6.0  # delta BIC: "strong" evidence (Raftery 1995)
 TIE = 0.5  # delta BIC below which the catalogue's order decides
-SECOND_ORDER = 2e-4  # of the gain in 2 log L of the selected effects: the error of their equations of first order
-HIGHEST_GATE = 30.0  # largest delta BIC that is required after large effects, see above
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that lacks more than one effect of the catalogue
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
@@ -185,7 +181,7 @@ class Selection:
         for i, score in enumerate(scores):
             this = effect(score.name)
             share = MOVER_SHARE if this.moves else CONSTANT_SHARE
-            if this.nonlinear and score.delta_bic > max(GATE_BIC, share * top):
+            if this.nonlinear and score.delta_bic > max(MIN_DELTA_BIC, share * top):
                 scores[i] = self._refined(score)
         return scores
 
@@ -213,7 +209,7 @@ class Selection:
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
-        values = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in scores if self._passes(s)}
+        values = {s.name: s.delta_bic - (0.0 if s.plausible else MIN_DELTA_BIC) for s in scores if self._passes(s)}
         if not values:
             return None
         best = max(values, key=lambda name: values[name])
@@ -232,11 +228,9 @@ class Selection:
         negative_lag = score.name == DELAYS[1] and score.values[0] <= 0
         if second_delay or negative_lag or not self._possible(score.name, self.names):
             return False
-        # after large effects, the gate exceeds the error of their equations of first order
-        of_first_order = SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
         slow = effect(score.name).of_the_room(self.observations.sensor)
-        gate = float(np.clip(of_first_order, SLOW_GATE_BIC if slow else GATE_BIC, HIGHEST_GATE))
-        significant = score.delta_bic > gate and score.p_value * len(self.candidates) < GATE_P
+        gain = 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
+        significant = passes(score, len(self.candidates), slow=slow, selected_gain=gain)
         return bool(score.admissible and significant and self._matters(score, partners))
 
     def _possible(self, name: str, selected: Sequence[str]) -> bool:
@@ -312,7 +306,7 @@ class Selection:
                 continue
             for other in [n for n in self.names if n != part and not effect(n).moves]:
                 rest = [n for n in self.names if n not in (part, other)]
-                if self._criterion([*rest, general]) > self._criterion(self.names) - GATE_BIC:
+                if self._criterion([*rest, general]) > self._criterion(self.names) - MIN_DELTA_BIC:
                     self.steps = self._replaced(part, self._given(rest)[general], other)
                     self._refit()
                     return
@@ -331,7 +325,7 @@ class Selection:
             delta_bic = scores.pop(name).delta_bic if name in scores else float("-inf")
             able = (s for s in scores.values() if s.admissible and not effect(s.name).moves)
             rival = next((s for s in able if self._possible(s.name, others)), None)
-            if rival is not None and rival.delta_bic > delta_bic + GATE_BIC:
+            if rival is not None and rival.delta_bic > delta_bic + MIN_DELTA_BIC:
                 if self._accept(self._replaced(name, rival)):
                     self._refit()
                     self._drop_insignificant()
@@ -376,7 +370,7 @@ class Selection:
         ranking = self.ranking
         before, _ = ranking.of_model([])
         able = [j for j, place in enumerate(ranking.places) if len(place)]
-        best: tuple[float, int, int] = (2.0 * GATE_BIC, -1, -1)
+        best: tuple[float, int, int] = (2.0 * MIN_DELTA_BIC, -1, -1)
         for j, k in combinations(able, 2):
             if ranking.candidates[j].effect.name != ranking.candidates[k].effect.name:
                 gain = 2.0 * (ranking.of_model([j, k])[0] - before)
@@ -390,6 +384,6 @@ class Selection:
         for member, partner in ((j, k), (k, j)):
             name = ranking.candidates[member].effect.name
             steps[name] = next(s for s in ranking.scores([partner], self.limits) if s.name == name)
-            if not self._passes(steps[name], [partner]) or steps[name].p_value * number >= GATE_P:
+            if not self._passes(steps[name], [partner]) or steps[name].p_value * number >= MAX_FALSE_PROBABILITY:
                 return
         self._accept(steps)

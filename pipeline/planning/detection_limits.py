@@ -32,10 +32,11 @@ import numpy as np
 import scipy
 
 from pipeline.estimation.design import Term
+from pipeline.estimation.gates import min_gain
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
 from pipeline.estimation.multi_position.model import NoiseHypothesis, log_likelihood, project_out
 from pipeline.estimation.ranking import RIDGE
-from pipeline.estimation.selection import ALIKE, DELAYS, GATE_BIC, GATE_P, Selection
+from pipeline.estimation.selection import ALIKE, DELAYS, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -198,9 +199,7 @@ class TurntableLimits(DetectionLimits):
         order = sorted(self.names, key=lambda name: (name in DELAYS[1:], self.names.index(name)))
         rank = {i: order.index(self.candidates[i].effect.name) for i in (j, *shares)}
         tie = np.array([0.0 if rank[i] < rank[j] else 1.0 for i in shares])[:, None]  # the first of equals is selected
-        gate = max(
-            GATE_BIC + k * float(np.log(self.ranking.samples)), float(scipy.special.chdtri(k, GATE_P / len(self.names)))
-        )
+        gate = min_gain(k, self.ranking.samples, len(self.names))
 
         def found(share: float) -> Values:
             return np.asarray(1.0 - scipy.special.chndtr(gate, k, self._gain(share**2 * signal)))
@@ -285,6 +284,7 @@ class RestLimits(DetectionLimits):
         shares = {i: float(np.sum(squares[2][self.hypothesis])) / power for i, squares in explained.items() if i != j}
         shares = {i: min(share, 1.0) for i, share in shares.items() if share > PARTLY}
         k, log_n = self._parameters(j), float(np.log(self.equations))
+        gate = min_gain(k, self.equations, len(self.names))
 
         def bic(share: float, i: int) -> Values:
             rss, drop = (a + 2.0 * share * b + share**2 * c for a, b, c in (total, explained[i]))
@@ -292,9 +292,7 @@ class RestLimits(DetectionLimits):
             return np.asarray(2.0 * self.factors[i] * gain - self._parameters(i) * log_n)
 
         def found(share: float) -> Values:
-            delta = bic(share, j)
-            p = scipy.special.chdtrc(k, np.maximum(delta + k * log_n, 0.0))
-            return np.asarray((delta > GATE_BIC) & (p * len(self.names) < GATE_P), float)
+            return np.asarray(bic(share, j) + k * log_n > gate, float)
 
         def ahead(share: float) -> Values:
             delta = bic(share, j)

@@ -41,8 +41,8 @@ import numpy as np
 import scipy
 
 from pipeline.estimation.engine import scaled_inverse
+from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
-from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion
@@ -220,7 +220,7 @@ def at_detection(case: Case) -> Case:
         return case
     ((name, values),) = case.hidden.items()
     count = len(values)
-    gate = count * np.log(3.0 * sum(r.samples for r in _used(case))) + GATE_BIC
+    gate = count * np.log(3.0 * sum(r.samples for r in _used(case))) + MIN_DELTA_BIC
     share = int(case.family.partition("_")[2]) / 100.0 * np.sqrt(gate / signals_left(case)[name])
     kept = [p.name == "time_constant" for p in effect(name).parameters(case.sensor)]
     return replace(case, hidden={name: np.where(kept, values, share * np.array(values)).tolist()})

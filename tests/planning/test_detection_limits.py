@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.design import Term, ordinary_base
+from pipeline.estimation.gates import passes
 from pipeline.estimation.gauss_markov import Blocks, Setting, selection_grid
 from pipeline.estimation.observations import observe
 from pipeline.estimation.ranking import Ranking
-from pipeline.estimation.selection import GATE_BIC, GATE_P, select
+from pipeline.estimation.selection import select
 from pipeline.model.effects import catalogue, effect
 from pipeline.planning.detection_limits import noise_sums
 from pipeline.planning.plan import FAULTLESS, ROOM, plan_of, stated_noise
@@ -60,7 +61,7 @@ def _found(planned: dict[str, dict[str, Any]], names: dict[str, str], factor: fl
             term = Term(effect(name), np.zeros(len(hidden[f"{sensor}.{name}"])))
             ranking = Ranking(observations, start, start, {name: term}, selection_grid(noise))
             score = ranking.scores([], {})[0]
-            found[sensor] += score.delta_bic > GATE_BIC and score.p_value * len(catalogue()) < GATE_P
+            found[sensor] += passes(score, len(catalogue()))
     return found
 
 

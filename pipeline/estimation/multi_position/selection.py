@@ -24,6 +24,7 @@ import scipy
 from pipeline.estimation.candidates import limits_of, starts_of, time_constants
 from pipeline.estimation.design import Term
 from pipeline.estimation.evidence import Problem, linear_problem
+from pipeline.estimation.gates import MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import random_walks
 from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.model import (
@@ -36,7 +37,7 @@ from pipeline.estimation.multi_position.model import (
 )
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import Score, without
-from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
+from pipeline.estimation.selection import MOST
 from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import Effect, Owner
 
@@ -183,7 +184,7 @@ class Selection:
         """Fit the competing nonlinear candidates to their optimum, which one linear step may not reach."""
         top = max((s.delta_bic for s in scored.scores.values()), default=0.0)
         for score in list(scored.scores.values()):
-            curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > GATE_BIC)
+            curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > MIN_DELTA_BIC)
             if not curved or score.delta_bic < max(COMPETES * top, 0.0):
                 continue
             refit = self._fitted(self._state(names), Term(effect(score.name), score.values))
@@ -209,14 +210,13 @@ class Selection:
     def _best(self, scored: Scored) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
         passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s)]
-        return max(passing, key=lambda s: s.delta_bic - (0.0 if s.plausible else GATE_BIC), default=None)
+        return max(passing, key=lambda s: s.delta_bic - (0.0 if s.plausible else MIN_DELTA_BIC), default=None)
 
     def _passes(self, score: Score) -> bool:
         fitted = [term.effect.name for term in self.fit.state.terms]
         if any(score.name in effect(name).contains or name in effect(score.name).contains for name in fitted):
             return False
-        significant = score.delta_bic > GATE_BIC and score.p_value * len(self.candidates) < GATE_P
-        return score.admissible and significant and self._possible(score)
+        return score.admissible and passes(score, len(self.candidates)) and self._possible(score)
 
     def _possible(self, score: Score) -> bool:
         """Return whether an effect needs no more than ten times its limits: beyond, it is no explanation."""
@@ -247,7 +247,7 @@ class Selection:
         """Replace a selected effect by another one that explains significantly more."""
         for name in self.names:
             scores = self._without(name).scores
-            threshold = GATE_BIC + (scores[name].delta_bic if name in scores else float("-inf"))
+            threshold = MIN_DELTA_BIC + (scores[name].delta_bic if name in scores else float("-inf"))
             rivals = [s for s in scores.values() if s.name not in self.names and s.admissible and self._possible(s)]
             rival = max(rivals, key=lambda s: s.delta_bic, default=None)
             if rival is not None and rival.delta_bic > threshold:
