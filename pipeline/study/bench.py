@@ -50,13 +50,12 @@ from pipeline.records import SENSORS, Recording, Values
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from pipeline.simulation.session import Streams, random_environment
-from pipeline.study.cases import COURSES, Case
+from pipeline.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, Case
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 
-INTERVAL_S = 0.12  # the default of ``UnitDescription``
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}
 OF_WHITE = {"ar_06": 0.6, "ar_09": 0.9}  # coefficient of the autoregression
 AMPLITUDE = {  # g and deg/s; by assumption, near the limits of the MPU-6050's sensor file
@@ -84,10 +83,14 @@ def recordings_of(case: Case) -> list[Recording]:
         }
         for sensor in SENSORS
     }
+    course = {"positions": case.rests} if case.rests else COURSES.get(case.procedure, COURSES["stop_and_go"])
     unit = UnitDescription(
         "unit",
         sensor=case.model,
-        course=COURSES["stop_and_go" if case.procedure == "at_rest" else case.procedure],
+        table=case.table,
+        procedure="multi_position" if case.rests else "three_axis_turns",
+        course=course,
+        interval_s=_interval(case),
         lost=0.1 if case.noise == "lost" else 0.0,
         accelerometer=noise_settings["accelerometer"],
         gyroscope=noise_settings["gyroscope"],
@@ -106,7 +109,7 @@ def recordings_of(case: Case) -> list[Recording]:
         ]
     rng = np.random.default_rng([case.seed, case.number, 1])
     for sensor in SENSORS:
-        recordings = _with_noise(recordings, sensor, case.noise, sensor_configs[sensor], rng)
+        recordings = _with_noise(recordings, sensor, case, sensor_configs[sensor], rng)
     if case.shape:
         recordings = _with_shape(recordings, case)
     if case.noise == "cold":
@@ -117,18 +120,19 @@ def recordings_of(case: Case) -> list[Recording]:
 
 
 def _with_noise(
-    recordings: list[Recording], sensor: str, noise: str, sensor_config: Mapping[str, Any], rng: np.random.Generator
+    recordings: list[Recording], sensor: str, case: Case, sensor_config: Mapping[str, Any], rng: np.random.Generator
 ) -> list[Recording]:
     """Add noise that the simulator does not have to one sensor, continuous over all recordings of the unit."""
     first = min(float(r.time[0]) for r in recordings)
     last = max(float(r.time[-1]) for r in recordings)
-    count, wander = int((last - first) / INTERVAL_S) + 2, sensor_config["bias_wander"]
+    noise, interval, wander = case.noise, _interval(case), sensor_config["bias_wander"]
+    count = int((last - first) / interval) + 2
     if noise in OF_WHITE:
         drive = np.sqrt(1.0 - OF_WHITE[noise] ** 2) * rng.standard_normal((count, 3))
         drive[0] = rng.standard_normal(3)
         added = _white(sensor_config) * scipy.signal.lfilter([1.0], [1.0, -OF_WHITE[noise]], drive, axis=0)
     elif noise == "random_walk":
-        step = wander * np.sqrt(INTERVAL_S / sensor_config["wander_time_s"])
+        step = wander * np.sqrt(interval / sensor_config["wander_time_s"])
         added = np.cumsum(step * rng.standard_normal((count, 3)), axis=0)
     elif noise == "one_over_f":
         shape = np.concatenate([[0.0], 1.0 / np.sqrt(np.fft.rfftfreq(count)[1:])])
@@ -137,7 +141,11 @@ def _with_noise(
         added = 3.0 * wander * (values / values.std(axis=0))
     else:
         return recordings
-    return [_added(r, sensor, added[np.rint((r.time - first) / INTERVAL_S).astype(int)]) for r in recordings]
+    return [_added(r, sensor, added[np.rint((r.time - first) / interval).astype(int)]) for r in recordings]
+
+
+def _interval(case: Case) -> float:
+    return INTERVAL_BY_HAND_S if case.rests else INTERVAL_S
 
 
 def _white(sensor_config: Mapping[str, Any]) -> float:

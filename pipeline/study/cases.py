@@ -6,6 +6,8 @@ The family, the number and the study's seed determine a case. Families:
     pairs, pairs_wander  two of them; with five times the bias wander
     triples              three
     null_<noise>         nothing; both sensors are judged
+    null_sensors         nothing, in any sensor of ``sensor_files`` on any shipped table
+    null_hand_<noise>    nothing, in any of them by hand, 15 to 40 rests
     unseen               an effect that the procedure cannot show
     removed              one effect, which is then removed from the catalogue
     one_axis             an effect on one axis only
@@ -24,12 +26,19 @@ map.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.uncertainty_budget import DITHERED
+from pipeline.files import CONFIGS
 from pipeline.model.effects import effect
 from pipeline.records import SENSORS, Values
+from pipeline.simulation.description import read_config
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 NOISES = ("white", "normal", "wander", "random_walk", "one_over_f", "ar_06", "ar_09")
 SHAPES = ("gear_mesh", "temperature_step", "saturation", "exponential", "band")
@@ -37,7 +46,8 @@ OF_TEMPERATURE = ("temperature_step", "saturation", "exponential")
 FAMILIES = (
     "single", "small", "tiny", "pairs", "pairs_wander", "triples", *(f"null_{noise}" for noise in NOISES), "unseen",
     "removed", "one_axis", *(f"shape_{shape}" for shape in SHAPES), "lost", "coarse", "cold",
-    *(f"cycle_{shape}" for shape in OF_TEMPERATURE), "staged", "limit_30", "limit_60", "limit_100",
+    *(f"cycle_{shape}" for shape in OF_TEMPERATURE), "staged", "limit_30", "limit_60", "limit_100", "null_sensors",
+    *(f"null_hand_{noise}" for noise in ("white", "normal", "wander", "random_walk")),
 )  # fmt: skip  # a new one goes last: its place is part of every case's random numbers
 # Long recordings at several rates, so that each observable effect can be detected.
 LONG: dict[str, Any] = {"rates_dps": (20.0, 60.0, 100.0, 200.0), "static_s": 300.0}
@@ -55,7 +65,10 @@ ALTERNATIVES = [  # not hidden together: their signals are nearly alike
 FACTOR = {"small": 0.3, "tiny": 0.1}  # of the sensor file's size
 WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the sensor file's
 STIM_SHARE = 0.25  # of the units of the families that have both models
-METHODS = REFERENCE, STAGED = "reference_least_squares", "staged"  # by which a base is calibrated
+METHODS = REFERENCE, STAGED, BY_HAND = "reference_least_squares", "staged", "rests_and_moves"  # that fit a base
+INTERVAL_S, INTERVAL_BY_HAND_S = 0.12, 0.01  # of a sample: the default of a simulation; by hand, moves are faster
+TABLES = {"acutronic": 0.5, "mark2": 0.45, "single_axis": 0.05}  # and their shares; the last takes 20 times as long
+RESTS = 15, 40  # by hand; from 15 on, some are held out of a fit
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 
 
@@ -77,6 +90,8 @@ class Case:
     amplitude: tuple[float, ...] = ()  # of that physics on each axis, relative to ``bench.AMPLITUDE``
     room_degc: float | None = None  # swing of the room's temperature; None: the simulator's
     method: str = REFERENCE  # by which the base is calibrated
+    table: str = "acutronic"  # ``hand``: rests and moves by hand
+    rests: int = 0  # by hand
 
     @property
     def key(self) -> str:
@@ -101,8 +116,14 @@ def draw(family: str, number: int, seed: int) -> Case:
     sensor = str(rng.choice(SENSORS))
     procedure = str(rng.choice(["stop_and_go", "continuous", "one_way"], p=[0.5, 0.3, 0.2]))
     if kind == "null":
-        wander = WANDER.get(detail, 1.0)
-        return Case(family, number, seed, model, sensor, procedure, noise=detail, wander=wander)
+        by_hand, noise = detail.startswith("hand_"), detail.removeprefix("hand_")
+        case = Case(family, number, seed, model, sensor, procedure, noise=noise, wander=WANDER.get(noise, 1.0))
+        if detail == "sensors" or by_hand:
+            case = replace(case, model=str(rng.choice(sensor_files(INTERVAL_BY_HAND_S if by_hand else INTERVAL_S))))
+        if detail == "sensors":
+            return replace(case, noise="normal", table=str(rng.choice([*TABLES], p=[*TABLES.values()])))
+        rests = int(rng.integers(RESTS[0], RESTS[1] + 1)) if by_hand else 0
+        return replace(case, procedure="multi_position", method=BY_HAND, table="hand", rests=rests) if by_hand else case
     if kind in ("shape", "cycle"):
         procedure = "continuous" if detail == "band" else "stop_and_go"
         amplitude = tuple((rng.uniform(0.7, 1.3, 3) * rng.choice([-1.0, 1.0], 3)).tolist())
@@ -244,6 +265,17 @@ AT_REST = (
     "lever_arm", "inner_lever_arms", "time_offset", "low_pass_lag", "clock_rate", "vibration_rectification",
     "rate_dependence",
 )  # fmt: skip
+
+
+@cache
+def sensor_files(interval_s: float) -> list[str]:
+    """Return the shipped sensor files whose rounding to counts is noise: white noise dithers it in both sensors."""
+
+    def dithered(figures: Mapping[str, Any]) -> bool:
+        return bool(figures["noise_density"] * np.sqrt(0.5 / interval_s) * figures["counts_per_unit"] >= DITHERED)
+
+    names = sorted(path.stem for path in (CONFIGS / "sensor").glob("*.yaml"))
+    return [name for name in names if all(dithered(read_config("sensor", name)[sensor]) for sensor in SENSORS)]
 
 
 def observable(model: str, sensor: str, procedure: str) -> list[str]:

@@ -125,6 +125,9 @@ def judge(case: Case) -> list[JSON]:
     out = []
     for sensor in SENSORS if case.kind == "null" else (case.sensor,):
         result: JSON = {"key": case.key, "sensor": sensor} | scored(state, sensor)
+        if case.kind == "null":
+            ranking = _part(state, sensor, state.diagnosis)["ranking"]
+            result["gains"] = {entry["effect"]: entry["delta_bic"] for entry in ranking}
         if whole:
             result["whole"] = scored(whole, sensor)
         if case.kind in HELD_OUT:
@@ -139,7 +142,9 @@ def diagnose_case(case: Case) -> tuple[ConfiguredUnit, UnitState]:
 
     Raises ``PipelineError`` if a step refuses the unit.
     """
-    unit = unit_of_recordings(recordings_of(case), [f"sensor={case.model}", f"method={case.method}"])
+    options = {"sensor": case.model, "table": case.table, "method": case.method}
+    options |= {"procedure": case.procedure} if case.rests else {}
+    unit = unit_of_recordings(recordings_of(case), [f"{group}={option}" for group, option in options.items()])
     with leaving_out(case.left_out):
         return unit, unit.run_to("diagnose")
 
