@@ -12,6 +12,7 @@ import pytest
 
 from pipeline.commands.research import study as main
 from pipeline.errors import ConfigurationError
+from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.model.effects import catalogue
 from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
@@ -102,8 +103,11 @@ def test_two_hidden_effects_are_found_and_no_third() -> None:
     assert exact(said(case))
 
 
-def test_nothing_is_found_where_nothing_is_hidden() -> None:
-    assert [entry["selected"] for entry in judge(draw("null_random_walk", 0, SEED))] == [[], []]
+@pytest.mark.parametrize("family", ["null_random_walk", "null_sensors", "null_hand_wander"])
+def test_nothing_is_found_where_nothing_is_hidden(family: str) -> None:
+    found = judge(draw(family, 0, SEED))
+    assert [entry["selected"] for entry in found] == [[], []]
+    assert all(max(entry["gains"].values()) < MIN_DELTA_BIC for entry in found)
 
 
 @pytest.mark.parametrize("number", range(2))

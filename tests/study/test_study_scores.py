@@ -12,6 +12,7 @@ from pipeline.study.scores import (
     cases_of,
     exact,
     excess_gone,
+    false_selections,
     family_scores,
     first_is_right,
     hard_to_replace,
@@ -46,6 +47,17 @@ def test_an_exact_set_has_nothing_more_and_nothing_less() -> None:
     assert not exact(truth("a") | said("a", "b"))
     assert exact(truth("a", "b") | said("c", "b", look_alikes={"c": {"a": 0.99}}))
     assert not exact(truth("a", "b") | said("b", look_alikes={"b": {"a": 0.99}}))
+
+
+def test_a_false_selection_is_counted_once_a_unit_by_the_larger_gain_of_its_sensors() -> None:
+    gains = [{"bias_drift": 11.0, "time_offset": 3.0}, {"bias_drift": 13.0, "g_sensitivity": 7.0}]
+    cases = [truth(rests=0) | said(gains=each) for each in gains]
+    cases.append(truth(rests=0) | said(key="null_normal-00001", gains={"warm_up": -9.0, "time_offset": -2.0}))
+    found = {(kind, gate): (n, count, share, ends) for _, kind, gate, n, count, share, ends in false_selections(cases)}
+    assert [found["slow", gate][1] for gate in ("10", "12", "14")] == [1, 1, 0]
+    assert [found["other", gate][1] for gate in ("4", "6", "8")] == [1, 1, 0]
+    assert found["slow", "10"] == (2, 1, "50.00 %", "1.258 to 98.74 %")  # of a beta distribution: 1 - sqrt(0.975)
+    assert false_selections([truth() | said()]) == []
 
 
 def test_another_effect_is_silent_unless_a_warning_is_said() -> None:
