@@ -45,6 +45,7 @@ from pipeline.config.user_effects import (
     with_given,
 )
 from pipeline.errors import ConfigurationError
+from pipeline.estimation.stages import NOT_WANTED, check_stages
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
 from pipeline.io.ingest_settings import check_ingest
@@ -57,7 +58,6 @@ if TYPE_CHECKING:
 
 Groups: TypeAlias = tuple[tuple[str, str], ...]  # group and option
 INSTANCE = "${ingest.instance}"
-NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 OF_A_SETUP = ("mounting", "bias")  # effects that exist only for one setup (pipeline.model.effects.mounting)
 
 
@@ -215,6 +215,10 @@ class Composer:
                 valid = [m for m in self.options["method"] if self._read("method", m)["stages"].get(sensor)]
                 raise Problem(f"method.{sensor}={name}: {name} has no stages for the {sensor}{nearest(name, valid)}")
             stages[sensor] = list(of_method[sensor])
+            try:
+                check_stages(sensor, stages[sensor])
+            except ConfigurationError as error:
+                raise Problem(f"method.{sensor}={name}: {error.message} (configs/method/{name}.yaml)") from None
         unused = ("file", "format") if GIVEN not in method.values() else ()
         return {**{key: value for key, value in method.items() if key not in unused}, "stages": stages}
 

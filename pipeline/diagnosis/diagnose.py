@@ -19,6 +19,7 @@ from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effe
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.rest_means import is_multi_position
+from pipeline.estimation.stages import last_fit
 from pipeline.model.effects import catalogue, effect
 from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
 from pipeline.validation.heldout import last_error, static_error
@@ -168,6 +169,7 @@ def evidence_of(
         implausible=() if accepted else [entry["effect"] for entry in selected if not entry["plausible"]],
         held_out=document.get("held_out"),
         method=str(method.get(sensor) or ""),
+        fit=last_fit(case.calibration),
         as_printed=bool(method.get("as_printed")),
         filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
         on_table=findings is None or findings.on_table,

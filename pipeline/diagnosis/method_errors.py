@@ -23,6 +23,7 @@ from scipy.linalg import block_diag
 from pipeline.diagnosis.words import template
 from pipeline.estimation.generalized_least_squares import Fit, fit_terms
 from pipeline.estimation.observations import filtered_motion
+from pipeline.estimation.stages import declared
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import table_motion
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion, Recording, SensorCalibration, Values
 
-FREE = ("reference_least_squares", "effects")  # stages that leave bias and matrix free
 LEAST_SHARE = 0.02  # of the mean square: a smaller part adds less than 1 % to the rms error
 SURE = 5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
 
@@ -41,14 +41,14 @@ SURE = 5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by ch
 def method_errors(
     calibration: SensorCalibration, selection: Selection, recordings: Sequence[Recording], settings: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Return the errors by the method's approximations, the largest share first; none if its fit is free.
+    """Return the errors by the method's approximations, the largest share first; none if it is the free fit.
 
     ``selection``: the free fit. ``recordings``: all of the unit, filtered. ``settings``: sections ``table``, ``method``
     and, for a given calibration, ``sensor``. Entries: ``name, meaning, size, unit, share, rms`` on the recordings of
     the fit (rms in the unit of the sensor), ``held_out_share`` and ``held_out_magnitude_share`` (or None).
     """
     stages = [stage.name for stage in calibration.stages]
-    if not stages or stages[-1] in FREE:
+    if not stages or declared(calibration.sensor, stages[-1]).reference:
         return []
     free, names = selection.base, [effect.name for effect in calibration.effects]
     fitted = {term.effect.name for term in free.terms}

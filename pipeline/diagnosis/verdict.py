@@ -6,10 +6,11 @@ error is compared with its 99 % interval (``pipeline.validation.expected_error``
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.words import of_unknown, template
+from pipeline.estimation.stages import FitStage
 from pipeline.model.effects.base import unit_of
 from pipeline.verdicts import Verdict
 
@@ -29,7 +30,6 @@ DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null f
 QUIET = 0.6  # times the noise: a smaller residual contradicts the noise of the rests
 FAR_ABOVE_BY_HAND = 10.0  # times the noise: nobody sets down or holds a unit so badly
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
-FREE = ("reference_least_squares", "nonlinear_least_squares", "rests_and_moves", "cholesky_lu")  # bias and matrix free
 STATIC_AGAIN = "record static again: ten minutes or more at rest, on a base that does not shake"
 SAME_SESSION = "record static in the session of the other recordings, without switching the unit off in between"
 
@@ -75,6 +75,7 @@ class Evidence:
     implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, unless the settings accept that
     held_out: Mapping[str, float] | None = None  # ``error_before, error_after, floor`` of the selection's own fits
     method: str = ""
+    fit: FitStage = field(default_factory=FitStage)  # last stage of the method
     as_printed: bool = False  # whether the method uses the equations of the thesis as printed
     filtered: bool = False
     on_table: bool = True  # a few rests by hand may have a small residual by chance
@@ -137,11 +138,6 @@ class Evidence:
         return self.method == GIVEN
 
     @property
-    def of_free_method(self) -> bool:
-        """Whether the method leaves bias and matrix free."""
-        return self.method in FREE
-
-    @property
     def unit(self) -> str:
         """The unit of the sensor."""
         return unit_of(self.sensor)
@@ -149,13 +145,13 @@ class Evidence:
     @property
     def static_differs(self) -> bool:
         """Whether the static recording contradicts a fit that neither a missing effect nor the method makes wrong."""
-        explained = self.found in {Verdict.NOTHING_MISSING, Verdict.NOT_ENOUGH_DATA} and self.of_free_method
+        explained = self.found in {Verdict.NOTHING_MISSING, Verdict.NOT_ENOUGH_DATA} and self.fit.free
         return explained and not self.approximations and self.static is not None and self.static.above
 
     @property
     def of_method(self) -> bool:
         """Whether the method causes a held-out error above its interval: a free fit is within its own interval."""
-        same = self.method == "reference_least_squares" and not self.filtered  # the calibration is the free fit
+        same = self.fit.reference and not self.filtered  # the calibration is the free fit
         free = self.free or self.published
         within = not (same or (free and free.above))
         return self.as_printed or within or bool(self.given and self.free is None and self.at_noise)
@@ -299,6 +295,6 @@ def _next_step(verdict: Verdict, document: Mapping[str, Any], e: Evidence) -> st
         return ""
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
     free = ["the default method" if e.given else "a method that fits the full matrix (reference_least_squares)"]
-    changes += [] if e.of_free_method else free
+    changes += [] if e.fit.free else free
     changes += ["no filter (filter=none)"] if e.filtered else []
     return f"calibrate the same recordings with {' and '.join(changes)}" if changes else ""

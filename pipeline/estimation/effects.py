@@ -11,11 +11,17 @@ from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
+from pipeline.estimation.stages import FitStage
 from pipeline.model.effects import bench_priors, effect, stated_priors
 from pipeline.records import Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.stages import Change
+
+ALL: tuple[Change, ...] = ("bias", "matrix", "effects")
+FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=ALL, free=True, reference=True)}
 
 
 def fit(

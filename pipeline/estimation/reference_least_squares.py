@@ -36,6 +36,7 @@ from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import noise_of, prior_of
+from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import Part, noise_of_fit, parts_of, settled, used_motions
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
 
 NAME = "reference_least_squares"
+FIT_STAGES = {NAME: FitStage(changes=("bias", "matrix", "effects"), free=True, reference=True)}
 COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
 WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
 SHARP_CHANGE = 1e-3  # of the largest rate between two samples, where the rate is not logged

@@ -1,15 +1,17 @@
 """Run the stages of a fit, and apply the correction of readings by the stages.
 
-A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``: a new
-stage needs only such a module and its name in a method's list. The stages of the staged method are functions of one
-module for each sensor, and take their name first. Stages that are the same for both sensors take the sensor first.
+A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``, or, if it
+is the same for both sensors, ``pipeline/estimation/<stage>.py`` with ``fit(sensor, recordings, previous, settings)``.
+The stages of the staged method are functions of one module for each sensor, whose ``fit`` takes their name first. Each
+module declares its stages in ``FIT_STAGES``, by name (``FitStage``). A new stage needs only such a module and its name
+in a method's list.
 
     recordings : all of a unit; a stage uses those of its roles
     previous   : the result of the stage before, whose stages the new result continues; None for the first
     settings   : sections of the configuration; ``noise`` by sensor if an earlier stage of the run estimated it
 
 A stage raises ``CannotCalibrateError`` if there is no recording for it, ``NotObservableError`` if the recordings do not
-determine its parameters, ``ConfigurationError`` if it cannot follow the stage before.
+determine its parameters. ``check_stages`` refuses a method whose stages cannot follow each other before any job.
 
 The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effects from an existing calibration file,
 for validation and diagnosis with the recordings. The uncertainty is that of the file. If the file states none, the
@@ -27,36 +29,95 @@ where b, p, n, s are (3,) and M is (3, 3).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
-from pipeline.records import NORMAL, Contribution, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import NORMAL, SENSORS, Contribution, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
 
-STAGED = {
-    "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),
-    "gyroscope": ("bias", "orthogonality_and_misalignment", "scale_factor"),
-}
-OF_BOTH_SENSORS = ("reference_least_squares", "effects")
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 KINDS = "subtract, matrix, two_sided"
 
+Change: TypeAlias = Literal["bias", "matrix", "effects"]
 
+
+@dataclass(frozen=True, kw_only=True)
+class FitStage:
+    """The declaration of a stage; the stages of one module continue each other."""
+
+    sensors: tuple[str, ...] = SENSORS
+    needs: tuple[Change, ...] = ()  # what an earlier stage must have changed
+    changes: tuple[Change, ...] = ()  # what it estimates
+    accepts: tuple[Change, ...] = ()  # changes by stages of other modules that it keeps, or estimates anew
+    free: bool = False  # no equation of it fixes an element of bias and matrix: held-out errors are not the method's
+    reference: bool = False  # the fit with which the diagnosis compares the other methods on a table
+
+
+FIT_STAGES = {GIVEN: FitStage(changes=("bias", "matrix", "effects")), NOT_WANTED: FitStage()}
+
+
+@cache
 def stage_module(sensor: str, stage: str) -> str:
     """Return the module of a stage."""
-    if stage in STAGED[sensor]:
-        return f"pipeline.estimation.{sensor}.staged"
-    if stage in (NOT_WANTED, GIVEN):
+    if stage in FIT_STAGES:
         return __name__
-    return f"pipeline.estimation.{stage}" if stage in OF_BOTH_SENSORS else f"pipeline.estimation.{sensor}.{stage}"
+    own, of_both = f"pipeline.estimation.{sensor}.{stage}", f"pipeline.estimation.{stage}"
+    return next((name for name in (own, of_both) if find_spec(name)), f"pipeline.estimation.{sensor}.staged")
+
+
+def declared(sensor: str, stage: str) -> FitStage:
+    """Return the declaration of a stage; raise ``ConfigurationError`` if there is no such stage of the sensor."""
+    module = stage_module(sensor, stage)
+    found: FitStage | None = getattr(import_module(module), "FIT_STAGES", {}).get(stage)
+    if found is None or sensor not in found.sensors:
+        raise ConfigurationError(
+            f"no stage of the {sensor} is called {stage!r}: a stage is a module pipeline/estimation/{stage}.py, or for "
+            f"one sensor pipeline/estimation/{sensor}/{stage}.py, with its declaration in FIT_STAGES"
+        )
+    return found
+
+
+def last_fit(calibration: SensorCalibration) -> FitStage:
+    """Return the declaration of the last stage of a calibration's method, before the stage ``effects``."""
+    names = [stage.name for stage in calibration.stages if stage.name != "effects"]
+    return declared(calibration.sensor, names[-1]) if names else FitStage()
+
+
+def check_stages(sensor: str, stages: Sequence[str]) -> None:
+    """Raise ``ConfigurationError`` if a stage of a method lacks what it needs, or loses what an earlier one changed.
+
+    ``stages``: of the sensor, in order.
+    """
+    for i, stage in enumerate(stages):
+        found, module = declared(sensor, stage), stage_module(sensor, stage)
+        made = {change for before in stages[:i] for change in declared(sensor, before).changes}
+        if lacking := [need for need in found.needs if need not in made]:
+            raise ConfigurationError(
+                f"the stage {stage} needs {_listed(lacking)} by an earlier stage: put a stage that estimates "
+                f"{'it' if len(lacking) == 1 else 'them'} before {stage}"
+            )
+        for before in stages[:i]:
+            lost = [change for change in declared(sensor, before).changes if change not in found.accepts]
+            if lost and stage_module(sensor, before) != module:
+                raise ConfigurationError(
+                    f"the stage {stage} cannot follow {before}: it does not honour {_listed(lost)} of {before}; change "
+                    "their order, or leave one of them out"
+                )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + " and " * (len(names) > 1) + names[-1]
 
 
 def fit_stage(
@@ -66,14 +127,18 @@ def fit_stage(
     previous: SensorCalibration | None,
     settings: Mapping[str, Any],
 ) -> SensorCalibration:
-    """Run a stage on the result of the stage before; raise ``CannotCalibrateError`` if the sensor's method is null."""
+    """Run a stage on the result of the stage before.
+
+    Raises ``CannotCalibrateError`` if the sensor's method is null, ``ConfigurationError`` as of ``check_stages``.
+    """
     if stage == NOT_WANTED:
         raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")
     if stage == GIVEN:
         return given_calibration(sensor, settings)
-    fit = import_module(stage_module(sensor, stage)).fit
-    first = (stage,) if stage in STAGED[sensor] else (sensor,) if stage in OF_BOTH_SENSORS else ()
-    calibration: SensorCalibration = fit(*first, recordings, previous, settings)
+    check_stages(sensor, [*(done.name for done in previous.stages), stage] if previous else [stage])
+    module, of_both = import_module(stage_module(sensor, stage)), len(declared(sensor, stage).sensors) > 1
+    first = (stage,) if len(module.FIT_STAGES) > 1 else (sensor,) if of_both else ()
+    calibration: SensorCalibration = module.fit(*first, recordings, previous, settings)
     return calibration
 
 
@@ -137,18 +202,6 @@ def staged_result(  # noqa: PLR0917  (the results of a stage)
         "degrees_of_freedom": float(degrees_of_freedom.min()),
     }
     return StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), {"steps": list(steps)}, details)
-
-
-def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mapping[str, Any]) -> list[str]:
-    """Return the names of the stages so far; raise ``ConfigurationError`` for a stage of another method."""
-    done = () if previous is None else previous.stages
-    unknown = [stage.name for stage in done if stage.name not in stages or stage.correction is None]
-    if unknown:
-        raise ConfigurationError(
-            f"a stage of the staged method cannot follow {unknown[0]!r}, which leaves no corrected readings for it; "
-            f"the stages of the {sensor} are {', '.join(stages)}"
-        )
-    return [stage.name for stage in done]
 
 
 def apply_correction(correction: Mapping[str, Any] | None, readings: Values) -> Values:

@@ -238,3 +238,27 @@ def test_an_effect_of_one_setup_needs_a_recording_that_is_made_there(tmp_path: P
         load(own, overrides="effects.accelerometer=[bias@hom]")
     with pytest.raises(ConfigurationError, match="no effect is called 'bias'"):
         load(own, overrides="effects.accelerometer=[bias]")
+
+
+@pytest.mark.parametrize(
+    ("stages", "words"),
+    [
+        (
+            "[reference_least_squares, scale_factor]",
+            "the stage scale_factor .* honour bias, matrix and effects of reference",
+        ),
+        ("[cholesky_lu]", "the stage cholesky_lu needs bias by an earlier stage"),
+        ("[nonlinear_least_squares]", "no stage of the gyroscope is called 'nonlinear_least_squares'"),
+        ("[noise]", "no stage of the gyroscope is called 'noise'"),
+    ],
+)
+def test_stages_that_cannot_follow_each_other_are_refused_before_any_job(
+    tmp_path: Path, stages: str, words: str
+) -> None:
+    directory = campaign(tmp_path, "unit\nU1\n")
+    method = f"accelerometer: staged\ngyroscope: own\nas_printed: false\nstages: {{gyroscope: {stages}}}\n"
+    file = directory / "configs" / "method" / "own.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text(method)
+    with pytest.raises(ConfigurationError, match=rf"method\.gyroscope=own: {words}.*own\.yaml"):
+        load(directory, overrides="method=own")

@@ -10,6 +10,7 @@ from bench_session import Session, record
 
 from pipeline.diagnosis.diagnose import doubts_of, held_out_of
 from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged, verdict_of_selection
+from pipeline.estimation.stages import declared
 from pipeline.one_unit import unit_of_recordings
 from pipeline.outcome import commands_of
 from pipeline.records import Note, Recording
@@ -18,10 +19,18 @@ from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
 
 INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
-NOTHING = Evidence("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, method="reference_least_squares")
-BY_HAND = replace(NOTHING, method="rests_and_moves", on_table=False)
+REFERENCE, OF_STAGED, OF_HAND = (
+    {"method": method, "fit": declared("gyroscope", stage)}
+    for method, stage in [
+        ("reference_least_squares", "reference_least_squares"),
+        ("staged", "scale_factor"),
+        ("rests_and_moves", "rests_and_moves"),
+    ]
+)
+NOTHING = Evidence("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, **REFERENCE)
+BY_HAND = replace(NOTHING, **OF_HAND, on_table=False)
 MISSING = replace(NOTHING, found="missing_effect", selected=("g_sensitivity",), over_noise=9.0, left_over_noise=1.0)
-STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
+STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, **OF_STAGED)
 
 
 OFF = {"p_value": 1e-5, "reads": "x", "of": "y", "error": 3e-4, "expanded_uncertainty": 1e-4}
@@ -71,12 +80,12 @@ def held_out(after: float) -> dict[str, float]:
         (STAGED, "left_by_method", "the method staged causes the rest"),
         (replace(STAGED, filtered=True), "left_by_method", "the method staged and the filter cause the rest"),
         (
-            replace(STAGED, filtered=True, method="reference_least_squares"),
+            replace(STAGED, filtered=True, **REFERENCE),
             "left_by_method",
             "delay and smoothing by the filter",
         ),
-        (replace(NOTHING, method="staged", approximations=("rotation", "bias")), "left_by_method", "rotation, bias"),
-        (replace(MISSING, method="staged", approximations=("rotation",)), "missing_effect", ""),
+        (replace(NOTHING, **OF_STAGED, approximations=("rotation", "bias")), "left_by_method", "rotation, bias"),
+        (replace(MISSING, **OF_STAGED, approximations=("rotation",)), "missing_effect", ""),
         (replace(STAGED, free=ABOVE, as_printed=True), "left_by_method", "as_printed"),
         (replace(STAGED, free=ABOVE), "reference_in_doubt", "contradict each other"),
         (replace(NOTHING, found="not_enough_data", published=BELOW), "floor_in_doubt", "too large"),

@@ -7,8 +7,7 @@ import pytest
 from table_turns import Bench, run_stages, settings, specific_force, stepped_angle
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.accelerometer.staged import fit as fit_stage
-from pipeline.estimation.stages import apply_correction
+from pipeline.estimation.stages import apply_correction, fit_stage
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter
 
@@ -283,8 +282,8 @@ def test_a_recording_about_another_axis_than_it_says_is_refused() -> None:
 
 def test_a_stage_of_another_method_cannot_come_before() -> None:
     before = SensorCalibration("accelerometer", stages=(StageResult("reference_least_squares", {}),))
-    with pytest.raises(ConfigurationError, match="cannot follow 'reference_least_squares'"):
-        fit_stage("scale_factor", Bench("accelerometer", BIAS, np.eye(3)).stop_and_go(), before, settings())
+    with pytest.raises(ConfigurationError, match="cannot follow reference_least_squares: it does not honour bias"):
+        fit_stage("accelerometer", "scale_factor", [], before, settings())
 
 
 def test_the_result_survives_its_file() -> None:

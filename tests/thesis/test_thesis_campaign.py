@@ -9,7 +9,9 @@ import pandas as pd
 import pytest
 
 from pipeline.config import load_campaign
-from pipeline.estimation.stages import STAGED, fit_stage
+from pipeline.estimation.accelerometer.staged import STAGES as OF_ACCELEROMETER
+from pipeline.estimation.gyroscope.staged import STAGES as OF_GYROSCOPE
+from pipeline.estimation.stages import fit_stage
 from pipeline.model.measurement import linear_truth
 from pipeline.records import Recording, SensorCalibration, coverage_factor
 from pipeline.signal.filters import apply_filter
@@ -86,7 +88,7 @@ def test_every_printed_row_has_a_unit_for_every_method() -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_accelerometer_s_stages_find_bias_and_scale_factor_of_the_truth(device: str) -> None:
-    found = fitted(f"{device}-continuous-1dps", "accelerometer", STAGED["accelerometer"], "staged")
+    found = fitted(f"{device}-continuous-1dps", "accelerometer", list(OF_ACCELEROMETER), "staged")
     row = printed_row("accel_parameters", device, "continuous-1dps")
     told = [row[f"b_{a}_g"] for a in "xyz"]
     assert np.abs(found.bias - told).max() < 0.002
@@ -96,7 +98,7 @@ def test_the_accelerometer_s_stages_find_bias_and_scale_factor_of_the_truth(devi
 @pytest.mark.parametrize("rate", [20, 200])
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_gyroscope_s_stages_find_the_printed_bias_and_matrix(device: str, rate: int) -> None:
-    found = fitted(f"{device}-gyro-{rate}dps", "gyroscope", STAGED["gyroscope"], "staged")
+    found = fitted(f"{device}-gyro-{rate}dps", "gyroscope", list(OF_GYROSCOPE), "staged")
     row = printed_row("gyro_parameters", device, f"gyro-{rate}dps")
     assert np.abs(found.bias - [row[f"b_{a}_dps"] for a in "xyz"]).max() < 0.02
     told = np.array([[row[f"M{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
@@ -106,7 +108,7 @@ def test_the_gyroscope_s_stages_find_the_printed_bias_and_matrix(device: str, ra
 @pytest.mark.parametrize(("device", "change"), [("mpu6050-1", 83.615), ("mpu6050-2", 78.859), ("stim300", 5.276)])
 def test_the_printed_advantage_over_cholesky_and_lu_is_the_missing_inversion(device: str, change: float) -> None:
     name = f"{device}-gyro-20dps"
-    staged = fitted(name, "gyroscope", STAGED["gyroscope"], "staged")
+    staged = fitted(name, "gyroscope", list(OF_GYROSCOPE), "staged")
     forward, inverted = (
         fitted(name, "gyroscope", ("bias", "cholesky_lu"), m) for m in ("cholesky-printed", "cholesky")
     )

@@ -42,6 +42,7 @@ from pipeline.estimation.multi_position.result import (
 )
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
+from pipeline.estimation.stages import FitStage
 from pipeline.estimation.turns import Part, noise_of_turns
 from pipeline.estimation.uncertainty_budget import (
     combined,
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
 
 
 NAME = "nonlinear_least_squares"
+FIT_STAGES = {NAME: FitStage(sensors=("accelerometer",), changes=("bias", "matrix"), free=True)}
 ROWS, COLUMNS = np.tril_indices(3)
 PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine values among bias and full matrix
 PLACED = np.eye(12)[:, PLACE]

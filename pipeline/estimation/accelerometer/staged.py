@@ -41,7 +41,7 @@ from pipeline.estimation.accelerometer.turn_extremes import (
 )
 from pipeline.estimation.engine import LinearMap, ResidualNoise
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.stages import apply_correction, staged_result, stages_before, two_sided
+from pipeline.estimation.stages import FitStage, apply_correction, staged_result, two_sided
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import noise_of_turns, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import (
@@ -169,6 +169,12 @@ def scale_factor(extremes: Extremes) -> Outcome:
 
 
 STAGES = {f.__name__: f for f in (orthogonality, misalignment, bias, scale_factor)}
+FIT_STAGES = {
+    "orthogonality": FitStage(sensors=("accelerometer",), changes=("matrix",)),
+    "misalignment": FitStage(sensors=("accelerometer",), changes=("matrix",)),
+    "bias": FitStage(sensors=("accelerometer",), changes=("bias",)),
+    "scale_factor": FitStage(sensors=("accelerometer",), changes=("matrix", "effects")),
+}
 
 
 @dataclass(frozen=True)
@@ -267,7 +273,7 @@ def fit(
     name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Run one stage of the staged method (``pipeline.estimation.stages``); role ``accelerometer``, on a table."""
-    before = stages_before("accelerometer", previous, STAGES)
+    before = [stage.name for stage in previous.stages] if previous else []
     estimator = Estimator.of(recordings, settings)
     turns, gravity_g, sinusoids = estimator.turns, estimator.gravity_g, estimator.sinusoids
     prior = prior_of("accelerometer", recordings, settings)

@@ -36,13 +36,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import of_channels
+from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import Part, noise_of_fit, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
@@ -54,6 +55,9 @@ if TYPE_CHECKING:
 
 
 NAME = "cholesky_lu"
+FIT_STAGES = {
+    NAME: FitStage(sensors=("gyroscope",), needs=("bias",), changes=("matrix",), accepts=("bias",), free=True),
+}
 STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
 MOTION_SHARE = 0.01  # of the largest rate, above which the table turns
 SLOWEST_DPS = 0.02  # five times Earth's rotation, which a log may contain
@@ -95,10 +99,7 @@ def fit(
 
     Role ``gyroscope``, on a table, after the stage ``bias``.
     """
-    if previous is None:
-        raise ConfigurationError(
-            "the stage cholesky_lu needs the bias: let the stage bias run before it (method.stages)"
-        )
+    assert previous is not None  # noqa: S101  (it needs the bias: FIT_STAGES)
     turns, Y, U, columns, A = forward_of(recordings, previous.bias, settings)
     as_printed = bool(settings["method"].get("as_printed", False))
     factors = factorise(A)

@@ -24,6 +24,7 @@ from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
+from pipeline.estimation.stages import FitStage
 from pipeline.records import Recording, SensorCalibration
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 
 NAME = "rests_and_moves"
+FIT_STAGES = {NAME: FitStage(sensors=("gyroscope",), changes=("bias", "matrix"), free=True)}
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
 UNKNOWN = 0.05  # standard uncertainty beyond which an element of the matrix is called undetermined
 ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"

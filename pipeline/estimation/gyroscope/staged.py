@@ -30,7 +30,7 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.stages import apply_correction, staged_result, stages_before
+from pipeline.estimation.stages import FitStage, apply_correction, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import Part, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
@@ -92,6 +92,11 @@ def scale_factor(response: Response) -> Outcome:
 
 
 STAGES = {f.__name__: f for f in (bias, orthogonality_and_misalignment, scale_factor)}
+FIT_STAGES = {
+    "bias": FitStage(sensors=("gyroscope",), changes=("bias",)),
+    "orthogonality_and_misalignment": FitStage(sensors=("gyroscope",), changes=("matrix",)),
+    "scale_factor": FitStage(sensors=("gyroscope",), changes=("matrix",)),
+}
 
 
 @dataclass(frozen=True)
@@ -158,7 +163,7 @@ def fit(
 
     Role ``gyroscope``, on a table; also role ``static`` if these recordings hold no rest.
     """
-    before = stages_before("gyroscope", previous, STAGES)
+    before = [stage.name for stage in previous.stages] if previous else []
     samples, weights, theta, response = estimates_of(recordings, settings)
     prior = prior_of("gyroscope", recordings, settings)
     design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])

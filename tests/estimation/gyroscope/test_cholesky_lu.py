@@ -9,8 +9,7 @@ import pytest
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
-from pipeline.estimation.gyroscope.staged import fit as fit_stage
-from pipeline.estimation.stages import apply_correction
+from pipeline.estimation.stages import apply_correction, fit_stage
 from pipeline.records import Recording, SensorCalibration, coverage_factor
 
 INTERVAL = 0.12
@@ -79,7 +78,7 @@ def _campaign(
 
 
 def _fit(recordings: list[Recording], settings: dict[str, Any] = SETTINGS) -> SensorCalibration:
-    return fit(recordings, fit_stage("bias", recordings, None, settings), settings)
+    return fit(recordings, fit_stage("gyroscope", "bias", recordings, None, settings), settings)
 
 
 def _values(calibration: SensorCalibration) -> dict[str, float]:
@@ -249,7 +248,7 @@ def test_without_a_rest_the_bias_of_a_static_recording_counts_with_its_uncertain
     turning = [r.select(np.abs(np.asarray(r.table_rate)) > 1.0) for r in _campaign(rng, rates=(20.0,))]
     reading = BIAS + 0.05 * rng.normal(size=(2000, 3))
     static = Recording("static", "static", None, (9000 + np.arange(2000)) * 120_000_000, gyroscope=reading)
-    before = fit_stage("bias", [*turning, static], None, SETTINGS)
+    before = fit_stage("gyroscope", "bias", [*turning, static], None, SETTINGS)
     assert before.covariance is not None
     known = fit([*turning, static], before, SETTINGS)
     vague = fit([*turning, static], dataclasses.replace(before, covariance=1e4 * before.covariance), SETTINGS)
@@ -284,5 +283,5 @@ def test_without_a_table_log_the_gyroscope_cannot_be_calibrated_and_the_recordin
 
 
 def test_without_the_bias_stage_it_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="let the stage bias run before it"):
-        fit(_campaign(), None, SETTINGS)
+    with pytest.raises(ConfigurationError, match="needs bias by an earlier stage"):
+        fit_stage("gyroscope", "cholesky_lu", _campaign(), None, SETTINGS)
