@@ -130,7 +130,7 @@ def calibrate_unit(
     from pipeline.outcome import RESULTS  # noqa: PLC0415
     from pipeline.result import UnitResult  # noqa: PLC0415
 
-    settings: dict[str, Any] = {
+    settings: Mapping[str, Any] = {
         "campaign": str(campaign),
         "results": "" if str(results) == RESULTS else str(results),
         "overrides": as_list(overrides, "overrides"),

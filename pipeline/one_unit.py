@@ -18,7 +18,7 @@ from pipeline.config.campaign import Campaign, UnitRow, cut_batches
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, key_of
 from pipeline.config.options import RUN_SETTINGS, Problem, nearest, parse
-from pipeline.config.stage_settings import as_job_reads, settings_of_unit
+from pipeline.config.stage_settings import settings_in_memory
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError, as_published, failure_of
 from pipeline.io.files import candidate_files, wrong_name
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pipeline.records import Recording
+    from pipeline.settings import Settings
 
     Paths = Sequence[str | os.PathLike[str]]
     Recordings = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str] | pd.DataFrame]
@@ -51,23 +52,22 @@ class ConfiguredUnit:
     stages: Mapping[str, Sequence[str]]
     run: Mapping[str, Any] = field(default_factory=dict)  # settings of the run that the page states
 
-    def settings(self, task: Task) -> dict[str, Any]:
-        """Return the settings that a task reads."""
+    def settings(self, task: Task) -> Settings:
+        """Return the settings that a task reads, as its job reads them from a file."""
         stage = task.step if task.step != "fit" else "effects" if task.stage == "effects" else "fit"
-        settings = settings_of_unit(self.row, stage, task.sensor)
-        return as_job_reads(settings | {"run": dict(self.run)} if self.run and stage == "report" else settings)
+        return settings_in_memory(self.row, stage, task.sensor, self.run)
 
     def with_missing(self) -> ConfiguredUnit:
         """Return the unit with all recordings optional."""
-        procedure = self.row.config["procedure"]
-        optional = {name: {**entry, "optional": True} for name, entry in procedure["recordings"].items()}
-        config = {**self.row.config, "procedure": {**procedure, "recordings": optional}}
+        procedure = self.row.config.procedure
+        optional = {name: entry.replaced(optional=True) for name, entry in procedure.recordings.items()}
+        config = self.row.config.replaced(procedure=procedure.replaced(recordings=optional))
         return replace(self, row=replace(self.row, config=config))
 
     def with_effects(self, sensor: str, names: Sequence[str]) -> ConfiguredUnit:
         """Return the unit with effects in the model of a sensor, instead of those that are configured."""
-        effects = {**self.row.config["effects"], sensor: list(names)}
-        return _configured(replace(self.row, config={**self.row.config, "effects": effects}), self.files)
+        effects = self.row.config.effects.replaced(**{sensor: list(names)})
+        return _configured(replace(self.row, config=self.row.config.replaced(effects=effects)), self.files)
 
     def state(self) -> UnitState:
         """Return the unit before its first step."""
@@ -102,8 +102,8 @@ class ConfiguredUnit:
 
         The order of summation, and so the last digits, depend on the number of threads.
         """
-        effects = as_job_reads(self.row.config.get("user_effects", {}))
-        with registered(effects), threadpool_limits(1, "blas"):
+        effects = self.row.config.user_effects
+        with registered(effects.json_value if effects else {}), threadpool_limits(1, "blas"):
             yield
 
 
@@ -235,28 +235,28 @@ def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # 
             "recordings: a folder is expected, or a mapping of names to files or DataFrames, for example "
             f"{{'recording': frame}}; got {kind}"
         )
-    procedure = row.config["procedure"]
-    known = procedure["recordings"]
+    procedure = row.config.procedure
+    known = procedure.recordings
     for name in recordings:
         if name not in known:
             raise ConfigurationError(
-                f"no recording of procedure {procedure['name']} is called {name!r}{nearest(str(name), known)}"
+                f"no recording of procedure {procedure.name} is called {name!r}{nearest(str(name), known)}"
             )
-    lacking = [n for n, entry in known.items() if n not in recordings and not entry.get("optional", False)]
+    lacking = [n for n, entry in known.items() if n not in recordings and not entry.optional]
     if lacking:
         raise MissingInputError(
-            f"missing recordings: {', '.join(lacking)}; procedure {procedure['name']} needs them"
+            f"missing recordings: {', '.join(lacking)}; procedure {procedure.name} needs them"
             f"{of_one_sensor(procedure, recordings)}"
         )
     frames = {n: _text_of(n, r) for n, r in recordings.items() if not isinstance(r, str | os.PathLike)}
     paths = {n: str(Path(r).resolve()) for n, r in recordings.items() if n not in frames}
-    columns = (row.config["ingest"].get("csv") or {}).get("columns")
+    columns = row.config.ingest.csv.get("columns")
     if frames and not paths and columns and columns != canonical()["csv"]["columns"]:
         message = "describes columns of files; a DataFrame has those of the canonical CSV: leave out the setting"
-        raise ConfigurationError(f"ingest={row.config['ingest']['name']} {message} of ingest")
-    entries = {n: known[n] | ({"file": paths[n]} if n in paths else {}) for n in known if n in recordings}
-    of_unit = {**procedure, "recordings": entries}
-    for name, candidates in candidate_files(of_unit, row.config["ingest"]).items():
+        raise ConfigurationError(f"ingest={row.config.ingest.name} {message} of ingest")
+    entries = {n: e.replaced(file=paths.get(n, e.file)) for n, e in known.items() if n in recordings}
+    of_unit = procedure.replaced(recordings=entries)
+    for name, candidates in candidate_files(of_unit, row.config.ingest).items():
         if name not in paths or any(os.path.exists(file) for files in candidates for file in files):  # noqa: PTH110
             continue
         if Path(paths[name]).is_dir():
@@ -264,7 +264,7 @@ def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # 
         message = f"recording {name}: there is no such file (tried {tried(candidates)})"
         raise MissingInputError(message, paths[name])
     files = UnitFiles(NO_CAMPAIGN, NO_CAMPAIGN, in_memory=frames)
-    return replace(row, config={**row.config, "procedure": of_unit}), files
+    return replace(row, config=row.config.replaced(procedure=of_unit)), files
 
 
 def _text_of(name: str, recording: Any) -> bytes:  # noqa: ANN401  (the user's)

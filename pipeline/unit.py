@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from pipeline.pack import Pack
     from pipeline.records import Fit, Recording, UnitRecordings
+    from pipeline.settings import Settings
 
 
 class Step(NamedTuple):
@@ -24,20 +25,38 @@ class Step(NamedTuple):
 
     function: str  # module of pipeline.stages, and its function
     reads: tuple[str, ...]  # attributes of ``UnitState`` that the function takes, beside ``settings``
+    settings: tuple[str, ...]  # sections of ``Settings`` that it reads; a change in another repeats no job
     returns: str  # attribute of ``UnitState`` that it returns; of ``fits``, the entry of one sensor
 
 
 DOCUMENTS = ("calibration", "validation", "diagnosis")
+BENCH = ("sensor", "table", "procedure")
 STEPS = {  # in the order of a run
-    "ingest": Step("ingest.ingest", ("files",), "checked"),
-    "filter": Step("filter.filter_recordings", ("checked",), "recordings"),
-    "fit": Step("fit.fit", ("recordings", "fits"), "fits"),  # once for each stage of the method of each sensor
-    "validate": Step("validate.held_out_document", ("unit", "recordings", "fits"), "validation"),
-    "diagnose": Step("diagnose.diagnose_unit", ("unit", "recordings", "fits", "validation"), "diagnosed"),
-    "calibration": Step("calibration.calibration_document", ("unit", "checked", "fits", "validation"), "calibration"),
-    "export": Step("export.export", DOCUMENTS, "exports"),
-    "report": Step("report.report", ("recordings", *DOCUMENTS, "omissions"), "pages"),
-    "summary": Step("summary.summarise", DOCUMENTS, "summary"),
+    "ingest": Step("ingest.ingest", ("files",), (*BENCH, "ingest"), "checked"),
+    "filter": Step("filter.filter_recordings", ("checked",), ("sensor", "filter"), "recordings"),
+    # once for each stage of the method of each sensor; the stage ``effects`` reads the section ``effects``, too
+    "fit": Step("fit.fit", ("recordings", "fits"), (*BENCH, "method", "uncertainty"), "fits"),
+    "validate": Step("validate.held_out_document", ("unit", "recordings", "fits"), (*BENCH, "limits"), "validation"),
+    "diagnose": Step(
+        "diagnose.diagnose_unit",
+        ("unit", "recordings", "fits", "validation"),
+        (*BENCH, "effects", "method", "diagnosis"),
+        "diagnosed",
+    ),
+    "calibration": Step(
+        "calibration.calibration_document",
+        ("unit", "checked", "fits", "validation"),
+        (*BENCH, "method", "ingest", "stated"),
+        "calibration",
+    ),
+    "export": Step("export.export", DOCUMENTS, ("sensor", "table"), "exports"),
+    "report": Step(
+        "report.report",
+        ("recordings", *DOCUMENTS, "omissions"),
+        (*BENCH, "method", "filter", "ingest", "effects", "limits", "certificate", "stated"),
+        "pages",
+    ),
+    "summary": Step("summary.summarise", DOCUMENTS, ("sensor", "stated"), "summary"),
 }
 
 
@@ -110,7 +129,7 @@ def tasks_of(stages: Mapping[str, Sequence[str]], until: str = "diagnose", *, fi
             return
 
 
-def run_step(task: Task, state: Any, settings: Mapping[str, Any]) -> Any:  # noqa: ANN401  (each step has its types)
+def run_step(task: Task, state: Any, settings: Settings) -> Any:  # noqa: ANN401  (each step has its types)
     """Call the function of a step with what it reads of ``state``, and return its result."""
     step = STEPS[task.step]
     module, _, function = step.function.rpartition(".")
@@ -119,7 +138,7 @@ def run_step(task: Task, state: Any, settings: Mapping[str, Any]) -> Any:  # noq
     return getattr(import_module(f"pipeline.stages.{module}"), function)(**inputs, settings=settings, **options)
 
 
-def run_steps(state: UnitState, tasks: Iterator[Task], settings_of: Callable[[Task], Mapping[str, Any]]) -> UnitState:
+def run_steps(state: UnitState, tasks: Iterator[Task], settings_of: Callable[[Task], Settings]) -> UnitState:
     """Run the tasks of a unit in memory; ``settings_of`` returns the settings that a task reads."""
     for task in tasks:
         state.task = task.name
@@ -134,7 +153,7 @@ def run_steps(state: UnitState, tasks: Iterator[Task], settings_of: Callable[[Ta
 def run_checked(
     recordings: Sequence[Recording],
     stages: Mapping[str, Sequence[str]],
-    settings: Mapping[str, Any],
+    settings: Settings,
     until: str = "fit",
 ) -> UnitState:
     """Run the steps from ``filter`` to ``until`` on recordings that are checked, or simulated without a fault.

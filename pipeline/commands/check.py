@@ -458,7 +458,7 @@ def _layouts(reading: Reading, code: str) -> list[Log]:
     return layouts
 
 
-def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save: Path | None) -> None:
+def _print_proposals(proposals: Sequence[Proposal], sensor: Mapping[str, Any], save: Path | None) -> None:
     """Print each proposed profile and the files as it reads them; with ``save``, write the only one."""
     if save is not None and len(proposals) > 1:
         raise ConfigurationError(f"{len(proposals)} profiles are proposed and --save writes one: check fewer files")

@@ -7,7 +7,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from pipeline.planning.guide import (
 )
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import NotCalibrated
+from pipeline.settings import RecordingFile
 from pipeline.signal.rests import WINDOW_S, find_rests
 from pipeline.signal.segments import cut
 from pipeline.simulation.description import BY_HAND
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
     from pipeline.planning.guide import Progress
     from pipeline.records import Recording, Values
+    from pipeline.settings import Settings
     from pipeline.signal.rests import Rest
     from pipeline.unit import UnitState
 
@@ -69,33 +71,33 @@ examples:
 class Source:
     """The files of a unit's recordings, and the configuration by which they are read."""
 
-    config: dict[str, Any]
+    config: Settings
     folder: Path | None  # of a campaign's unit
     files: tuple[Path, ...]  # on the command line
 
-    def entries(self) -> dict[str, tuple[dict[str, Any], list[Path]]]:
-        """Return role and files of each recording that exists."""
+    def entries(self) -> dict[str, tuple[RecordingFile, list[Path]]]:
+        """Return the entry and the files of each recording that exists."""
         if self.folder is not None:
-            procedure = self.config["procedure"]
-            found = recording_files(procedure, self.config["ingest"], self.folder)
-            return {name: (procedure["recordings"][name], files) for name, files in found.items()}
-        groups = [group for group in grouped(self.files, self.config["ingest"]) if all(f.exists() for f in group)]
-        return {group[0].stem: ({"role": "rests", "axis": None}, group) for group in groups}
+            procedure = self.config.procedure
+            found = recording_files(procedure, self.config.ingest, self.folder)
+            return {name: (procedure.recordings[name], files) for name, files in found.items()}
+        groups = [group for group in grouped(self.files, self.config.ingest) if all(f.exists() for f in group)]
+        return {g[0].stem: (RecordingFile(file=g[0].stem, role="rests", axis=None, optional=False), g) for g in groups}
 
     def read(self, *, growing: bool) -> list[Recording]:
         """Return the recordings; of a growing log the complete rows or chunks."""
-        entries, ingest = self.entries(), self.config["ingest"]
-        if growing and ingest.get("mcap"):
-            ingest = {**ingest, "mcap": {**ingest["mcap"], "allow_truncated": True}}
-        procedure = {**self.config["procedure"], "recordings": {n: entry for n, (entry, _) in entries.items()}}
-        settings = {**self.config, "ingest": ingest, "procedure": procedure}
+        entries, ingest = self.entries(), self.config.ingest
+        if growing and ingest.mcap:
+            ingest = ingest.replaced(mcap={**ingest.mcap, "allow_truncated": True})
+        procedure = self.config.procedure.replaced(recordings={n: entry for n, (entry, _) in entries.items()})
+        settings = self.config.replaced(ingest=ingest, procedure=procedure)
         recordings = []
         with tempfile.TemporaryDirectory() as folder:
             for name, (entry, files) in entries.items():
                 whole = [complete_rows(f, Path(folder)) for f in files] if growing else files
-                table, windows = read_table(whole, ingest), entry.get("windows")
-                role = "rests" if entry["role"] == "session" and not windows else entry["role"]
-                read = to_recording(name, {**entry, "role": role}, table, self.config["sensor"], checks_of(ingest))
+                table, windows = read_table(whole, ingest), entry.windows
+                role = "rests" if entry.role == "session" and not windows else entry.role
+                read = to_recording(name, entry.replaced(role=role), table, self.config.sensor, checks_of(ingest))
                 recordings += cut(read, windows) if windows else [read]
         return check_recordings(recordings, settings) if recordings else []
 
@@ -173,15 +175,15 @@ def _source(arguments: argparse.Namespace) -> Source:
     return Source(_by_hand(config_of_log(first, arguments.ingest, arguments.sensor, more)), None, files)
 
 
-def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
+def _by_hand(config: Settings) -> Settings:
     """Return a configuration whose procedure is recorded by hand; its recording gets as many rests as are needed."""
-    procedure = config["procedure"]
-    if config["table"]["motion"] != "none":
+    procedure = config.procedure
+    if config.table.motion != "none":
         raise ConfigurationError(
-            f"procedure {procedure['name']} is recorded on a table; guide is for those recorded by hand: "
+            f"procedure {procedure.name} is recorded on a table; guide is for those recorded by hand: "
             "multi_position, orientations_24, six_positions, ferraris (docs/record.md)"
         )
-    return {**config, "procedure": {**procedure, "holdout_from": 0}}
+    return config.replaced(procedure=procedure.replaced(holdout_from=0))
 
 
 def _held_out(source: Source) -> list[str]:
@@ -191,7 +193,7 @@ def _held_out(source: Source) -> list[str]:
     if procedure.get("faces"):
         return []
     entries = [entry for entry, _ in source.entries().values()]
-    if any(part["role"] == "validation" for entry in entries for part in [entry, *(entry.get("windows") or ())]):
+    if any(part.role == "validation" for entry in entries for part in [entry, *(entry.windows or ())]):
         return ["no rest is held out of the fit: the recording for validation judges it"]
     if not every:
         return ["no rest is held out of the fit: procedure.holdout_every is 0"]
@@ -229,7 +231,7 @@ class Goals(NamedTuple):
     gyroscope: float | None  # per cent of the matrix; None: no goal
 
 
-def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goals, dwell: float) -> Advice:
+def _advice(recordings: Sequence[Recording], config: Settings, goals: Goals, dwell: float) -> Advice:
     if config["procedure"].get("faces"):
         done, words = next_face_or_turn(recordings, config["procedure"], dwell)
         return Advice(done, [], words)
@@ -256,7 +258,7 @@ def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goal
 
 
 def _next_turn(
-    unit: UnitState, config: dict[str, Any], progress: Progress, goal: float, dwell: float
+    unit: UnitState, config: Settings, progress: Progress, goal: float, dwell: float
 ) -> tuple[bool, list[str]]:
     """Return whether the gyroscope's goal is reached, and the next turn in words."""
     found = unit.fits["gyroscope"]

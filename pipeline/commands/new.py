@@ -18,7 +18,7 @@ from pipeline.simulation.description import UnitDescription, read_option
 from pipeline.simulation.procedures import TABLE_PROCEDURES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
@@ -99,7 +99,7 @@ def _chosen(group: str, given: str | None, default: str) -> str:
     return input(f"{group} [{default}]: ").strip() or default
 
 
-def _chosen_ranges(sensor: dict[str, Any], given: list[float] | None) -> list[float]:
+def _chosen_ranges(sensor: Mapping[str, Any], given: list[float] | None) -> list[float]:
     """Return the range of each sensor: the given one, the user's answer on a terminal, or that of the sensor file."""
     defaults = _ranges_of(sensor)
     if given is None and sys.stdin.isatty():
@@ -111,11 +111,11 @@ def _chosen_ranges(sensor: dict[str, Any], given: list[float] | None) -> list[fl
     return [*(given or []), *defaults[len(given or []) :]]
 
 
-def _ranges_of(sensor: dict[str, Any]) -> list[float]:
+def _ranges_of(sensor: Mapping[str, Any]) -> list[float]:
     return [float(sensor[s]["full_scale"]) for s in SENSORS if sensor.get(s)]
 
 
-def _campaign(procedure: str, name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
+def _campaign(procedure: str, name: str, sensor: Mapping[str, Any], wanted: list[float]) -> str:
     """Return ``campaign.yaml``; settings of ranges that equal those of the sensor file are comments."""
     defaults = [(s, sensor[s]["full_scale"], SENSOR_UNITS[s]) for s in SENSORS if sensor.get(s)]
     changed = [

@@ -20,10 +20,11 @@ from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.config.campaign import Campaign
     from pipeline.records import Recording
+    from pipeline.settings import Settings
 
 DEFAULT_PROFILE = "canonical_csv"
 SEARCHED_FOLDERS = 4  # from the folder of the log upwards: a campaign is above raw/<unit>/
@@ -34,12 +35,17 @@ class Reading:
     """Files that are read as one recording, and the sections of the configuration for it."""
 
     files: list[Path]
-    settings: dict[str, Any]
+    settings: Mapping[str, Any]
     read_with: str  # profile, sensor and place in a campaign, in words
 
     @classmethod
     def alone(
-        cls, files: list[Path], ingest: dict[str, Any], sensor: dict[str, Any], read_with: str = "", role: str = "rests"
+        cls,
+        files: list[Path],
+        ingest: Mapping[str, Any],
+        sensor: Mapping[str, Any],
+        read_with: str = "",
+        role: str = "rests",
     ) -> Reading:
         """Return the reading of files that belong to no campaign, without a table."""
         recordings = {files[0].stem: {"role": role, "axis": None}}
@@ -62,7 +68,7 @@ class Reading:
         return check_recordings([self.recording()], self.settings)[0]
 
 
-def grouped(files: Sequence[Path], ingest: dict[str, Any]) -> list[list[Path]]:
+def grouped(files: Sequence[Path], ingest: Mapping[str, Any]) -> list[list[Path]]:
     """Return the files of each recording: one, or one for each part of the profile."""
     parts, of_messages = [part["file"] for part in parts_of(ingest)], bool((ingest.get("mcap") or {}).get("parts"))
     groups: dict[Path, list[Path]] = {}
@@ -115,8 +121,8 @@ def recordings_of_files(
 
 def config_of_log(
     file: Path, profile: str | None, sensor: str | None, more: Sequence[str] = (), campaign: Path | None = None
-) -> dict[str, Any]:
-    """Return the configuration for a single log, from a profile (default: ``DEFAULT_PROFILE``) and a sensor.
+) -> Settings:
+    """Return the settings for a single log, from a profile (default: ``DEFAULT_PROFILE``) and a sensor.
 
     Both may be options of ``campaign`` or, by default, of the campaign that contains the log. ``more``: overrides.
     """

@@ -35,17 +35,18 @@ from pydantic import ValidationError
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, mapping_of, nearest, parse
-from pipeline.config.schema import OF_BENCH, RunSettings
 from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import GIVEN, PYTHON
 from pipeline.errors import ConfigurationError, first
 from pipeline.files import CONFIGS, SHIPPED
 from pipeline.history import SENSORS
+from pipeline.settings import OF_BENCH, RunSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.config.layers import Layers
+    from pipeline.settings import Settings
 
     Rows = Mapping[str, Mapping[str, str]]  # unit to its cells by column
 
@@ -60,7 +61,7 @@ class UnitRow:
 
     name: str
     row: dict[str, str]
-    config: dict[str, Any]
+    config: Settings
     overrides: dict[str, str] = field(default_factory=dict)
 
     @cached_property
@@ -117,8 +118,7 @@ class Campaign:
 
     def folder(self, unit: str) -> Path:
         """Return the folder of the recordings of a unit."""
-        folder: str = self.units[unit].config["procedure"]["folder"]
-        return self.recorded / folder
+        return self.recorded / self.units[unit].config.procedure.folder
 
     def truth(self, unit: str) -> Path:
         """Return the file of the true parameters of a unit, which exists if its recordings were simulated."""
@@ -220,8 +220,8 @@ def cut_batches(
     """
     by_chain: dict[str, list[str]] = {}
     for name, unit in units.items():
-        method = unit.config["method"]
-        methods = [method["name"], *(method[sensor] or f"no_{sensor}" for sensor in SENSORS)]
+        method = unit.config.method
+        methods = [method.name, *(method.of(sensor) or f"no_{sensor}" for sensor in SENSORS)]
         by_chain.setdefault("+".join(dict.fromkeys(methods)), []).append(name)
     batches: dict[str, list[str]] = {}
     chains: dict[str, dict[str, list[str]]] = {}
@@ -237,11 +237,11 @@ def cut_batches(
             batch = f"{chain}-{number:04d}"
             batches[batch] = names[start:stop]
             configs = [units[n].config for n in batches[batch]]
-            of_bench = any(c["table"].get(key) for c in configs for key in OF_BENCH)
-            wanted = {sensor: of_bench or any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
-            effects = {sensor: wanted[sensor] and configs[0]["method"][sensor] != GIVEN for sensor in SENSORS}
-            stages = configs[0]["method"]["stages"]
-            chains[batch] = {sensor: stages[sensor] + ["effects"] * effects[sensor] for sensor in SENSORS}
+            of_bench = any(getattr(c.table, key) for c in configs for key in OF_BENCH)
+            wanted = {sensor: of_bench or any(c.effects.of(sensor) for c in configs) for sensor in SENSORS}
+            method = configs[0].method
+            effects = {sensor: wanted[sensor] and method.of(sensor) != GIVEN for sensor in SENSORS}
+            chains[batch] = {s: [*(method.stages.of(s) or ()), *["effects"] * effects[s]] for s in SENSORS}
             start = stop
     return batches, chains
 
@@ -270,7 +270,7 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
         value that identifies its device) or None; ``x`` (``label``; ``values`` by unit, None for the table time;
         ``named``: whether points are labelled with their names) or None.
     """
-    rows = {name: unit.row | {g: unit.config[g]["name"] for g in GROUPS} for name, unit in units.items()}
+    rows = {name: unit.row | {g: getattr(unit.config, g).name for g in GROUPS} for name, unit in units.items()}
     comparisons, problems = [], []
     for number, entry in enumerate(entries, 1):
         try:

@@ -35,7 +35,6 @@ from pipeline.config.options import (
     read_option,
     with_references,
 )
-from pipeline.config.schema import OF_BENCH, SECTIONS, Unit
 from pipeline.config.user_effects import (
     GIVEN,
     ONLY_FROM_THE_COMMAND_LINE,
@@ -50,6 +49,7 @@ from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.model.sensor_file import completed, range_settings, without_overridden
+from pipeline.settings import OF_BENCH, SECTIONS, Method, Procedure, Section, Sensor, Settings, Stages, Unit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -84,12 +84,12 @@ class Composer:
         self.user_effects: UserEffects = load_user_effects(campaign, [*self.searchpath, CONFIGS], python_effects)
         self.effects = {f.stem for f in (CONFIGS / "effect").glob("*.yaml")} | set(self.user_effects.effects)
         self._bases: dict[Groups, tuple[dict[str, Any], bool]] = {}
-        self._checked_bases: dict[int, dict[str, Any]] = {}  # by the id of a section of ``_bases``
-        self._resolved: dict[str, dict[str, Any]] = {}
+        self._checked_bases: dict[int, Section] = {}  # by the id of a section of ``_bases``
+        self._resolved: dict[str, Settings] = {}
         self._valid_ingest: set[str] = set()
 
-    def unit(self, name: str, layers: Sequence[str]) -> dict[str, Any]:
-        """Return the checked configuration of a unit from its overrides, weakest first.
+    def unit(self, name: str, layers: Sequence[str]) -> Settings:
+        """Return the checked settings of a unit from its overrides, weakest first.
 
         Raises ``Problem`` with one line for each error.
         """
@@ -98,10 +98,11 @@ class Composer:
         if key not in self._resolved:
             self._resolved[key] = self._resolve(groups, values)
         resolved = self._resolved[key]
-        procedure = resolved["procedure"]
-        folder = procedure["folder"].replace("{unit}", name)
-        given = with_given(resolved, self.below, name) if GIVEN in resolved["method"].values() else {}
-        return {**resolved, **given, "unit": name, "procedure": {**procedure, "folder": folder}}
+        procedure = resolved.procedure
+        unit = resolved.replaced(
+            unit=name, procedure=procedure.replaced(folder=procedure.folder.replace("{unit}", name))
+        )
+        return with_given(unit, self.below) if GIVEN in (unit.method.accelerometer, unit.method.gyroscope) else unit
 
     def split(self, layers: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, Any]]]:
         """Split overrides into the chosen options by group, and the values in their order; raises ``Problem``."""
@@ -129,7 +130,7 @@ class Composer:
         except ConfigurationError as error:
             raise Problem(error.message) from None
 
-    def _resolve(self, groups: dict[str, str], values: list[tuple[str, Any]]) -> dict[str, Any]:
+    def _resolve(self, groups: dict[str, str], values: list[tuple[str, Any]]) -> Settings:
         base, has_references = self._base(self.complete(groups))
         merged = dict(base)
         for key, value in values:
@@ -143,7 +144,8 @@ class Composer:
                 merged = with_references(merged, merged)
             except ConfigurationError as error:
                 raise Problem(error.message) from error
-        checked, errors = {}, []
+        checked: dict[str, Any] = {}
+        errors: list[Any] = []
         for section, content in merged.items():
             try:
                 checked[section] = self._checked(section, content, of_base=content is base.get(section))
@@ -153,18 +155,19 @@ class Composer:
             raise Problem("\n".join(_explain(e, merged) for e in errors))
         checked["method"] = self._with_stages(checked["method"])
         checked["procedure"] = _with_unused_optional(checked["procedure"], checked["method"])
-        self._check_meaning(checked)
-        return checked | self.user_effects.section()
+        settings = Settings.model_construct(unit="", user_effects=self.user_effects.section(), **checked)
+        self._check_meaning(settings)
+        return settings
 
-    def _checked(self, section: str, content: Any, *, of_base: bool) -> dict[str, Any]:  # noqa: ANN401  (the user's)
+    def _checked(self, section: str, content: Any, *, of_base: bool) -> Section:  # noqa: ANN401  (the user's)
         """Validate a section against the schema (a section of a base once); raises ``ValidationError``."""
         if of_base and id(content) in self._checked_bases:
             return self._checked_bases[id(content)]
         if section not in SECTIONS:
             raise ValidationError.from_exception_data("", [{"type": "extra_forbidden", "loc": (), "input": content}])
-        checked = SECTIONS[section].model_validate(content).model_dump()
-        if section == "sensor":
-            self.user_effects.add_limits(checked)
+        checked = SECTIONS[section].model_validate(content)
+        if isinstance(checked, Sensor):
+            checked = self.user_effects.with_limits(checked)
         if of_base:
             self._checked_bases[id(content)] = checked
         return checked
@@ -201,34 +204,41 @@ class Composer:
             self._bases[key] = plain, "${" in repr(plain)
         return self._bases[key]
 
-    def _with_stages(self, method: dict[str, Any]) -> dict[str, Any]:
+    def _with_stages(self, method: Method) -> Method:
         """Return the method with the stages of the method that is chosen for each sensor."""
-        stages = {sensor: [NOT_WANTED] for sensor in SENSORS if method[sensor] is None}
-        if len(stages) == len(SENSORS):
+        stages: dict[str, list[str]] = {}
+        if method.accelerometer is None and method.gyroscope is None:
             raise Problem("method.accelerometer and method.gyroscope are both null: no sensor would be calibrated")
-        for sensor in (s for s in SENSORS if s not in stages):
-            name = method[sensor]
+        for sensor in SENSORS:
+            name = method.of(sensor)
+            if name is None:
+                stages[sensor] = [NOT_WANTED]
+                continue
             if name not in self.options["method"]:
                 raise Problem(f"method.{sensor}={name}: no such method{nearest(name, self.options['method'])}")
-            of_method = method["stages"] if name == method["name"] else self._read("method", name)["stages"]
-            if not of_method.get(sensor):
-                valid = [m for m in self.options["method"] if self._read("method", m)["stages"].get(sensor)]
+            of_method = method.stages.of(sensor) if name == method.name else self._stages(name).get(sensor)
+            if not of_method:
+                valid = [m for m in self.options["method"] if self._stages(m).get(sensor)]
                 raise Problem(f"method.{sensor}={name}: {name} has no stages for the {sensor}{nearest(name, valid)}")
-            stages[sensor] = list(of_method[sensor])
+            stages[sensor] = list(of_method)
             try:
                 check_stages(sensor, stages[sensor])
             except ConfigurationError as error:
                 raise Problem(f"method.{sensor}={name}: {error.message} (configs/method/{name}.yaml)") from None
-        unused = ("file", "format") if GIVEN not in method.values() else ()
-        return {**{key: value for key, value in method.items() if key not in unused}, "stages": stages}
+        unused = {} if GIVEN in (method.accelerometer, method.gyroscope) else {"file": None, "format": None}
+        return method.replaced(stages=Stages(**stages), **unused)
 
-    def _check_effect(self, sensor: str, whole: str, procedure: dict[str, Any]) -> None:
+    def _stages(self, method: str) -> dict[str, Any]:
+        stages: dict[str, Any] = self._read("method", method)["stages"]
+        return stages
+
+    def _check_effect(self, sensor: str, whole: str, procedure: Procedure) -> None:
         name, separator, setup = whole.partition("@")
         if separator:
-            known = {entry.get("setup") for entry in procedure["recordings"].values()} - {None}
+            known = {entry.setup for entry in procedure.recordings.values() if entry.setup is not None}
             if setup not in known:
                 hint = nearest(setup, known) if known else "; name the setup of each recording in the procedure config"
-                raise Problem(f"{whole}: no recording of procedure {procedure['name']} has setup: {setup}{hint}")
+                raise Problem(f"{whole}: no recording of procedure {procedure.name} has setup: {setup}{hint}")
             if name in OF_A_SETUP:
                 return
         if name not in self.effects:
@@ -247,27 +257,27 @@ class Composer:
                 hint = nearest(name, self.effects)
                 raise Problem(f"sensor.{sensor}.effects.{name}: no effect is called {name!r}{hint}")
 
-    def _check_meaning(self, config: dict[str, Any]) -> None:
-        stated = {key for key in OF_BENCH if config["table"].get(key)}
+    def _check_meaning(self, settings: Settings) -> None:
+        stated = {key for key in OF_BENCH if getattr(settings.table, key)}
         of_bench = [name for name in self.effects if stated and read_option("effect", name, ()).get("prior") in stated]
-        for sensor, names in config["effects"].items():
-            self._check_limits(sensor, config["sensor"][sensor]["effects"])
+        for sensor in SENSORS:
+            names = settings.effects.of(sensor)
+            self._check_limits(sensor, settings.sensor.of(sensor).effects)
             for name in [] if names == "auto" else names:
-                self._check_effect(sensor, name, config["procedure"])
+                self._check_effect(sensor, name, settings.procedure)
             for name in [] if names == "auto" else [*of_bench, *names]:
                 user_effect = self.user_effects.effects.get(name)
                 contains = user_effect.contains if user_effect else read_option("effect", name, ()).get("contains", [])
                 if within := [other for other in names if other in contains]:
                     raise Problem(f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them")
-        ingest = repr((config["ingest"], config["procedure"]))
+        ingest = repr((settings.ingest, settings.procedure))
         if ingest not in self._valid_ingest:
             try:
-                check_ingest(config["ingest"], config["procedure"])
+                check_ingest(settings.ingest, settings.procedure)
             except ConfigurationError as error:
                 raise Problem(error.message) from error
             self._valid_ingest.add(ingest)
-        both = [config["table"][k] is None for k in ("latitude_deg", "azimuth_deg")]
-        if any(both) and not all(both):
+        if (settings.table.latitude_deg is None) != (settings.table.azimuth_deg is None):
             raise Problem(
                 "table.latitude_deg and table.azimuth_deg: set both (Earth's rotation is modelled) or neither (null)"
             )
@@ -291,12 +301,12 @@ def _compose(groups: Groups, folders: Sequence[Path], *_: object) -> DictConfig:
         GlobalHydra.instance().hydra = before
 
 
-def _with_unused_optional(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str, Any]:
+def _with_unused_optional(procedure: Procedure, method: Method) -> Procedure:
     """Return the procedure with optional recordings for a sensor that is not calibrated."""
-    unused = {sensor for sensor in SENSORS if method[sensor] is None}
-    entries = procedure["recordings"].items()
-    recordings = {name: {**e, "optional": True} if e["role"] in unused else e for name, e in entries}
-    return {**procedure, "recordings": recordings} if unused else procedure
+    unused = {sensor for sensor in SENSORS if method.of(sensor) is None}
+    entries = procedure.recordings.items()
+    recordings = {name: e.replaced(optional=True) if e.role in unused else e for name, e in entries}
+    return procedure.replaced(recordings=recordings) if unused else procedure
 
 
 def _quoted(folder: Path) -> str:
@@ -315,7 +325,7 @@ def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: AN
     tree[path[-1]] = value
 
 
-def _explain(error: Any, config: dict[str, Any]) -> str:  # noqa: ANN401  (pydantic's TypedDict)
+def _explain(error: Any, config: Mapping[str, Any]) -> str:  # noqa: ANN401  (pydantic's TypedDict)
     """Describe an error of pydantic in a sentence with key, value and nearest valid name."""
     *above, last = path = [str(p) for p in error["loc"]]
     shown = json.dumps(error["input"], default=str)

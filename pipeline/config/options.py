@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 
-from pipeline.config.schema import RunSettings
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
 from pipeline.io.yaml_file import read_yaml
+from pipeline.settings import RunSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

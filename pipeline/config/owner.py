@@ -111,7 +111,7 @@ def complete_record(campaign: Campaign) -> None:
 
 def _digests(campaign: Campaign, unit: str) -> list[str]:
     config = campaign.units[unit].config
-    return digests_of_files(config["procedure"], config["ingest"], campaign.folder(unit))
+    return digests_of_files(config.procedure, config.ingest, campaign.folder(unit))
 
 
 def _refusal(campaign: Campaign, reason: str) -> OtherCampaignError:

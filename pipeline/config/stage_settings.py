@@ -14,11 +14,12 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipeline.config.schema import OF_BENCH
 from pipeline.config.user_effects import effects_for
 from pipeline.files import CONFIGS
-from pipeline.history import digest
+from pipeline.history import SENSORS, digest
 from pipeline.io.files import recording_files
+from pipeline.settings import Board, Settings, Stated, Unit
+from pipeline.unit import BENCH, STEPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -32,109 +33,49 @@ EFFECTS = CONFIGS / "effect"  # read by pipeline.model.effects
 IMPORT = re.compile(
     r"^[ \t]*(?:from (pipeline[\w.]*|jinja2) import (\([^)]*\)|.*)|import (pipeline[\w.]*))", re.MULTILINE
 )
-# Dotted keys that a stage reads; {sensor} is the sensor of the stage.
-BOTH = ("accelerometer", "gyroscope")
-NOISE = ("noise_density", "bias_wander", "wander_time_s")
-BY_HAND = tuple(f"procedure.{key}" for key in ("holdout_every", "holdout_from", "faces", "turns"))
-FIT_OF_TABLE = (
-    "motion", "gravity_g", "latitude_deg", "azimuth_deg", "azimuth_of", "angle_accuracy_deg", "rate_accuracy",
-    "orthogonality_deg",
-    "wobble_deg", "levelling_deg", "gravity_accuracy_g", "azimuth_accuracy_deg", *OF_BENCH,
-)  # fmt: skip
-FIT_OF_SENSOR = (
-    "full_scale", "counts_per_unit", *NOISE, "effects.bias_temperature", "effects.scale_factor_temperature",
-    "effects.clock_rate", "repeatability_bias", "repeatability_scale_factor",
-)  # fmt: skip
-FIT = (
-    *(f"table.{key}" for key in FIT_OF_TABLE),
-    *(f"sensor.{{sensor}}.{key}" for key in FIT_OF_SENSOR),
-    *(f"sensor.accelerometer.{key}" for key in (*NOISE, "cross_axis")),  # by hand, a gyroscope fit includes its fit
-    "sensor.temperature_accuracy_degc", *BY_HAND, "method.{sensor}", "method.as_printed", "method.given",
-    "uncertainty.monte_carlo",
-)  # fmt: skip
-# Effects that explain a deviation of table, clock or gyroscope: the checks of recordings read their limits.
-LIMITS_OF_CHECKS = (
-    "time_offset", "low_pass_lag", "clock_rate", "table_encoder_error", "table_rate_ripple", "table_backlash",
-    "table_tilt", "table_axis_nonorthogonality", "g_sensitivity", "g_squared_sensitivity", "bias_drift",
-    "bias_temperature", "warm_up",
-)  # fmt: skip
-INGEST_OF_TABLE = (
-    "motion", "gravity_g", "latitude_deg", "azimuth_deg", "azimuth_of", "rate_accuracy", "sense", "zero_deg",
-    "angle_accuracy_deg", "orthogonality_deg", "seat_deg",
-)  # fmt: skip
-INGEST_OF_SENSOR = (
-    "axis_map", "full_scale", "bias", "scale_factor", "cross_axis", *NOISE,
-    *(f"effects.{name}" for name in LIMITS_OF_CHECKS),
-)  # fmt: skip
-SENSORS_AND_TABLE = ("sensor", "table", *BY_HAND)
-READS: dict[str, tuple[str, ...]] = {
-    "ingest": (
-        "ingest", "procedure.folder", "procedure.recordings", "procedure.mounting_tolerance_deg", "procedure.turns",
-        "sensor.axis_map",
-        *(f"table.{key}" for key in INGEST_OF_TABLE),
-        *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in INGEST_OF_SENSOR),
-    ),
-    "filter": ("filter", *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in NOISE)),
-    "fit": FIT,
-    "effects": (*FIT, "effects.{sensor}", "sensor.{sensor}.effects"),
-    "calibration": (
-        "sensor.name", "sensor.axis_map", "sensor.accelerometer", "sensor.gyroscope", "table.name", "procedure.name",
-        "method", "ingest.csv", "ingest.mcap", "config_sha256",
-    ),
-    "validate": (*SENSORS_AND_TABLE, "limits"),
-    "diagnose": (*SENSORS_AND_TABLE, "effects", "method", "diagnosis"),
-    "export": ("sensor", "table.gravity_g"),
-    "report": (
-        "sensor", "table", "procedure", "method", "filter", "ingest", "effects", "limits", "certificate",
-        "config_sha256",
-    ),
-    "summary": tuple(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("bias", "scale_factor", "cross_axis")),
-    "prior": SENSORS_AND_TABLE,
-}  # fmt: skip
-WITH_DIGEST = [stage for stage, keys in READS.items() if "config_sha256" in keys]
+OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": BENCH}
 
 
-def config_sha256(config: Mapping[str, Any]) -> str:
+def config_sha256(settings: Settings) -> str:
     """Return the SHA-256 of the configuration of a unit as canonical JSON, without the section ``certificate``."""
-    return hashlib.sha256(_canonical({k: v for k, v in config.items() if k != "certificate"})).hexdigest()
+    sections = [*(name for name in Unit.model_fields if name != "certificate"), "unit"]
+    content = {name: _json_value(getattr(settings, name)) for name in sections}
+    content |= {"user_effects": settings.user_effects.json_value} if settings.user_effects else {}
+    return hashlib.sha256(_canonical(content)).hexdigest()
 
 
-def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, Any]:
-    """Return the settings of a unit that a stage reads: a key of ``READS``, or a stage of the fit of a sensor."""
-    settings: dict[str, Any] = {}
-    paths = _paths(stage, sensor)
-    mounted = config["table"].get("seat_deg") is not None or "mounting" in (config["effects"]["gyroscope"] or ())
-    if stage == "effects" and sensor == "gyroscope" and mounted:  # gravity determines the mounting of the unit in
-        paths = paths + _paths(stage, "accelerometer")  # each recording
-    for *branch, leaf in paths:
-        source: Any = config
-        target = settings
-        for step in branch:
-            source = source[step]
-            target = target.setdefault(step, {})
-        if leaf in source or (branch[-1:] != ["effects"] and leaf != "given"):  # a sensor file limits some effects
-            target[leaf] = source[leaf]
-    return settings
+def _json_value(value: Any) -> Any:  # noqa: ANN401  (a section, or the name of the unit)
+    return value if isinstance(value, str) else value.json_value
 
 
-def settings_of_unit(unit: UnitRow, stage: str, sensor: str = "") -> dict[str, Any]:
-    """Return the settings of a unit that a stage reads, without those of its campaign."""
-    digest = {"config_sha256": unit.config_sha256} if stage in WITH_DIGEST else {}
-    settings = select_settings(unit.config | digest, stage, sensor)
-    if stage == "report":
-        settings["row"] = {c: unit.row[c] for c in ("serial", "lot", "date") if unit.row.get(c)}
-    return settings
+def sections_of(stage: str, sensor: str, settings: Settings) -> tuple[str, ...]:
+    """Return the sections that a stage reads: a key of ``OF_STAGES``, or the stage ``effects`` of a sensor's fit."""
+    if stage != "effects":
+        return OF_STAGES[stage]
+    mounted = settings.table.seat_deg is not None or "mounting" in settings.effects.gyroscope
+    both = sensor == "gyroscope" and mounted  # gravity determines the mounting of the unit in each recording
+    return (*OF_STAGES["fit"], f"effects.{sensor}", *(["effects.accelerometer"] if both else []))
 
 
-def as_job_reads(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings as read from the file of a job: keys, and with them recordings, are in alphabetical order."""
-    found: dict[str, Any] = json.loads(_canonical(settings))
-    return found
+def settings_of_unit(unit: UnitRow, stage: str, sensor: str, stated: Stated) -> dict[str, Any]:
+    """Return the settings of a unit that a stage reads, as JSON values; ``stated``: what the run states about it."""
+    sections = sections_of(stage, sensor, unit.config)
+    settings = unit.config.replaced(stated=stated) if "stated" in sections else unit.config
+    return settings.only(sections)
 
 
-@cache
-def _paths(stage: str, sensor: str) -> list[list[str]]:
-    return [key.format(sensor=sensor).split(".") for key in READS.get(stage, FIT)]
+def _stated(unit: UnitRow, stage: str, run: Mapping[str, Any] | None = None, board: Board | None = None) -> Stated:
+    """Return what calibration and page state about a unit; the calibration does not depend on its row and its run."""
+    if stage != "report":
+        return Stated(config_sha256=unit.config_sha256, board=board)
+    row = {column: unit.row[column] for column in ("serial", "lot", "date") if unit.row.get(column)}
+    return Stated(config_sha256=unit.config_sha256, row=row, run=dict(run or {}))
+
+
+def settings_in_memory(unit: UnitRow, stage: str, sensor: str = "", run: Mapping[str, Any] | None = None) -> Settings:
+    """Return the settings that a stage reads as its job reads them: keys, and with them recordings, are sorted."""
+    content = settings_of_unit(unit, stage, sensor, _stated(unit, stage, run))
+    return Settings.of_sections(json.loads(_canonical(content)))
 
 
 class SettingsFile(NamedTuple):
@@ -155,18 +96,18 @@ def settings_of_jobs(
     configs, sections = _sections(campaign)
     compared = sorted({unit for c in campaign.compare for g in c["groups"] for unit in g["units"]})
     summaries = {
-        name: {
-            "row": unit.row, "overrides": unit.overrides, "config": configs[name], "compared": name in compared,
-            "lot_prior": campaign.combine == "lot",
-        }
+        name: Stated(
+            row=unit.row, overrides=unit.overrides, sections=configs[name], compared=name in compared,
+            lot_prior=campaign.combine == "lot",
+        )
         for name, unit in campaign.units.items()
     }  # fmt: skip
     files: dict[str, dict[str, SettingsFile]] = {}
     for batch, units in campaign.batches.items():
         rows = [campaign.units[unit] for unit in units]
-        fits = [(s, stage) for s in BOTH for stage in campaign.chains[batch][s]]
+        fits = [(s, stage) for s in SENSORS for stage in campaign.chains[batch][s]]
         outputs = {f"fit/{s}/{stage}": (stage if stage == "effects" else "fit", s) for s, stage in fits}
-        outputs |= {stage: (stage, "") for stage in READS if stage not in ("fit", "effects", "prior")}
+        outputs |= {stage: (stage, "") for stage in OF_STAGES if stage not in ("fit", "prior")}
         outputs |= {"prior": ("prior", "")} if campaign.combine == "lot" else {}
         files[batch] = {
             output: _file(output, _content(campaign, rows, *stage, summaries), again(f"batches/{batch}/{output}.zip"))
@@ -196,20 +137,16 @@ def _file(output: str, content: dict[str, Any], again: int) -> SettingsFile:
 
 
 def _content(
-    campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: str, summaries: Mapping[str, Any]
+    campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: str, summaries: Mapping[str, Stated]
 ) -> dict[str, Any]:
     """Return the settings that a stage reads for the units of a batch; ``sensor``: of a stage of a fit."""
-    settings = {row.name: settings_of_unit(row, stage, sensor) for row in rows}
-    if stage == "report":
-        for row in rows:
-            settings[row.name] |= {"run": campaign.run_settings(row.name)}
-    if stage == "summary":
-        settings = {row.name: settings[row.name] | summaries[row.name] for row in rows}
-    if stage == "calibration" and campaign.boards:
-        for row in rows:
-            board = row.row.get("board", "")
-            if board in campaign.boards:
-                settings[row.name] |= {"board": {"name": board, "chips": campaign.boards[board]}}
+    settings = {}
+    for row in rows:
+        chips = campaign.boards.get(row.row.get("board", ""))
+        board = Board(name=row.row["board"], chips=chips) if chips and stage == "calibration" else None
+        run = campaign.run_settings(row.name) if stage == "report" else None
+        stated = summaries[row.name] if stage == "summary" else _stated(row, stage, run, board)
+        settings[row.name] = settings_of_unit(row, stage, sensor, stated)
     content: dict[str, Any] = dict(zip(("common", "units"), in_common(settings), strict=True))
     content |= effects_for(stage, sensor, [r.config for r in rows])
     if stage in ("ingest", "report"):
@@ -225,7 +162,7 @@ def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> str | None:
         return None
     digest = hashlib.sha256()
     for row in rows:
-        files = recording_files(row.config["procedure"], row.config["ingest"], campaign.folder(row.name))
+        files = recording_files(row.config.procedure, row.config.ingest, campaign.folder(row.name))
         for path in sorted({path for paths in files.values() for path in paths}):
             status = path.stat()
             digest.update(f"{path}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
@@ -261,10 +198,12 @@ def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, 
     digests: dict[str, dict[str, str]] = {}
     for name, unit in campaign.units.items():
         digests[name] = {}
-        for section, content in unit.config.items():
-            if section in ("unit", "certificate"):
+        for section in [*(s for s in Unit.model_fields if s != "certificate"), "user_effects"]:
+            content = getattr(unit.config, section)
+            if content is None:
                 continue
-            value = {k: v for k, v in content.items() if k != "folder"} if section == "procedure" else content
+            value = content.json_value
+            value = {k: v for k, v in value.items() if k != "folder"} if section == "procedure" else value
             if section == "procedure" or id(content) not in known:
                 known[id(content)] = digest(value)
                 values.setdefault(known[id(content)], value)

@@ -13,17 +13,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.options import Problem
-from pipeline.config.schema import OF_BENCH
 from pipeline.errors import ConfigurationError, PipelineError
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
 from pipeline.io.files import read_text
 from pipeline.io.yaml_file import LARGEST_BYTES
+from pipeline.settings import OF_BENCH, UserEffectFiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from pipeline.model.effects.base import Effect
+    from pipeline.settings import Sensor, Settings
 
 PYTHON = "python_effects"
 GIVEN = "given"  # name of the method
@@ -41,20 +42,22 @@ class UserEffects:
     effects: dict[str, Effect] = field(default_factory=dict)
     python: dict[str, dict[str, str]] = field(default_factory=dict)  # path and sha256 of Python effects, by name
 
-    def section(self) -> dict[str, Any]:
-        """Return the section ``user_effects`` for the configuration of each unit; empty without such effects."""
+    def section(self) -> UserEffectFiles | None:
+        """Return the section ``user_effects`` for the settings of each unit; None without such effects."""
         if not self.effects:
-            return {}
-        formulas = [e.definition for name, e in self.effects.items() if name not in self.python]
-        return {"user_effects": {"formulas": formulas, "python": list(self.python.values())}}
+            return None
+        formulas = [e.definition or {} for name, e in self.effects.items() if name not in self.python]
+        return UserEffectFiles(formulas=formulas, python=list(self.python.values()))
 
-    def add_limits(self, sensor_configs: dict[str, Any]) -> None:
-        """Add the limits of the effects to those of the sensor files, which have precedence."""
+    def with_limits(self, sensor_model: Sensor) -> Sensor:
+        """Return a sensor model with the limits of the effects beside its own, which have precedence."""
         for effect in self.effects.values():
             for sensor in effect.sensors:
-                limits = sensor_configs[sensor]["effects"]
-                if effect.name not in limits:
-                    sensor_configs[sensor]["effects"] = {**effect.limits(sensor), **limits}
+                data_sheet = sensor_model.of(sensor)
+                if effect.name not in data_sheet.effects:
+                    limits = {**effect.limits(sensor), **data_sheet.effects}
+                    sensor_model = sensor_model.replaced(**{sensor: data_sheet.replaced(effects=limits)})
+        return sensor_model
 
 
 def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[str]) -> UserEffects:
@@ -107,33 +110,32 @@ def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[
     return UserEffects(loaded, hashes)
 
 
-def effects_for(stage: str, sensor: str, configs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def effects_for(stage: str, sensor: str, units: Sequence[Settings]) -> dict[str, Any]:
     """Return the section ``user_effects`` that a stage needs for some units; empty if it needs none.
 
     A fit needs the configured effects, or all effects for ``auto``. Diagnosis and report need all of them. The other
     stages read fitted effects, which contain their formulas but not their Python code.
     """
-    units = list(configs)
-    section = next((c["user_effects"] for c in units if "user_effects" in c), None)
+    section = next((unit.user_effects for unit in units if unit.user_effects), None)
     if section is None or stage not in ("effects", "validate", "diagnose", "export", "report", "prior"):
         return {}
+    formulas, python = section.formulas, section.python
     if stage not in ("diagnose", "report"):
         wanted: set[str] = set()
-        for config in units:
-            for of_sensor, names in config["effects"].items():
+        for unit in units:
+            for of_sensor in SENSORS:
+                names = unit.effects.of(of_sensor)
                 if sensor in ("", of_sensor):
                     wanted |= {"auto"} if names == "auto" else set(names)
         everything = "auto" in wanted
-        formulas = section["formulas"] if stage == "effects" else []
-        section = {
-            "formulas": [d for d in formulas if everything or d["name"] in wanted],
-            "python": [e for e in section["python"] if everything or Path(e["path"]).stem in wanted],
-        }
-    return {"user_effects": section} if section["formulas"] or section["python"] else {}
+        formulas = formulas if stage == "effects" else []
+        formulas = [d for d in formulas if everything or d["name"] in wanted]
+        python = [e for e in python if everything or Path(e["path"]).stem in wanted]
+    return {"user_effects": {"formulas": formulas, "python": python}} if formulas or python else {}
 
 
-def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str, Any]:
-    """Return the sections ``method`` and ``effects`` of a unit with the calibration from its file ``method.file``.
+def with_given(settings: Settings, campaign: Path) -> Settings:
+    """Return the settings of a unit with the calibration from its file ``method.file``.
 
     ``method.given``: ``source`` (for texts), ``sha256``, ``notes``, and bias, matrix, effects and uncertainties of each
     sensor as in ``calibrations/<unit>.json``. ``effects``: the effects of the file that the sensor causes. Raises
@@ -143,20 +145,20 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
     from pipeline.model.effects import owner_of  # noqa: PLC0415  (as above)
     from pipeline.model.effects.base import Owner  # noqa: PLC0415  (as above)
 
-    method, effects = dict(config["method"]), dict(config["effects"])
-    if not method["file"]:
+    method, effects = settings.method, {sensor: settings.effects.of(sensor) for sensor in SENSORS}
+    if not method.file:
         raise Problem("method=given: method.file is not set; name the calibration, in any format of docs/exports.md")
-    if stated := [f"table.{key}" for key in OF_BENCH if config["table"].get(key)]:
+    if stated := [f"table.{key}" for key in OF_BENCH if getattr(settings.table, key)]:
         raise Problem(f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null")
-    file = campaign / method["file"].replace("{unit}", unit)
+    file = campaign / method.file.replace("{unit}", settings.unit)
     try:
-        content = read_any(file, method["format"], counts_of(config["sensor"]))
+        content = read_any(file, method.format, counts_of(settings.sensor))
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
     except PipelineError as error:
         raise Problem(f"method.file: {error}") from error
     given: dict[str, Any] = {"source": f"{file.name} ({content.format_name})", "sha256": digest, "notes": content.notes}
     for sensor in SENSORS:
-        if method[sensor] != GIVEN:
+        if method.of(sensor) != GIVEN:
             continue
         if effects[sensor]:
             raise Problem(
@@ -172,4 +174,4 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
         part["uncertain"] = calibration.covariance is not None
         part["of_the_bench"] = [e.name for e in calibration.effects if e not in of_sensor]
         given[sensor] = part
-    return {"method": {**method, "given": given}, "effects": effects}
+    return settings.replaced(method=method.replaced(given=given), effects=settings.effects.replaced(**effects))

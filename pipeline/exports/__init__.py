@@ -26,7 +26,7 @@ from dataclasses import MISSING, dataclass, field, replace
 from dataclasses import fields as dataclass_fields
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
@@ -41,6 +41,9 @@ from pipeline.model.formula import c_number
 from pipeline.model.log_motion import SIGNALS
 from pipeline.model.measurement import sensor_effects
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 JSON = dict[str, Any]
 TEMPLATES = Path(__file__).parent / "templates"
@@ -126,7 +129,7 @@ class ExportedUnit:
     """A unit to export: its documents, as in ``exports``, and quantities that several formats need."""
 
     document: JSON
-    settings: JSON
+    settings: Mapping[str, Any]
     validation: JSON | None = None
     diagnosis: JSON | None = None
 
@@ -150,7 +153,7 @@ class ExportedUnit:
 
 
 def exports(
-    calibration: JSON, settings: JSON, validation: JSON | None = None, diagnosis: JSON | None = None
+    calibration: JSON, settings: Mapping[str, Any], validation: JSON | None = None, diagnosis: JSON | None = None
 ) -> dict[str, str]:
     """Return the texts of a calibration in every format, by file name.
 

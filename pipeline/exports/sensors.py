@@ -143,7 +143,7 @@ class ExportedSensor:
         Counts per g or deg/s.
     """
 
-    def __init__(self, calibration: SensorCalibration, unit: str, config: dict[str, Any]) -> None:
+    def __init__(self, calibration: SensorCalibration, unit: str, config: Mapping[str, Any]) -> None:
         self.calibration, self.name, self.unit, self.config = calibration, calibration.sensor, unit, config
         self.factor = FACTORS[unit]
         self.bias, self.matrix = calibration.bias * self.factor, calibration.matrix

@@ -21,7 +21,7 @@ from pipeline.planning.plan import Document, plan_of, share_text, size_text
 from pipeline.records import AXES, SENSORS
 from pipeline.report.pages import template
 from pipeline.signal.rests import SETTLING_S
-from pipeline.simulation.description import UnitDescription, course_of, read_config
+from pipeline.simulation.description import UnitDescription, course_of, shipped_settings
 from pipeline.simulation.procedures import TABLE_PROCEDURES, Course, plan
 from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 
@@ -53,7 +53,7 @@ class Change:
 def changes(unit: UnitDescription) -> list[Change]:
     """Return the proposed changes of a unit's procedure."""
     course, on_table = course_of(unit), unit.procedure in TABLE_PROCEDURES
-    full = float(read_config("sensor", unit.sensor)["gyroscope"]["full_scale"])
+    full = shipped_settings(sensor=unit.sensor).sensor.gyroscope.full_scale
     fixed = replace(unit, samples=None, course=asdict(course))
     found: list[Change] = []
 
@@ -176,15 +176,15 @@ def _listed(keys: Sequence[str]) -> str:
 
 def readme(unit: UnitDescription, name: str) -> str:
     """Return the README of a campaign with the description of its first unit."""
-    procedure, course = read_config("procedure", unit.procedure), course_of(unit)
+    settings, course = shipped_settings(procedure=unit.procedure, table=unit.table), course_of(unit)
     ups = LEVEL_AT_ZERO[:, 2]  # the vertical in the body frame at table angle 0, for turns about each axis
     text: str = template("campaign_readme.md").render(
         name=name,
         unit=unit,
         course=course,
-        table=read_config("table", unit.table),
-        procedure=procedure,
-        folder=procedure["folder"].replace("{unit}", unit.unit),
+        table=settings.table,
+        procedure=settings.procedure,
+        folder=settings.procedure.folder.replace("{unit}", unit.unit),
         planned=plan(unit.procedure, course, np.random.default_rng(0)),
         plan=plan_of(unit),
         axes=AXES,

@@ -64,6 +64,7 @@ from pipeline.unit import Task, run_checked, run_steps
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.settings import Settings
     from pipeline.unit import UnitState
 
 
@@ -149,9 +150,7 @@ class Proposal:
     expected: float  # g; largest U with these rests
 
 
-def fitted_by_hand(
-    recordings: Sequence[Recording], settings: Mapping[str, Any], *, gyroscope: bool = False
-) -> UnitState:
+def fitted_by_hand(recordings: Sequence[Recording], settings: Settings, *, gyroscope: bool = False) -> UnitState:
     """Return the unit with the fit of the accelerometer, and of the gyroscope where it is asked for.
 
     ``settings``: sections ``sensor``, ``table``, ``procedure`` and ``filter``; for the gyroscope also ``effects``. The
@@ -168,7 +167,7 @@ def fitted_by_hand(
     return unit
 
 
-def progress_of(unit: UnitState, settings: Mapping[str, Any], dwell: float) -> Progress:
+def progress_of(unit: UnitState, settings: Settings, dwell: float) -> Progress:
     """Return the state of the accelerometer's calibration.
 
     ``unit``: with the fit of the accelerometer (``fitted_by_hand``). ``dwell``: s, of a future rest. Raises

@@ -32,13 +32,14 @@ from pipeline.planning.detection_limits import Detection, DetectionLimits, RestL
 from pipeline.records import SENSORS, Noise, NotCalibrated, Recording, SensorCalibration
 from pipeline.report.pages import template
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, course_of, read_config
+from pipeline.simulation.description import UnitDescription, course_of, shipped_settings
 from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from pipeline.records import Fit
+    from pipeline.settings import DataSheet, Settings
     from pipeline.simulation.trajectory import Planned
 
 CLEARLY_LARGER = 1.2  # times the smallest size: least size of a named effect that is printed
@@ -64,7 +65,7 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
         "table": unit.table,
         "procedure": unit.procedure,
         "course": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(course_of(unit)).items()},
-        "at_a_table": simulated.table["motion"] != "none",
+        "at_a_table": simulated.settings.table.motion != "none",
         "minutes": simulated.minutes,
         "samples": sum(r.samples for r in simulated.recordings),
         "warnings": _warnings(simulated, unit.sensor),
@@ -113,8 +114,8 @@ def of_sensor(
             by_rests = select_by_hand(sensor, simulated)
             limits, hidden = RestLimits(by_rests, noise), not_observable_by_hand(by_rests, [])
         else:
-            observations = observe(sensor, simulated.recordings, simulated.table)
-            selection = select(observations, [], noise, simulated.sensor_configs[sensor], search=False)
+            observations = observe(sensor, simulated.recordings, simulated.settings.table)
+            selection = select(observations, [], noise, simulated.settings.sensor.of(sensor), search=False)
             limits, hidden = TurntableLimits(selection, noise), not_observable(selection, [])
     except NotObservableError as error:
         return {**document, "reason": error.message}
@@ -142,7 +143,7 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Select
     if sensor == "gyroscope":
         start, other = SensorCalibration(sensor), start
     model = require_model(simulated.recordings, start, simulated.noise[sensor], simulated.settings, other)
-    return by_hand.Selection(model, start, [], simulated.noise[sensor], simulated.sensor_configs[sensor])
+    return by_hand.Selection(model, start, [], simulated.noise[sensor], simulated.settings.sensor.of(sensor))
 
 
 def _entry(sensor: str, detection: Detection, *, limited: bool) -> Document:
@@ -171,17 +172,9 @@ class SimulatedProcedure:
     """The recordings of a procedure with a faultless sensor and table, and the configurations and noise of both."""
 
     recordings: list[Recording]
-    sensor_configs: Mapping[str, Any]
-    table: Mapping[str, Any]
-    procedure: Mapping[str, Any]
+    settings: Settings
     noise: dict[str, Noise]
     minutes: float  # from power-on to the end of the last recording
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The sections of a configuration."""
-        sections = {"sensor": self.sensor_configs, "table": self.table, "procedure": self.procedure}
-        return {**sections, "effects": {"accelerometer": [], "gyroscope": []}, "filter": {"name": "none"}}
 
     @cached_property
     def accelerometer_by_hand(self) -> Fit:
@@ -199,16 +192,14 @@ def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> 
         unit, effects={}, imperfections=FAULTLESS, held_out={}, temperature={**ROOM, **unit.temperature}
     )
     recordings, _ = simulate_unit(faultless, SEED, 0, extra)
-    sensor_configs, table = read_config("sensor", unit.sensor), read_config("table", unit.table)
+    settings = shipped_settings(sensor=unit.sensor, table=unit.table, procedure=unit.procedure)
     long_rest = any(recording.role == "static" for recording in recordings)
-    noise = {s: stated_noise(sensor_configs[s], unit.interval_s, long_rest=long_rest) for s in SENSORS}
+    noise = {s: stated_noise(settings.sensor.of(s), unit.interval_s, long_rest=long_rest) for s in SENSORS}
     minutes = max(float(r.time[-1]) for r in recordings) / 60.0
-    return SimulatedProcedure(
-        recordings, sensor_configs, table, read_config("procedure", unit.procedure), noise, minutes
-    )
+    return SimulatedProcedure(recordings, settings, noise, minutes)
 
 
-def stated_noise(sensor_config: Mapping[str, Any], interval: float, *, long_rest: bool) -> Noise:
+def stated_noise(data_sheet: DataSheet, interval: float, *, long_rest: bool) -> Noise:
     """Return the noise of a sensor by the sensor file.
 
         white^2 = noise_density^2 / (2 dt) + (1 / counts_per_unit)^2 / 12
@@ -216,22 +207,22 @@ def stated_noise(sensor_config: Mapping[str, Any], interval: float, *, long_rest
     with the sampling interval dt in s, the one-sided density in unit/sqrt(Hz), and the quantisation. ``long_rest``:
     whether a long rest will determine the noise.
     """
-    quantisation = 1.0 / (12.0 * sensor_config["counts_per_unit"] ** 2)
-    white = np.sqrt(sensor_config["noise_density"] ** 2 * 0.5 / interval + quantisation)
-    wander, time = float(sensor_config.get("bias_wander") or 0.0), float(sensor_config.get("wander_time_s") or 100.0)
-    return Noise(np.full(3, white), np.full(3, wander), time, "static" if long_rest else "rests")
+    quantisation = 1.0 / (12.0 * data_sheet.counts_per_unit**2)
+    white = np.sqrt(data_sheet.noise_density**2 * 0.5 / interval + quantisation)
+    wander = np.full(3, data_sheet.bias_wander)
+    return Noise(np.full(3, white), wander, data_sheet.wander_time_s, "static" if long_rest else "rests")
 
 
 def _warnings(simulated: SimulatedProcedure, sensor: str) -> list[str]:
     """Return the limitations of sensor and table in the procedure, and the assumed figures, as sentences."""
-    full = float(simulated.sensor_configs["gyroscope"]["full_scale"])
+    full = simulated.settings.sensor.gyroscope.full_scale
     rates = [float(np.abs(r.table_rate).max()) for r in simulated.recordings if r.table_rate is not None]
-    fastest, assumed = max(rates, default=0.0), assumed_figures(sensor, simulated.sensor_configs)
+    fastest, assumed = max(rates, default=0.0), assumed_figures(sensor, simulated.settings.sensor)
     found = [assumed] if assumed else []
     if fastest > full:
         found.append(f"the fastest turn, {fastest:g} deg/s, is beyond the gyroscope's full scale of {full:g} deg/s")
-    if simulated.table["motion"] == "commanded":
-        angle = float(simulated.table["angle_accuracy_deg"])
+    if simulated.settings.table.motion == "commanded":
+        angle = simulated.settings.table.angle_accuracy_deg
         found.append(
             f"the table logs its program, not its motion: angle errors of {angle:g} deg read as "
             f"{1000.0 * np.radians(angle):.2g} mg, and sizes below that are only found if they repeat from stop to stop"

@@ -46,7 +46,7 @@ from pipeline.profile_detection.unit_guesses import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.profile_detection.columns import Log
     from pipeline.records import Values
@@ -89,7 +89,7 @@ class Proposal:
         keys = [k for k, v in self.csv.items() if v == UNKNOWN]
         return keys + [c for entries in self.columns for c, e in entries.items() if UNKNOWN in e.values()]
 
-    def ingest(self, name: str, sensor: dict[str, Any]) -> dict[str, Any]:
+    def ingest(self, name: str, sensor: Mapping[str, Any]) -> dict[str, Any]:
         """Return the proposal as the section ``ingest`` of a configuration, with the counts of the sensor's file."""
         figures = {OF_SENSOR.format(s): sensor[s]["counts_per_unit"] for s in TRIADS if s in sensor}
         columns = [
@@ -110,7 +110,7 @@ class Proposal:
         return {"name": name, "csv": {**self.csv, "parts": parts, "columns": {}}, "mcap": {}}
 
 
-def propose(logs: Sequence[Log], sensor: dict[str, Any] | None = None) -> list[Proposal]:
+def propose(logs: Sequence[Log], sensor: Mapping[str, Any] | None = None) -> list[Proposal]:
     """Return a proposal for each layout among the logs.
 
     ``sensor``: the configuration of the sensor, if the user states one, for counts that the log does not determine.
@@ -177,7 +177,7 @@ def _fill_in(proposal: Proposal, other: Proposal) -> None:
     proposal.remarks += [r for r in other.remarks if r not in proposal.remarks]
 
 
-def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
+def _proposal(parts: list[Columns], sensor: Mapping[str, Any]) -> Proposal:
     logs = [columns.log for columns in parts]
     seen = [{key: _described(log.numbers.get(i)) for i, key in enumerate(log.keys)} for log in logs]
     first = logs[0]
@@ -236,7 +236,7 @@ def _described(values: Values | None) -> str:
 
 
 def _gyroscope(
-    parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: dict[str, Any]
+    parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: Mapping[str, Any]
 ) -> Guess:
     """Return the unit of the rates from the table, from gravity, or, for counts, from the configuration."""
     moves, why_none = list[Move](), "no accelerometer in the log that determines the unit"

@@ -20,7 +20,7 @@ from pipeline.io.units import COUNTS, DEGREES, FORCE_UNITS, UNITS
 from pipeline.profile_detection.columns import NO_SENSOR, OFFSETS, stated_unit, whole, words_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.io.gravity_rotation import Move
     from pipeline.profile_detection.columns import Columns
@@ -225,7 +225,7 @@ def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Gu
     return Guess(entry, f"counts, {measured:.3g} a deg/s, {seen}{taken}")
 
 
-def other_range(guess: Guess, sensor: dict[str, Any]) -> list[str]:
+def other_range(guess: Guess, sensor: Mapping[str, Any]) -> list[str]:
     """Return a remark if the accelerometer's counts differ from those of the stated sensor."""
     stated, seen = sensor.get("accelerometer", {}).get("counts_per_unit"), guess.entry.get("counts_per_unit")
     if not stated or not seen or abs(seen / stated - 1) < CLOSE:
@@ -235,7 +235,7 @@ def other_range(guess: Guess, sensor: dict[str, Any]) -> list[str]:
     return [f"sensor={name} states {stated:g} counts a g: set {where}, as the logger does"]
 
 
-def counts_of_sensor(guess: Guess, name: str, sensor: dict[str, Any]) -> Guess:
+def counts_of_sensor(guess: Guess, name: str, sensor: Mapping[str, Any]) -> Guess:
     """Return a guess of counts that refers to the configuration of the sensor, if one is stated."""
     figure = OF_SENSOR.format(name)
     if name not in sensor:

@@ -30,6 +30,8 @@ from pipeline.report.unit_page import files_read
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from pipeline.settings import Certificate, Settings
+
 JSON = dict[str, Any]
 STAMP = "NOT A CALIBRATION CERTIFICATE - incomplete: "
 ONLY_THIS_ITEM = "The results relate only to the item calibrated."
@@ -59,16 +61,16 @@ ASKED = (
 )  # statements that the standard requires: name, clause and the key to set
 
 
-def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temperature: str | None) -> JSON:
+def certificate(calibration: JSON, validation: JSON | None, settings: Settings, temperature: str | None) -> JSON:
     """Return the report of one calibrated unit.
 
-    ``settings``: the unit's resolved configuration, with ``row`` (serial, lot, date of ``units.csv``); ``temperature``:
+    ``settings``: of the unit; ``temperature``:
     range of the sensor's temperature, degC, None where it was not recorded.
     """
-    stated = settings["certificate"]
+    stated = settings.certificate
     document: JSON = {
         "schema": "imu-calibration/certificate/1",
-        "administrativeData": _administrative(calibration, stated, settings.get("row") or {}),
+        "administrativeData": _administrative(calibration, stated, settings.stated.row),
         "measurementResults": [
             _result(sensor, calibration, (validation or {}).get(sensor) or {}, settings, temperature)
             for sensor in SENSORS
@@ -78,7 +80,7 @@ def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temp
             "calibration": f"calibrations/{calibration['unit']}.json",
             "config_sha256": calibration.get("config_sha256"),
             "inputs": files_read(calibration.get("inputs")),
-            "command": run_command(settings["run"]) if settings.get("run") else None,
+            "command": run_command(settings.stated.run) if settings.stated.run else None,
         },
     }
     missing = [
@@ -90,53 +92,53 @@ def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temp
     return {"complete": not missing, "stamp": stamp, "missing": missing, **document}
 
 
-def _administrative(calibration: JSON, stated: JSON, row: JSON) -> JSON:
+def _administrative(calibration: JSON, stated: Certificate, row: JSON) -> JSON:
     serial, date = row.get("serial"), row.get("date") or ""
-    begin = stated["performed"]["begin"] or (date if DAY.fullmatch(date) else None)
-    number = stated["number"]
+    begin = stated.performed.begin or (date if DAY.fullmatch(date) else None)
+    number = stated.number
     return {
         "dccSoftware": [{"name": n, "release": v} for n, v in (calibration.get("software") or {}).items()],
         "coreData": {
-            "title": stated["title"],
+            "title": stated.title,
             "uniqueIdentifier": number
             and number.replace("{unit}", calibration["unit"]).replace("{serial}", serial or "?"),
-            "countryCodeISO3166_1": stated["country"],
+            "countryCodeISO3166_1": stated.country,
             "usedLangCodeISO639_1": "en",
-            "receiptDate": stated["received"],
+            "receiptDate": stated.received,
             "beginPerformanceDate": begin,
-            "endPerformanceDate": stated["performed"]["end"] or begin,
-            "performanceLocation": stated["place"],
-            "issueDate": stated["issued"],
+            "endPerformanceDate": stated.performed.end or begin,
+            "performanceLocation": stated.place,
+            "issueDate": stated.issued,
         },
         "items": [
             {
-                "name": stated["item"]["description"] or f"inertial measurement unit {calibration.get('sensor')}",
-                "manufacturer": stated["item"]["manufacturer"],
+                "name": stated.item.description or f"inertial measurement unit {calibration.get('sensor')}",
+                "manufacturer": stated.item.manufacturer,
                 "model": calibration.get("sensor"),
                 "identifications": [
                     {"issuer": "manufacturer", "name": "serial number", "value": serial},
                     {"issuer": "laboratory", "name": "unit", "value": calibration["unit"]},
                 ],
-                "condition": stated["item"]["condition"],
+                "condition": stated.item.condition,
             }
         ],
-        "calibrationLaboratory": stated["laboratory"],
-        "respPersons": [stated["authorised_by"]],
-        "customer": stated["customer"],
+        "calibrationLaboratory": stated.laboratory.json_value,
+        "respPersons": [stated.authorised_by.json_value],
+        "customer": stated.customer.json_value,
         "statements": {
             "item": ONLY_THIS_ITEM,
             "uncertainty": COVERAGE,
-            "traceability": stated["traceability"],
-            "sampling": stated["sampling"],
-            "externalResults": stated["external_results"],
-            "opinions": stated["opinions"],
+            "traceability": stated.traceability,
+            "sampling": stated.sampling,
+            "externalResults": stated.external_results,
+            "opinions": stated.opinions,
             "software": SOFTWARE_SAYS,
         },
     }
 
 
-def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temperature: str | None) -> JSON:
-    part, stated, table = calibration[sensor], settings["certificate"], settings["table"]
+def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, temperature: str | None) -> JSON:
+    part, stated, table = calibration[sensor], settings.certificate, settings.table
     first, last = first_and_last_step(held_out)
     return {
         "name": sensor,
@@ -146,19 +148,19 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
             {
                 "name": (calibration.get("methods") or {}).get(sensor) or calibration.get("method"),
                 "procedure": calibration.get("procedure"),
-                "document": stated["method"]["document"],
-                "deviations": stated["method"]["deviations"],
+                "document": stated.method.document,
+                "deviations": stated.method.deviations,
             }
         ],
         "measuringEquipments": [
-            *stated["equipment"],
-            {"name": f"table {calibration.get('table')}", "used_for": "motion of reference", "configured": table},
+            *(used.json_value for used in stated.equipment),
+            {"name": f"table {calibration.get('table')}", "used_for": "motion of reference", "configured": table.json_value},
         ],
         "influenceConditions": {
             "temperature of the sensor, degC": temperature,
-            "local gravity, g": table.get("gravity_g"),
-            "accuracy of local gravity, g": table.get("gravity_accuracy_g"),
-            "laboratory": stated["environment"],
+            "local gravity, g": table.gravity_g,
+            "accuracy of local gravity, g": table.gravity_accuracy_g,
+            "laboratory": stated.environment,
         },
         "results": _quantities(part),
         "beyondLimits": part.get("beyond_limits") or [],
@@ -168,7 +170,7 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
         "noiseFloor": held_out.get("noise_floor"),
         "residualsOverTemperature": held_out.get("over_temperature"),
         "conformity": {
-            **stated["conformity"],
+            **stated.conformity.json_value,
             "checks": held_out.get("limits") or [],
             "pass": held_out.get("pass"),
         },
@@ -188,7 +190,7 @@ def _quantities(part: JSON) -> list[JSON]:
     return rows
 
 
-def _wanted(document: JSON, stated: JSON) -> Iterator[tuple[str, str, str, Any]]:
+def _wanted(document: JSON, stated: Certificate) -> Iterator[tuple[str, str, str, Any]]:
     """Yield the statements that the standard requires: name, clause, the key to set, and the statement if known."""
     core, results = document["administrativeData"]["coreData"], document["measurementResults"]
     conditions = [r["influenceConditions"] for r in results]
@@ -196,8 +198,8 @@ def _wanted(document: JSON, stated: JSON) -> Iterator[tuple[str, str, str, Any]]
     known = {
         "certificate.number": core["uniqueIdentifier"],
         "certificate.performed.begin": core["beginPerformanceDate"],
-        "certificate.customer.contact": stated["customer"]["contact"] or stated["customer"]["address"],
-        "certificate.environment": stated["environment"] or measured,
+        "certificate.customer.contact": stated.customer.contact or stated.customer.address,
+        "certificate.environment": stated.environment or measured,
         "serial in units.csv": document["administrativeData"]["items"][0]["identifications"][0]["value"],
     }
     for what, clause, key in ASKED:
@@ -211,7 +213,7 @@ def _wanted(document: JSON, stated: JSON) -> Iterator[tuple[str, str, str, Any]]
         yield f"results of the {sensor} before and after", "7.8.4.1 d", "a held-out recording", r["beforeAdjustment"]
     if any(r["conformity"]["checks"] for r in results):
         for what, key in (("specification", "specification"), ("decision rule", "decision_rule")):
-            yield what, "7.8.6.2", f"certificate.conformity.{key}", stated["conformity"][key]
+            yield what, "7.8.6.2", f"certificate.conformity.{key}", getattr(stated.conformity, key)
 
 
 def certificate_page(unit: str, report: JSON) -> str:

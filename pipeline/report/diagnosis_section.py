@@ -23,7 +23,7 @@ from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import measured, number, percent, plain, unit_text
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 
 JSON = dict[str, Any]
@@ -45,7 +45,7 @@ SIGNALS = {
 }
 
 
-def limit_rows(sensor: str, found: JSON, sensor_config: JSON) -> list[JSON]:
+def limit_rows(sensor: str, found: JSON, sensor_config: Mapping[str, Any]) -> list[JSON]:
     """Return the upper limits of each effect that was not selected as text, and as share of the sensor file's limit.
 
     ``share`` is None where the sensor file has no limit; the largest come first. ``excluded``: whether the recordings

@@ -6,7 +6,7 @@ A unit without limits neither passes nor fails; a unit that failed does not pass
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
 from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.samples import OTHER, samples_of_motion
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 JSON = dict[str, Any]
 ALIKE = 1.2  # held-out errors of diagnosis and validation that agree within this factor are shown as one series
@@ -102,7 +105,7 @@ def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
 
 
 def held_out_figures(
-    sensor: str, calibration: JSON, held_out: JSON, recordings: list[Recording], table: JSON
+    sensor: str, calibration: JSON, held_out: JSON, recordings: list[Recording], table: Mapping[str, Any]
 ) -> list[Figure]:
     """Draw the error of the magnitude in each held-out recording with a reference, as in the validation.
 

@@ -6,7 +6,7 @@ one-sided, ``N = noise_density / sqrt(2)``. Source: IEEE Std 952-1997, annex C.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from pipeline.records import AXES, SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, chart, sentences
 from pipeline.report.numbers import number, percent, plain
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 JSON = dict[str, Any]
 # Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
 # 260 Hz) change the white noise of a sample by sqrt(52) = 7 at one sampling rate, its ranges by 2 to 8.
@@ -26,7 +29,7 @@ SURE = 0.9  # probability of a set of terms above which no other set is named
 SYMBOLS = dict(zip(UNITS, "QNBKGRA", strict=True))
 
 
-def allan(sensor: str, noise: JSON | None, sensor_config: JSON, wander: JSON | None) -> Figure | None:
+def allan(sensor: str, noise: JSON | None, sensor_config: Mapping[str, Any], wander: JSON | None) -> Figure | None:
     """Draw the Allan deviation of each axis; None where no noise was identified.
 
     ``noise``: the sensor's part of ``noise`` in its calibration; ``sensor_config``: the sensor's section of the
@@ -126,7 +129,7 @@ def _text(part: JSON | None) -> str:
     return text
 
 
-def _white(axes: JSON, sensor_config: JSON) -> JSON:
+def _white(axes: JSON, sensor_config: Mapping[str, Any]) -> JSON:
     """Return the white noise, its ratio to the sensor file's white noise with a likely cause, and the other terms."""
     terms = [part["terms"] for part in axes.values()]
     names = {name for t in terms for name, _ in each_term(t)}

@@ -27,7 +27,7 @@ from pipeline.report.numbers import plain
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
 JSON = dict[str, Any]
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
@@ -135,7 +135,7 @@ def _elements(part: JSON, matrix: np.ndarray, J: np.ndarray) -> Callable[[str, i
     return element
 
 
-def parameter_rows(sensor: str, part: JSON, sensor_config: JSON) -> list[JSON]:
+def parameter_rows(sensor: str, part: JSON, sensor_config: Mapping[str, Any]) -> list[JSON]:
     """Return bias, scale factor errors, cross-axis terms and effects.
 
     A row has ``p``, ``name``, ``limit`` (or None), ``share`` of the limit, and ``beyond``: whether the calibration
@@ -209,7 +209,7 @@ def sheet_columns(row: JSON) -> dict[str, str]:
     return {k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in COLUMNS)}
 
 
-def unit_parameters(calibration: JSON, sensor_configs: JSON) -> list[tuple[Any, ...]]:
+def unit_parameters(calibration: JSON, sensor_configs: Mapping[str, Any] | None) -> list[tuple[Any, ...]]:
     """Return a row with the columns ``PARAMETERS`` for each parameter of a unit; none for a failed unit.
 
     These are the fitted parameters, and the elements of P that a sensor file limits. ``sensor_configs``: the section
@@ -218,9 +218,8 @@ def unit_parameters(calibration: JSON, sensor_configs: JSON) -> list[tuple[Any, 
     rows = []
     for sensor in [s for s in SENSORS if calibration.get(s)]:
         fitted = fitted_parameters(calibration[sensor])
-        limits = {
-            row["p"]: row for row in parameter_rows(sensor, calibration[sensor], sensor_configs.get(sensor) or {})
-        }
+        sensor_config = (sensor_configs or {}).get(sensor) or {}
+        limits = {row["p"]: row for row in parameter_rows(sensor, calibration[sensor], sensor_config)}
         limits = {p: row for p, row in limits.items() if row["limit"]}
         for p in dict.fromkeys([*fitted, *limits]):
             row = limits.get(p) or {"name": None, "limit": None, "beyond": False}

@@ -31,7 +31,7 @@ from pipeline.signal.encoder_rate import rate_by_angle
 from pipeline.signal.filters import filtered
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
 
 JSON = dict[str, Any]
@@ -60,7 +60,7 @@ class Residual:
         return self.reading - self.predicted
 
 
-def residuals(sensor: str, part: JSON, recordings: list[Recording], table: JSON) -> list[Residual]:
+def residuals(sensor: str, part: JSON, recordings: list[Recording], table: Mapping[str, Any]) -> list[Residual]:
     """Return the residuals of the recordings for a sensor whose motion is known.
 
     ``part``: the sensor's part of the calibration; ``table``: this section of the unit's configuration.

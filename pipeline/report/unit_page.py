@@ -43,6 +43,8 @@ from pipeline.verdicts import css_class
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.settings import Settings
+
 JSON = dict[str, Any]
 LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name
 USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found in the readings, with their colours
@@ -59,7 +61,7 @@ def render(
     validation: JSON | None,
     diagnosis: JSON | None,
     recordings: list[Recording],
-    settings: JSON,
+    settings: Settings,
     *,
     words: dict[str, list[str]] | None = None,
     incomplete: Sequence[JSON] = (),
@@ -76,8 +78,8 @@ def render(
     environment = {
         "temperature": sensor_temperature(recordings),
         "recorded_s": sum(_duration(r) for r in recordings if r.samples),
-        "table": settings.get("table") or {},
-        "filter": (settings.get("filter") or {}).get("name", "none"),
+        "table": settings.table,
+        "filter": settings.filter.name,
     }
     sensors = []
     for sensor in SENSORS if ok else ():
@@ -106,9 +108,9 @@ def render(
         segments=segments(recordings, rests, calibration),
         rests=rest_rows(calibration),
         environment=environment if recordings else None,
-        row={k: v for k, v in (settings.get("row") or {}).items() if v},
-        command=run_command(settings["run"]) if settings.get("run") else None,
-        settings_text=json_text({k: v for k, v in settings.items() if k not in ("row", "run", "certificate")}),
+        row={k: v for k, v in settings.stated.row.items() if v},
+        command=run_command(settings.stated.run) if settings.stated.run else None,
+        settings_text=json_text(_shown(settings)),
     )
     return page
 
@@ -126,11 +128,11 @@ def found_mounting(calibration: JSON) -> JSON | None:
 
 
 def _sensor(
-    sensor: str, calibration: JSON, held_out: JSON, found: JSON, *, recordings: list[Recording], settings: JSON
+    sensor: str, calibration: JSON, held_out: JSON, found: JSON, *, recordings: list[Recording], settings: Settings
 ) -> JSON:
     """Return what the template shows of a calibrated sensor, from its parts of validation and diagnosis."""
-    part, table = calibration[sensor], settings["table"]
-    sensor_config = (settings.get("sensor") or {}).get(sensor) or {}
+    part, table = calibration[sensor], settings.table
+    sensor_config = settings.sensor.of(sensor)
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
@@ -139,7 +141,7 @@ def _sensor(
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
-    parameters, run = parameter_rows(sensor, part, sensor_config), settings.get("run")
+    parameters, run = parameter_rows(sensor, part, sensor_config), settings.stated.run
     return {
         "held_out": held_out,
         "before": first.get("rms_error"),
@@ -172,9 +174,15 @@ def _sensor(
         "of_rests": table.get("motion") == "none" and not logged,
         "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), run)
-        if (run := settings.get("run"))
+        if (run := settings.stated.run)
         else {},
     }
+
+
+def _shown(settings: Settings) -> JSON:
+    """Return the settings that the page shows: what determines the results, and its digest."""
+    sections = {k: v.json_value for k, v in settings.items() if k not in ("stated", "certificate")}
+    return dict(sorted({**sections, "config_sha256": settings.stated.config_sha256}.items()))
 
 
 def files_read(inputs: list[JSON] | None) -> list[JSON]:

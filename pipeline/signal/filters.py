@@ -52,7 +52,7 @@ from pipeline.errors import ConfigurationError, InputError
 from pipeline.records import Integers, Note, Recording, Values, noise_of_steps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
 
 GAP = 1.5  # medians of the interval: a lost sample makes two of one
@@ -67,7 +67,7 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
 }
 
 
-def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
+def apply_filter(recording: Recording, settings: Mapping[str, Any]) -> Recording:
     """Filter the accelerometer and gyroscope readings of a recording; all other channels are unchanged.
 
     ``settings``: ``name`` (``none``, ``rc_low_pass``, ``low_pass``, ``high_pass``, ``band_pass``, ``band_stop``),
@@ -106,7 +106,7 @@ def filtered(values: Values, recording: Recording) -> Values:
     return values if recording.filter["name"] == "none" else _filter_of(recording, recording.filter)[1](values)
 
 
-def _filter_of(recording: Recording, settings: dict[str, Any]) -> tuple[Values, Callable[[Values], Values]]:
+def _filter_of(recording: Recording, settings: Mapping[str, Any]) -> tuple[Values, Callable[[Values], Values]]:
     """Return the second-order sections of a filter, and the function that filters values at a recording's samples."""
     zero_phase, interval = bool(settings["zero_phase"]), recording.interval
     if settings["name"] == "rc_low_pass":
@@ -173,7 +173,7 @@ def _rc_low_pass(time: Values, reading: Values, time_constant: float) -> Values:
     return out
 
 
-def _group_delay(settings: dict[str, Any], sections: Values, interval: float) -> float:
+def _group_delay(settings: Mapping[str, Any], sections: Values, interval: float) -> float:
     """Return the group delay, s, of second-order sections b0 b1 b2 a0 a1 a2: at 0 Hz, or in the middle of a band."""
     n, omega = np.arange(3), 0.0  # rad a sample
     if settings["name"] == "band_pass":  # the middle of the band as the bilinear transform maps it
@@ -200,7 +200,7 @@ def _noise_gain(sections: Values, *, zero_phase: bool) -> float:
     return float(np.sqrt(weight @ response / size))
 
 
-def _time_constant(settings: dict[str, Any], interval: float) -> float:
+def _time_constant(settings: Mapping[str, Any], interval: float) -> float:
     """Return RC in s, from the cutoff where one is given."""
     cutoff, time_constant = settings["cutoff_hz"], settings["time_constant_s"]
     if cutoff is None and time_constant is None:
@@ -224,7 +224,7 @@ def _require_below_nyquist(key: str, frequency: float | None, interval: float) -
         )
 
 
-def _butterworth_sections(settings: dict[str, Any], interval: float) -> Values:
+def _butterworth_sections(settings: Mapping[str, Any], interval: float) -> Values:
     from scipy.signal import butter  # noqa: PLC0415  (0.6 s that the default, no filter, does not pay)
 
     name, order = settings["name"], settings["order"]

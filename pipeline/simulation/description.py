@@ -32,6 +32,7 @@ from pipeline.files import CONFIGS
 from pipeline.io.files import wrong_name
 from pipeline.io.yaml_file import read_yaml
 from pipeline.model.sensor_file import completed
+from pipeline.settings import SECTIONS, Settings
 from pipeline.simulation.procedures import (
     FERRARIS,
     ONE_RECORDING,
@@ -205,6 +206,19 @@ def _read_mapping(path: Path) -> dict[str, Any]:
 def read_config(group: str, name: str) -> dict[str, Any]:
     """Return ``read_option``, for a sensor ``completed``; each call returns a new copy."""
     return deepcopy(_config(group, name))
+
+
+@cache
+def shipped_settings(**options: str) -> Settings:
+    """Return the settings of shipped options of groups, ``sensor="mpu6050"``, with the default of every other setting.
+
+    Raises ``ConfigurationError`` if a group has no such option.
+    """
+    defaults = _read_mapping(CONFIGS / "config.yaml")
+    chosen = {group: name for entry in defaults["defaults"] if isinstance(entry, dict) for group, name in entry.items()}
+    content = {group: {"name": name, **_config(group, name)} for group, name in (chosen | options).items()}
+    content |= {name: defaults[name] for name in SECTIONS if name not in content}
+    return Settings.with_sections(**{name: section.model_validate(content[name]) for name, section in SECTIONS.items()})
 
 
 @cache

@@ -24,11 +24,12 @@ from pipeline.errors import DamagedFileError, failure_of, is_of_run, omission
 from pipeline.files import read_json, write_json
 from pipeline.pack import FAILED, INCOMPLETE, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written, repetitions
+from pipeline.settings import Settings
 from pipeline.stages import MODULES
 from pipeline.unit import STEPS, Task, run_step
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from types import ModuleType
 
 FITS = ("accelerometer", "gyroscope")
@@ -59,7 +60,8 @@ class Job:
     """One stage for one batch."""
 
     stage: str
-    units: dict[str, dict[str, Any]]  # unit to its settings
+    units: dict[str, Settings]  # unit to its settings
+    content: dict[str, dict[str, Any]]  # unit to its settings as JSON values
     run: dict[str, Any]  # settings of the run, and the options of the command line
     inputs: dict[str, Pack]  # stage to its output
     output: Path  # file to write
@@ -87,7 +89,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
     with new_pack(job.output) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
-            inputs = _inputs_of(job, unit, settings) if stage in BY_INPUTS else ""
+            inputs = _inputs_of(job, unit) if stage in BY_INPUTS else ""
             files = _unchanged(last, unit, inputs) if inputs and not edited else {}
             if files:
                 print(f"{stage}: {unit} unchanged, taken from the last run", file=sys.stderr, flush=True)
@@ -121,10 +123,10 @@ def forget_last_outputs(results: Path) -> None:
         last.unlink()
 
 
-def _inputs_of(job: Job, unit: str, settings: dict[str, Any]) -> str:
+def _inputs_of(job: Job, unit: str) -> str:
     """Return a digest of a unit's settings, code and files of earlier stages; empty if a file is damaged."""
     run = {key: value for key, value in job.run.items() if key != "again"}
-    found = hashlib.sha256(json.dumps([run, settings], sort_keys=True).encode())
+    found = hashlib.sha256(json.dumps([run, job.content[unit]], sort_keys=True).encode())
     prefixes = (f"{unit}.", f"{unit}_")
     try:
         for pack in job.inputs.values():
@@ -163,12 +165,13 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
         from pipeline.model.effects import register_user_effects  # noqa: PLC0415  (numpy, where there are any)
 
         register_user_effects(content["user_effects"])
-    units, output = content.pop("units"), arguments.pop("output")
+    of_units, output = content.pop("units"), arguments.pop("output")
     inputs = {name: Pack(arguments.pop(name)) for name in INPUTS[stage]}
     for name in ("recordings", "previous"):
         if path := arguments.pop(name, ""):
             inputs[name] = Pack(Path(path))
-    return Job(stage, units, content | arguments, inputs, output, results)
+    units = {unit: Settings.of_sections(sections) for unit, sections in of_units.items()}
+    return Job(stage, units, of_units, content | arguments, inputs, output, results)
 
 
 def merge_common(content: dict[str, Any]) -> dict[str, Any]:
@@ -181,7 +184,7 @@ def merge_common(content: dict[str, Any]) -> dict[str, Any]:
     return content
 
 
-def _merged(common: dict[str, Any], unit_settings: dict[str, Any]) -> dict[str, Any]:
+def _merged(common: dict[str, Any], unit_settings: Mapping[str, Any]) -> dict[str, Any]:
     below = {k: _merged(common[k], v) for k, v in unit_settings.items() if isinstance(v, dict) and k in common}
     return dict(sorted({**common, **unit_settings, **below}.items()))
 
@@ -197,7 +200,7 @@ def _below(job: Job, output: Path) -> str:
     return output.relative_to(job.results).as_posix().removeprefix(".") if output.is_relative_to(job.results) else ""
 
 
-def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> dict[str, bytes]:
+def _files_of(module: ModuleType, job: Job, unit: str, settings: Settings) -> dict[str, bytes]:
     """Return the files of a unit; for a unit that failed here or before, with the record of its failure."""
     name = unit + FAILED
     stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
@@ -215,9 +218,7 @@ def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any])
     return _encoded({name: failure} | (of_failed(job, unit, settings, failure) if of_failed else {}))
 
 
-def _made_or_replaced(
-    module: ModuleType, job: Job, unit: str, settings: dict[str, Any], stage: str
-) -> dict[str, bytes]:
+def _made_or_replaced(module: ModuleType, job: Job, unit: str, settings: Settings, stage: str) -> dict[str, bytes]:
     """Return the files that a stage makes of a unit; of a stage after the fit that fails, those that replace them."""
     try:
         return _encoded(_made(module, job, unit, settings))
@@ -230,7 +231,7 @@ def _made_or_replaced(
         return _encoded({**instead, unit + INCOMPLETE: [record]})
 
 
-def _made(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> Files:
+def _made(module: ModuleType, job: Job, unit: str, settings: Settings) -> Files:
     """Load what a step reads from the files of earlier stages, call it, and return what it made as files."""
     if job.stage not in STEPS:
         files: Files = getattr(module, f"{job.stage}_unit")(job, unit, settings)

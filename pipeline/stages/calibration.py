@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Fit
+    from pipeline.settings import Board, Settings
     from pipeline.stages.batch import Job
 
 MOVE = "record turns of 100 deg/s and more about all axes"
@@ -40,7 +41,7 @@ def calibration_document(
     checked: list[Recording],
     fits: Mapping[str, Fit],
     validation: Mapping[str, Any],
-    settings: Mapping[str, Any],
+    settings: Settings,
 ) -> dict[str, Any]:
     """Return ``calibrations/<unit>.json``: the fits, noise at rest, inputs and software.
 
@@ -50,42 +51,40 @@ def calibration_document(
     if len(reasons) == len(SENSORS):
         told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
         raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
-    axes = {s: list(m) for s, m in axis_maps(settings["sensor"]).items()}
+    axes = {s: list(m) for s, m in axis_maps(settings.sensor).items()}
     document = header(unit, settings) | {
         "status": "ok",
         "error": None,
-        "log": {"ingest": settings["ingest"], "axis_map": axes},
+        "log": {"ingest": {"csv": settings.ingest.csv, "mcap": settings.ingest.mcap}, "axis_map": axes},
         "inputs": inputs(checked),
         "calibrated_range": calibrated_range(checked),
         "not_calibrated": reasons,
         "noise": identify_noise(checked),
     }
     for sensor, fit in fits.items():
-        found = None if sensor in reasons else judged(sensor, fit.to_json(), settings["sensor"][sensor])
+        found = None if sensor in reasons else judged(sensor, fit.to_json(), settings.sensor.of(sensor))
         document[sensor] = found
     return document
 
 
-def not_calibrated(
-    fits: Mapping[str, Fit], validation: Mapping[str, Any], settings: Mapping[str, Any]
-) -> dict[str, str]:
+def not_calibrated(fits: Mapping[str, Fit], validation: Mapping[str, Any], settings: Settings) -> dict[str, str]:
     """Return the sensors that are not calibrated, each with the reason."""
     reasons = {sensor: fit.reason for sensor, fit in fits.items() if isinstance(fit, NotCalibrated)}
-    if not settings["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
+    if not settings.method.as_printed:  # printed errata are shown as they are; the verdict is left_by_method
         fitted = {sensor: validation[sensor] for sensor in SENSORS if sensor not in reasons}
         reasons |= {s: v["worse_than_raw"] for s, v in fitted.items() if v and v["worse_than_raw"]}
     return reasons
 
 
-def calibration_in_batch(job: Job, unit: str, settings: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
+def calibration_in_batch(job: Job, unit: str, settings: Settings, document: dict[str, Any]) -> dict[str, Any]:
     """Return the document with what the other units of the batch tell: the chips of a board."""
-    board = settings.get("board")
+    board = settings.stated.board
     return document | {"board": _on_board(job, unit, board)} if board else document
 
 
-def _on_board(job: Job, unit: str, board: dict[str, Any]) -> dict[str, Any]:
+def _on_board(job: Job, unit: str, board: Board) -> dict[str, Any]:
     """Return the board of a unit; for its reference chip, with the mounting of all other chips relative to it."""
-    reference, *others = board["chips"]
+    reference, *others = board.chips
     chips: dict[str, Any] = {}
     for other in others if unit == reference else ():
         try:
@@ -96,7 +95,7 @@ def _on_board(job: Job, unit: str, board: dict[str, Any]) -> dict[str, Any]:
             chips[other] = {"refused": error.message}
         except np.linalg.LinAlgError:
             chips[other] = {"refused": f"the readings do not determine how {other} sits: {MOVE}"}
-    return {"name": board["name"], "reference": reference, "chips": chips}
+    return {"name": board.name, "reference": reference, "chips": chips}
 
 
 def _chip(job: Job, unit: str) -> Chip:
@@ -104,7 +103,7 @@ def _chip(job: Job, unit: str) -> Chip:
     stored, settings = StoredUnit(job, unit), job.units[unit]
     reasons = not_calibrated(stored.fits, stored.validation, settings)
     found = {s: None if s in reasons else c for s, c in calibrated(stored.fits).items()}
-    return Chip(unit, stored.checked, found, settings["sensor"])
+    return Chip(unit, stored.checked, found, settings.sensor)
 
 
 def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -124,7 +123,7 @@ def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
     return found
 
 
-def judged(sensor: str, fit: dict[str, Any], sensor_config: dict[str, Any]) -> dict[str, Any]:
+def judged(sensor: str, fit: dict[str, Any], sensor_config: Mapping[str, Any]) -> dict[str, Any]:
     """Add to a fit the parameters beyond the sensor file's limits, and those that only the limits determine.
 
     Which of those beyond are implausible depends on their uncertainty, and on what the configuration accepts.
@@ -136,16 +135,16 @@ def judged(sensor: str, fit: dict[str, Any], sensor_config: dict[str, Any]) -> d
     return fit | lists | {"not_determined": not_determined(fit)}
 
 
-def header(unit: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+def header(unit: str, settings: Settings) -> dict[str, Any]:
     """Return the part of a calibration document that does not depend on the fit."""
     return {
         "schema_version": SCHEMA_VERSION,
         "unit": unit,
         "status": None,
         "error": None,
-        **{group: settings[group]["name"] for group in ("sensor", "table", "procedure", "method")},
-        "methods": {sensor: settings["method"][sensor] for sensor in SENSORS},
-        "config_sha256": settings["config_sha256"],
+        **{group: getattr(settings, group).name for group in ("sensor", "table", "procedure", "method")},
+        "methods": {sensor: settings.method.of(sensor) for sensor in SENSORS},
+        "config_sha256": settings.stated.config_sha256,
         "software": dict(_software()),
     }
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from pipeline.pack import Files
     from pipeline.records import Fit, Noise, SensorCalibration, UnitRecordings
+    from pipeline.settings import Settings
     from pipeline.stages.batch import Job
 
 
@@ -33,14 +34,14 @@ def diagnose_unit(
     recordings: UnitRecordings,
     fits: Mapping[str, Fit],
     validation: Mapping[str, Any],
-    settings: Mapping[str, Any],
+    settings: Settings,
 ) -> Diagnosis:
     """Diagnose which physical effects the models of both sensors lack.
 
     A diagnosis of one sensor that fails does not stop the other.
     """
     known = calibrated(fits)
-    noises = required_noises(recordings, settings["sensor"], known)
+    noises = required_noises(recordings, settings.sensor, known)
     made = Diagnosis({"schema_version": SCHEMA_VERSION, "unit": unit}, {}, [])
     for sensor, calibration in known.items():
         if calibration is None:
@@ -59,7 +60,7 @@ def diagnose_unit(
     return made
 
 
-def diagnose_without(job: Job, unit: str, settings: dict[str, Any], record: dict[str, Any]) -> Files:
+def diagnose_without(job: Job, unit: str, settings: Settings, record: dict[str, Any]) -> Files:
     """Return the document of a unit without a diagnosis of either sensor."""
     known = calibrated(StoredUnit(job, unit).fits)
     parts = {s: c and without_diagnosis(s, settings, record) for s, c in known.items()}
@@ -71,7 +72,7 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
     known: Mapping[str, SensorCalibration | None],
     recordings: UnitRecordings,
     noise: Noise,
-    settings: Mapping[str, Any],
+    settings: Settings,
     validation: Mapping[str, Any],
     gravity: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
@@ -88,5 +89,5 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
         moves=validation["gravity_direction"] if sensor == "gyroscope" else None,
     )
     other = next(c for s, c in known.items() if s != sensor)
-    found["effective_noise"] = effective_noise(calibration, filtered, noise, settings["table"], found, other=other)
+    found["effective_noise"] = effective_noise(calibration, filtered, noise, settings.table, found, other=other)
     return found

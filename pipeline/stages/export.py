@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.exports import exports
 
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
+
 
 def export(
-    calibration: dict[str, Any], validation: dict[str, Any], diagnosis: dict[str, Any], settings: dict[str, Any]
+    calibration: dict[str, Any], validation: dict[str, Any], diagnosis: dict[str, Any], settings: Settings
 ) -> dict[str, str]:
     """Return the files of ``exports/<unit>/`` by name."""
     return exports(calibration, settings, validation, diagnosis)

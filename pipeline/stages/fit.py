@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.stages import GIVEN, fit_stage
@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.records import Fit, UnitRecordings
+    from pipeline.settings import Settings
 
 
 def fit(
     recordings: UnitRecordings,
     fits: Mapping[str, Fit],
-    settings: Mapping[str, Any],
+    settings: Settings,
     *,
     sensor: str,
     stage: str,
@@ -32,10 +33,10 @@ def fit(
     previous = fits.get(sensor)
     if isinstance(previous, NotCalibrated):
         return previous
-    settings = {**settings, "noise": recordings.noises}
+    with_noise = {**settings, "noise": recordings.noises}
     try:
-        found = fit_stage(sensor, stage, recordings.filtered, previous, settings)
+        found = fit_stage(sensor, stage, recordings.filtered, previous, with_noise)
         # only after the last stage, or it would be counted twice; a given calibration states its own uncertainty
-        return with_stated(found, recordings.filtered, settings) if last and stage != GIVEN else found
+        return with_stated(found, recordings.filtered, with_noise) if last and stage != GIVEN else found
     except CannotCalibrateError as reason:
         return NotCalibrated(reason.message)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from pipeline.records import Recording
+    from pipeline.settings import Settings
     from pipeline.stages.batch import Job
     from pipeline.unit import UnitFiles
 
@@ -30,11 +31,11 @@ def collect_batch(job: Job) -> None:
     stored once. A unit with an unreadable recording has failed, as in ``ingest``.
     """
     files: dict[str, bytes] = {}
-    folders = {unit: Path(job.run["directory"], s["procedure"]["folder"]) for unit, s in job.units.items()}
+    folders = {unit: Path(job.run["directory"], s.procedure.folder) for unit, s in job.units.items()}
     done: set[str] = set()
     with new_pack(job.output) as add:
         for unit, settings in job.units.items():
-            found = recording_files(settings["procedure"], settings["ingest"], folders[unit])
+            found = recording_files(settings.procedure, settings.ingest, folders[unit])
             try:
                 for path in sorted({path for paths in found.values() for path in paths}):
                     if _member(path) not in done:
@@ -49,7 +50,7 @@ def collect_batch(job: Job) -> None:
         add({name: content for name, content in files.items() if name not in done})
 
 
-def _extract(recordings: Pack, settings: Mapping[str, Any], folder: Path, root: str) -> None:
+def _extract(recordings: Pack, settings: Settings, folder: Path, root: str) -> None:
     """Write the recordings of a unit below ``root``, which replaces the root of the file system."""
     if f"{_member(folder)}/" in recordings:
         Path(f"{root}{folder}").mkdir(parents=True)
@@ -60,8 +61,8 @@ def _extract(recordings: Pack, settings: Mapping[str, Any], folder: Path, root: 
             copy.write_bytes(recordings.read(_member(path)))
 
 
-def _candidates(settings: Mapping[str, Any], folder: Path) -> list[Path]:
-    files = candidate_files(settings["procedure"], settings["ingest"]).values()
+def _candidates(settings: Settings, folder: Path) -> list[Path]:
+    files = candidate_files(settings.procedure, settings.ingest).values()
     return [folder / file for candidates in files for candidate in candidates for file in candidate]
 
 
@@ -69,7 +70,7 @@ def _member(path: Path) -> str:
     return os.path.normpath(path).lstrip("/")
 
 
-def ingest(files: UnitFiles, settings: dict[str, Any]) -> list[Recording]:
+def ingest(files: UnitFiles, settings: Settings) -> list[Recording]:
     """Read, cut and check the recordings of a unit."""
     if files.archive is None:
         return _ingested(files, settings)
@@ -84,16 +85,17 @@ def ingest(files: UnitFiles, settings: dict[str, Any]) -> list[Recording]:
         return [replace(r, source=_named(r.source, lambda file: file.removeprefix(root))) for r in ingested]
 
 
-def _ingested(files: UnitFiles, settings: dict[str, Any]) -> list[Recording]:
-    procedure, recordings = settings["procedure"], []
+def _ingested(files: UnitFiles, settings: Settings) -> list[Recording]:
+    procedure, recordings = settings.procedure, []
     whole = files.recordings or read_recordings(
-        procedure, settings["ingest"], settings["sensor"], files.folder, files.in_memory
+        procedure, settings.ingest, settings.sensor, files.folder, files.in_memory
     )
     held_out = any(read.role == "validation" for read in whole)
     for read in whole:
-        windows = procedure["recordings"].get(read.name, {}).get("windows")
-        if read.role == "rests" and procedure["turns"] and not held_out:
-            turns = held_out_windows(read, procedure["turns"])
+        entry = procedure.recordings.get(read.name)
+        windows = entry.windows if entry else None
+        if read.role == "rests" and procedure.turns and not held_out:
+            turns = held_out_windows(read, procedure.turns)
             recordings += cut(read, turns, found=True) if turns else [read]
         else:
             recordings += cut(read, windows) if read.role == "session" else [read]

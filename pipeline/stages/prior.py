@@ -18,6 +18,7 @@ from pipeline.stages.validate import held_out_errors
 
 if TYPE_CHECKING:
     from pipeline.pack import Files
+    from pipeline.settings import Settings
     from pipeline.stages.batch import Job
 
 LOTS = "told.json"  # description of the lots for ``fleet.json``
@@ -45,7 +46,7 @@ def _of_batch(lots: Pack, batch: str) -> Any:  # noqa: ANN401  (a JSON document)
     return lots.json(f"{batch}.json")
 
 
-def prior_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
+def prior_unit(job: Job, unit: str, settings: Settings) -> Files:
     """Return the files that the priors of a unit add or change, by paths relative to the results."""
     given = _of_batch(job.inputs["lots"], job.output.parent.name)[unit]
     if not given:
@@ -69,7 +70,7 @@ def prior_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     return {f"{unit}/{path}": content for path, content in files.items()}
 
 
-def prior_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:  # noqa: ARG001
+def prior_failed(job: Job, unit: str, settings: Settings, failure: dict[str, Any]) -> Files:  # noqa: ARG001
     """Return the document and the page of a unit that fails in this stage."""
     earlier = f"{unit}.calibration.json" in job.inputs["report"]
     return {} if earlier else failed_files(job.inputs["calibration"], unit, failure)

@@ -17,6 +17,7 @@ from pipeline.stages.unit_files import recordings_of
 if TYPE_CHECKING:
     from pipeline.pack import Files
     from pipeline.records import UnitRecordings
+    from pipeline.settings import Settings
     from pipeline.stages.batch import Job
 
 
@@ -27,7 +28,7 @@ def report(
     validation: dict[str, Any],
     diagnosis: dict[str, Any],
     omissions: list[dict[str, Any]],
-    settings: dict[str, Any],
+    settings: Settings,
 ) -> Files:
     """Return the page and the calibration report (certificate) of a unit, by their names below ``reports``.
 
@@ -41,12 +42,12 @@ def report(
     return {f"{unit}.html": page} | {f"certificates/{unit}.{kind}": made for kind, made in kinds.items() if made}
 
 
-def report_without(job: Job, unit: str, settings: dict[str, Any], record: dict[str, Any]) -> Files:  # noqa: ARG001
+def report_without(job: Job, unit: str, settings: Settings, record: dict[str, Any]) -> Files:  # noqa: ARG001
     """Return a page that states why the page of a calibrated unit could not be made."""
     return {f"{unit}.html": failure_page(unit, record, calibrated=True)}
 
 
-def report_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> Files:
+def report_failed(job: Job, unit: str, settings: Settings, failure: dict[str, Any]) -> Files:
     """Return the page and the calibration document of a unit that failed."""
     document = header(unit, settings) | {"status": "failed", "error": failure, "inputs": []}
     document |= {"accelerometer": None, "gyroscope": None, "not_calibrated": {}}
@@ -58,7 +59,7 @@ def report_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[s
     return {f"{unit}.calibration.json": document, f"{unit}.html": page}
 
 
-def _page_of_failed(job: Job, document: dict[str, Any], settings: dict[str, Any]) -> str:
+def _page_of_failed(job: Job, document: dict[str, Any], settings: Settings) -> str:
     """Add the recordings that were read before the failure to a unit's document, and return its page."""
     unit = document["unit"]
     recordings = recordings_of(job.inputs, unit) if f"{unit}.noise.json" in job.inputs["filter"] else []

@@ -12,35 +12,37 @@ from pipeline.history import unit_state
 from pipeline.io.digests import digests_of_entries
 from pipeline.report.pages import failure_page
 from pipeline.report.parameters import sheet_columns, summary_row, unit_parameters
+from pipeline.settings import Stated
 
 if TYPE_CHECKING:
     from pipeline.pack import Files, Pack
+    from pipeline.settings import Sensor, Settings
     from pipeline.stages.batch import Job
 
 JSON = dict[str, Any]
 KEPT = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
 
 
-def summarise(calibration: JSON, validation: JSON, diagnosis: JSON, settings: JSON) -> JSON:
+def summarise(calibration: JSON, validation: JSON, diagnosis: JSON, settings: Settings) -> JSON:
     """Return the summary of a calibrated unit."""
-    found = summary(settings, None, calibration, validation, diagnosis)
-    if settings["compared"]:
+    found = summary(settings.stated, settings.sensor, None, calibration, validation=validation, diagnosis=diagnosis)
+    if settings.stated.compared:
         from pipeline.report.comparison import unit_figures  # noqa: PLC0415  (pandas, where units are compared)
 
         found["figures"] = unit_figures(calibration, validation, diagnosis)
-    if settings["lot_prior"]:
+    if settings.stated.lot_prior:
         from pipeline.report.combined import estimates  # noqa: PLC0415  (only where a lot is the prior)
 
-        found["estimates"] = [e._asdict() for e in estimates(settings["row"], calibration, diagnosis)]
+        found["estimates"] = [e._asdict() for e in estimates(settings.stated.row, calibration, diagnosis)]
     return found
 
 
-def summary_without(job: Job, unit: str, settings: JSON, record: JSON) -> Files:  # noqa: ARG001
+def summary_without(job: Job, unit: str, settings: Settings, record: JSON) -> Files:  # noqa: ARG001
     """Return the summary of a calibrated unit whose documents could not be summarised."""
-    return {f"{unit}.json": summary(settings, None, {"unit": unit, "status": "ok"})}
+    return {f"{unit}.json": summary(settings.stated, settings.sensor, None, {"unit": unit, "status": "ok"})}
 
 
-def summary_failed(job: Job, unit: str, settings: JSON, failure: JSON) -> Files:
+def summary_failed(job: Job, unit: str, settings: Settings, failure: JSON) -> Files:
     """Return the summary of a failed unit; for one that fails in this stage, with its document and its page."""
     name, report, files = f"{unit}.calibration.json", job.inputs["report"], {}
     try:
@@ -48,26 +50,25 @@ def summary_failed(job: Job, unit: str, settings: JSON, failure: JSON) -> Files:
     except PipelineError:
         files = failed_files(job.inputs["calibration"], unit, failure)
         calibration = files[name]
-    return {f"{unit}.json": summary(settings, failure, calibration), **files}
+    return {f"{unit}.json": summary(settings.stated, settings.sensor, failure, calibration), **files}
 
 
 def summary(
-    settings: JSON,
+    stated: Stated,
+    sensor: Sensor | None,
     failure: JSON | None,
     calibration: JSON,
+    *,
     validation: JSON | None = None,
     diagnosis: JSON | None = None,
 ) -> JSON:
-    """Return the part of a summary that failed units also have.
-
-    ``settings``: ``row`` of ``units.csv``, ``overrides`` and ``config``, the digest of each section.
-    """
+    """Return the part of a summary that failed units also have; ``sensor`` is None where it is not known."""
     documents = calibration, validation, diagnosis
     return {
-        "row": summary_row(calibration["unit"], *documents, settings["row"]),
+        "row": summary_row(calibration["unit"], *documents, stated.row),
         "failure": failure,
-        "state": unit_state(*documents, settings["overrides"], settings["config"]),
-        "parameters": unit_parameters(calibration, settings.get("sensor", {})),
+        "state": unit_state(*documents, stated.overrides, stated.sections),
+        "parameters": unit_parameters(calibration, sensor),
         "sha256": digests_of_entries(calibration.get("inputs") or ()),
     }
 
@@ -86,5 +87,7 @@ def failed_files(calibrations: Pack, unit: str, failure: JSON) -> Files:
 def failed_summary(found: JSON, failure: JSON, document: JSON) -> JSON:
     """Return the summary of a unit that fails after its first summary, ``found``."""
     state = found.get("state", {})
-    settings = {"row": sheet_columns(found.get("row", {})), **{k: state.get(k, {}) for k in ("overrides", "config")}}
-    return summary(settings, failure, document)
+    stated = Stated(
+        row=sheet_columns(found.get("row", {})), overrides=state.get("overrides", {}), sections=state.get("config", {})
+    )
+    return summary(stated, None, failure, document)

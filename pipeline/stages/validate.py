@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.records import Fit, UnitRecordings
+    from pipeline.settings import Settings
 
 
 def held_out_document(
-    unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Mapping[str, Any]
+    unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings
 ) -> dict[str, Any]:
     """Return ``validations/<unit>.json``: the errors on held-out motion after each step of both fits."""
     filtered, found = recordings.filtered, calibrated(fits)
@@ -30,10 +31,10 @@ def held_out_document(
     return document
 
 
-def held_out_errors(recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Mapping[str, Any]) -> dict[str, Any]:
+def held_out_errors(recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings) -> dict[str, Any]:
     """Return the part of each sensor in ``validations/<unit>.json``; None for a sensor without a calibration."""
     known = calibrated(fits)
-    noises = required_noises(recordings, settings["sensor"], known)
+    noises = required_noises(recordings, settings.sensor, known)
     found = {}
     for sensor, calibration in known.items():
         other = next(c for s, c in known.items() if s != sensor)

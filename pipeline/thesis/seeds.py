@@ -37,7 +37,7 @@ from pipeline.model.measurement import linear_truth
 from pipeline.records import SENSORS, Mask, NotCalibrated, Recording, Values
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import Description, UnitDescription, read_config, read_description
+from pipeline.simulation.description import Description, UnitDescription, read_description, shipped_settings
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
 from pipeline.simulation.session import received
 from pipeline.thesis.tables import AXES, DEVICES, SILENT
@@ -47,6 +47,8 @@ from pipeline.validation.samples import samples_of_motion
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
+
+    from pipeline.settings import Settings
 
 
 FOUND = ("O_y", "O_z", "M", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
@@ -102,19 +104,19 @@ class Set:
         exact = self.still if self.unit.table == "acutronic" else _exact(self.unit, seed, self.number)
         if cause == SHAKEN:
             exact = self.shaken
-        sensor_config = read_config("sensor", self.unit.sensor)[self.sensor]
+        data_sheet = shipped_settings(sensor=self.unit.sensor).sensor.of(self.sensor)
         given = getattr(self.unit, self.sensor)
         if cause != SHEET and "noise_density" in given:
-            sensor_config = {**sensor_config, "noise_density": given["noise_density"]}  # of the whole bandwidth
+            data_sheet = data_sheet.replaced(noise_density=given["noise_density"])  # of the whole bandwidth
         lost = self.unit.lost if cause in (LOST, SHAKEN) else 0.0
         link, noise = (np.random.default_rng([seed, self.number, k]) for k in (0, 1 + SENSORS.index(self.sensor)))
-        simulated = SimulatedSensor(self.sensor, sensor_config, np.zeros(3), np.eye(3))
-        wander = bias_wander([r.time for r in exact], sensor_config["wander_time_s"], noise)
+        simulated = SimulatedSensor(self.sensor, data_sheet, np.zeros(3), np.eye(3))
+        wander = bias_wander([r.time for r in exact], data_sheet.wander_time_s, noise)
         out = []
         for recording, slow in zip(exact, wander, strict=True):
             white = simulated.white(recording.interval) * noise.standard_normal(slow.shape)
             reading = simulated.quantised(
-                np.asarray(recording.reading(self.sensor)) + white + sensor_config["bias_wander"] * slow
+                np.asarray(recording.reading(self.sensor)) + white + data_sheet.bias_wander * slow
             )
             readings: dict[str, Any] = {s: reading if s == self.sensor else None for s in SENSORS}
             out.append((replace(recording, **readings), received(recording.samples, lost, link)))
@@ -144,8 +146,9 @@ class Drawn:
         if self.filter == "unfiltered":
             return recording
         time_constant = SAME_GAIN_S if self.filter == "same-gain" else TIME_CONSTANT_S
-        wanted = {**read_config("filter", "rc_low_pass"), "time_constant_s": float(time_constant)}
-        return apply_filter(recording, {**wanted, "zero_phase": self.filter != "rc_low_pass"})
+        shipped = shipped_settings(filter="rc_low_pass").filter
+        causal = self.filter == "rc_low_pass"
+        return apply_filter(recording, shipped.replaced(time_constant_s=float(time_constant), zero_phase=not causal))
 
     def turns(self) -> list[Recording]:
         """Return the filtered turns."""
@@ -168,16 +171,19 @@ class Drawn:
 
     def least_squares_accelerometer(self) -> Row:
         """Return the error after nonlinear least squares."""
-        settings = self._settings() | {"filter": {"name": "none"}}  # the turns are filtered
+        settings = self._settings()  # without a filter: the turns are filtered
         unit = run_checked(self.turns(), {"accelerometer": ["nonlinear_least_squares"]}, settings)
         fitted = unit.fits["accelerometer"]
         assert not isinstance(fitted, NotCalibrated)  # noqa: S101  (turns about three axes)
         return self._accelerometer_error(partial(linear_truth, fitted))
 
-    def _settings(self, *, as_printed: bool = False) -> dict[str, Any]:
-        table, sensor = (read_config(group, getattr(self.turns_set.unit, group)) for group in ("table", "sensor"))
-        method = {"as_printed": as_printed}
-        return {"table": table, "sensor": sensor, "procedure": {"holdout_every": 0}, "method": method}
+    def _settings(self, *, as_printed: bool = False) -> Settings:
+        unit = self.turns_set.unit
+        shipped = shipped_settings(sensor=unit.sensor, table=unit.table, procedure=unit.procedure)
+        return shipped.replaced(
+            method=shipped.method.replaced(as_printed=as_printed),
+            procedure=shipped.procedure.replaced(holdout_every=0),
+        )
 
     def _accelerometer_error(self, correct: Callable[[Values], Values]) -> Row:
         """Return the mean |e| of the held-out motion, corrected."""
@@ -195,7 +201,7 @@ class Drawn:
             "cholesky-printed": cholesky_lu.calibration_matrix(A, as_printed=True),
             "cholesky": cholesky_lu.calibration_matrix(A, as_printed=False),
         }
-        motion = samples_of_motion("gyroscope", self.filtered(self.held_out), SILENT, settings["table"])
+        motion = samples_of_motion("gyroscope", self.filtered(self.held_out), SILENT, settings.table)
         assert motion is not None  # noqa: S101  (the table logs its rate)
         for method, matrix in matrices.items():
             error = np.linalg.norm((motion.reading - bias) @ matrix.T, axis=1) - motion.magnitude

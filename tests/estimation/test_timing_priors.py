@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from pipeline.config.schema import OF_BENCH
+from pipeline.settings import OF_BENCH
 from pipeline.model.effects import bench_priors
 from pipeline.one_unit import unit_of_recordings
 from pipeline.records import SensorCalibration

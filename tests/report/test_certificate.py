@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.config.schema import Certificate
+from pipeline.settings import Certificate
 from pipeline.report.certificate import STAMP, certificate
 from pipeline.report.certificate import certificate_page as render
 

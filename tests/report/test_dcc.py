@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from pipeline.config.schema import Certificate
+from pipeline.settings import Certificate
 from pipeline.report.certificate import certificate, digital_certificate, dsi_unit, missing_for_dcc
 
 from .conftest import Unit, build_unit

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pipeline.commands.explain import explain
-from pipeline.config.schema import Certificate
+from pipeline.settings import Certificate
 from pipeline.files import write_json
 from pipeline.outcome import outcome, read_summary
 from pipeline.report import campaign_page

@@ -1,14 +1,19 @@
-"""Define the schema of the configuration of a unit: names, types and ranges.
+"""The settings of a unit: names, types and ranges, as functions read them.
 
 Comments in ``configs/`` explain each key. Unknown keys are refused, except in column maps of ``ingest`` and in limits
-of effects, whose keys are names of channels and effects.
+of effects, whose keys are names of channels and effects. A step of the chain has the sections that ``STEPS`` in
+``pipeline.unit`` names; an access to another section raises ``AttributeError``.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -18,12 +23,90 @@ AxisMap = Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
 Sense = Literal[1, -1]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Setting = TypeVar("Setting")
+AnySection = TypeVar("AnySection", bound="Section")
 
 
-class Section(BaseModel):
+if TYPE_CHECKING:
+
+    class _Mapping(Mapping[str, Any]):
+        """A mapping, for functions that do not yet take typed settings."""
+
+        def __getitem__(self, key: str) -> Any: ...  # noqa: ANN401
+        def __len__(self) -> int: ...
+
+else:
+    _Mapping = object
+
+
+class Section(BaseModel, _Mapping):  # type: ignore[misc]
     """A part of the configuration: strict types, no unknown keys."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    def of(self, name: str) -> Any:  # noqa: ANN401  (``OfSensors`` and ``Sensor`` state the type)
+        """Return the setting of a name, such as that of a sensor."""
+        return getattr(self, name)
+
+    def replaced(self, **values: object) -> Self:
+        """Return a copy with other values, which are not checked."""
+        known = {name: self.__dict__[name] for name in type(self).model_fields if name in self.__dict__}
+        return _constructed(type(self), known | values)
+
+    @cached_property
+    def json_value(self) -> dict[str, Any]:
+        """The settings as a JSON value, which must not be changed; computed once, as units share sections."""
+        return self.model_dump(mode="json")
+
+    if not TYPE_CHECKING:  # access as to a mapping, of functions that do not yet take typed settings
+
+        def __getitem__(self, key: str) -> Any:  # noqa: ANN401
+            try:
+                return getattr(self, key)
+            except AttributeError:
+                raise KeyError(key) from None
+
+        def get(self, key: str, default: Any = None) -> Any:  # noqa: ANN401
+            """Return a setting, or the default."""
+            return getattr(self, key, default)
+
+        def __contains__(self, key: str) -> bool:
+            return key in self.keys()
+
+        def __iter__(self) -> Iterator[str]:
+            return iter(self.keys())
+
+        def __len__(self) -> int:
+            return len(self.keys())
+
+        def keys(self) -> list[str]:
+            """Return the names of the settings."""
+            return [name for name in type(self).model_fields if name in self.__dict__]
+
+        def items(self) -> list[tuple[str, Any]]:
+            """Return names and values."""
+            return [(name, self.__dict__[name]) for name in self.keys()]
+
+        def values(self) -> list[Any]:
+            """Return the values."""
+            return [self.__dict__[name] for name in self.keys()]
+
+
+def _constructed(model: type[AnySection], values: Mapping[str, Any]) -> AnySection:
+    """Return a section with these values alone: others are missing, and not their defaults."""
+    made = model.model_construct(**values)
+    for name in made.__dict__.keys() - values.keys():
+        del made.__dict__[name]
+    return made
+
+
+def _partial(model: type[AnySection], content: Mapping[str, Any]) -> AnySection:
+    """Return a section from JSON values that ``Section.json_value`` made, of all its settings or of some."""
+    fields = model.model_fields
+    if all(name in content for name, field in fields.items() if field.is_required()):
+        return model.model_validate(content, strict=False)
+    kinds: dict[str, Any] = {name: fields[name].annotation for name in content}
+    sections = {n: k for n, k in kinds.items() if isinstance(k, type) and issubclass(k, Section)}
+    return _constructed(model, {n: _partial(sections[n], v) if n in sections else v for n, v in content.items()})
 
 
 class DataSheet(Section):
@@ -54,6 +137,11 @@ class Sensor(Section):
     temperature_accuracy_degc: NonNegative | None = None
     accelerometer: DataSheet
     gyroscope: DataSheet
+
+    def of(self, name: str) -> DataSheet:
+        """Return the figures of the accelerometer or the gyroscope."""
+        found: DataSheet = getattr(self, name)
+        return found
 
 
 OF_BENCH = ("seat_deg", "time_offset_s", "clock_accuracy_ppm", "lag_s")  # keys of a table: priors in configs/effect
@@ -165,6 +253,11 @@ class Stages(Section):
     accelerometer: list[str] | None = None
     gyroscope: list[str] | None = None
 
+    def of(self, name: str) -> list[str] | None:
+        """Return the stages of a sensor."""
+        found: list[str] | None = getattr(self, name)
+        return found
+
 
 class Method(Section):
     """The method for each sensor."""
@@ -176,6 +269,12 @@ class Method(Section):
     file: Annotated[str, Field(min_length=1)] | None = None
     format: Annotated[str, Field(min_length=1)] | None = None
     stages: Stages
+    given: dict[str, Any] | None = None  # of ``method=given``: the calibration that was read (``with_given``)
+
+    def of(self, name: str) -> str | None:
+        """Return the method of a sensor; None if it is not calibrated."""
+        found: str | None = getattr(self, name)
+        return found
 
 
 class Filter(Section):
@@ -195,6 +294,11 @@ class OfSensors(Section, Generic[Setting]):
 
     accelerometer: Setting
     gyroscope: Setting
+
+    def of(self, name: str) -> Setting:
+        """Return the setting of the accelerometer or the gyroscope."""
+        found: Setting = getattr(self, name)
+        return found
 
 
 class Uncertainty(Section):
@@ -316,9 +420,8 @@ class Certificate(Section):
 
 
 class Unit(Section):
-    """The whole configuration of one unit."""
+    """The whole configuration of one unit, as its overrides state it."""
 
-    unit: str
     sensor: Sensor
     table: Table
     procedure: Procedure
@@ -332,6 +435,63 @@ class Unit(Section):
     certificate: Certificate
 
 
+class UserEffectFiles(Section):
+    """The effects that the user defines: content of effect files, and path and SHA-256 of Python files."""
+
+    formulas: list[dict[str, Any]]
+    python: list[dict[str, str]]
+
+
+class Board(Section):
+    """A board with several chips; the first is the reference."""
+
+    name: str
+    chips: list[str]
+
+
+class Stated(Section):
+    """What results state about a unit and its run, and what depends on other units."""
+
+    config_sha256: str = ""
+    row: dict[str, str] = {}  # of ``units.csv``
+    run: dict[str, Any] = {}  # settings of ``snakemake --config``
+    overrides: dict[str, str] = {}
+    sections: dict[str, str] = {}  # digest of each section of the configuration
+    compared: bool = False  # whether the campaign's page compares the unit with others
+    lot_prior: bool = False  # whether the unit contributes to the prior of its lot
+    board: Board | None = None
+
+
+class Settings(Unit):
+    """The settings of a unit: its configuration, and what is stated about it."""
+
+    unit: str
+    user_effects: UserEffectFiles | None = None
+    stated: Stated = Stated()
+
+    def only(self, sections: Iterable[str]) -> dict[str, Any]:
+        """Return sections as JSON values; ``effects.gyroscope`` is the part of one sensor."""
+        found: dict[str, Any] = {}
+        for path in sections:
+            section, _, part = path.partition(".")
+            value = getattr(self, section).json_value
+            if part:
+                found.setdefault(section, {})[part] = value[part]
+            else:
+                found[section] = value
+        return found
+
+    @classmethod
+    def with_sections(cls, **sections: Section) -> Self:
+        """Return settings of these sections alone."""
+        return _constructed(cls, sections)
+
+    @classmethod
+    def of_sections(cls, sections: Mapping[str, Any]) -> Self:
+        """Return the settings that ``only`` selected; an access to another section raises ``AttributeError``."""
+        return _partial(cls, sections)
+
+
 class RunSettings(Section):
     """Settings of a run, from ``campaign.yaml`` or the command line. Error messages quote a description."""
 
@@ -340,8 +500,8 @@ class RunSettings(Section):
     publish_limit: int = Field(ge=0, description="a whole number from 0 on")
 
 
-SECTIONS: dict[str, type[BaseModel]] = {
+SECTIONS: dict[str, type[Section]] = {
     name: field.annotation
     for name, field in Unit.model_fields.items()
-    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+    if isinstance(field.annotation, type) and issubclass(field.annotation, Section)
 }
