@@ -301,6 +301,10 @@ class OfSensors(Section, Generic[Setting]):
         return found
 
 
+class Effects(OfSensors[list[str] | Literal["auto"]]):
+    """The effects of each sensor that are fitted with bias and matrix."""
+
+
 class Uncertainty(Section):
     """Settings of the uncertainty computation."""
 
@@ -321,6 +325,10 @@ class SensorLimits(Section):
     held_out_max_abs_error: Positive | None
     bias: Positive | None
     scale_factor: Positive | None
+
+
+class Limits(OfSensors[SensorLimits]):
+    """The limits of each sensor."""
 
 
 class Ingest(Section):
@@ -428,10 +436,10 @@ class Unit(Section):
     method: Method
     filter: Filter
     ingest: Ingest
-    effects: OfSensors[list[str] | Literal["auto"]]
+    effects: Effects
     uncertainty: Uncertainty
     diagnosis: Diagnosis
-    limits: OfSensors[SensorLimits]
+    limits: Limits
     certificate: Certificate
 
 
