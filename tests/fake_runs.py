@@ -71,8 +71,9 @@ def campaign_of(directory: Path, results: Path, *, template: Path, take_over: bo
     """Return the campaign in a directory; ``results``: folder of all results, ``template``: any other new folder."""
     made = _template(template)
     config = made.units["U1"].config
+    procedure = config.procedure
     units = {
-        unit: UnitRow(unit, {"unit": unit}, config | {"procedure": config["procedure"] | {"folder": f"raw/{unit}"}})
+        unit: UnitRow(unit, {"unit": unit}, config.replaced(procedure=procedure.replaced(folder=f"raw/{unit}")))
         for unit in units_of(directory)
     }
     return replace(

@@ -38,14 +38,15 @@ OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": B
 
 def config_sha256(settings: Settings) -> str:
     """Return the SHA-256 of the configuration of a unit as canonical JSON, without the section ``certificate``."""
-    sections = [*(name for name in Unit.model_fields if name != "certificate"), "unit"]
-    content = {name: _json_value(getattr(settings, name)) for name in sections}
-    content |= {"user_effects": settings.user_effects.json_value} if settings.user_effects else {}
+    content = {name: section for name, section in configuration(settings).items() if name != "certificate"}
     return hashlib.sha256(_canonical(content)).hexdigest()
 
 
-def _json_value(value: Any) -> Any:  # noqa: ANN401  (a section, or the name of the unit)
-    return value if isinstance(value, str) else value.json_value
+def configuration(settings: Settings) -> dict[str, Any]:
+    """Return the whole configuration of a unit as dictionaries."""
+    sections = {name: getattr(settings, name).model_dump() for name in Unit.model_fields}
+    of_user = {"user_effects": settings.user_effects.model_dump()} if settings.user_effects else {}
+    return {"unit": settings.unit, **sections, **of_user}
 
 
 def sections_of(stage: str, sensor: str, settings: Settings) -> tuple[str, ...]:

@@ -154,7 +154,11 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, 
         ],
         "measuringEquipments": [
             *(used.json_value for used in stated.equipment),
-            {"name": f"table {calibration.get('table')}", "used_for": "motion of reference", "configured": table.json_value},
+            {
+                "name": f"table {calibration.get('table')}",
+                "used_for": "motion of reference",
+                "configured": table.json_value,
+            },
         ],
         "influenceConditions": {
             "temperature of the sensor, degC": temperature,

@@ -15,7 +15,7 @@ import hashlib
 import json
 import sys
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,11 +61,11 @@ class Job:
 
     stage: str
     units: dict[str, Settings]  # unit to its settings
-    content: dict[str, dict[str, Any]]  # unit to its settings as JSON values
     run: dict[str, Any]  # settings of the run, and the options of the command line
     inputs: dict[str, Pack]  # stage to its output
     output: Path  # file to write
     results: Path  # folder of the campaign's results
+    content: dict[str, dict[str, Any]] = field(default_factory=dict)  # unit to its settings as JSON values
 
 
 def main(stage: str, argv: Sequence[str]) -> int:
@@ -171,7 +171,7 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
         if path := arguments.pop(name, ""):
             inputs[name] = Pack(Path(path))
     units = {unit: Settings.of_sections(sections) for unit, sections in of_units.items()}
-    return Job(stage, units, of_units, content | arguments, inputs, output, results)
+    return Job(stage, units, content | arguments, inputs, output, results, of_units)
 
 
 def merge_common(content: dict[str, Any]) -> dict[str, Any]:

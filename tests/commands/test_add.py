@@ -32,7 +32,7 @@ def campaign(tmp_path: Path) -> Path:
 
 
 def effects(campaign: Path, unit: str) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = load_campaign({"campaign": str(campaign)}).units[unit].config["effects"]
+    found: dict[str, list[str]] = load_campaign({"campaign": str(campaign)}).units[unit].config.effects.json_value
     return found
 
 

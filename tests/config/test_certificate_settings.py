@@ -19,10 +19,10 @@ def campaign(folder: Path, laboratory: str) -> Path:
 def test_a_unit_takes_the_laboratory_of_its_row_and_keeps_its_hash(tmp_path: Path) -> None:
     loaded = load_campaign({"campaign": str(campaign(tmp_path, "laboratory: {name: Mine}\nissued: 2026-03-01\n"))})
     mine, blank = (loaded.units[u].config for u in ("U1", "U2"))
-    assert (mine["certificate"]["laboratory"]["name"], mine["certificate"]["issued"]) == ("Mine", "2026-03-01")
-    assert blank["certificate"]["laboratory"]["name"] is None
-    assert config_sha256(mine) == config_sha256(mine | {"certificate": blank["certificate"]})
-    assert config_sha256(mine) != config_sha256(mine | {"filter": blank["filter"] | {"order": 3}})
+    assert (mine.certificate.laboratory.name, mine.certificate.issued) == ("Mine", "2026-03-01")
+    assert blank.certificate.laboratory.name is None
+    assert config_sha256(mine) == config_sha256(mine.replaced(certificate=blank.certificate))
+    assert config_sha256(mine) != config_sha256(mine.replaced(filter=blank.filter.replaced(order=3)))
 
 
 def test_a_date_that_is_none_is_refused_by_name(tmp_path: Path) -> None:

@@ -89,8 +89,8 @@ def test_the_chips_of_a_board_stay_in_one_batch(tmp_path: Path) -> None:
     assert list(campaign.batches.values()) == [["left-unit", "middle-unit", "right-unit"], ["other-unit"]]
     content = [json.loads(f["calibration"].content) for f in settings_of_jobs(campaign).values() if "calibration" in f]
     boards = [merge_common(c)["units"] for c in content]
-    assert boards[0]["right-unit"]["board"] == {"name": "B1", "chips": campaign.boards["B1"]}
-    assert "board" not in boards[1]["other-unit"]
+    assert boards[0]["right-unit"]["stated"]["board"] == {"name": "B1", "chips": campaign.boards["B1"]}
+    assert boards[1]["other-unit"]["stated"]["board"] is None
 
 
 def test_chips_of_a_board_with_different_methods_are_refused(tmp_path: Path) -> None:

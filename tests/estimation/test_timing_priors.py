@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from pipeline.settings import OF_BENCH
 from pipeline.model.effects import bench_priors
 from pipeline.one_unit import unit_of_recordings
 from pipeline.records import SensorCalibration
+from pipeline.settings import OF_BENCH
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from pipeline.study.bench import recordings_of

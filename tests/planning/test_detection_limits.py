@@ -18,6 +18,7 @@ from pipeline.model.effects import catalogue, effect
 from pipeline.planning.detection_limits import noise_sums
 from pipeline.planning.plan import FAULTLESS, ROOM, plan_of, stated_noise
 from pipeline.records import SENSORS
+from pipeline.settings import DataSheet
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 
@@ -55,7 +56,7 @@ def _found(planned: dict[str, dict[str, Any]], names: dict[str, str], factor: fl
         }
         recordings, _ = simulate_unit(replace(PROCEDURE, effects=hidden), 2, number)
         for sensor, name in names.items():
-            noise = stated_noise(sheets[sensor], PROCEDURE.interval_s, long_rest=True)
+            noise = stated_noise(DataSheet.model_validate(sheets[sensor]), PROCEDURE.interval_s, long_rest=True)
             observations = observe(sensor, recordings, table)
             start = ordinary_base(observations, noise)
             term = Term(effect(name), np.zeros(len(hidden[f"{sensor}.{name}"])))
@@ -83,7 +84,7 @@ def test_an_effect_of_twice_the_planned_size_is_named(planned: dict[str, dict[st
         sizes = {f"{s}.{name}": [2.0 * v for v in planned[s][name]["sizes"].values()] for s, name in hidden.items()}
         recordings, _ = simulate_unit(replace(PROCEDURE, effects=sizes), 4, number)
         for sensor, name in hidden.items():
-            noise = stated_noise(sheets[sensor], PROCEDURE.interval_s, long_rest=True)
+            noise = stated_noise(DataSheet.model_validate(sheets[sensor]), PROCEDURE.interval_s, long_rest=True)
             assert select(observe(sensor, recordings, table), [], noise, sheets[sensor]).names == [name]
 
 
@@ -97,7 +98,7 @@ def test_an_effect_is_taken_for_its_simpler_look_alike_where_the_plan_says_so(
     sheets, table = read_config("sensor", unit.sensor), read_config("table", unit.table)
     for number in range(4):
         recordings, _ = simulate_unit(unit, 3, number)
-        noise = stated_noise(sheets["accelerometer"], unit.interval_s, long_rest=True)
+        noise = stated_noise(DataSheet.model_validate(sheets["accelerometer"]), unit.interval_s, long_rest=True)
         observations = observe("accelerometer", recordings, table)
         assert select(observations, [], noise, sheets["accelerometer"]).names == ["bias_temperature"]
 

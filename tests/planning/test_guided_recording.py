@@ -26,17 +26,13 @@ from pipeline.planning.guide import (
     progress_of as progress_of_unit,
 )
 from pipeline.records import Recording, SensorCalibration
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-SETTINGS: dict[str, Any] = {
-    "sensor": read_config("sensor", "mpu6050"),
-    "table": read_config("table", "hand"),
-    "procedure": {"holdout_every": 0},
-    "filter": {"name": "none"},
-}
+SHIPPED = shipped_settings(sensor="mpu6050", table="hand", procedure="multi_position")
+SETTINGS = SHIPPED.replaced(procedure=SHIPPED.procedure.replaced(holdout_every=0))
 WHITE, RATE, DWELL = 8e-4, 20.0, 4.0
 AXES = {f"{s}{a}": sign * np.eye(3)[i] for i, a in enumerate("xyz") for s, sign in (("+", 1.0), ("-", -1.0))}
 
@@ -97,8 +93,8 @@ def test_a_plan_is_as_good_as_a_design_that_is_known_to_be_optimal() -> None:
 
 @pytest.mark.parametrize("sensor", ["mpu6050", "stim300", "bmi270"])
 def test_the_default_goal_is_what_24_rests_45_deg_apart_give(sensor: str) -> None:
-    sheets, angles = read_config("sensor", sensor), np.radians(np.arange(8) * 45.0)
-    sheet = sheets["accelerometer"]
+    model, angles = shipped_settings(sensor=sensor).sensor, np.radians(np.arange(8) * 45.0)
+    sheet = model.accelerometer
     turns = [np.roll([0.0, np.cos(a), np.sin(a)], axis) for axis in range(3) for a in angles]
     found = []
     for seed in range(6):
@@ -109,7 +105,7 @@ def test_the_default_goal_is_what_24_rests_45_deg_apart_give(sensor: str) -> Non
         for step in np.sqrt(1 - keep**2) * rng.standard_normal((quiet.samples - 1, 3)):
             wander.append(keep * wander[-1] + step)
         log = replace(quiet, accelerometer=quiet.accelerometer + sheet["bias_wander"] * np.array(wander))
-        found.append(progress_of([log], {**SETTINGS, "sensor": sheets}, DWELL).expanded)
+        found.append(progress_of([log], SETTINGS.replaced(sensor=model), DWELL).expanded)
     assert default_goal(sheet, 1.0, DWELL) == pytest.approx(np.median(found), rel=0.25)
 
 
@@ -140,7 +136,7 @@ def test_the_plan_starts_from_the_covariance_of_the_fit_while_a_misalignment_is_
 
 def test_the_rest_that_is_held_out_is_far_from_the_others() -> None:
     rng = np.random.default_rng(3)
-    settings = {**SETTINGS, "procedure": {"holdout_every": 3}}
+    settings = SETTINGS.replaced(procedure=SETTINGS.procedure.replaced(holdout_every=3))
     for count in range(1, 8):
         progress = progress_of([recorded(attitudes()[:count], rng)], settings, DWELL)
         after = progress_of([recorded(attitudes()[: count + 1], rng)], settings, DWELL)

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.settings import Certificate
 from pipeline.report.certificate import STAMP, certificate
 from pipeline.report.certificate import certificate_page as render
+from pipeline.settings import Certificate
 
 from .conftest import Unit, build_unit
 

@@ -6,8 +6,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from pipeline.settings import Certificate
 from pipeline.report.certificate import certificate, digital_certificate, dsi_unit, missing_for_dcc
+from pipeline.settings import Certificate
 
 from .conftest import Unit, build_unit
 from .test_certificate import BUDGET, STATED, settings_of

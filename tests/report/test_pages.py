@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from pipeline.commands.explain import explain
-from pipeline.settings import Certificate
 from pipeline.files import write_json
 from pipeline.outcome import outcome, read_summary
 from pipeline.report import campaign_page
@@ -22,6 +21,7 @@ from pipeline.report.chart import Figure, Panel, Samples, chart
 from pipeline.report.fleet import parameter_table, write_summary
 from pipeline.report.parameters import COLUMNS, summary_row, unit_parameters
 from pipeline.report.unit_page import render
+from pipeline.settings import Certificate
 from pipeline.stages.calibration import judged
 
 from .conftest import SHEET, Unit, build_unit

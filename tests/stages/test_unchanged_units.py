@@ -24,7 +24,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201
 
     def diagnose(_: object, __: batch.Job, unit: str, settings: dict) -> dict:
         computed.append(unit)
-        return {f"{unit}.json": {"found": settings["effects"]}}
+        return {f"{unit}.json": {"found": settings.diagnosis.depth}}
 
     monkeypatch.setattr(batch, "_made", diagnose)
     monkeypatch.setattr(batch, "hold_as_job", lambda _: None)
@@ -34,7 +34,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201
         output.unlink(missing_ok=True)  # as Snakemake does
         (tmp_path / "results" / "configs").mkdir(parents=True, exist_ok=True)
         config = tmp_path / "results" / "configs" / "diagnose.json"
-        units = {u: {"effects": effects.get(u, 0)} for u in ("U1", "U10")}
+        units = {u: {"diagnosis": {"depth": "full" if effects.get(u, 0) else "standard"}} for u in ("U1", "U10")}
         config.write_text(json.dumps({"units": units} | ({"again": again} if again else {})))
         argv = ["--config", str(config), "--output", str(output), "--code", code]
         for stage, changed in files.items():
@@ -43,10 +43,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201
             argv += [f"--{stage}", str(tmp_path / f"{stage}.zip")]
         computed.clear()
         batch.main("diagnose", argv)
-        assert [Pack(output).json(f"{u}.json")["found"] for u in ("U1", "U10")] == [
-            effects.get("U1", 0),
-            effects.get("U10", 0),
-        ]
+        depths = ["full" if effects.get(u, 0) else "standard" for u in ("U1", "U10")]
+        assert [Pack(output).json(f"{u}.json")["found"] for u in ("U1", "U10")] == depths
         return list(computed)
 
     return run_job
