@@ -109,6 +109,17 @@ def _partial(model: type[AnySection], content: Mapping[str, Any]) -> AnySection:
     return _constructed(model, {n: _partial(sections[n], v) if n in sections else v for n, v in content.items()})
 
 
+OfAxes = Annotated[list[Finite], Field(min_length=3, max_length=3)]  # x, y, z
+
+
+class KnownTemperature(Section):
+    """Known coefficients of temperature of one sensor, for the method ``known_temperature``."""
+
+    bias: OfAxes | None = None
+    scale_factor: OfAxes | None = None
+    reference_degc: Finite = 25.0
+
+
 class DataSheet(Section):
     """The figures of one sensor: accelerometer or gyroscope."""
 
@@ -126,6 +137,7 @@ class DataSheet(Section):
     axis_map: AxisMap | None = None
     repeatability_bias: NonNegative | None = None
     repeatability_scale_factor: NonNegative | None = None
+    known_temperature: KnownTemperature = KnownTemperature()
     accept_implausible: bool = False
 
 
@@ -270,6 +282,7 @@ class Method(Section):
     format: Annotated[str, Field(min_length=1)] | None = None
     stages: Stages
     given: dict[str, Any] | None = None  # of ``method=given``: the calibration that was read (``with_given``)
+    known: dict[str, list[dict[str, Any]]] | None = None  # effects that stages of a sensor know, name and parameters
 
     def of(self, name: str) -> str | None:
         """Return the method of a sensor; None if it is not calibrated."""

@@ -44,7 +44,7 @@ from pipeline.config.user_effects import (
     with_given,
 )
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.stages import NOT_WANTED, check_stages
+from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
 from pipeline.io.ingest_settings import check_ingest
@@ -153,7 +153,7 @@ class Composer:
                 errors += [{**e, "loc": (section, *e["loc"])} for e in error.errors()]
         if errors:
             raise Problem("\n".join(_explain(e, merged) for e in errors))
-        checked["method"] = self._with_stages(checked["method"])
+        checked["method"] = _with_known(self._with_stages(checked["method"]), checked["sensor"])
         checked["procedure"] = _with_unused_optional(checked["procedure"], checked["method"])
         settings = Settings.model_construct(unit="", user_effects=self.user_effects.section(), **checked)
         self._check_meaning(settings)
@@ -225,6 +225,11 @@ class Composer:
                 check_stages(sensor, stages[sensor])
             except ConfigurationError as error:
                 raise Problem(f"method.{sensor}={name}: {error.message} (configs/method/{name}.yaml)") from None
+            if not any({"bias", "matrix"} & {*declared(sensor, stage).changes} for stage in stages[sensor]):
+                raise Problem(
+                    f"method.{sensor}={name}: no stage fits bias or matrix: add one that does, such as "
+                    f"reference_least_squares (configs/method/{name}.yaml)"
+                )
         unused = {} if GIVEN in (method.accelerometer, method.gyroscope) else {"file": None, "format": None}
         return method.replaced(stages=Stages(**stages), **unused)
 
@@ -299,6 +304,20 @@ def _compose(groups: Groups, folders: Sequence[Path], *_: object) -> DictConfig:
             return compose("config", overrides)
     finally:
         GlobalHydra.instance().hydra = before
+
+
+def _with_known(method: Method, sensors: Sensor) -> Method:
+    """Return the method with the known effects of its stages (``known``) by sensor; raises ``Problem``."""
+    known = {}
+    for sensor in SENSORS:
+        declarations = [declared(sensor, stage) for stage in method.stages.of(sensor) or ()]
+        try:
+            effects = [e for stage in declarations if stage.known for e in stage.known(sensor, sensors.of(sensor))]
+        except ConfigurationError as error:
+            raise Problem(f"method.{sensor}={method.of(sensor)}: {error.message}") from None
+        if effects:
+            known[sensor] = [{"name": e.name, "parameters": e.parameters} for e in effects]
+    return method.replaced(known=known) if known else method
 
 
 def _with_unused_optional(procedure: Procedure, method: Method) -> Procedure:

@@ -18,6 +18,7 @@ from pipeline.diagnosis.words import next_experiment, to_distinguish
 from pipeline.estimation.design import Term, placed
 from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.gates import MIN_DELTA_BIC
+from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import ALIKE, EVIDENCE, INFLATED
 from pipeline.model.effects import effect
@@ -49,6 +50,11 @@ class Case:
     def sensor(self) -> str:
         """The sensor."""
         return self.calibration.sensor
+
+    @property
+    def modelled(self) -> list[str]:
+        """Effects in the model, and effects with known parameters."""
+        return [*self.configured, *(e.name for e in known_effects(self.sensor, self.settings))]
 
     @property
     def sensor_config(self) -> Mapping[str, Any]:

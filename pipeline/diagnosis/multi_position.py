@@ -72,7 +72,7 @@ def findings(case: Case) -> Findings:
         ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
         expected = replace(expected, bias=Setting(ratio, noise.correlation_time))
     with_scatter = replace(expected, scatter=selection.fits[-1].noise.scatter)
-    hidden, unknown = not_observable_by_hand(selection, case.configured), _dependences(selection)
+    hidden, unknown = not_observable_by_hand(selection, case.modelled), _dependences(selection)
     chi = [
         float(np.sum(project_out(model.equations(fit.state), [with_scatter]).residual ** 2)) for fit in selection.fits
     ]

@@ -85,7 +85,7 @@ def _described(discovery: Discovery, case: Case) -> Findings:
     held_out = None
     if errors and noise is not None:
         held_out = {"error_before": errors[0], "error_after": errors[-1], "floor": floor}
-    hidden = not_observable(reported, case.configured)
+    hidden = not_observable(reported, case.modelled)
     squares = [fit.residual_rms**2 for fit in fits]
     reference = observations.less_stop_errors.expected_square
     noise_square = None if noise is None else float(np.mean(reference * noise.white**2 + noise.wander**2))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.stages import Change
 
 ALL: tuple[Change, ...] = ("bias", "matrix", "effects")
-FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=ALL, free=True, reference=True)}
+FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=("readings", *ALL), free=True, reference=True)}
 
 
 def fit(

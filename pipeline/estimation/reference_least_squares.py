@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 
 NAME = "reference_least_squares"
-FIT_STAGES = {NAME: FitStage(changes=("bias", "matrix", "effects"), free=True, reference=True)}
+FIT_STAGES = {NAME: FitStage(accepts=("readings",), changes=("bias", "matrix", "effects"), free=True, reference=True)}
 COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
 WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
 SHARP_CHANGE = 1e-3  # of the largest rate between two samples, where the rate is not logged

@@ -29,8 +29,8 @@ where b, p, n, s are (3,) and M is (3, 3).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -38,30 +38,40 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
+from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
 from pipeline.records import NORMAL, SENSORS, Contribution, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
+    from pipeline.records import FittedEffect
+    from pipeline.settings import DataSheet
 
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 KINDS = "subtract, matrix, two_sided"
 
-Change: TypeAlias = Literal["bias", "matrix", "effects"]
+MOST_PASSES = 4  # each reduces the error of the known effects by their share of the reading, at most a hundredth
+SETTLED = 1e-6  # change of bias, g or deg/s, and matrix in a pass: the known effects change by a hundredth of it
+Change: TypeAlias = Literal["readings", "bias", "matrix", "effects"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitStage:
-    """The declaration of a stage; the stages of one module continue each other."""
+    """The declaration of a stage; the stages of one module continue each other.
+
+    A stage that changes the readings states effects with known parameters, from the sensor's section of the settings;
+    ``fit_stage`` subtracts them from what all later stages read, and adds them to what these return.
+    """
 
     sensors: tuple[str, ...] = SENSORS
     needs: tuple[Change, ...] = ()  # what an earlier stage must have changed
-    changes: tuple[Change, ...] = ()  # what it estimates
-    accepts: tuple[Change, ...] = ()  # changes by stages of other modules that it keeps, or estimates anew
+    changes: tuple[Change, ...] = ()  # what it estimates or corrects
+    accepts: tuple[Change, ...] = ()  # changes by stages of other modules that it uses, keeps or estimates anew
     free: bool = False  # no equation of it fixes an element of bias and matrix: held-out errors are not the method's
     reference: bool = False  # the fit with which the diagnosis compares the other methods on a table
+    known: Callable[[str, DataSheet], list[FittedEffect]] | None = None  # of a stage that changes the readings
 
 
 FIT_STAGES = {GIVEN: FitStage(changes=("bias", "matrix", "effects")), NOT_WANTED: FitStage()}
@@ -137,9 +147,39 @@ def fit_stage(
         return given_calibration(sensor, settings)
     check_stages(sensor, [*(done.name for done in previous.stages), stage] if previous else [stage])
     module, of_both = import_module(stage_module(sensor, stage)), len(declared(sensor, stage).sensors) > 1
-    first = (stage,) if len(module.FIT_STAGES) > 1 else (sensor,) if of_both else ()
-    calibration: SensorCalibration = module.fit(*first, recordings, previous, settings)
+    fit = partial(module.fit, *((stage,) if len(module.FIT_STAGES) > 1 else (sensor,) if of_both else ()))
+    for other in SENSORS:
+        if other != sensor and (of_other := known_effects(other, settings)):
+            recordings = subtracted(recordings, SensorCalibration(other), of_other, ("rests",))
+    known = () if declared(sensor, stage).known else known_effects(sensor, settings)
+    if known and previous is not None:
+        return _fit_to_corrected(fit, recordings, previous, known, settings)
+    calibration: SensorCalibration = fit(recordings, previous, settings)
     return calibration
+
+
+def _fit_to_corrected(
+    fit: Callable[..., SensorCalibration],
+    recordings: Sequence[Recording],
+    previous: SensorCalibration,
+    known: Sequence[FittedEffect],
+    settings: Mapping[str, Any],
+) -> SensorCalibration:
+    """Return the fit to the readings less the known effects, which depend on bias and matrix, with these effects."""
+    sensor, held = previous.sensor, [s for s in previous.stages if declared(previous.sensor, s.name).known]
+    before = without_known(previous, known)
+    before = replace(before, stages=tuple(s for s in previous.stages if s not in held))
+    at, passes = before, 0
+    while True:
+        corrected = subtracted(recordings, at, known, (sensor, "rests"))
+        found = fit(corrected, before if before.stages else None, settings)
+        if found is before:  # nothing to fit
+            return previous
+        passes += 1
+        change = max(np.abs(found.bias - at.bias).max(), np.abs(found.matrix - at.matrix).max())
+        if change <= SETTLED or passes == MOST_PASSES:
+            return with_known(found, known, held)
+        at = found
 
 
 def is_given(sensor: str, settings: Mapping[str, Any]) -> bool:

@@ -8,6 +8,7 @@ from pipeline.diagnosis.diagnose import diagnose, without_diagnosis
 from pipeline.diagnosis.effective_noise import effective_noise
 from pipeline.diagnosis.formula_discovery import effect_file
 from pipeline.errors import omission
+from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
 from pipeline.records import SCHEMA_VERSION, calibrated
 from pipeline.stages.unit_files import StoredUnit
@@ -40,8 +41,8 @@ def diagnose_unit(
 
     A diagnosis of one sensor that fails does not stop the other.
     """
-    known = calibrated(fits)
-    noises = required_noises(recordings, settings.sensor, known)
+    noises = required_noises(recordings, settings.sensor, calibrated(fits))
+    recordings, known = without_known_effects(recordings, calibrated(fits), settings)
     made = Diagnosis({"schema_version": SCHEMA_VERSION, "unit": unit}, {}, [])
     for sensor, calibration in known.items():
         if calibration is None:

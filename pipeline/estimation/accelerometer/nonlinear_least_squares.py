@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 NAME = "nonlinear_least_squares"
-FIT_STAGES = {NAME: FitStage(sensors=("accelerometer",), changes=("bias", "matrix"), free=True)}
+FIT_STAGES = {NAME: FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
 ROWS, COLUMNS = np.tril_indices(3)
 PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine values among bias and full matrix
 PLACED = np.eye(12)[:, PLACE]

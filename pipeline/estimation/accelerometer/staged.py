@@ -170,10 +170,10 @@ def scale_factor(extremes: Extremes) -> Outcome:
 
 STAGES = {f.__name__: f for f in (orthogonality, misalignment, bias, scale_factor)}
 FIT_STAGES = {
-    "orthogonality": FitStage(sensors=("accelerometer",), changes=("matrix",)),
-    "misalignment": FitStage(sensors=("accelerometer",), changes=("matrix",)),
-    "bias": FitStage(sensors=("accelerometer",), changes=("bias",)),
-    "scale_factor": FitStage(sensors=("accelerometer",), changes=("matrix", "effects")),
+    "orthogonality": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix",)),
+    "misalignment": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix",)),
+    "bias": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("bias",)),
+    "scale_factor": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix", "effects")),
 }
 
 

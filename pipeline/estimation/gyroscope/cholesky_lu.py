@@ -56,7 +56,9 @@ if TYPE_CHECKING:
 
 NAME = "cholesky_lu"
 FIT_STAGES = {
-    NAME: FitStage(sensors=("gyroscope",), needs=("bias",), changes=("matrix",), accepts=("bias",), free=True),
+    NAME: FitStage(
+        sensors=("gyroscope",), needs=("bias",), changes=("matrix",), accepts=("readings", "bias"), free=True
+    ),
 }
 STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
 MOTION_SHARE = 0.01  # of the largest rate, above which the table turns

@@ -93,9 +93,9 @@ def scale_factor(response: Response) -> Outcome:
 
 STAGES = {f.__name__: f for f in (bias, orthogonality_and_misalignment, scale_factor)}
 FIT_STAGES = {
-    "bias": FitStage(sensors=("gyroscope",), changes=("bias",)),
-    "orthogonality_and_misalignment": FitStage(sensors=("gyroscope",), changes=("matrix",)),
-    "scale_factor": FitStage(sensors=("gyroscope",), changes=("matrix",)),
+    "bias": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias",)),
+    "orthogonality_and_misalignment": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
+    "scale_factor": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
 }
 
 

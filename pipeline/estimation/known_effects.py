@@ -1,0 +1,147 @@
+"""Subtract effects with known parameters from readings, and keep them in the calibration that is fitted to the others.
+
+    reading - z(motion, K; p) = bias + K @ truth + noise
+
+with the effects z and known parameters p that a stage of the method states (``FitStage.known``). ``truth`` is that of
+the readings themselves by bias and matrix so far (``pipeline.model.measurement``), so that no table is needed. An
+effect of the same name that is fitted to the corrected readings is what the known parameters leave: the calibration has
+the sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.monte_carlo import KEY
+from pipeline.estimation.uncertainty_budget import with_uncertainty
+from pipeline.model.measurement import Part, compensate
+from pipeline.records import FittedEffect, Recording, SensorCalibration, UnitRecordings, Values, motion_at_rest
+from pipeline.signal.filters import temperature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.records import StageResult
+
+SOURCE = "known effects"  # of the uncertainty budget
+# Values of a known parameter in a budget; others are 0.
+OF_KNOWN = {"degrees_of_freedom": None, "effective_degrees_of_freedom": None, "validated": True}
+
+
+def known_effects(sensor: str, settings: Mapping[str, Any]) -> tuple[FittedEffect, ...]:
+    """Return the effects that the method of a sensor knows before the fit (``method.known``)."""
+    known = (settings.get("method") or {}).get("known") or {}
+    return tuple(FittedEffect(**entry) for entry in known.get(sensor) or ())
+
+
+def subtracted(
+    recordings: Sequence[Recording],
+    calibration: SensorCalibration,
+    known: Sequence[FittedEffect],
+    needed: Sequence[str] = (),
+) -> list[Recording]:
+    """Return the recordings with the known effects subtracted from the readings of the calibration's sensor.
+
+    ``calibration``: its bias and matrix are used. A recording without a temperature loses the readings of this sensor;
+    raises ``CannotCalibrateError`` if its role is one of ``needed``.
+    """
+    sensor, found = calibration.sensor, []
+    field, part = "specific_force" if sensor == "accelerometer" else "angular_rate", Part.of(calibration, known)
+    for recording in recordings:
+        reading = recording.reading(sensor)
+        if reading is None:
+            found.append(recording)
+            continue
+        if recording.temperature is None:
+            if recording.role in needed:
+                raise CannotCalibrateError(
+                    f"{recording.name} logs no temperature, which the known {_names(known)} of the {sensor} need: "
+                    "record it, or choose a method without known effects"
+                )
+            found.append(recording.with_readings(**{sensor: None}))
+            continue
+        motion = replace(motion_at_rest(recording.time), temperature=temperature_of(recording))
+        truth = compensate(calibration, reading, motion, known)
+        corrected = part.take_off(reading, replace(motion, **{field: truth}))  # type: ignore[arg-type]
+        found.append(recording.with_readings(**{sensor: corrected}))
+    return found
+
+
+def with_known(
+    calibration: SensorCalibration, known: Sequence[FittedEffect], stages: Sequence[StageResult]
+) -> SensorCalibration:
+    """Return a calibration by corrected readings with the known effects, and the results of the stages that state them.
+
+    The known parameters have no uncertainty, which the budget states.
+    """
+    values = {effect.name: effect.values for effect in known}
+    fitted = [_moved(e, values[e.name]) if e.name in values else e for e in calibration.effects]
+    more = [effect for effect in known if effect.name not in {e.name for e in fitted}]
+    found = replace(calibration, effects=(*fitted, *more), stages=(*stages, *calibration.stages))
+    if calibration.covariance is None or calibration.budget is None:
+        return found
+    size, added = len(calibration.covariance), [p for effect in more for p in effect.parameters.values()]
+    covariance = np.pad(calibration.covariance, (0, len(added)))
+    freedom = np.pad(calibration.effective_freedom(), (0, len(added)), constant_values=np.inf)
+    budget = _of_parameters(calibration.budget, size, range(size + len(added)))
+    budget["parameters"] = found.parameter_names()
+    budget["units"] = [*calibration.budget["units"], *(str(p["unit"]) for p in added)]
+    if "estimate" in budget.get(KEY, {}):
+        estimates = [found.bias, found.matrix.ravel(), *(effect.values for effect in found.effects)]
+        budget[KEY]["estimate"] = np.concatenate(estimates).tolist()
+    reason = f"no uncertainty of the known {_names(known)} is stated: zeros stand for it"
+    missing = [*calibration.budget["not_included"], {"source": SOURCE, "reason": reason}]
+    return with_uncertainty(found, covariance, freedom, budget, missing)
+
+
+def _of_parameters(value: Any, size: int, rows: Sequence[int], more: float | None = 0.0) -> Any:  # noqa: ANN401  (JSON)
+    """Return a budget of ``size`` parameters with those of ``rows``; a row from ``size`` on is a known parameter."""
+    if isinstance(value, dict):
+        return {key: _of_parameters(each, size, rows, OF_KNOWN.get(key, more)) for key, each in value.items()}
+    if isinstance(value, list) and len(value) == size and not isinstance(value[0], dict):
+        return [value[row] if row < size else more for row in rows]
+    return [_of_parameters(each, size, rows, more) for each in value] if isinstance(value, list) else value
+
+
+def _names(known: Sequence[FittedEffect]) -> str:
+    return " and ".join(effect.name for effect in known)
+
+
+def without_known(calibration: SensorCalibration, known: Sequence[FittedEffect]) -> SensorCalibration:
+    """Return the calibration of readings from which the known effects are subtracted: undoes ``with_known``."""
+    values, size = {effect.name: effect.values for effect in known}, len(calibration.parameter_names())
+    covariance = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance
+    effects, rows, first = [], list(range(12)), 12
+    for effect in calibration.effects:
+        own = range(first, first + len(effect.parameters))
+        first += len(own)
+        left = _moved(effect, -values[effect.name]) if effect.name in values else effect
+        if effect.name not in values or np.any(left.values) or np.any(covariance[own, own]):
+            effects.append(left)
+            rows += own
+    freedom = None if calibration.freedom is None else calibration.freedom[rows]
+    budget, covariance = _of_parameters(calibration.budget, size, rows), covariance[np.ix_(rows, rows)]
+    return replace(calibration, effects=tuple(effects), covariance=covariance, freedom=freedom, budget=budget)
+
+
+def _moved(effect: FittedEffect, by: Values) -> FittedEffect:
+    """Return an effect that is linear in its parameters with other values."""
+    pairs = zip(effect.parameters.items(), (effect.values + by).tolist(), strict=True)
+    return replace(effect, parameters={name: {**parameter, "value": value} for (name, parameter), value in pairs})
+
+
+def without_known_effects(
+    recordings: UnitRecordings, calibrations: Mapping[str, SensorCalibration | None], settings: Mapping[str, Any]
+) -> tuple[UnitRecordings, dict[str, SensorCalibration | None]]:
+    """Return the recordings of a unit less the known effects of both sensors, and calibrations of these readings."""
+    filtered, found = recordings.filtered, dict(calibrations)
+    for sensor, calibration in calibrations.items():
+        known = known_effects(sensor, settings)
+        if calibration is not None and known:
+            filtered = subtracted(filtered, calibration, known)
+            found[sensor] = without_known(calibration, known)
+    return replace(recordings, filtered=filtered), found

@@ -1,0 +1,75 @@
+"""State the known coefficients of temperature of a sensor (``method=known_temperature``); for both sensors.
+
+    z = b_T (T - 25 degC) + k_T (T - 25 degC) u
+
+are the effects ``bias_temperature`` and ``scale_factor_temperature``, by axis, with the truth u. They are subtracted
+from the readings of the stages after this one (``pipeline.estimation.known_effects``). Of the settings
+``sensor.<sensor>.known_temperature``, ``bias`` is b_T, in g or deg/s per degC. ``scale_factor`` is the relative change
+s per degC of the scale factor against that at ``reference_degc`` T_r; with a scale factor of about 1,
+
+    k_T = s / (1 + s (25 degC - T_r))
+
+The bias is fitted, and that at T_r differs from that at 25 degC by a constant: for ``bias`` T_r is of no consequence.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.estimation.known_effects import known_effects
+from pipeline.estimation.stages import FitStage
+from pipeline.model.effects import effect
+from pipeline.model.effects.base import REFERENCE_TEMPERATURE
+from pipeline.records import FittedEffect, Recording, SensorCalibration, StageResult
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.settings import DataSheet
+
+NAME = "known_temperature"
+
+
+def known(sensor: str, sheet: DataSheet) -> list[FittedEffect]:
+    """Return the effects with known parameters; raise ``ConfigurationError`` if the settings state no coefficient."""
+    stated, values = sheet.known_temperature, {}
+    if stated.bias is not None:
+        values["bias_temperature"] = np.array(stated.bias)
+    if stated.scale_factor is not None:
+        s = np.array(stated.scale_factor)
+        values["scale_factor_temperature"] = s / (1.0 + s * (REFERENCE_TEMPERATURE - stated.reference_degc))
+    if not values:
+        raise ConfigurationError(
+            f"sensor.{sensor}.{NAME} states neither bias nor scale_factor: state a coefficient, or choose another "
+            f"method.{sensor}"
+        )
+    return [
+        FittedEffect(
+            name,
+            {
+                p.name: {"value": value, "unit": p.unit, "expanded_uncertainty": None}
+                for p, value in zip(effect(name).parameters(sensor), of_axes.tolist(), strict=True)
+            },
+        )
+        for name, of_axes in values.items()
+    ]
+
+
+FIT_STAGES = {NAME: FitStage(changes=("readings",), known=known)}
+
+
+def fit(
+    sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Return the known effects as a calibration without bias and matrix (``pipeline.estimation.stages``)."""
+    del recordings, previous  # it is the first stage
+    effects = known_effects(sensor, settings)
+    parameters = {
+        f"{e.name}.{name}": {"value": p["value"], "unit": p["unit"], "standard_uncertainty": None}
+        for e in effects
+        for name, p in e.parameters.items()
+    }
+    return SensorCalibration(sensor, effects=effects, stages=(StageResult(NAME, parameters),))
