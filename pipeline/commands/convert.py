@@ -57,7 +57,8 @@ def main(argv: Sequence[str]) -> int:
         print(f"  {line}")
     if format_name == CALIBRATION and imported.document is None:
         stated = [s for s, c in imported.sensors.items() if c.covariance is not None]
-        print(f"uncertainty: {f'of the bias of the {stated}' if stated else 'none'} is known; zeros stand for it")
+        known = f"that of the bias of the {' and the '.join(stated)} alone" if stated else "none"
+        print(f"uncertainty: {known} is known; the others are null")
     return 0
 
 

@@ -46,8 +46,28 @@ def document_of(imported: ImportedCalibration) -> JSON:
         "software": {"imu-calibration": version("imu-calibration")},
         "inputs": [],
         "not_calibrated": missing,
-        **{s: imported.sensors[s].to_json() if s in imported.sensors else None for s in SENSORS},
+        **{s: _part(imported.sensors[s]) if s in imported.sensors else None for s in SENSORS},
+        **({"log": {"ingest": None, "axis_map": imported.axis_maps}} if imported.stated_axes else {}),
     }
+
+
+def _part(calibration: SensorCalibration) -> JSON:
+    """Return the part of ``calibrations/<unit>.json`` for a sensor; null: an uncertainty that is not known."""
+    part, C = calibration.to_json(), calibration.covariance
+    known = np.zeros(len(calibration.parameter_names()), bool) if C is None else np.diag(C) > 0.0
+
+    def where(mask: Any, values: Any) -> Any:  # noqa: ANN401  (arrays of any shape)
+        found = np.array(values, object)
+        found[~np.asarray(mask)] = None
+        return found.tolist()
+
+    for key in ("standard_uncertainty", "expanded_uncertainty"):
+        part[key] = {
+            "bias": where(known[:3], part[key]["bias"]),
+            "matrix": where(known[3:12].reshape(3, 3), part[key]["matrix"]),
+        }
+    part["covariance"]["values"] = where(np.outer(known, known), part["covariance"]["values"])
+    return part
 
 
 def settings_of(imported: ImportedCalibration, config: Mapping[str, Any]) -> JSON:
@@ -100,6 +120,9 @@ def lost(imported: ImportedCalibration, format_name: str, file: Path, config: Ma
         return [f"bias and matrix: {format_name} is for {declared.equation}"]
     back = read_any(file, format_name, counts_of(config))
     lines = []
+    if back.axis_maps != imported.axis_maps:
+        maps = ", ".join(f"{s} {' '.join(m)}" for s, m in imported.axis_maps.items())
+        lines.append(f"the axes of the sensor along those of the body ({maps}): turn the readings to body axes first")
     for s, calibration in imported.sensors.items():
         if s not in back.sensors:
             lines.append(f"{s}: all of it; {format_name} holds no {s}")

@@ -26,6 +26,7 @@ from pipeline.errors import ConfigurationError, InputError, MissingInputError, f
 from pipeline.exports import formats
 from pipeline.exports.sensors import FACTORS, FUNCTIONS
 from pipeline.exports.text_kinds import Expressions, Node, parsed
+from pipeline.io.channel_table import STRAIGHT, maps_of_log
 from pipeline.io.files import read_text
 from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.effects import effect
@@ -33,7 +34,7 @@ from pipeline.pack import is_published, read_published
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from pipeline.exports import Format
     from pipeline.records import Values
@@ -42,7 +43,9 @@ CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.
 LARGEST_BYTES = 50_000_000  # of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100
 UNIT_SCALE = (0.5, 2.0)  # range of the singular values of a matrix if readings and truth have the same unit
 EFFECT_IN_C = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
-TURNED_READINGS = re.compile(r"Turn the readings to body axes first: [^.]*\.")  # a remark in our exports
+TURNED_READINGS = re.compile(r"Turn\s+the\s+readings\s+to\s+body\s+axes\s+first:\s[^.]*\.")  # a remark in our exports
+OWNER = re.compile(r"the (\w+)'s x along")  # in such a remark: a sensor, or "sensor" for both
+BODY_AXIS = re.compile(r"along body ([+-][xyz])")
 ROUNDING = 1e-12  # rounding errors of the formats' arithmetic, relative to the largest number
 
 
@@ -56,6 +59,13 @@ class ImportedCalibration:
     noise: dict[str, float] = field(default_factory=dict)  # the stated ones of Kalibr's four parameters
     notes: list[str] = field(default_factory=list)  # assumptions, and values that were not read
     document: dict[str, Any] | None = None  # ``calibrations/<unit>.json``, if the file is in this format
+    stated_axes: dict[str, tuple[str, ...]] = field(default_factory=dict)  # axis map of each sensor; empty: not stated
+
+    @property
+    def axis_maps(self) -> dict[str, tuple[str, ...]]:
+        """Sensor to the body axes along which its reading axes point."""
+        log = {"axis_map": self.stated_axes} if self.document is None else self.document.get("log")
+        return maps_of_log(log or {})
 
 
 def read_any(
@@ -112,10 +122,17 @@ def _read_file(
     except (TemplateError, KeyError, ValueError, TypeError, np.linalg.LinAlgError) as error:
         reason = error.args[0] if isinstance(error, KeyError) else error
         raise InputError(f"this is no {format_name} ({declared.consumer}): {reason}", str(file)) from error
-    imported.notes.extend(TURNED_READINGS.findall(text))
+    turned = [" ".join(remark.split()) for remark in TURNED_READINGS.findall(text)]
+    imported.notes.extend(turned)
     if effects := dict.fromkeys(EFFECT_IN_C.findall(text)):
         imported.notes.append(f"effects in C expressions, which are not read: {', '.join(effects)}")
-    return imported
+    return replace(imported, stated_axes=_stated_axes(turned))
+
+
+def _stated_axes(remarks: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return the axis map of each sensor from the remarks of a file; empty without a remark."""
+    stated = {owner[1]: tuple(BODY_AXIS.findall(remark)) for remark in remarks if (owner := OWNER.search(remark))}
+    return {s: stated.get(s) or stated.get("sensor") or STRAIGHT for s in SENSORS} if stated else {}
 
 
 def counts_of(config: Mapping[str, Any]) -> dict[str, float | None]:

@@ -126,7 +126,7 @@ def _rms(values: Sequence[Any]) -> Any:  # noqa: ANN401  (numbers, or lists of t
 
 
 OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic")
-TEMPERATURES = (-40.0, 85.0)  # degC, the widest specified range of such parts
+TEMPERATURES = [-40.0, 85.0]  # degC, the widest specified range of such parts
 ORDER = 4  # coefficients of a polynomial of third order in the temperature
 
 
@@ -198,6 +198,10 @@ class ExportedSensor:
         polynomial[:, 1] += self.effects.get("bias_temperature", np.zeros(3))
         polynomial[:, 1:] += self.effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
         return polynomial * self.factor
+
+    def bias_at(self, temperature: float) -> Values:
+        """Return the bias at a temperature, degC, in the unit of the format."""
+        return np.asarray(self.bias_polynomial @ (temperature - REFERENCE_TEMPERATURE) ** np.arange(3))
 
     @property
     def g_sensitivity(self) -> Values:
@@ -318,6 +322,11 @@ def sampling_rate(document: dict[str, Any]) -> float:
     return float(rates[0]) if rates else 0.0
 
 
+def temperatures(document: Mapping[str, Any]) -> list[float]:
+    """Return the range of temperatures of a calibration's recordings, degC; if it is not known, ``TEMPERATURES``."""
+    return (document.get("calibrated_range") or {}).get("temperature_degc") or TEMPERATURES
+
+
 def plain(content: Any) -> Any:  # noqa: ANN401
     """Return content with lists instead of arrays."""
     if isinstance(content, dict):
@@ -348,5 +357,6 @@ FUNCTIONS: dict[str, Any] = {
     "REFERENCE_TEMPERATURE": REFERENCE_TEMPERATURE,
     "SI": SI,
     "STANDARD_GRAVITY": STANDARD_GRAVITY,
-    "TEMPERATURES": TEMPERATURES,
+    "clip": lambda value, limits: float(np.clip(value, *limits)),
+    "temperatures": temperatures,
 }

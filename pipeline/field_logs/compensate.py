@@ -77,9 +77,9 @@ class LogProfile:
             maps = maps_of_log({"axis_map": log["axis_map"]})
             for axis_map in maps.values():
                 axis_matrix(axis_map)
-            return cls({**log["ingest"]}, maps)
+            return cls(CANONICAL_CSV if log["ingest"] is None else {**log["ingest"]}, maps)
         except (KeyError, TypeError, ConfigurationError) as error:
-            expected = "log is invalid; expected ingest, an object, and axis_map, for example [+x, +y, +z]"
+            expected = "log is invalid; expected ingest, an object or null, and axis_map, for example [+x, +y, +z]"
             raise InputError(f"{expected}; got {error}", file) from None
 
     def to_body(self, sensor: str, readings: Values) -> Values:

@@ -81,7 +81,9 @@ _EFFECT = fields(
     },
     ("name", "parameters"),
 )
-_COVARIANCE = fields({"parameters": items(text), "values": items(items(number))}, ("parameters", "values"), others=True)
+_COVARIANCE = fields(
+    {"parameters": items(text), "values": items(items(or_none(number)))}, ("parameters", "values"), others=True
+)
 _STAGE = fields(
     {
         "name": text,

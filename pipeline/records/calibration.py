@@ -118,15 +118,16 @@ class SensorCalibration:
 
     @classmethod
     def from_json(cls, sensor: str, data: dict[str, Any]) -> Self:
-        """Return the object from the value of ``to_json``."""
+        """Return the object from the value of ``to_json``; null in the covariance: not known."""
         freedom = data.get("effective_degrees_of_freedom")
+        covariance = np.array(data["covariance"]["values"], float)
         return cls(
             sensor=sensor,
             bias=np.array(data["bias"], float),
             matrix=np.array(data["matrix"], float),
             stages=tuple(StageResult(**s) for s in data["stages"]),
             effects=tuple(FittedEffect(**e) for e in data["effects"]),
-            covariance=np.array(data["covariance"]["values"], float),
+            covariance=None if np.isnan(covariance).all() else np.nan_to_num(covariance, copy=False),
             degrees_of_freedom=float("inf") if data["degrees_of_freedom"] is None else data["degrees_of_freedom"],
             converged=data["converged"],
             freedom=None if freedom is None else np.array([np.inf if nu is None else nu for nu in freedom]),

@@ -14,6 +14,7 @@ from stage_files import export_all
 
 from pipeline import load_calibration
 from pipeline.exports import Format, formats
+from pipeline.exports.reading import read_any
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0
@@ -205,6 +206,34 @@ def test_an_autopilots_thermal_correction_is_that_of_the_bias(
     assert px4["TC_A_ENABLE"] == px4["TC_G_ENABLE"] == ardupilot["INS_TCAL1_ENABLE"] == 1
     assert not any(key.startswith("TC_") for key in parameters(cold, "px4.params"))
     assert "Left out of this format" not in warm.text("px4.params") + warm.text("ardupilot.param")
+
+
+@pytest.mark.parametrize("limits", [[25.3, 36.8], [20.0, 24.0], None])
+def test_an_autopilot_corrects_by_temperature_where_the_calibration_was_recorded(
+    tmp_path: Path, limits: list[float] | None
+) -> None:
+    """PX4 limits T to TMIN ... TMAX; ArduPilot limits T and CALTEMP (AP_InertialSensor_tempcal.cpp)."""
+    unit = Unit(tmp_path / "first", accelerometer=(WARMER,), gyroscope=(WARMER,))
+    unit.document["calibrated_range"] = {"temperature_degc": limits} if limits else {}
+    export_all(unit.document, SETTINGS, tmp_path / "first")
+    px4, ardupilot = parameters(unit, "px4.params"), parameters(unit, "ardupilot.param")
+    low, high = limits or (-40.0, 85.0)
+    for of_file, name in ((px4, "TC_A0"), (px4, "TC_G0"), (ardupilot, "INS_TCAL1")):
+        assert [of_file[f"{name}_TMIN"], of_file[f"{name}_TMAX"]] == [low, high]
+    T = np.linspace(low, high, 7)[:, None]
+    c = [np.array([ardupilot[f"INS_TCAL1_ACC{k}_{a}"] for a in "XYZ"]) for k in (1, 2, 3)]
+
+    def p(T: Any) -> Any:
+        t = np.clip(T, low, high) - 35.0
+        return (c[0] + (c[1] + c[2] * t) * t) * t * 1e-6
+
+    offset = np.array([ardupilot[f"INS_ACCOFFS_{a}"] for a in "XYZ"])
+    corrected = offset + p(T) - p(ardupilot["INS_ACC1_CALTEMP"])
+    coefficients = WARMER.values.reshape(3, 2)
+    bias = BIAS["accelerometer"] + coefficients[:, 0] * (T - 25.0) + coefficients[:, 1] * (T - 25.0) ** 2
+    np.testing.assert_allclose(corrected, bias * G0, atol=1e-8)
+    back = read_any(tmp_path / "first" / "ardupilot.param").sensors["accelerometer"]
+    np.testing.assert_allclose(back.bias, BIAS["accelerometer"], atol=1e-9)
 
 
 def test_flight_controllers_in_counts_leave_what_their_remarks_say(tmp_path: Path) -> None:

@@ -11,12 +11,13 @@ import yaml
 from stage_files import export_all
 from test_consumer_formats import BIAS, COUNTS, MATRIX, SCALED, SENSITIVE, SETTINGS, WARM, WARMER
 
-from pipeline import load_calibration
+from pipeline import exports, load_calibration
 from pipeline.commands.convert import main
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.exports import formats
 from pipeline.exports.conversion import SAMPLE, explain_calibration
 from pipeline.exports.reading import read_any
+from pipeline.field_logs.compensate import LogProfile
 from pipeline.records import SENSORS, SensorCalibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0
@@ -175,6 +176,62 @@ def test_a_chain_of_conversions_keeps_every_parameter(folder: Path, tmp_path: Pa
         np.testing.assert_allclose(last[s].bias, first[s].bias, rtol=0, atol=1e-9)
         np.testing.assert_allclose(last[s].matrix, first[s].matrix, rtol=0, atol=1e-9)
     np.testing.assert_allclose(last["gyroscope"].effects[0].values, SENSITIVE.values, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "maps", [["-y", "+x", "+z"], {"accelerometer": ["+x", "-y", "-z"], "gyroscope": ["+x", "+y", "+z"]}]
+)
+@pytest.mark.parametrize("name", sorted({"px4.params", "imu_calib.yaml", *WHOLE} - {"imu_tk_acc.calib"}))
+def test_the_axis_map_survives_a_conversion_and_back(
+    tmp_path: Path, name: str, maps: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A log of the unit, in the axes of the sensor, is turned alike by the calibration and by its copy of a copy."""
+    made = document() | {"log": {"ingest": {"csv": {}}, "axis_map": maps}}
+    (tmp_path / "first.json").write_text(json.dumps(made))
+    assert main([str(tmp_path / "first.json"), str(tmp_path / name), "--sensor", "mpu6050"]) == 0
+    assert main([str(tmp_path / name), str(tmp_path / "calibration.json"), "--sensor", "mpu6050"]) == 0
+    assert "axes of the sensor along" not in capsys.readouterr().out
+    last = json.loads((tmp_path / "calibration.json").read_text())
+    readings = np.array([[1.0, 2.0, 3.0]])
+    profile = LogProfile.of_calibration(last, "calibration.json")
+    for s in SENSORS:
+        before = LogProfile.of_calibration(made, "first.json").to_body(s, readings)
+        np.testing.assert_array_equal(profile.to_body(s, readings), before)
+    assert profile.ingest == LogProfile().ingest  # no format states the columns of a log
+
+
+def test_an_axis_map_that_a_format_cannot_hold_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(exports.TEMPLATES, tmp_path / "templates")
+    silent = (exports.TEMPLATES / "px4.params.j2").read_text().replace("{{ remarks | comment }}\n", "")
+    (tmp_path / "templates" / "px4.params.j2").write_text(silent)
+    monkeypatch.setattr(exports, "TEMPLATES", tmp_path / "templates")
+    formats.cache_clear()
+    (tmp_path / "first.json").write_text(json.dumps(document() | {"log": {"axis_map": ["-y", "+x", "+z"]}}))
+    try:
+        main([str(tmp_path / "first.json"), str(tmp_path / "px4.params")])
+    finally:
+        formats.cache_clear()
+    assert "body (accelerometer -y +x +z, gyroscope -y +x +z): turn the readings" in capsys.readouterr().out
+
+
+def test_an_uncertainty_that_no_file_states_is_null(folder: Path, tmp_path: Path) -> None:
+    """Kalibr states none, Azure Kinect that of the bias; what reads the result again knows as much."""
+    main([str(folder / "kalibr.yaml"), str(tmp_path / "calibration.json")])
+    unknown = json.loads((tmp_path / "calibration.json").read_text())["gyroscope"]
+    for key in ("standard_uncertainty", "expanded_uncertainty"):
+        assert unknown[key] == {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
+    assert {x for row in unknown["covariance"]["values"] for x in row} == {None}
+    assert read_any(tmp_path / "calibration.json").sensors["gyroscope"].covariance is None
+    assert load_calibration(tmp_path / "calibration.json").apply(np.eye(3), np.eye(3)).gyroscope.shape == (3, 3)
+    main([str(folder / "azure_kinect.json"), str(tmp_path / "calibration.json")])
+    in_part = json.loads((tmp_path / "calibration.json").read_text())["accelerometer"]
+    assert in_part["standard_uncertainty"]["bias"] == pytest.approx([1e-4] * 3)
+    assert in_part["expanded_uncertainty"]["matrix"] == [[None] * 3] * 3
+    assert in_part["covariance"]["values"][3][3] is None
+    again = read_any(tmp_path / "calibration.json").sensors["accelerometer"].covariance
+    np.testing.assert_allclose(np.diag(again)[:4], [1e-8, 1e-8, 1e-8, 0.0])
 
 
 def test_noise_that_both_formats_hold_is_kept_with_its_origin(folder: Path, tmp_path: Path) -> None:
