@@ -47,7 +47,7 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
         return []
     observations, fit = selection.observations.less_stop_errors, selection.fit
     slices = placed(fit.terms)
-    design = design_at(observations, fit)
+    design = fit.design(observations)
     products = design.products([fit.setting])[0]
     without_each = [
         (design_at(rest, fit).products([fit.setting])[0], rest) for rest in without_each_recording(observations)

@@ -24,7 +24,6 @@ import numpy as np
 from pipeline.diagnosis.functional_forms import columns_of, signals_of
 from pipeline.estimation.design import BASE, Term, placed
 from pipeline.estimation.gauss_markov import WHITE, Blocks, Products, Setting
-from pipeline.estimation.generalized_least_squares import design_at
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.ranking import projection
 from pipeline.model.effects.base import Layout, truth, unit_of
@@ -210,7 +209,7 @@ class _Columns:
     def __init__(self, selection: Selection) -> None:
         self.observations = selection.observations.less_stop_errors
         self.weight = self.observations.weight
-        self.design = design_at(self.observations, selection.fit)
+        self.design = selection.fit.design(self.observations)
         of_axis = [self.design.of_axis(c) for c in range(3)]
         self.columns = [found[:, :-1] for found in of_axis]
         self.residual = np.stack([found[:, -1] for found in of_axis], axis=1)

@@ -24,7 +24,6 @@ import scipy
 
 from pipeline.estimation.design import true_motion
 from pipeline.estimation.gauss_markov import WHITE, GaussMarkov
-from pipeline.estimation.generalized_least_squares import design_at
 from pipeline.estimation.ranking import LEFT, RIDGE
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ class Scan:
         self._label = self._blocks.label(len(self._weight))
         self._noise = GaussMarkov(self._blocks, [WHITE, *selection.settings])
         self._unit = float(ROUNDING * np.sqrt(observations.samples)) ** 0.5
-        design = design_at(observations, selection.fit)
+        design = selection.fit.design(observations)
         A, places = design.columns.columns, [design.places(c)[0] for c in range(3)]
         if explained is not None:
             values, first = self.values(explained), A.shape[1]

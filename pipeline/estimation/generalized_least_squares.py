@@ -17,6 +17,7 @@ about the noise, weighted by their restricted likelihood.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -79,6 +80,17 @@ class Fit(Start):
     condition: float  # of the scaled products of columns
     cosine: float  # largest between the residual and a column, both whitened
     rank: int  # parameters, or combinations of them, that the readings determine
+
+    @cached_property
+    def _designs(self) -> dict[Observations, Design]:
+        """The results of ``design``."""
+        return {}
+
+    def design(self, observations: Observations) -> Design:
+        """Return the design of observations at this solution, with the residual as readings; it is built once."""
+        if observations not in self._designs:
+            self._designs[observations] = design_at(observations, self)
+        return self._designs[observations]
 
 
 def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
@@ -255,7 +267,7 @@ def fit_best(
 
 def require_observable(observations: Observations, fit: Fit) -> None:
     """Raise ``NotObservableError``, with the parameters, if the recordings do not determine a fit."""
-    design = design_at(observations, fit)
+    design = fit.design(observations)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
     free = np.ones(len(names), bool)  # a prior determines the others
     for place, term in zip(design.slices, fit.terms, strict=True):
@@ -358,7 +370,7 @@ def calibration_of(
     if settings is None:
         return combined(found, [scatter_contribution(covariance, fit.degrees_of_freedom)], {})
     names = [term.effect.name for term in fit.terms]
-    design = design_at(observations, fit)
+    design = fit.design(observations)
     first = design.linear_map(fit.setting)
     prior = wander_prior(noise, (settings.get("sensor") or {}).get(sensor) or {})
     whole = first.then(change)

@@ -63,7 +63,7 @@ class Part:
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observations:
     """The data of one sensor for a fit."""
 
@@ -87,15 +87,19 @@ class Observations:
         """All weights: (n,) array."""
         return np.concatenate([part.weight for part in self.parts])
 
-    @cached_property
+    @property
     def less_stop_errors(self) -> Observations:
         """The observations with smaller weights at the stops, for sums in which errors of the angle count as noise."""
+        return self._less_stop_errors if self.angle_deg > 0.0 else self
+
+    @cached_property
+    def _less_stop_errors(self) -> Observations:
         parts = []
-        for part in self.parts if self.angle_deg > 0.0 else ():
+        for part in self.parts:
             weight, rests = part.weight / (1.0 + _lost_at_stops(part, self)), part.motion.still
             share = float(weight[rests].sum() / part.weight[rests].sum()) if rests.any() else 1.0
             parts.append(replace(part, weight=weight, scatter=share * part.scatter))
-        return replace(self, parts=tuple(parts) or self.parts, angle_deg=0.0)
+        return replace(self, parts=tuple(parts), angle_deg=0.0)
 
     @cached_property
     def scatter(self) -> Values:
