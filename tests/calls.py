@@ -1,4 +1,4 @@
-"""Which functions are called, and how often: of the steps of a unit, and of what is computed once a recording."""
+"""Which functions are called, and how often: of the steps of a unit, and of what is computed once a unit."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
+from pipeline.estimation.design import Design
 from pipeline.unit import STEPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
+
+    from pipeline.estimation.observations import Observations
 
 Calls = Counter[tuple[str, str]]  # function, and recording if it has one
 ONCE_A_RECORDING = (
@@ -20,15 +24,16 @@ ONCE_A_RECORDING = (
     "pipeline.model.kinematics._motion_of_attitude",
     "pipeline.signal.filters.smooth_temperature",
     "pipeline.signal.encoder_rate._rate_of",
-    "pipeline.signal.rests._rests_by_hand",
-    "pipeline.signal.rests._rests_by_table",
+    "pipeline.signal.rests.find_rests",
+    "pipeline.signal.rests.rests_from_table",
 )
+ONCE_A_RECORDING_AND_SENSOR = ("pipeline.estimation.observations._part",)
 OF_STEPS = tuple(f"pipeline.stages.{step.function}" for step in STEPS.values())
 
 
 @contextmanager
 def counted(functions: Iterable[str]) -> Iterator[Calls]:
-    """Replace functions by ones that count their calls."""
+    """Count the calls of functions; of a quantity that is declared ``once``, the computations."""
     calls: Calls = Counter()
 
     def counting(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -42,8 +47,30 @@ def counted(functions: Iterable[str]) -> Iterator[Calls]:
     with pytest.MonkeyPatch.context() as patch:
         for path in functions:
             module, _, name = path.rpartition(".")
-            patch.setattr(path, counting(name, getattr(import_module(module), name)))
+            function = getattr(import_module(module), name)
+            if computed := getattr(function, "__wrapped__", None):
+                patch.setattr(function, "__wrapped__", counting(name, computed))
+            else:
+                patch.setattr(path, counting(name, function))
         yield calls
+
+
+@contextmanager
+def designs() -> Iterator[Counter[tuple[Any, ...]]]:
+    """Count the designs that are built, by sensor and all values that determine the design."""
+    built: Counter[tuple[Any, ...]] = Counter()
+    build = Design.__init__
+
+    def counting(design: Design, observations: Observations, terms: Any, *values: Any, **options: Any) -> None:
+        arrays = (observations.reading, observations.weight, *values, *(options.get(n) for n in ("target", "base")))
+        of_terms = tuple((t.effect.name, t.values.tobytes(), t.full) for t in terms)
+        of_values = tuple(None if value is None else np.asarray(value).tobytes() for value in arrays)
+        built[observations.sensor, of_terms, of_values, observations.angle_deg, options.get("project", False)] += 1
+        build(design, observations, terms, *values, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Design, "__init__", counting)
+        yield built
 
 
 def names(calls: Calls) -> set[str]:

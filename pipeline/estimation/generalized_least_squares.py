@@ -101,7 +101,8 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     """
     linear = not any(term.effect.nonlinear or term.effect.layout == Layout.SHARED for term in terms)
     rounds, converged, state = 0, False, _with_all_columns(start, terms)
-    solved = _solve(design_at(observations, state), observations, settings)
+    design = design_at(observations, state)
+    solved = _solve(design, observations, settings)
     while rounds < ROUNDS and not converged:
         rounds += 1
         moved, taken = stepped(state.terms, solved.step[BASE:])
@@ -112,12 +113,13 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         small[:BASE] = np.maximum(small[:BASE], 1e-12)
         converged = linear or bool(np.all(np.abs(taken) <= small))
         if not linear:
-            solved = _solve(design_at(observations, state), observations, settings)
+            design = design_at(observations, state)
+            solved = _solve(design, observations, settings)
     residual, _ = _residual(observations, state)
     noise = observations.less_stop_errors
     squares = np.sum(noise.weight[:, None] * residual**2) + np.sum(noise.scatter)
     covariance, freedom = solved.posterior.averaged()
-    return Fit(
+    found = Fit(
         state.bias,
         state.K,
         state.scale,
@@ -133,6 +135,9 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         cosine=solved.cosine_after if linear else solved.cosine,
         rank=solved.rank,
     )
+    if not linear:
+        found._designs[observations] = design  # of the last round  # noqa: SLF001
+    return found
 
 
 def _with_all_columns(start: Start, terms: Sequence[Term]) -> Start:

@@ -26,6 +26,7 @@ from pipeline.estimation.turns import Rows, reference_valid, rows_of
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
+from pipeline.records import once, once_of_log
 from pipeline.signal.encoder_rate import rate_by_angle
 from pipeline.signal.filters import filtered, impulse_response
 
@@ -205,7 +206,8 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
     settings of ``bench_priors``.
     """
     used = [r for r in recordings if r.role in ROLES and r.samples >= 6]
-    parts = [part for part in (_part(sensor, recording, table) for recording in used) if part is not None]
+    logged = [(r, table_motion(r, table)) for r in used if r.reading(sensor) is not None]
+    parts = [part for r, motion in logged if motion is not None and (part := _part(r, sensor, motion)) is not None]
 
     def in_time(part: Part) -> tuple[bool, str, float]:
         """Order recordings in time, within the unit or else within their setup."""
@@ -223,16 +225,14 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
     )
 
 
-def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part | None:
+@once
+def _part(recording: Recording, sensor: str, motion: Motion) -> Part | None:
     reading = recording.reading(sensor)
-    motion = None if reading is None else table_motion(recording, table)
-    if reading is None or motion is None:
-        return None
-    motion = replace(motion, direction=turning_direction(motion))
+    assert reading is not None  # noqa: S101
     filtered = recording.filter["name"] != "none"
     if filtered:
         sure = _filter_settled(motion, recording) if sensor == "gyroscope" else reference_valid(motion)
-        motion = replace(filtered_motion(motion, recording), reference_valid=sure)
+        motion = replace(filtered_motion(_with_direction(motion), recording), reference_valid=sure)
     valid = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.valid)
     rows = rows_of(motion, valid, together=not filtered).settled(reading)
     if len(rows.first) == 0:
@@ -243,7 +243,7 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     by_angle = rate_by_angle(recording) if sensor == "gyroscope" and recording.axis is not None else None
     return Part(
         recording.name,
-        rows.motion(motion) if filtered else _shared(recording, motion, rows),
+        rows.motion(motion) if filtered else _motion_at(recording, motion, rows),
         means,
         weight=rows.count * independent,
         scatter=np.sum(squares, axis=0) * independent,
@@ -253,10 +253,14 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     )
 
 
-def _shared(recording: Recording, motion: Motion, rows: Rows) -> Motion:
+@once_of_log
+def _motion_at(recording: Recording, motion: Motion, rows: Rows) -> Motion:  # noqa: ARG001  (which keeps the result)
     """Return the motion at the rows, which is mostly the same for both sensors of a recording."""
-    key = "rows", id(motion.specific_force), rows.kept.tobytes(), rows.first.tobytes()  # the recording keeps the array
-    return recording.once(key, lambda: rows.motion(motion))
+    return rows.motion(_with_direction(motion))
+
+
+def _with_direction(motion: Motion) -> Motion:
+    return replace(motion, direction=turning_direction(motion))
 
 
 def filtered_motion(motion: Motion, recording: Recording) -> Motion:

@@ -193,7 +193,7 @@ class Selection:
             values = np.maximum(values, this.starts(self.observations.sensor)[0])
         terms = [*self.base.terms, *self._terms(), Term(this, values)]
         fit = fit_terms(self.observations, terms, self.start, self.settings)
-        self.fits[*self.names, score.name] = fit
+        self.fits[*self.names, score.name] = replace(fit)  # without its design: there are many candidates
         before, _ = self.ranking.of_model(self.ranking.of_effects(self.names))
         gain = max(2.0 * (fit.log_likelihood - before), 0.0)
         values = fit.terms[-1].values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -175,14 +175,24 @@ def blocks_of_samples(parts: Sequence[Part]) -> Blocks:
     return Blocks(firsts, weights, start, length, clocks)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rows:
-    """Groups of a recording's samples whose means are the rows of a fit."""
+    """Groups of a recording's samples whose means are the rows of a fit; equal ones are one argument of ``once``."""
 
     kept: Index  # (k,); indices of the samples
     first: Index  # (m,); where in ``kept`` each group starts
     count: Values  # (m,); samples of each group
     total: int  # samples of the recording
+
+    @cached_property
+    def _key(self) -> tuple[bytes, bytes, int]:
+        return self.kept.tobytes(), self.first.tobytes(), self.total
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Rows) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
 
     def settled(self, reading: Values) -> Rows:
         """Split groups whose readings, (n, 3), scatter too much into single samples.

@@ -27,7 +27,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.model.encoder_trajectory import EncoderTrajectory
-from pipeline.records import AXES, Motion, Recording, Values, conjugate_product, continuous
+from pipeline.records import AXES, Motion, Recording, Values, conjugate_product, continuous, once_of_log
 from pipeline.signal.encoder_rate import rate_by_angle
 from pipeline.signal.filters import temperature_of
 from pipeline.signal.rests import still_samples
@@ -86,39 +86,40 @@ def reference_motion(
 ) -> Motion | None:
     """Return the motion of a recording by the log of the table; None where the recording has no such log.
 
-    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``. It is computed once a
-    recording; its arrays are shared. ``earth_rate_level``: Earth's rotation in the level frame, (3,), deg/s, or None.
-    ``one_shaft``: level x is the axis about which the encoder counts right-handed, the same in all turns
-    (``table.azimuth_of``), not the body axis at angle 0. Raises ``InputError`` if there are too few samples to
-    differentiate the log.
+    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``. ``earth_rate_level``: Earth's rotation
+    in the level frame, (3,), deg/s, or None. ``one_shaft``: level x is the axis about which the encoder counts
+    right-handed, the same in all turns (``table.azimuth_of``), not the body axis at angle 0. Raises ``InputError`` if
+    there are too few samples to differentiate the log.
     """
+    earth = None if earth_rate_level is None else tuple(earth_rate_level.tolist())
+    return _reference_motion(recording, gravity_g, earth, one_shaft=one_shaft)
+
+
+@once_of_log
+def _reference_motion(
+    recording: Recording, gravity_g: float, earth: tuple[float, ...] | None, *, one_shaft: bool
+) -> Motion | None:
     if recording.axis is not None and recording.table_angle is not None:
         build: Callable[..., Motion] = partial(_motion_of_turn, shaft=recording.sense if one_shaft else 0)
     elif recording.table_attitude is not None:
         build = _motion_of_attitude
     else:
         return None
-
-    def motion() -> Motion:
-        if recording.samples < 6:
-            raise InputError(
-                f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the "
-                "table",
-                recording.source.get("file"),
-            )
-        temperature = None if recording.temperature is None else temperature_of(recording)
-        own_clock = "table" if "table_clock" in recording.source else "sensor"
-        logged = partial(
-            replace,
-            temperature=temperature,
-            timed_by=own_clock if recording.table_rate is None else "",
-            recording=recording.name,
-            setup=recording.setup,
+    if recording.samples < 6:
+        raise InputError(
+            f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the table",
+            recording.source.get("file"),
         )
-        return build(recording, gravity_g, earth_rate_level, logged)
-
-    level = None if earth_rate_level is None else earth_rate_level.tobytes()
-    return recording.once(("motion", gravity_g, level, one_shaft), motion)
+    temperature = None if recording.temperature is None else temperature_of(recording)
+    own_clock = "table" if "table_clock" in recording.source else "sensor"
+    logged = partial(
+        replace,
+        temperature=temperature,
+        timed_by=own_clock if recording.table_rate is None else "",
+        recording=recording.name,
+        setup=recording.setup,
+    )
+    return build(recording, gravity_g, None if earth is None else np.array(earth), logged)
 
 
 def _motion_of_turn(

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.quality_flags import GAP_INTERVALS
-from pipeline.records import AXES, SENSORS, conjugate_product, continuous, median, noise_of_steps
+from pipeline.records import AXES, SENSORS, conjugate_product, continuous, median, noise_of_steps, once, once_of_log
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -111,21 +111,19 @@ def quantiles(values: Values, *shares: float) -> Values:
     return np.asarray(np.partition(values, places, axis=0)[places])
 
 
+@once_of_log
 def gaps(recording: Recording) -> Mask:
     """Return which intervals are longer than 1.5 times the usual one: (n - 1,) array."""
     longest = GAP_INTERVALS * recording.interval * 1e9
-    return recording.once("gaps", lambda: np.asarray(np.diff(recording.time_ns) > longest))
+    return np.asarray(np.diff(recording.time_ns) > longest)
 
 
-def of_table(recording: Recording) -> list[Channel]:
+@once_of_log
+def of_table(recording: Recording) -> tuple[Channel, ...]:
     """Return the rotation by the table's log: its rate, and the angle of a turn or the attitude of held-out motion.
 
     In held-out motion the rate is a magnitude.
     """
-    return [*recording.once("rotation of the table", lambda: _of_table(recording))]
-
-
-def _of_table(recording: Recording) -> list[Channel]:
     channels, turns = [], recording.axis is not None
     rate, angle, attitude = recording.table_rate, recording.table_angle, recording.table_attitude
     if rate is not None:
@@ -134,7 +132,7 @@ def _of_table(recording: Recording) -> list[Channel]:
         channels.append(_of_turned("table_angle", recording, np.diff(angle)))
     if not turns and attitude is not None:
         channels.append(_of_turned("table_attitude", recording, np.linalg.norm(spin(attitude), axis=1)))
-    return channels
+    return tuple(channels)
 
 
 def spin(attitude: Values) -> Values:
@@ -172,12 +170,9 @@ def alike(one: Values, two: Values) -> float:
     return float(a @ b) / size if size > 0.0 else 0.0
 
 
+@once
 def gravity_turned(recording: Recording) -> Values | None:
     """Return the angle by which gravity turned about the turn axis in each interval, deg; None if it does not turn."""
-    return recording.once("gravity_turned", lambda: _gravity_turned(recording))
-
-
-def _gravity_turned(recording: Recording) -> Values | None:
     force, axis = recording.accelerometer, axis_index(recording)
     if force is None:
         return None

@@ -23,7 +23,6 @@ interval contradicts this.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,7 +51,7 @@ from pipeline.preprocessing.reference_scale import (
     doubt_of_angle,
     doubt_of_scale,
 )
-from pipeline.records import Note, median
+from pipeline.records import Note, median, once
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -146,8 +145,7 @@ class _Gyroscope:
             rate = recording.logged_rate
             if rate is None or recording.gyroscope is None:
                 continue
-            slopes = partial(_slopes, recording.gyroscope, rate)
-            gain, bias = self.slopes[recording.name] = recording.once("slopes of the gyroscope", slopes)
+            gain, bias = self.slopes[recording.name] = _slopes(recording)
             if np.all(gain):
                 turned = int(np.argmax(np.abs(gain)))  # not the stated axis: the mounting is checked later
                 found.append((turned, float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
@@ -181,8 +179,12 @@ class _Gyroscope:
         return np.asarray(np.linalg.solve(self.matrix, (recording.gyroscope - self.bias).T).T)
 
 
-def _slopes(reading: Values, rate: Values) -> Values:
-    """Return gain and bias of each axis of a gyroscope against a rate: (2, 3) array; zeros if the rate is constant."""
+@once
+def _slopes(recording: Recording) -> Values:
+    """Return gain and bias of each axis of a gyroscope by the table's rate: (2, 3) array; zeros if it is constant."""
+    reading, rate = recording.gyroscope, recording.logged_rate
+    assert reading is not None  # noqa: S101
+    assert rate is not None  # noqa: S101
     change = rate - median(rate)
     if largest_but(np.abs(change), 100) < LEAST_RATE_DPS:
         return np.zeros((2, 3))
@@ -191,7 +193,7 @@ def _slopes(reading: Values, rate: Values) -> Values:
 
 
 def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> tuple[list[Note], Delay | None]:
-    channels, axis = of_table(recording), axis_index(recording)
+    channels, axis = [*of_table(recording)], axis_index(recording)
     if any(alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels):
         rate, angle = (limits.column(recording, name) for name in ("table_rate", "table_angle"))
         problem = f"{rate} and the change of {angle} have opposite signs"
@@ -214,7 +216,7 @@ def _check_motion(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -
     vector = gyroscope.vector(recording)
     size = None if vector is None else np.linalg.norm(vector, axis=1)
     check_scale_of_motion(recording, size, limits)
-    channels = of_table(recording)
+    channels = [*of_table(recording)]
     if size is not None:
         channels.append(of_rate(recording, "gyroscope", size, recording.valid))
     found = _compare(recording, channels, limits)

@@ -39,6 +39,8 @@ from pipeline.records.recording import (
     median,
     motion_at_rest,
     noise_of_steps,
+    once,
+    once_of_log,
     rate_of_attitude,
 )
 
@@ -79,5 +81,7 @@ __all__ = [
     "median",
     "motion_at_rest",
     "noise_of_steps",
+    "once",
+    "once_of_log",
     "rate_of_attitude",
 ]

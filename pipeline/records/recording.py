@@ -19,8 +19,8 @@ by a quintic spline through the components: at 0.12 s between samples and 200 de
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
+from functools import cached_property, wraps
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -34,7 +34,8 @@ Values: TypeAlias = "NDArray[np.float64]"
 Mask: TypeAlias = "NDArray[np.bool_]"
 Integers: TypeAlias = "NDArray[np.int64]"
 Index: TypeAlias = "NDArray[np.intp]"
-Computed = TypeVar("Computed")
+Quantity = TypeVar("Quantity")
+Arguments = ParamSpec("Arguments")
 
 AXES = ("x", "y", "z")
 SENSORS = ("accelerometer", "gyroscope")
@@ -124,29 +125,23 @@ class Recording:
         return float(median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
 
     @cached_property
-    def _computed(self) -> dict[Hashable, Any]:
-        """The quantities of ``once``."""
+    def _quantities(self) -> dict[Hashable, Any]:
+        """The quantities that are declared ``once``, by function and arguments."""
         return {}
 
-    def once(self, key: Hashable, compute: Callable[[], Computed]) -> Computed:
-        """Return a quantity that follows from this recording and ``key``, computed at the first call.
-
-        The steps of a unit pass on its recordings (``UnitRecordings``), so that each motion of the table, smoothed
-        temperature and list of rests is computed once a unit.
-        """
-        if key not in self._computed:
-            self._computed[key] = compute()
-        found: Computed = self._computed[key]
-        return found
+    @cached_property
+    def _quantities_of_log(self) -> dict[Hashable, Any]:
+        """Those that are declared ``once_of_log``."""
+        return {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is copied to another process: not the quantities of ``once``, which contain functions."""
-        return {name: value for name, value in vars(self).items() if name != "_computed"}
+        """Return what is copied to another process: not the quantities, which contain functions."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("_quantities")}
 
     def with_readings(self, **fields: Any) -> Self:  # noqa: ANN401  (of the dataclass)
-        """Return the recording with other readings, flags or role, and the motions that are already computed."""
+        """Return the recording with other readings, flags, filter or role, and the same quantities of its log."""
         changed = replace(self, **fields)
-        changed._computed.update({k: v for k, v in self._computed.items() if isinstance(v, Motion)})  # noqa: SLF001
+        vars(changed)["_quantities_of_log"] = self._quantities_of_log
         return changed
 
     @property
@@ -175,6 +170,40 @@ class Recording:
     def select(self, index: NDArray[Any] | slice) -> Self:
         """Return the recording with only the samples of ``index`` (slice, mask or integers)."""
         return replace(self, **{n: v[index] for n in OF_SAMPLES if (v := getattr(self, n)) is not None})
+
+
+def once(
+    compute: Callable[Concatenate[Recording, Arguments], Quantity],
+) -> Callable[Concatenate[Recording, Arguments], Quantity]:
+    """Declare a quantity of a recording: it follows from the recording and further arguments, which have a hash.
+
+    The function computes it at the first call, and the recording keeps it. The steps of a unit pass on its recordings
+    (``UnitRecordings``), so that each motion of the table, smoothed temperature, list of rests and row of a fit is
+    computed once a unit. Callers must not change it.
+    """
+    return _kept(compute, lambda recording: recording._quantities)  # noqa: SLF001
+
+
+def once_of_log(
+    compute: Callable[Concatenate[Recording, Arguments], Quantity],
+) -> Callable[Concatenate[Recording, Arguments], Quantity]:
+    """Declare a quantity as ``once`` that depends on no readings, flags, filter or role (``with_readings``)."""
+    return _kept(compute, lambda recording: recording._quantities_of_log)  # noqa: SLF001
+
+
+def _kept(
+    compute: Callable[Concatenate[Recording, Arguments], Quantity],
+    quantities: Callable[[Recording], dict[Hashable, Any]],
+) -> Callable[Concatenate[Recording, Arguments], Quantity]:
+    @wraps(compute)
+    def quantity(recording: Recording, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> Quantity:
+        known, key = quantities(recording), (quantity, arguments, *sorted(named.items()))
+        if key not in known:
+            known[key] = quantity.__wrapped__(recording, *arguments, **named)
+        found: Quantity = known[key]
+        return found
+
+    return quantity
 
 
 def files_of_readings(source: dict[str, Any]) -> list[dict[str, Any]]:
@@ -233,7 +262,7 @@ class Noise:
 class UnitRecordings:
     """The recordings of one unit after checks and filter, and the noise of each sensor.
 
-    The steps of a unit pass them on in memory, so that ``Recording.once`` computes each quantity once a unit.
+    The steps of a unit pass them on in memory, with the quantities of each that are computed ``once``.
     """
 
     filtered: list[Recording]  # with the filter ``none``, those of ingest
@@ -258,7 +287,7 @@ def median(values: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
     return np.expand_dims(middle, axis) if keepdims else middle
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Motion:
     """The true motion in the body frame, from the log of a table (without noise) or from calibrated signals.
 

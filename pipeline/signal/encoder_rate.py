@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.records import once_of_log
 from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 
 if TYPE_CHECKING:
@@ -57,12 +58,13 @@ class EncoderRate:
     vague: Mask  # where the rate is unreliable: at a bend of a fine angle, at a gap of a coarse one
 
 
+@once_of_log
 def rate_by_angle(recording: Recording) -> EncoderRate | None:
     """Return the rate from the angle; None where the table logs a rate or no angle, or below 6 samples."""
     angle = recording.table_angle
     if recording.table_rate is not None or angle is None or recording.samples < FEWEST:
         return None
-    return recording.once("encoder_rate", lambda: _rate_of(recording.time * recording.table_seconds, angle))
+    return _rate_of(recording.time * recording.table_seconds, angle)
 
 
 def _rate_of(time: Values, angle: Values) -> EncoderRate:

@@ -41,7 +41,6 @@ Lepski, Theory of Probability and Its Applications 35, 1991.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
@@ -49,7 +48,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.records import Integers, Note, Recording, Values, noise_of_steps
+from pipeline.records import Integers, Note, Recording, Values, noise_of_steps, once_of_log
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -88,8 +87,7 @@ def apply_filter(recording: Recording, settings: Mapping[str, Any]) -> Recording
         )
     sections, run = _filter_of(recording, settings)
     zero_phase, interval = bool(settings["zero_phase"]), recording.interval
-    return replace(
-        recording,
+    return recording.with_readings(
         accelerometer=None if recording.accelerometer is None else run(recording.accelerometer),
         gyroscope=None if recording.gyroscope is None else run(recording.gyroscope),
         notes=recording.notes + (() if name == "rc_low_pass" else _timing_notes(recording)),
@@ -308,11 +306,12 @@ def smooth_temperature(time: Values, temperature: Values, bandwidth: float = 10.
     return smooth
 
 
+@once_of_log
 def temperature_of(recording: Recording) -> Values:
     """Return the smoothed temperature of a recording that logs it: (n,) array, degC."""
     logged = recording.temperature
     assert logged is not None  # noqa: S101
-    return recording.once("temperature", lambda: smooth_temperature(recording.time, logged))
+    return smooth_temperature(recording.time, logged)
 
 
 def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:

@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps
+from pipeline.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps, once
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 
 if TYPE_CHECKING:
@@ -113,18 +113,15 @@ def _parabolas(time: Values) -> Values:
     return np.linalg.qr(np.polynomial.legendre.legvander(x, DEGREE))[0]
 
 
+@once
 def creep_of_rest(recording: Recording, start: int, stop: int) -> Creep:
     """Return the creep in the samples ``start <= n < stop`` of a recording, without flagged and missing ones."""
     force = recording.accelerometer
     assert force is not None  # noqa: S101
-
-    def creep() -> Creep:
-        good = (recording.valid[start:stop]) & np.isfinite(force[start:stop]).all(axis=1)
-        count = np.array([max(int(good.sum()), 1)])
-        share = float(variance_of_mean(filter_autocovariance(recording), count)[0])
-        return creep_of_readings(recording.time[start:stop][good], force[start:stop][good], share)
-
-    return recording.once(("creep", start, stop), creep)
+    good = (recording.valid[start:stop]) & np.isfinite(force[start:stop]).all(axis=1)
+    count = np.array([max(int(good.sum()), 1)])
+    share = float(variance_of_mean(filter_autocovariance(recording), count)[0])
+    return creep_of_readings(recording.time[start:stop][good], force[start:stop][good], share)
 
 
 def creep_of_readings(time: Values, force: Values, share: float = 0.0) -> Creep:

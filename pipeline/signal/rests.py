@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import Integers, Mask, Recording, Values, median, noise_of_steps
+from pipeline.records import Integers, Mask, Recording, Values, median, noise_of_steps, once
 from pipeline.signal.filters import filter_autocovariance, stretch_starts
 from pipeline.signal.quiet_motion import RATE_LIMIT_DPS, counts_of, creep_of_rest, quiet_pieces, windows
 
@@ -94,15 +94,12 @@ def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> M
     return still
 
 
+@once
 def rests_from_table(recording: Recording) -> list[Rest]:
     """Return the rests by the rate of the table, or by the derivative of its angle; none without such a log.
 
-    Their first 0.3 s, and the delay of the recording's filter, are not included. They are found once a recording.
+    Their first 0.3 s, and the delay of the recording's filter, are not included.
     """
-    return recording.once("rests_by_table", lambda: _rests_by_table(recording))
-
-
-def _rests_by_table(recording: Recording) -> list[Rest]:
     rate = recording.logged_rate
     if rate is None:
         return []
@@ -110,15 +107,12 @@ def _rests_by_table(recording: Recording) -> list[Rest]:
     return [Rest(start, stop) for start, stop in runs(still)]
 
 
+@once
 def find_rests(recording: Recording) -> list[Rest]:
     """Find the rests of a hand-held recording from its readings, in order of time, each at least 1 s long.
 
-    A rest in which the sensor moved is marked as refused, with the reason. They are found once a recording.
+    A rest in which the sensor moved is marked as refused, with the reason.
     """
-    return recording.once("rests_by_hand", lambda: _rests_by_hand(recording))
-
-
-def _rests_by_hand(recording: Recording) -> list[Rest]:
     force = recording.accelerometer
     size = max(5, round(WINDOW_S / _interval(recording))) if recording.samples > 1 else 5
     if force is None or recording.samples < 2 * size:

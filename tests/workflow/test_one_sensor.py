@@ -87,7 +87,7 @@ def test_calibrate_unit_saves_the_files_of_the_run_by_hand(done: Bench, tmp_path
     saved = {str(file.relative_to(tmp_path)): file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     assert len(saved) > 10
     assert saved == {path: (done.results / path).read_bytes() for path in saved}
-    assert calls["_rests_by_hand", "recording"] == calls["_rests_by_table", "recording"] == 1
+    assert calls["find_rests", "recording"] == calls["rests_from_table", "recording"] == 1
     assert set(calls.values()) == {1}
     alone = pipeline.calibrate({"recording": done.campaign / "raw" / "csv" / "recording.csv"}, sensor="generic",
                                procedure="multi_position", method="rests_and_moves")  # fmt: skip

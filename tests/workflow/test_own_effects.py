@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import OF_STEPS, ONCE_A_RECORDING, Calls, counted, names
+from calls import OF_STEPS, ONCE_A_RECORDING, ONCE_A_RECORDING_AND_SENSOR, Calls, counted, designs, names
 from whole_run import run_campaign
 
 import pipeline
@@ -121,7 +121,7 @@ def test_a_run_calibrate_unit_and_check_are_one_chain(
 ) -> None:
     """The same functions make the same files, and what a step computes of a recording the next ones need not."""
     settings = {"campaign": str(bench.campaign), "results": str(bench.results.parent)}
-    with counted((*OF_STEPS, *ONCE_A_RECORDING)) as calls:
+    with counted((*OF_STEPS, *ONCE_A_RECORDING, *ONCE_A_RECORDING_AND_SENSOR)) as calls, designs() as built:
         pipeline.calibrate_unit(bench.campaign, "known", results=bench.results.parent).save(tmp_path)
     assert names(run) == {name.rpartition(".")[2] for name in OF_STEPS}
     assert names(calls) >= names(run) - {"summarise"}  # of all units
@@ -134,7 +134,10 @@ def test_a_run_calibrate_unit_and_check_are_one_chain(
     assert computed["_motion_of_turn"] == [1] * turns
     assert computed["_motion_of_attitude"] == [1]  # of the held-out motion
     assert computed["smooth_temperature"] == [1] * (turns + 2)
-    assert max(computed["_rests_by_table"]) == 2  # as read, and in body axes
+    assert max(computed["rests_from_table"]) == 2  # as read, and in body axes
+    assert max(computed["_part"]) == 2  # of each sensor
+    assert {sensor for sensor, *_ in built} == {"accelerometer", "gyroscope"}
+    assert set(built.values()) == {1}
     with counted(OF_STEPS) as calls:
         assert check.main(["--campaign", str(bench.campaign), "--unit", "known"]) == 0
     assert "unit known: " in capsys.readouterr().out
