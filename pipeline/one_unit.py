@@ -18,7 +18,7 @@ from pipeline.config.campaign import Campaign, UnitRow, cut_batches
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, key_of
 from pipeline.config.options import RUN_SETTINGS, Problem, nearest, parse
-from pipeline.config.stage_settings import settings_in_memory
+from pipeline.config.stage_settings import as_job_reads, settings_in_memory
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError, as_published, failure_of
 from pipeline.io.files import candidate_files, wrong_name
@@ -103,7 +103,7 @@ class ConfiguredUnit:
         The order of summation, and so the last digits, depend on the number of threads.
         """
         effects = self.row.config.user_effects
-        with registered(effects.json_value if effects else {}), threadpool_limits(1, "blas"):
+        with registered(as_job_reads(effects.json_value) if effects else {}), threadpool_limits(1, "blas"):
             yield
 
 

@@ -76,7 +76,12 @@ def _stated(unit: UnitRow, stage: str, run: Mapping[str, Any] | None = None, boa
 def settings_in_memory(unit: UnitRow, stage: str, sensor: str = "", run: Mapping[str, Any] | None = None) -> Settings:
     """Return the settings that a stage reads as its job reads them: keys, and with them recordings, are sorted."""
     content = settings_of_unit(unit, stage, sensor, _stated(unit, stage, run))
-    return Settings.of_sections(json.loads(_canonical(content)))
+    return Settings.of_sections(as_job_reads(content))
+
+
+def as_job_reads(value: Any) -> Any:  # noqa: ANN401  (any JSON value)
+    """Return a value as a job reads it from its settings: keys, and with them terms of effects, are sorted."""
+    return json.loads(_canonical(value))
 
 
 class SettingsFile(NamedTuple):
