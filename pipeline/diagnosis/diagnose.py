@@ -21,7 +21,7 @@ from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
 from pipeline.model.effects import catalogue, effect
-from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
+from pipeline.records import MATRIX, Noise, Recording, SensorCalibration
 from pipeline.validation.heldout import last_error, static_error
 from pipeline.validation.samples import HeldOutCase
 from pipeline.verdicts import Verdict
@@ -212,9 +212,8 @@ def _tilt_is_within_uncertainty(case: Case) -> bool:
     if fit is None or other is None or fit.covariance is None:
         return False
     before, after = ({e.name: e.values for e in each.effects}[MOUNTING] for each in (fit, other))
-    first = next(k for k, name in enumerate(fit.parameter_names()) if name.startswith(f"{MOUNTING}."))
-    u = np.sqrt(np.diag(fit.covariance)[first : first + len(before)])
-    return bool(np.all(np.abs(after - before) < coverage_factor(fit.effective_freedom()[first]) * u))
+    mountings = fit.parameters.select(fit.parameters.of_effect(MOUNTING))
+    return bool(np.all(np.abs(after - before) < mountings.expanded_uncertainty))
 
 
 def _leaning(diagnosis: Mapping[str, Any] | None, fit: SensorCalibration | None) -> dict[str, float]:
@@ -229,7 +228,7 @@ def _doubts_of_axes(leaning: Mapping[str, float], calibration: SensorCalibration
     """Return the tilts of the turn axes that exceed the matrix's U: to a gyroscope they look like a misalignment."""
     if calibration.covariance is None:
         return []
-    U = np.degrees(2.0 * np.sqrt(float(np.max(np.diag(calibration.covariance)[3:12]))))
+    U = np.degrees(2.0 * float(np.max(calibration.parameters.standard_uncertainty[MATRIX])))
     return [
         f"by the accelerometer's {name} the turn axes lean by up to {size:.2g} deg, and the matrix of the gyroscope is "
         f"off by as much ({np.radians(size):.2g}), beyond its uncertainty"

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.design import BASE, Design, Term, placed
+from pipeline.estimation.design import Design, Term, placed
 from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import Fit, design_at
 from pipeline.estimation.observations import without_each_recording
 from pipeline.estimation.ranking import projection, without
+from pipeline.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,7 +117,7 @@ def _refitted(fit: Fit, index: Index, least: float, products: Values, rest: Obse
         return {}
     within, samples, p = float(np.sum(rest.scatter / fit.scale**2)), 3.0 * rest.samples, products.shape[1] - 1
     given = without(products, np.setdiff1d(np.arange(p), index))
-    values = np.concatenate([term.values for term in fit.terms])[index - BASE]
+    values = np.concatenate([term.values for term in fit.terms])[index - BASE_COUNT]
     step = projection(given, index)[0][:, -1]  # from the values of the fit, whose residual is the last column
     left = float(without(given, index)[0, -1, -1])
     alone = left + float((step + values) @ given[0][np.ix_(index, index)] @ (step + values))

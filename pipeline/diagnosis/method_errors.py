@@ -27,6 +27,7 @@ from pipeline.estimation.stages import declared
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import table_motion
+from pipeline.records import BASE, BASE_COUNT, BIAS, matrix_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -117,11 +118,11 @@ class _Difference:
 
         ``of_free``: covariance of the free fit's bias and matrix, and (9, 9) derivative of E to this matrix.
         """
-        M, variance = method.matrix, np.zeros(12)
+        M, variance = method.matrix, np.zeros(BASE_COUNT)
         for covariance, derivative in (of_free, (_covariance(method, settings), np.kron(np.eye(3), K.T))):
             if covariance is not None:
                 J = block_diag(M, derivative)
-                variance += np.diag(J @ covariance[:12, :12] @ J.T)
+                variance += np.diag(J @ covariance[BASE, BASE] @ J.T)
         E = M @ K - np.eye(3)
         diagonal = np.diag(np.diag(E))
         parts = {
@@ -146,10 +147,10 @@ class _Difference:
 
     def certain(self, selected: Sequence[str]) -> dict[str, bool]:
         """Return which parts exceed the noise of the two fits."""
-        u = self.uncertainty[3:].reshape(3, 3)
+        u = matrix_of(self.uncertainty)
         least = SURE * np.where(np.eye(3) > 0.0, u, np.hypot(u, u.T) / 2.0)
         complete = {effect.name for effect in self.method.effects}.issuperset(selected)
-        of_bias = complete and bool(np.any(np.abs(self.bias) > SURE * self.uncertainty[:3]))
+        of_bias = complete and bool(np.any(np.abs(self.bias) > SURE * self.uncertainty[BIAS]))
         of_matrix = {name: bool(np.any(np.abs(matrix) > least)) for name, matrix in self.matrices.items()}
         return {"two_sided": complete, "bias": of_bias, **of_matrix}
 
@@ -159,11 +160,13 @@ def _covariance(calibration: SensorCalibration, settings: Mapping[str, Any]) -> 
 
     If a given calibration states none, its bias varies by at least the wander of the sensor file.
     """
-    covariance = np.zeros((12, 12)) if calibration.covariance is None else calibration.covariance[:12, :12]
+    covariance = calibration.parameters.covariance[BASE, BASE]
     if covariance.any() or [stage.name for stage in calibration.stages] != ["given"]:
         return covariance
     wander = float(settings["sensor"][calibration.sensor]["bias_wander"])
-    return np.diag([wander**2] * 3 + [0.0] * 9)
+    covariance = np.zeros_like(covariance)
+    covariance[BIAS, BIAS] = wander**2 * np.eye(3)
+    return covariance
 
 
 def _errors(

@@ -22,12 +22,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.functional_forms import columns_of, signals_of
-from pipeline.estimation.design import BASE, Term, placed
+from pipeline.estimation.design import Term, placed
 from pipeline.estimation.gauss_markov import WHITE, Blocks, Products, Setting
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.ranking import projection
 from pipeline.model.effects.base import Layout, truth, unit_of
 from pipeline.model.formula import parse
+from pipeline.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -79,7 +80,7 @@ def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     significant = _most_significant(term, sensor, np.abs(term.values) / uncertainty)
     chosen = []
     for c, j in enumerate(significant):
-        if j is not None and np.any(regression.columns[c][:, block.start - BASE + OWN + j]):
+        if j is not None and np.any(regression.columns[c][:, block.start - BASE_COUNT + OWN + j]):
             x = regression.left_of_column(c, block.start + j, products)
             chosen.append((c, j, x, regression.weight @ x**2 / sigma[c] ** 2))
     information = sum(each for *_, each in chosen)
@@ -228,7 +229,7 @@ class _Columns:
         places = self.design.places(c)[1][:-1]
         others, delta = np.flatnonzero(np.arange(len(products)) != index), np.zeros(len(products))
         delta[others] = projection(products[None], others)[0][:, index]
-        return np.asarray(self.columns[c][:, index - BASE + OWN] - self.columns[c] @ delta[places])
+        return np.asarray(self.columns[c][:, index - BASE_COUNT + OWN] - self.columns[c] @ delta[places])
 
     def left_of(self, c: int, values: Values, setting: Setting) -> Values:
         """Return the residual of (n,) values after a fit of base and effects, free on this axis: (n,) array."""

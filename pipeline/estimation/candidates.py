@@ -128,8 +128,8 @@ def prior_of(
         if shared:
             here, there = (np.add.outer(np.multiply(3, k), np.arange(3)).ravel() for k in zip(*shared, strict=True))
             mean[here] = found.values[there]
-            first = accelerometer.parameter_names().index(f"{MOUNTING}.{next(iter(found.parameters))}")
-            covariance[np.ix_(here, here)] = accelerometer.covariance[np.ix_(first + there, first + there)]
+            mountings = accelerometer.parameters.select(accelerometer.parameters.of_effect(MOUNTING))
+            covariance[np.ix_(here, here)] = mountings.covariance[np.ix_(there, there)]
             covariance += np.kron(np.full((len(own),) * 2, np.diag(covariance)[here].mean()), np.eye(3))
     return NormalPrior(mean, np.asarray(np.linalg.inv(covariance), np.float64))
 

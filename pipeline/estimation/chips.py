@@ -31,7 +31,7 @@ from pipeline.estimation.engine import assess_noise, scaled_inverse
 from pipeline.estimation.gauss_markov import Prior
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, own_and_bench
 from pipeline.model.kinematics import turn_by_vector
-from pipeline.records import AXES, SENSOR_UNITS, SENSORS, SensorCalibration, Values, coverage_factor
+from pipeline.records import AXES, MATRIX, SENSOR_UNITS, SENSORS, SensorCalibration, Values, coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -133,7 +133,7 @@ def _errors(fitted: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
             calibration = chip.calibrations[of]
             assert calibration is not None  # noqa: S101  (of the sensors)
             of_unit, of_bench = own_and_bench(calibration)
-            freedom_of_unit = float(np.min(calibration.effective_freedom()[3:12]))
+            freedom_of_unit = float(np.min(calibration.parameters.degrees_of_freedom[MATRIX]))
             shears = [d.reshape(3, 3) @ np.linalg.inv(calibration.matrix) for d in np.eye(9)]
             pairs = [(none, R.T @ E @ R) if number else (E, none) for E in shears]
             sources.append((f"calibration of the {of} of {chip.unit}", "A", freedom_of_unit, of_unit, pairs))
@@ -148,7 +148,7 @@ def _errors(fitted: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
             of_axes = np.zeros((3, 9))
             if of == "accelerometer":
                 of_axes = np.stack([_axes_change(chips, R, *E) for E in pairs], axis=1)
-            errors.append(Error(source, kind, degrees, covariance[3:12, 3:12], np.stack(of_fits, axis=1), of_axes))
+            errors.append(Error(source, kind, degrees, covariance[MATRIX, MATRIX], np.stack(of_fits, axis=1), of_axes))
     return errors
 
 

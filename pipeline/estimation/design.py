@@ -31,7 +31,7 @@ from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.observations import without_rows
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.model.effects.base import Effect, Layout, truth
-from pipeline.records import motion_at_rest
+from pipeline.records import BASE_COUNT, MATRIX_ROWS, motion_at_rest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -39,14 +39,12 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations, Part
     from pipeline.records import Index, Motion, Noise, Values
 
-BASE = 12  # parameters: bias and matrix
 REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
 WEAKEST_DIRECTION, PART_OF_IT = 1e-3, 0.1  # singular value of unit columns that is determined; share of its vector
 SIGNALS = (  # fields of ``Motion`` on which formulas depend
     "time", "specific_force", "angular_rate", "angular_acceleration", "temperature", "angle", "rate", "level",
     "direction",
 )  # fmt: skip
-BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
 Result = TypeVar("Result")
 
 
@@ -81,7 +79,7 @@ class Term:
         return of(sensor, motion, K, self.values)
 
 
-def placed(terms: Sequence[Term], base: int = BASE) -> dict[str, tuple[Term, slice]]:
+def placed(terms: Sequence[Term], base: int = BASE_COUNT) -> dict[str, tuple[Term, slice]]:
     """Return each term and the slice of its parameters, which follow ``base`` parameters, by the effect's name."""
     edges = np.cumsum([base, *(len(term.values) for term in terms)]).tolist()
     return {t.effect.name: (t, slice(*edge)) for t, edge in zip(terms, pairwise(edges), strict=True)}
@@ -246,10 +244,10 @@ class Design:
     def _place(self, sensor: str, terms: Sequence[Term]) -> None:
         """Assign to each axis its columns of A, and the parameter of each column."""
         local: list[list[int]] = [[0, 1, 2, 3] for _ in range(3)]
-        total: list[list[int]] = [[c, 3 + 3 * c, 4 + 3 * c, 5 + 3 * c] for c in range(3)]
+        total: list[list[int]] = [[c, *range(row.start, row.stop)] for c, row in enumerate(MATRIX_ROWS)]
         self.slices: list[slice] = []
         self._columns: list[list[slice]] = []
-        width, parameters = 4, BASE
+        width, parameters = 4, BASE_COUNT
         for term in terms:
             layout = term.layout()
             shared, count = layout == Layout.SHARED, len(term.effect.parameters(sensor))

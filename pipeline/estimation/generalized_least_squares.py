@@ -25,8 +25,6 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import HELD, TILT, is_held, parameter_names, require_available, starts_of
 from pipeline.estimation.design import (
-    BASE,
-    BASE_NAMES,
     Design,
     Start,
     Term,
@@ -52,7 +50,23 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.model.effects.base import Layout, truth
 from pipeline.model.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-from pipeline.records import NORMAL, Contribution, Noise, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import (
+    AFTER_BASE,
+    BASE,
+    BASE_COUNT,
+    BASE_NAMES,
+    BIAS,
+    MATRIX,
+    NORMAL,
+    Contribution,
+    Noise,
+    Recording,
+    SensorCalibration,
+    StageResult,
+    Values,
+    base_values,
+    matrix_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -105,12 +119,12 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     solved = _solve(design, observations, settings)
     while rounds < ROUNDS and not converged:
         rounds += 1
-        moved, taken = stepped(state.terms, solved.step[BASE:])
-        taken = np.concatenate([solved.step[:BASE], taken])
-        K = state.K + taken[3:BASE].reshape(3, 3)
-        state = replace(state, bias=state.bias + taken[:3], K=K, terms=tuple(moved))
+        moved, taken = stepped(state.terms, solved.step[AFTER_BASE])
+        taken = np.concatenate([solved.step[BASE], taken])
+        K = state.K + matrix_of(taken)
+        state = replace(state, bias=state.bias + taken[BIAS], K=K, terms=tuple(moved))
         small = SMALL_STEP * np.sqrt(np.diag(solved.best_covariance))
-        small[:BASE] = np.maximum(small[:BASE], 1e-12)
+        small[BASE] = np.maximum(small[BASE], 1e-12)
         converged = linear or bool(np.all(np.abs(taken) <= small))
         if not linear:
             design = design_at(observations, state)
@@ -339,13 +353,13 @@ def calibration_of(
     (fit, turned), sensor = fit_in_mean_frame(fit), observations.sensor
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
-    change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)
+    change[MATRIX, MATRIX] = -np.kron(matrix, matrix.T)
     covariance = change @ fit.covariance @ change.T
     change = change @ turned
     effects, parameters = effect_parameters(sensor, fit.terms, covariance)
     held = [is_held(name, parameter) for name, parameter in parameters.items()]
     if any(held):  # no estimates: 0 without an uncertainty
-        rows = BASE + np.flatnonzero(held)
+        rows = BASE_COUNT + np.flatnonzero(held)
         change[rows] = covariance[rows] = covariance[:, rows] = 0.0
         of_terms = np.split(held, np.cumsum([len(term.values) for term in fit.terms])[:-1])
         terms = [
@@ -381,7 +395,7 @@ def calibration_of(
     whole = first.then(change)
     reference = Reference(sensor, [part.motion for part in observations.parts], fit.K, settings["table"])
     errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))), reference)
-    values = np.concatenate([fit.bias, fit.K.ravel(), *(term.values for term in fit.terms)])
+    values = np.concatenate([base_values(fit.bias, fit.K), *(term.values for term in fit.terms)])
     of_channels = np.concatenate(first.derivative, axis=1)
 
     def results(drawn: Values) -> Values:

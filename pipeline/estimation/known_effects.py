@@ -19,7 +19,15 @@ from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.monte_carlo import KEY
 from pipeline.estimation.uncertainty_budget import with_uncertainty
 from pipeline.model.measurement import Part, compensate
-from pipeline.records import FittedEffect, Recording, SensorCalibration, UnitRecordings, Values, motion_at_rest
+from pipeline.records import (
+    BASE_NAMES,
+    FittedEffect,
+    Recording,
+    SensorCalibration,
+    UnitRecordings,
+    Values,
+    motion_at_rest,
+)
 from pipeline.signal.filters import temperature_of
 
 if TYPE_CHECKING:
@@ -86,13 +94,11 @@ def with_known(
         return found
     size, added = len(calibration.covariance), [p for effect in more for p in effect.parameters.values()]
     covariance = np.pad(calibration.covariance, (0, len(added)))
-    freedom = np.pad(calibration.effective_freedom(), (0, len(added)), constant_values=np.inf)
+    freedom = np.pad(calibration.parameters.degrees_of_freedom, (0, len(added)), constant_values=np.inf)
     budget = _of_parameters(calibration.budget, size, range(size + len(added)))
-    budget["parameters"] = found.parameter_names()
-    budget["units"] = [*calibration.budget["units"], *(str(p["unit"]) for p in added)]
+    budget |= {"parameters": list(found.parameters.names), "units": list(found.parameters.units)}
     if "estimate" in budget.get(KEY, {}):
-        estimates = [found.bias, found.matrix.ravel(), *(effect.values for effect in found.effects)]
-        budget[KEY]["estimate"] = np.concatenate(estimates).tolist()
+        budget[KEY]["estimate"] = found.parameters.values.tolist()
     reason = f"no uncertainty of the known {_names(known)} is stated: zeros stand for it"
     missing = [*calibration.budget["not_included"], {"source": SOURCE, "reason": reason}]
     return with_uncertainty(found, covariance, freedom, budget, missing)
@@ -113,18 +119,20 @@ def _names(known: Sequence[FittedEffect]) -> str:
 
 def without_known(calibration: SensorCalibration, known: Sequence[FittedEffect]) -> SensorCalibration:
     """Return the calibration of readings from which the known effects are subtracted: undoes ``with_known``."""
-    values, size = {effect.name: effect.values for effect in known}, len(calibration.parameter_names())
-    covariance = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance
-    effects, rows, first = [], list(range(12)), 12
+    values, parameters = {effect.name: effect.values for effect in known}, calibration.parameters
+    effects, names = [], list(BASE_NAMES)
     for effect in calibration.effects:
-        own = range(first, first + len(effect.parameters))
-        first += len(own)
+        own = parameters.select(parameters.of_effect(effect.name))
         left = _moved(effect, -values[effect.name]) if effect.name in values else effect
-        if effect.name not in values or np.any(left.values) or np.any(covariance[own, own]):
+        if effect.name not in values or np.any(left.values) or np.any(own.standard_uncertainty):
             effects.append(left)
-            rows += own
+            names += own.names
+    rows = parameters.places(names)
     freedom = None if calibration.freedom is None else calibration.freedom[rows]
-    budget, covariance = _of_parameters(calibration.budget, size, rows), covariance[np.ix_(rows, rows)]
+    budget, covariance = (
+        _of_parameters(calibration.budget, len(parameters), rows.tolist()),
+        parameters.select(rows).covariance,
+    )
     return replace(calibration, effects=tuple(effects), covariance=covariance, freedom=freedom, budget=budget)
 
 

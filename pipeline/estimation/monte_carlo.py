@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.estimation.design import BASE
 from pipeline.estimation.engine import Posterior, draw_normal
+from pipeline.records import AFTER_BASE, BIAS, MATRIX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -129,8 +129,7 @@ def with_trials(
         for source in direct:
             values = values + draw_normal(rng, source.covariance, len(values))
         drawn.append(values)
-    effects = [value for effect in calibration.effects for value in effect.values]
-    estimate = np.concatenate([calibration.bias, calibration.matrix.ravel(), effects])
+    estimate = calibration.parameters.values
     budget = dict(calibration.budget or {})
     expanded, digits = np.array(budget["expanded_uncertainty"]), 2 if trials >= TWO_DIGITS else 1
     found = distribution_of(np.concatenate(drawn))
@@ -190,6 +189,6 @@ def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Ca
 
 def with_matrix(values: Values) -> Values:
     """Return (t, 12 + p) parameters with the matrix instead of K."""
-    K = values[:, 3:BASE].reshape(-1, 3, 3)
+    K = values[:, MATRIX].reshape(-1, 3, 3)
     matrix = np.linalg.solve(K, np.broadcast_to(np.eye(3), K.shape)).reshape(-1, 9)
-    return np.concatenate([values[:, :3], matrix, values[:, BASE:]], axis=1)
+    return np.concatenate([values[:, BIAS], matrix, values[:, AFTER_BASE]], axis=1)

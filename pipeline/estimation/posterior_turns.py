@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
-from pipeline.estimation.design import BASE, Design, Term, placed
+from pipeline.estimation.design import Design, Term, placed
 from pipeline.estimation.evidence import Problem, linear_problem
 from pipeline.estimation.gauss_markov import WHITE, random_walks
 from pipeline.estimation.generalized_least_squares import Fit, design_at, fit_terms
 from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import EXCITED, without
 from pipeline.estimation.selection import DELAYS, Selection
+from pipeline.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -142,7 +143,7 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
         for name, candidate in candidates.items()
         for term, weight in _versions(observations.sensor, fit, candidate)
     ]
-    known = BASE + sum(len(term.values) for term in configured)
+    known = BASE_COUNT + sum(len(term.values) for term in configured)
     design, base, products, logarithms, places = _products(selection, fit, listed, known)
     settings = [WHITE, *selection.settings, *random_walks(selection.settings).values()]
     size = np.where(design.sizes() > 0.0, design.sizes(), 1.0)

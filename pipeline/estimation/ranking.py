@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.estimation.design import BASE, Design, Start, Term
+from pipeline.estimation.design import Design, Start, Term
 from pipeline.estimation.gauss_markov import WHITE, Setting
+from pipeline.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -79,7 +80,7 @@ class Ranking:
         stacked, logarithms = design.products(self.settings)
         self.design, self.stacked, self.logarithms = design, stacked, logarithms
         self.penalty = 0.5 * logarithms - np.array([setting.prior for setting in self.settings])
-        known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
+        known = BASE_COUNT + sum(s.stop - s.start for s in design.slices[: len(configured)])
         self.projected = without(stacked, np.arange(known))[:, known:, known:]
         self.spans = [slice(s.start - known, s.stop - known) for s in design.slices[len(configured) :]]
         size = np.where(design.sizes() > 0, design.sizes(), 1.0)[known:]

@@ -42,7 +42,7 @@ from pipeline.estimation.turns import Part, noise_of_fit, parts_of, settled, use
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import truth
-from pipeline.records import AXES, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import AXES, BASE_COUNT, MATRIX, Recording, SensorCalibration, StageResult, Values
 from pipeline.signal.filters import filtered
 
 if TYPE_CHECKING:
@@ -75,10 +75,10 @@ def fit(
     prior = prior_of(sensor, recordings, settings)
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
-    J = np.zeros((3, 12, 4))
+    J = np.zeros((3, BASE_COUNT, 4))
     for channel in range(3):
         J[channel, channel, 0] = 1.0
-        J[channel, 3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
+        J[channel, MATRIX, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
     weights = factors.weights()
     fit = LinearMap((weights, weights, weights), (J[0], J[1], J[2]))
     reference = Reference(sensor, used_motions(parts), K, settings["table"])

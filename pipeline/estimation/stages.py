@@ -39,7 +39,7 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
-from pipeline.records import NORMAL, SENSORS, Contribution, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import BASE, NORMAL, SENSORS, Contribution, Recording, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -201,18 +201,17 @@ def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibra
         raise CannotCalibrateError(f"the given calibration {source} holds nothing of the {sensor}")
     found = SensorCalibration.from_json(sensor, part)
     bench = part["of_the_bench"]
-    kept = [i for i, name in enumerate(found.parameter_names()) if name.partition(".")[0] not in bench]
-    assert found.covariance is not None  # noqa: S101  (JSON has zeros if none is known)
-    covariance = found.covariance[np.ix_(kept, kept)]
-    parameters = base_parameters(sensor, found.bias, found.matrix, covariance[:12, :12])
+    every = found.parameters
+    kept = every.select(every.places([name for name in every.names if name.partition(".")[0] not in bench]))
+    parameters = base_parameters(sensor, found.bias, found.matrix, kept.covariance[BASE, BASE])
     details = {"source": source, "sha256": given["sha256"], "notes": given["notes"], "left_out": bench}
     stage = StageResult(GIVEN, parameters, details=details)
     effects = tuple(e for e in found.effects if e.name not in bench)
     calibration = SensorCalibration(sensor, found.bias, found.matrix, effects=effects, stages=(stage,))
     if not part["uncertain"]:
         return combined(calibration, [], unknown_uncertainty(sensor, settings))
-    freedom = np.full(len(kept), np.inf) if found.freedom is None else found.freedom[kept]
-    line = Contribution(GIVEN_SOURCE, "B", NORMAL, covariance, freedom, remark=f"as {source} states it")
+    freedom = np.full(len(kept), np.inf) if found.freedom is None else kept.degrees_of_freedom
+    line = Contribution(GIVEN_SOURCE, "B", NORMAL, kept.covariance, freedom, remark=f"as {source} states it")
     return combined(calibration, [line], {})
 
 

@@ -36,6 +36,8 @@ from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.preprocessing.evidence import EXPANDED
 from pipeline.preprocessing.reference_scale import SIGNIFICANT, rate_against_angle
 from pipeline.records import (
+    BIAS,
+    MATRIX,
     NORMAL,
     RECTANGULAR,
     SENSOR_UNITS,
@@ -171,13 +173,13 @@ def _bounded(entry: Mapping[str, Any], table: Mapping[str, Any], limit_ppm: floa
 
 def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]:
     """Return name, unit and effect, (p, 3), of errors of bias and of scale factor of each reading axis."""
-    size = len(calibration.parameter_names())
+    size = len(calibration.parameters)
     of_scale = np.zeros((size, 3))
     for axis in range(3):
         change = np.zeros((3, 3))
         change[:, axis] = -calibration.matrix[:, axis]
-        of_scale[3:12, axis] = change.ravel()
-    return [("bias", SENSOR_UNITS[calibration.sensor], np.eye(size)[:, :3]), ("scale_factor", "1", of_scale)]
+        of_scale[MATRIX, axis] = change.ravel()
+    return [("bias", SENSOR_UNITS[calibration.sensor], np.eye(size)[:, BIAS]), ("scale_factor", "1", of_scale)]
 
 
 def _repeatability(

@@ -22,11 +22,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.candidates import TILT, tilt_like_zeros
-from pipeline.estimation.design import BASE, BASE_NAMES, Term
 from pipeline.estimation.monte_carlo import through, trials_of, with_trials
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.records import (
+    AFTER_BASE,
+    BASE_NAMES,
     LIMIT,
+    MATRIX,
     NORMAL,
     RECTANGULAR,
     SENSOR_UNITS,
@@ -34,6 +36,8 @@ from pipeline.records import (
     FittedEffect,
     SensorCalibration,
     Values,
+    base_units,
+    base_values,
     coverage_factor,
     finite,
 )
@@ -43,6 +47,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from pipeline.estimation.design import Term
     from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
 
@@ -116,8 +121,8 @@ def gravity_line(calibration: SensorCalibration, table: Mapping[str, Any]) -> tu
     u = table.get("gravity_accuracy_g")
     if not u:
         return [], {GRAVITY: "table.gravity_accuracy_g is not stated"} if u is None else {}
-    effect = np.zeros((len(calibration.parameter_names()), 1))
-    effect[3:12, 0] = calibration.matrix.ravel() / float(table.get("gravity_g") or 1.0)
+    effect = np.zeros((len(calibration.parameters), 1))
+    effect[MATRIX, 0] = calibration.matrix.ravel() / float(table.get("gravity_g") or 1.0)
     return [type_b(GRAVITY, NORMAL, float(u), "g", effect)], {}
 
 
@@ -125,8 +130,8 @@ def clock_contribution(
     calibration: SensorCalibration, ppm: float, distribution: str = NORMAL, remark: str = ""
 ) -> Contribution:
     """Return the contribution of the sensor's clock, for rates that are an angle over its time: ``dM = M de``."""
-    effect = np.zeros((len(calibration.parameter_names()), 1))
-    effect[3:12, 0] = 1e-6 * calibration.matrix.ravel()
+    effect = np.zeros((len(calibration.parameters), 1))
+    effect[MATRIX, 0] = 1e-6 * calibration.matrix.ravel()
     return type_b(TIME_BASE, distribution, ppm, "ppm", effect, remark)
 
 
@@ -160,19 +165,17 @@ def combined(
 
     ``contributions``: to all of its parameters. ``not_included``: source to the reason why it is not included.
     """
-    size = len(calibration.parameter_names())
-    covariance, freedom = np.zeros((size, size)), np.full(size, np.inf)
+    parameters = calibration.parameters
+    covariance, freedom = np.zeros((len(parameters),) * 2), np.full(len(parameters), np.inf)
     if contributions:
         covariance = np.sum([c.covariance for c in contributions], axis=0)
         freedom = effective_degrees_of_freedom(
             np.array([c.standard_uncertainty for c in contributions]),
             np.array([c.degrees_of_freedom for c in contributions]),
         )
-    unit = SENSOR_UNITS[calibration.sensor]
-    of_effects = [str(p.get("unit", "")) for effect in calibration.effects for p in effect.parameters.values()]
     head = {
-        "parameters": calibration.parameter_names(),
-        "units": [unit] * 3 + ["1"] * 9 + of_effects,
+        "parameters": list(parameters.names),
+        "units": list(parameters.units),
         "contributions": [c.to_json() for c in contributions],
     }
     reasons = {**not_included, "repeatability": f"{NOT_STATED}, and compare"}
@@ -229,12 +232,11 @@ def covariance_without_reference(calibration: SensorCalibration) -> Values:
 
     Both scale the matrix, ``dM = M e``, and the reference equally, so that held-out errors do not contain them.
     """
-    size = len(calibration.parameter_names())
-    out = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance.copy()
+    out = calibration.parameters.covariance.copy()
     for line in (calibration.budget or {}).get("contributions", ()):
         if line["source"] in (GRAVITY, TIME_BASE):
-            shared = np.zeros(size)
-            shared[3:12] = np.sign(calibration.matrix.ravel()) * line["contribution"][3:12]
+            shared = np.zeros(len(out))
+            shared[MATRIX] = np.sign(calibration.matrix.ravel()) * line["contribution"][MATRIX]
             out -= np.outer(shared, shared)
     return out
 
@@ -244,10 +246,9 @@ def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Val
 
     ``shared``: a part of the readings' contribution that is also counted for the bench.
     """
-    size = len(calibration.parameter_names())
-    C = np.zeros((size, size)) if calibration.covariance is None else calibration.covariance
+    C = calibration.parameters.covariance
     lines = (calibration.budget or {}).get("contributions", [])
-    of_bench = np.zeros(size)
+    of_bench = np.zeros(len(C))
     for line in lines:
         part, whole = np.square(line["parts"].get(shared, 0.0)), np.square(line["contribution"])
         of_bench += np.where(part > BY_CHANCE * whole, part, 0.0)
@@ -267,8 +268,7 @@ def stage_parameters(values: Mapping[str, tuple[float, str]], covariance: Values
 
 def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Values) -> dict[str, dict[str, Any]]:
     """Return bias and matrix as the parameters of a stage."""
-    units = [SENSOR_UNITS[sensor]] * 3 + ["1"] * 9
-    values = zip(np.concatenate([bias, matrix.ravel()]).tolist(), units, strict=True)
+    values = zip(base_values(bias, matrix).tolist(), base_units(sensor), strict=True)
     return stage_parameters(dict(zip(BASE_NAMES, values, strict=True)), covariance)
 
 
@@ -276,7 +276,7 @@ def effect_parameters(
     sensor: str, terms: Sequence[Term], covariance: Values
 ) -> tuple[tuple[FittedEffect, ...], dict[str, dict[str, Any]]]:
     """Return the fitted effects, and their parameters as published with a stage; they follow bias and matrix."""
-    u = iter(np.sqrt(np.clip(np.diag(covariance)[BASE:], 0.0, None)).tolist())
+    u = iter(np.sqrt(np.clip(np.diag(covariance)[AFTER_BASE], 0.0, None)).tolist())
     effects, parameters = [], {}
     for term in terms:
         pairs = zip(term.effect.parameters(sensor), term.values.tolist(), strict=True)
@@ -306,7 +306,7 @@ def with_uncertainty(
         "expanded_uncertainty": (factors * u).tolist(),
         "not_included": list(not_included),
     }
-    expanded, effects = iter((factors * u).tolist()[12:]), []
+    expanded, effects = iter((factors * u).tolist()[AFTER_BASE]), []
     for effect in calibration.effects:
         parameters = {n: {**p, "expanded_uncertainty": next(expanded) or None} for n, p in effect.parameters.items()}
         effects.append(replace(effect, parameters=parameters))

@@ -20,7 +20,7 @@ from pipeline.files import json_text, write_atomically
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect_of
 from pipeline.model.measurement import sensor_effects
-from pipeline.records import SCHEMA_VERSION, SENSOR_UNITS, SENSORS, SensorCalibration, coverage_factor
+from pipeline.records import BIAS, MATRIX, SCHEMA_VERSION, SENSOR_UNITS, SENSORS, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -53,8 +53,7 @@ def document_of(imported: ImportedCalibration) -> JSON:
 
 def _part(calibration: SensorCalibration) -> JSON:
     """Return the part of ``calibrations/<unit>.json`` for a sensor; null: an uncertainty that is not known."""
-    part, C = calibration.to_json(), calibration.covariance
-    known = np.zeros(len(calibration.parameter_names()), bool) if C is None else np.diag(C) > 0.0
+    part, known = calibration.to_json(), np.diag(calibration.parameters.covariance) > 0.0
 
     def where(mask: Any, values: Any) -> Any:  # noqa: ANN401  (arrays of any shape)
         found = np.array(values, object)
@@ -63,8 +62,8 @@ def _part(calibration: SensorCalibration) -> JSON:
 
     for key in ("standard_uncertainty", "expanded_uncertainty"):
         part[key] = {
-            "bias": where(known[:3], part[key]["bias"]),
-            "matrix": where(known[3:12].reshape(3, 3), part[key]["matrix"]),
+            "bias": where(known[BIAS], part[key]["bias"]),
+            "matrix": where(known[MATRIX].reshape(3, 3), part[key]["matrix"]),
         }
     part["covariance"]["values"] = where(np.outer(known, known), part["covariance"]["values"])
     return part
@@ -197,8 +196,8 @@ def _explained(calibration: SensorCalibration, imported: ImportedCalibration) ->
     truth = getattr(compensation.apply(**SAMPLE, smoothing=0.0), sensor)
     centred, expanded = SAMPLE[sensor] - calibration.bias, None  # expanded uncertainties (95 %); None: unknown
     if calibration.covariance is not None:
-        standard = np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None))
-        expanded = coverage_factor(calibration.effective_freedom()) * standard
+        U = calibration.parameters.expanded_uncertainty
+        expanded = {"bias": U[BIAS], "matrix": U[MATRIX].max()}
     return {
         "unit": SENSOR_UNITS[sensor],
         "calibration": calibration,

@@ -31,7 +31,7 @@ from pipeline.io.files import read_text
 from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.effects import effect
 from pipeline.pack import is_published, read_published
-from pipeline.records import SENSORS, FittedEffect, SensorCalibration
+from pipeline.records import BASE_COUNT, BIAS, SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -256,9 +256,9 @@ def _calibration(
             effects.append(_fitted(name, sensor, values_of.ravel() / unit))
     covariance = None
     if "bias_deviation" in arrays and np.any(arrays["bias_deviation"]):
-        size = 12 + sum(len(e.parameters) for e in effects)
+        size = BASE_COUNT + sum(len(e.parameters) for e in effects)
         covariance = np.zeros((size, size))
-        covariance[:3, :3] = np.diag((arrays["bias_deviation"].ravel() / raw) ** 2)
+        covariance[BIAS, BIAS] = np.diag((arrays["bias_deviation"].ravel() / raw) ** 2)
         notes.append(f"{sensor}: the file states an uncertainty of the bias, and none of the matrix")
     return SensorCalibration(sensor, polynomial[:, 0], matrix, effects=tuple(effects), covariance=covariance)
 

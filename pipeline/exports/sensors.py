@@ -28,7 +28,7 @@ from pipeline.io.channel_table import STRAIGHT, maps_of_log
 from pipeline.model.calibration_file import FAST_S, sentences
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
-from pipeline.records import AXES, SENSORS
+from pipeline.records import AXES, BIAS, SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -161,8 +161,7 @@ class ExportedSensor:
     @property
     def bias_deviation(self) -> Values:
         """Standard uncertainty of the bias; zeros if it is unknown."""
-        covariance = self.calibration.covariance
-        return np.zeros(3) if covariance is None else np.sqrt(np.diag(covariance)[:3]) * self.factor
+        return self.calibration.parameters.standard_uncertainty[BIAS] * self.factor
 
     @property
     def scale(self) -> Values:

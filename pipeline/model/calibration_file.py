@@ -41,6 +41,7 @@ from pipeline.model.effects.base import parameter_limits
 from pipeline.pack import read_published
 from pipeline.records import (
     AXES,
+    BIAS_NAMES,
     LIMIT,
     READABLE_VERSIONS,
     SENSOR_UNITS,
@@ -332,8 +333,8 @@ def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], sensor_config: Map
     spread = part["expanded_uncertainty"]
     of_matrix = np.abs(K) @ np.array(spread["matrix"], float) @ np.abs(K)  # dK = -K dM K
     floor, unit = LOW_COST_BIAS[sensor] * sensor_config["full_scale"], SENSOR_UNITS[sensor]
-    for a, value, uncertainty in zip(AXES, part["bias"], spread["bias"], strict=True):
-        yield f"bias_{a}", float(value), float(uncertainty), unit, sensor_config["bias"], floor, OF_BIAS
+    for name, value, uncertainty in zip(BIAS_NAMES, part["bias"], spread["bias"], strict=True):
+        yield name, float(value), float(uncertainty), unit, sensor_config["bias"], floor, OF_BIAS
     scale, limit = _scale_cause(sensor, np.diag(P)), sensor_config["scale_factor"]
     for i, a in enumerate(AXES):
         yield f"scale_factor_{a}", float(P[i, i] - 1.0), float(of_matrix[i, i]), "1", limit, LOW_COST_SCALE, scale

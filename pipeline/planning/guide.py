@@ -55,7 +55,7 @@ from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, lim
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.estimation.multi_position.moves import sound_span
 from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
-from pipeline.records import AXES, NotCalibrated, Recording, SensorCalibration, Values, coverage_factor
+from pipeline.records import AXES, BIAS, NotCalibrated, Recording, SensorCalibration, Values, coverage_factor
 from pipeline.signal.rests import WINDOW_S, Rest, find_rests
 from pipeline.signal.segments import multiples, turns_by_hand
 from pipeline.simulation.trajectory import rotation_by
@@ -179,7 +179,7 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> Progress:
     fitted = None if isinstance(fit, NotCalibrated) else fit
     values, scatter, reason = IDEAL, 0.0, fit.reason if isinstance(fit, NotCalibrated) else _undetermined(fit)
     if fitted is not None:
-        values = np.concatenate([fitted.bias, fitted.matrix.ravel()])[PLACE]
+        values = fitted.parameters.values[PLACE]
         scatter = float(fitted.stages[-1].details["scatter_between_rests"])
     sensor_config, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
     rests, white = orientations.rests, _white_of_rest(orientations, sensor_config, dwell)
@@ -192,12 +192,12 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> Progress:
         F = F + (J / (np.mean(orientations.white**2) * rests.share + scatter**2)[:, None]).T @ J
     inflation, freedom, expanded = np.ones(9), np.full(9, np.inf), np.inf
     if fitted is not None:
-        assert fitted.covariance is not None  # noqa: S101
-        covariance = fitted.covariance[np.ix_(PLACE, PLACE)]
+        nine = fitted.parameters.select(PLACE)
+        covariance = nine.covariance
         if fitted.stages[-1].details[KNOWN_BY_LIMIT]:
-            F = np.linalg.inv(covariance)
+            F = np.asarray(np.linalg.inv(covariance), np.float64)
         else:
-            freedom, inflation = fitted.effective_freedom()[PLACE], np.diag(covariance) / np.diag(np.linalg.inv(F))
+            freedom, inflation = nine.degrees_of_freedom, np.diag(covariance) / np.diag(np.linalg.inv(F))
         expanded = np.inf if reason else float(np.max(coverage_factor(freedom) * np.sqrt(np.diag(covariance))))
     of_both = [(pair, False) for pair in orientations.used] + [(pair, True) for pair in orientations.held_out]
     of_both.sort(key=lambda entry: (recordings.index(entry[0][0]), entry[0][1].start))
@@ -239,7 +239,7 @@ def derivative_of(y: Values, values: Values) -> Values:
 
     ``d/db = -L^T n`` and ``d/dL_ij = n_i (y - b)_j``, with ``n = u / |u|``.
     """
-    L, centred = triangle(values), y - values[:3]
+    L, centred = triangle(values), y - values[BIAS]
     u = centred @ L.T
     n = u / np.linalg.norm(u, axis=1, keepdims=True)
     return np.concatenate([-n @ L, n[:, ROWS] * centred[:, COLUMNS]], axis=1)
@@ -267,14 +267,14 @@ def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Valu
     """Return the direction of the vertical in the body at each rest: (m, 3) array."""
     readings = [np.asarray(r.accelerometer)[rest.start : rest.stop] for r, rest in pairs]
     mean = np.array([np.nanmean(values, axis=0) for values in readings]).reshape(-1, 3)
-    force = (mean - values[:3]) @ triangle(values).T
+    force = (mean - values[BIAS]) @ triangle(values).T
     return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
 
 
 def propose(progress: Progress, goal: float) -> Proposal:
     """Return the next rest, with the number of rests up to the goal, g; at most ``MOST``."""
     up = attitudes()
-    readings = progress.values[:3] + up @ np.linalg.inv(triangle(progress.values)).T
+    readings = progress.values[BIAS] + up @ np.linalg.inv(triangle(progress.values)).T
     X = derivative_of(readings, progress.values) / progress.error
     planned, F = _planned(progress, X, goal)
     expected = progress.largest(F, len(planned))

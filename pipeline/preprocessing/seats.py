@@ -49,6 +49,7 @@ NOISE_C_G = 4e-3  # likewise in c: half of a K2 of 6e-3 1/g (twice 0.3 %), or 8 
 CLEARLY, OF_TWO_MORE = 1.0, 4.0  # chi-square by which leans have to be better than seats: 1 sigma; 2 sigma with tilt
 FITS = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
 GAUGE = 1e-6  # weight with which the seats have the smallest sum of squares
+OF_K, OF_BIAS, FURTHER = slice(0, 9), slice(9, 12), slice(12, None)  # columns of the design of ``_fit``
 QUARTERS = np.array([0.0, 90.0, 180.0, 270.0])
 TABLE = ("table_tilt", "table_axis_nonorthogonality")
 # Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
@@ -137,16 +138,16 @@ def _fit(turns: Sequence[_Conventional], K: Values, columns: Values, limits: Seq
 
     ``columns`` is (n, 3, 3, m): of each turn c, p and q with K the unit matrix.
     """
-    design = np.zeros((*columns.shape[:3], 12 + columns.shape[3]))
+    design = np.zeros((*columns.shape[:3], FURTHER.start + columns.shape[3]))
     for k, turn in enumerate(turns):
-        design[k, 1:, :, :9] = [np.kron(np.eye(3), ideal) for ideal in turn.ideal]
-    design[:, 0, :, 9:12] = np.eye(3)
-    design[..., 12:] = K @ columns
+        design[k, 1:, :, OF_K] = [np.kron(np.eye(3), ideal) for ideal in turn.ideal]
+    design[:, 0, :, OF_BIAS] = np.eye(3)
+    design[..., FURTHER] = K @ columns
     weight = 1.0 / np.array([[NOISE_C_G], [NOISE_PQ_G], [NOISE_PQ_G]])
     A = (weight[..., None] * design).reshape(9 * len(turns), -1)
     y = (weight * np.array([turn.gravity for turn in turns])).ravel()
     values = np.linalg.lstsq(A, y, rcond=1e-9)[0]
-    exceeded = np.any(np.abs(values[12:]) > np.array(limits))
+    exceeded = np.any(np.abs(values[FURTHER]) > np.array(limits))
     return float("inf") if exceeded else float(np.sum((y - A @ values) ** 2))
 
 

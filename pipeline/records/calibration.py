@@ -11,14 +11,21 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
+from pipeline.records.parameters import (
+    BASE_NAMES,
+    BIAS,
+    SENSOR_UNITS,
+    Parameters,
+    base_units,
+    base_values,
+    matrix_of,
+)
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import ArrayLike
-
     from pipeline.records.recording import Values
 
-SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 SCHEMA_VERSION = 2  # of published documents; the keys of each version are in pipeline/schemas
 READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null
 NORMAL, RECTANGULAR = "normal", "rectangular"
@@ -69,8 +76,7 @@ class SensorCalibration:
     matrix: Values = field(default_factory=lambda: np.eye(3))  # (3, 3), dimensionless
     stages: tuple[StageResult, ...] = ()
     effects: tuple[FittedEffect, ...] = ()
-    # (p, p), of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then of the parameters of each effect; it includes all
-    # lines of the uncertainty budget.
+    # (p, p), in the order of ``pipeline.records.parameters``; it includes all lines of the uncertainty budget.
     covariance: Values | None = None
     degrees_of_freedom: float = float("inf")  # smallest of all parameters
     converged: bool = True
@@ -78,24 +84,25 @@ class SensorCalibration:
     budget: dict[str, Any] | None = None  # as published; see pipeline.estimation.uncertainty_budget
     convergence: dict[str, Any] | None = None
 
-    def parameter_names(self) -> list[str]:
-        """Return the names of the rows of the covariance."""
-        names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
-        return names + [f"{e.name}.{p}" for e in self.effects for p in e.parameters]
-
-    def effective_freedom(self) -> Values:
-        """Return the effective degrees of freedom of each parameter: (p,) array."""
-        if self.freedom is not None:
-            return self.freedom
-        return np.full(len(self.parameter_names()), self.degrees_of_freedom)
+    @property
+    def parameters(self) -> Parameters:
+        """Bias, matrix and the parameters of each effect."""
+        of_effects = [
+            (f"{e.name}.{name}", str(p.get("unit", ""))) for e in self.effects for name, p in e.parameters.items()
+        ]
+        names = (*BASE_NAMES, *(name for name, _ in of_effects))
+        return Parameters(
+            names,
+            (*base_units(self.sensor), *(unit for _, unit in of_effects)),
+            np.concatenate([base_values(self.bias, self.matrix), *(e.values for e in self.effects)]),
+            np.zeros((len(names), len(names))) if self.covariance is None else self.covariance,
+            np.full(len(names), self.degrees_of_freedom) if self.freedom is None else self.freedom,
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the part of ``calibrations/<unit>.json`` for this sensor."""
-        size = len(self.parameter_names())
-        covariance = np.zeros((size, size)) if self.covariance is None else self.covariance
-        freedom = self.effective_freedom()
-        factors = coverage_factor(freedom)
-        standard = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        parameters = self.parameters
+        factors, standard = parameters.coverage_factor, parameters.standard_uncertainty
         return {
             "unit": SENSOR_UNITS[self.sensor],
             "bias": self.bias.tolist(),
@@ -104,8 +111,8 @@ class SensorCalibration:
             "expanded_uncertainty": _shaped(factors * standard),
             "coverage_factor": _shaped(factors),
             "degrees_of_freedom": self.degrees_of_freedom if np.isfinite(self.degrees_of_freedom) else None,
-            "effective_degrees_of_freedom": finite(freedom),
-            "covariance": {"parameters": self.parameter_names(), "values": covariance.tolist()},
+            "effective_degrees_of_freedom": finite(parameters.degrees_of_freedom),
+            "covariance": {"parameters": list(parameters.names), "values": parameters.covariance.tolist()},
             "stages": [dict(vars(s)) for s in self.stages],
             "effects": [
                 {"name": e.name, "parameters": e.parameters} | ({"definition": e.definition} if e.definition else {})
@@ -162,21 +169,8 @@ def calibrated(fits: Mapping[str, Fit]) -> dict[str, SensorCalibration | None]:
 
 
 def _shaped(values: Values) -> dict[str, Any]:
-    """Return the first 12 values in the shapes of bias and matrix."""
-    return {"bias": values[:3].tolist(), "matrix": values[3:12].reshape(3, 3).tolist()}
-
-
-def coverage_factor(degrees_of_freedom: ArrayLike, probability: float = 0.95) -> Values:
-    """Return the two-sided coverage factor k of Student's t, in the shape of ``degrees_of_freedom``.
-
-    k solves ``P(|t_nu| <= k) = probability`` (JCGM 100:2008, annex G); for infinite ``nu`` it is the normal quantile.
-    """
-    from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (0.1 s, only needed to write uncertainties)
-
-    nu, upper = np.asarray(degrees_of_freedom, float), 0.5 + probability / 2.0
-    limited = np.isfinite(nu)
-    factors: Values = np.where(limited, stdtrit(np.where(limited, nu, 1.0), upper), ndtri(upper))[()]
-    return factors
+    """Return values of all parameters in the shapes of bias and matrix."""
+    return {"bias": values[BIAS].tolist(), "matrix": matrix_of(values).tolist()}
 
 
 @dataclass(frozen=True)

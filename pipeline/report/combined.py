@@ -42,6 +42,8 @@ from pipeline.io.files import wrong_name
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import Owner
 from pipeline.records import (
+    BASE_COUNT,
+    BIAS,
     NORMAL,
     SENSORS,
     Contribution,
@@ -51,6 +53,7 @@ from pipeline.records import (
     StageResult,
     Values,
     files_of_readings,
+    matrix_of,
 )
 from pipeline.report.numbers import number, plain
 from pipeline.report.pages import template
@@ -134,14 +137,14 @@ def _combined(serial: str, documents: Sequence[JSON]) -> JSON:
 
 def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
     each = [SensorCalibration.from_json(sensor, part) for part in parts]
-    x, kind = np.stack([values_of(c) for c in each]), kinds_of(each[0])
+    x, kind = np.stack([c.parameters.values for c in each]), kinds_of(each[0])
     by_readings, by_bench = zip(*(own_and_bench(c) for c in each), strict=True)
     r2 = repeatability(x, np.stack([np.diag(A) for A in by_readings]), kind) ** 2
     weights = [scaled_inverse(A + np.diag(r2)) for A in by_readings]
     covariance = scaled_inverse(np.sum(weights, axis=0))
     mean = x.mean(axis=0)  # a parameter that all calibrations state exactly is not changed
     theta = mean + covariance @ np.sum([W @ (xi - mean) for W, xi in zip(weights, x, strict=True)], axis=0)
-    freedom = np.sum([c.effective_freedom() for c in each], axis=0)
+    freedom = np.sum([c.parameters.degrees_of_freedom for c in each], axis=0)
     alone = scaled_inverse(np.sum([scaled_inverse(A) for A in by_readings], axis=0))
     scatter = np.where(r2 > 0.0, np.bincount(kind)[kind] * (len(x) - 1.0), np.inf)
     lines = [
@@ -154,25 +157,20 @@ def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
     return with_values(first, theta, lines).to_json()
 
 
-def values_of(calibration: SensorCalibration) -> Values:
-    """Return bias, matrix and effects of a sensor, in the order of the covariance's rows."""
-    return np.concatenate([calibration.bias, calibration.matrix.ravel(), *(e.values for e in calibration.effects)])
-
-
 def kinds_of(calibration: SensorCalibration) -> Index:
     """Return the kind of each parameter, 0 ..: bias, scale factors, cross-axis elements, then each effect."""
     return np.concatenate([KIND, *(np.full(len(e.values), 3 + k) for k, e in enumerate(calibration.effects))])
 
 
 def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[Contribution]) -> SensorCalibration:
-    """Return a calibration with other values, in the order of ``values_of``, and a budget of these contributions."""
-    effects, at = [], 12
+    """Return a calibration with other values, in the order of ``parameters``, and a budget of these contributions."""
+    effects, at = [], BASE_COUNT
     for effect in calibration.effects:
         values = theta[at : at + len(effect.parameters)].tolist()
         described = {n: {**p, "value": v} for (n, p), v in zip(effect.parameters.items(), values, strict=True)}
         effects.append(replace(effect, parameters=described))
         at += len(described)
-    changed = replace(calibration, bias=theta[:3], matrix=theta[3:12].reshape(3, 3), effects=tuple(effects))
+    changed = replace(calibration, bias=theta[BIAS], matrix=matrix_of(theta), effects=tuple(effects))
     return budget_of(changed, lines, {})
 
 
@@ -261,13 +259,13 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
         verdict = (diagnosis.get(sensor) or {}).get("verdict")
         refused = f"the diagnosis of its {sensor}: {plain(verdict)}" if verdict in DOUBTFUL else None
         refused = refused if fit.converged else f"the fit of its {sensor} did not converge"
-        x = values_of(fit)
+        x = fit.parameters.values
         found.append(
             Estimate(
                 unit=calibration["unit"],
                 sensor=sensor,
                 lot=calibration["sensor"] + (f", lot {lot}" if lot else ""),
-                comparable=json.dumps([*same, (calibration.get("log") or {}).get("axis_map"), fit.parameter_names()]),
+                comparable=json.dumps([*same, (calibration.get("log") or {}).get("axis_map"), fit.parameters.names]),
                 device=str(row.get("serial") or x.tobytes()),  # one recording in two units is one device
                 refused=refused,
                 values=x,
@@ -291,7 +289,7 @@ def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Valu
     own, shared = own_and_bench(fit, LACK_OF_FIT)
     total = np.maximum(np.diag(own + shared), 1e-300)
     of_readings, of_own = np.diag(readings) / total, np.diag(own) / total
-    freedom, lack = fit.effective_freedom() * of_readings**2, of_readings - of_own
+    freedom, lack = fit.parameters.degrees_of_freedom * of_readings**2, of_readings - of_own
     of_shared = np.divide(freedom * (1.0 - of_own) ** 2, lack**2, out=np.full(len(lack), np.inf), where=lack > 1e-6)
     return own, shared, (freedom, of_shared)
 
@@ -367,7 +365,7 @@ def _sensor_with_prior(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSO
     fit = SensorCalibration.from_json(sensor, part)
     own, shared, (freedom, of_shared) = _divided(fit)
     known, u = prior.known, np.sqrt(np.diag(shared))
-    found = with_prior(values_of(fit), own, prior.predicted, known)
+    found = with_prior(fit.parameters.values, own, prior.predicted, known)
     growth = np.divide(np.maximum(u, prior.shared), u, out=np.ones(len(u)), where=u > 0.0)
     remark = f"of {prior.lot}: mean and spread of {prior.siblings} siblings"
     lines = [
@@ -379,7 +377,7 @@ def _sensor_with_prior(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSO
     after = with_values(replace(fit, stages=(*fit.stages, stage)), found.values, lines)
     budget = {**(after.budget or {}), "not_included": (part.get("uncertainty_budget") or {}).get("not_included", [])}
     added = {
-        "parameters": [name for name, k in zip(fit.parameter_names(), known, strict=True) if k],
+        "parameters": [name for name, k in zip(fit.parameters.names, known, strict=True) if k],
         "mean": prior.predicted.mean.tolist(),
         "standard_deviation": np.sqrt(prior.predicted.variance).tolist(),
         "share": found.share[known].tolist(),

@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.records import SENSOR_UNITS, SENSORS
+from pipeline.records import BASE, BIAS, SENSOR_UNITS, SENSORS, matrix_of
 from pipeline.report.chart import Figure
 from pipeline.report.group_charts import COLOURS, Point, bars, curves
 from pipeline.report.held_out_section import first_and_last_step
@@ -261,10 +261,10 @@ def against_truth(figures: JSON, truth: JSON) -> float | None:
     """Return the rms error against the true parameters of a simulated sensor (its part of ``truth/<unit>.json``)."""
     if figures["reference_rms"] is None:
         return None
-    values = np.array([p.value for p in figures["parameters"].values()][:12])
-    matrix = values[3:].reshape(3, 3)
+    values = np.array([p.value for p in figures["parameters"].values()][BASE])
+    matrix = matrix_of(values)
     error = matrix @ np.linalg.inv(np.array(truth["matrix"], float)) - np.eye(3)
-    bias = matrix @ (np.array(truth["bias"], float) - values[:3])
+    bias = matrix @ (np.array(truth["bias"], float) - values[BIAS])
     return float(np.sqrt(figures["reference_rms"] ** 2 * np.sum(error**2) / 3.0 + np.sum(bias**2)))
 
 

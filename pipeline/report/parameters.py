@@ -15,13 +15,14 @@ If such a column has the name of one in ``COLUMNS``, it gets the prefix ``sheet_
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pipeline.estimation.candidates import is_held
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, limited_effects, without_rotation
-from pipeline.records import AXES, SENSORS
+from pipeline.records import AFTER_BASE, AXES, BASE_NAMES, BIAS, BIAS_NAMES, MATRIX, MATRIX_NAMES, SENSORS
 from pipeline.report.held_out_section import first_and_last_step, passes
 from pipeline.report.numbers import plain
 from pipeline.verdicts import Verdict
@@ -77,14 +78,9 @@ def fitted_parameters(part: JSON) -> list[Parameter]:
     k = part.get("coverage_factor") or NO_UNCERTAINTY
     budget = part.get("uncertainty_budget") or {"parameters": [], "coverage_factor": []}
     k_of_effects = dict(zip(budget["parameters"], budget["coverage_factor"], strict=True))
-    found = [
-        Parameter(f"bias_{a}", part["bias"][i], part["unit"], U["bias"][i], k["bias"][i]) for i, a in enumerate(AXES)
-    ]
-    found += [
-        Parameter(f"matrix_{a}{b}", part["matrix"][i][j], "1", U["matrix"][i][j], k["matrix"][i][j])
-        for i, a in enumerate(AXES)
-        for j, b in enumerate(AXES)
-    ]
+    values, expanded, factors = ([*each["bias"], *chain(*each["matrix"])] for each in (part, U, k))
+    units = (part["unit"],) * len(BIAS_NAMES) + ("1",) * len(MATRIX_NAMES)
+    found = list(map(Parameter, BASE_NAMES, values, units, expanded, factors))
     for effect in part.get("effects") or []:
         for symbol, p in effect["parameters"].items():
             name, expanded = f"{effect['name']}.{symbol}", p.get("expanded_uncertainty")
@@ -126,7 +122,7 @@ def _elements(part: JSON, matrix: np.ndarray, J: np.ndarray) -> Callable[[str, i
     covariance = (part.get("covariance") or {}).get("values")
     u: np.ndarray | None = None
     if covariance is not None and k[0][0] is not None:
-        u = np.sqrt(np.clip(np.diag(J @ np.array(covariance, float)[3:12, 3:12] @ J.T), 0.0, None)).reshape(3, 3)
+        u = np.sqrt(np.clip(np.diag(J @ np.array(covariance, float)[MATRIX, MATRIX] @ J.T), 0.0, None)).reshape(3, 3)
 
     def element(name: str, i: int, j: int) -> Parameter:
         U = None if u is None else float(k[i][j] * u[i, j])
@@ -147,12 +143,12 @@ def parameter_rows(sensor: str, part: JSON, sensor_config: Mapping[str, Any]) ->
     limits = {
         name: limit for name, _, _, _, limit, *_ in limited_effects(sensor, part, sensor_config.get("effects") or {})
     }
-    found = [(p, p.words.capitalize(), sensor_config.get("bias")) for p in fitted[:3]]
+    found = [(p, p.words.capitalize(), sensor_config.get("bias")) for p in fitted[BIAS]]
     for p in sensor_errors(part):
         kind, _, axes = p.name.rpartition("_")
         name = f"Cross-axis sensitivity {axes}" if kind == "cross_axis" else f"Scale factor error {axes}"
         found.append((p, name, sensor_config.get(kind)))
-    for p in fitted[12:]:
+    for p in fitted[AFTER_BASE]:
         held = is_held(p.name, {"value": p.value, "unit": p.unit, "standard_uncertainty": p.standard_uncertainty})
         name = f"{p.words} (not determined, fixed at 0)" if held else p.words
         found.append((p, name, limits.get(p.name)))

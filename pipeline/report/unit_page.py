@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.files import json_text
 from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, left_out, sentences
 from pipeline.outcome import as_overrides, commands_of, found_mountings, place, run_command
-from pipeline.records import SENSOR_UNITS, SENSORS, Recording, Values
+from pipeline.records import MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, Line, Panel, chart
 from pipeline.report.diagnosis_section import (
     added_variable,
@@ -155,7 +155,7 @@ def _sensor(
         "noise_figure": allan(sensor, at_rest, sensor_config, found.get("wander")),
         "noise_terms": term_rows(at_rest),
         "noise_remarks": remarks(at_rest),
-        "matrix": fitted_parameters(part)[3:12],
+        "matrix": fitted_parameters(part)[MATRIX],
         "parameters": parameters,
         "beyond_limits": beyond_words(part),
         "rests": rest_rows(part),

@@ -31,7 +31,7 @@ from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect
-from pipeline.records import Integers, Noise, Recording, SensorCalibration, Values, continuous, level_in_body
+from pipeline.records import MATRIX, Integers, Noise, Recording, SensorCalibration, Values, continuous, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -233,10 +233,10 @@ def gravity_direction(
     found["max_deg"] = {name: float(np.max(error)) for name, (error, _) in errors.items()}
     found["noise_floor_deg"] = float(np.mean(errors["after"][1]))
     found["creeping_rests"] = int(np.count_nonzero(gravity.creeping))
-    if gyroscope.covariance is not None and gyroscope.covariance[3:12, 3:12].any():
+    if gyroscope.parameters.covariance[MATRIX, MATRIX].any():
         ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
         details = gyroscope.stages[-1].details if gyroscope.stages else {}
-        covariance, freedom = covariance_without_reference(gyroscope), gyroscope.effective_freedom()
+        covariance, freedom = covariance_without_reference(gyroscope), gyroscope.parameters.degrees_of_freedom
         found["largest_expected_rms_deg"] = model.largest_direction_error(
             states["after"], covariance, freedom, details, ratio
         )

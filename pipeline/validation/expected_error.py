@@ -43,6 +43,7 @@ from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STA
 from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED, covariance_without_reference
 from pipeline.model.measurement import inverse_of
+from pipeline.records import BASE_COUNT, BIAS, MATRIX_ROWS
 from pipeline.validation.error_breakdown import last_step
 from pipeline.validation.samples import Samples, mean_squares, reference_vector
 
@@ -91,16 +92,15 @@ def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSa
     chosen = samples.representative
     truth = reference_vector(calibration, samples)[chosen]
     along = truth / np.maximum(np.linalg.norm(truth, axis=1, keepdims=True), 1e-300)
-    J = np.zeros((len(chosen), 3, len(calibration.parameter_names())))
-    covariance = np.zeros(J.shape[2:] * 2) if calibration.covariance is None else calibration.covariance
-    J[:, :, :3] = -calibration.matrix
+    steps = calibration.parameters.standard_uncertainty.tolist()
+    J = np.zeros((len(chosen), 3, len(steps)))
+    J[:, :, BIAS] = -calibration.matrix
     before = vector[chosen] @ inverse_of(calibration).T
-    for i in range(3):
-        J[:, i, 3 + 3 * i : 6 + 3 * i] = before
+    for i, row in enumerate(MATRIX_ROWS):
+        J[:, i, row] = before
     names = [(n, name) for n, effect in enumerate(calibration.effects) for name in effect.parameters]
-    for column, (n, name) in enumerate(names, 12):
-        step = float(np.sqrt(max(covariance[column, column], 0.0)))
-        if step > 0.0:
+    for column, (n, name) in enumerate(names, BASE_COUNT):
+        if (step := steps[column]) > 0.0:
             moved = last_step(_changed(calibration, n, name, step), samples)
             assert moved is not None  # noqa: S101  (the same effects)
             shift = along * (moved[1] - magnitude)[chosen, None]
@@ -175,7 +175,7 @@ def _of_parameters(calibration: SensorCalibration, table: Mapping[str, Any]) -> 
     The covariance is without lack of fit. Errors that calibration and reference share are left out. Their size is
     exact, so that the degrees of freedom of the remaining variance follow by Welch and Satterthwaite.
     """
-    size = len(calibration.parameter_names())
+    parameters, size = calibration.parameters, len(calibration.parameters)
     lines = (calibration.budget or {}).get("contributions", ())
     out, nu = np.zeros((size + 1, size + 1)), np.full(size + 1, np.inf)
     if calibration.covariance is not None:
@@ -186,7 +186,7 @@ def _of_parameters(calibration: SensorCalibration, table: Mapping[str, Any]) -> 
         out[:size, :size] = covariance * scale[:, None] * scale
         share = np.clip(remaining / np.where(total > 0.0, total, 1.0), 0.0, 1.0)
         with np.errstate(invalid="ignore"):  # of a parameter without variance
-            nu[:size] = np.where(share > 0.0, np.maximum(calibration.effective_freedom() * share**2, 1.0), np.inf)
+            nu[:size] = np.where(share > 0.0, np.maximum(parameters.degrees_of_freedom * share**2, 1.0), np.inf)
     if calibration.sensor == "gyroscope" and not any(line["source"] == "table rate" for line in lines):
         out[size, size] = float(table.get("rate_accuracy") or 0.0) ** 2
     return out, nu

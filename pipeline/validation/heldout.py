@@ -42,7 +42,7 @@ from pipeline.io.quality_flags import STUCK
 from pipeline.model.effects import bench_priors, effect_of
 from pipeline.model.effects.base import unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
-from pipeline.records import AXES
+from pipeline.records import AXES, MATRIX
 from pipeline.signal.rests import Rest
 from pipeline.validation.error_breakdown import (
     direction_known,
@@ -65,7 +65,6 @@ FEWEST_SAMPLES = 5  # of the t-test
 BIN_DEGC = 5.0  # a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
 SWEEP_DEGC = 2 * BIN_DEGC  # fills two bins; a unit that warms up on the bench changes by less
 FEWEST_IN_BIN = 10  # samples of a bin that is shown
-MATRIX = slice(3, 12)  # its elements among the parameters of a calibration
 FIGURES = ("mean_abs_error", "sum_abs_error", "max_error", "min_error", "rms_error", "change_percent")
 
 
@@ -279,7 +278,7 @@ def _agreement(
     error = np.linalg.inv(fit.matrix).ravel() - np.eye(3).ravel()
     C = covariance_without_reference(fit)[MATRIX, MATRIX]
     C += slopes @ covariance_without_reference(calibration) @ slopes.T
-    freedom = min(float(np.min(each.effective_freedom()[MATRIX])) for each in (fit, calibration))
+    freedom = min(float(np.min(each.parameters.degrees_of_freedom[MATRIX])) for each in (fit, calibration))
     from scipy.special import fdtrc  # noqa: PLC0415  (only held-out motion with a vector reference needs it)
 
     p_value = float(fdtrc(9, min(freedom, 1e9), float(error @ np.linalg.solve(C, error)) / 9.0))

@@ -54,7 +54,7 @@ def test_the_order_of_the_effects_is_kept_with_units_and_expanded_uncertainties(
         "accelerometer", record(Session(2, effects={"accelerometer": hidden})), names, None, SETTINGS
     )
     assert [e.name for e in calibration.effects] == names
-    assert calibration.parameter_names()[-1] == "lever_arm.r_z"
+    assert calibration.parameters.names[-1] == "lever_arm.r_z"
     r_x = calibration.effects[1].parameters["r_x"]
     assert r_x["unit"] == "m"
     assert 0 < r_x["expanded_uncertainty"] < 0.002

@@ -194,7 +194,7 @@ def test_the_result_is_the_same_every_time_and_survives_its_file() -> None:
     assert first.to_json() == second.to_json()
     back = SensorCalibration.from_json("gyroscope", first.to_json())
     assert back.to_json() == first.to_json()
-    assert list(first.stages[0].parameters) == first.parameter_names()
+    assert list(first.stages[0].parameters) == list(first.parameters.names)
 
 
 def test_the_covariance_of_the_matrix_is_that_of_its_inverse_by_simulation() -> None:

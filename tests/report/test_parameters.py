@@ -20,7 +20,7 @@ def part_with_unequal_freedom() -> dict:
     covariance = np.diag(np.full(13, 1e-6))
     fit = SensorCalibration("gyroscope", effects=(effect,), covariance=covariance, freedom=freedom)
     budget = {
-        "parameters": fit.parameter_names(),
+        "parameters": list(fit.parameters.names),
         "coverage_factor": [k[f] for f in freedom.tolist()],
         "contributions": [],
     }

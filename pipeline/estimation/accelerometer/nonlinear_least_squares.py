@@ -51,7 +51,21 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.model.kinematics import table_motion
-from pipeline.records import AXES, Mask, Noise, Recording, SensorCalibration, Values, coverage_factor
+from pipeline.records import (
+    AXES,
+    BASE_COUNT,
+    BIAS,
+    BIAS_NAMES,
+    MATRIX,
+    Mask,
+    Noise,
+    Recording,
+    SensorCalibration,
+    Values,
+    base_units,
+    base_values,
+    coverage_factor,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -60,12 +74,11 @@ if TYPE_CHECKING:
 NAME = "nonlinear_least_squares"
 FIT_STAGES = {NAME: FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
 ROWS, COLUMNS = np.tril_indices(3)
-PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine values among bias and full matrix
-PLACED = np.eye(12)[:, PLACE]
+TRIANGLE = slice(BIAS.stop, None)  # of the nine values: the elements of L; the bias comes first
+PLACE = np.arange(BASE_COUNT)[[*range(BIAS.stop), *(MATRIX.start + np.ravel_multi_index((ROWS, COLUMNS), (3, 3)))]]
+PLACED = np.eye(BASE_COUNT)[:, PLACE]
 ELEMENTS = [(AXES[i], AXES[j]) for i, j in zip(ROWS, COLUMNS, strict=True)]
-NAMES = np.array(
-    [f"bias_{axis}" for axis in AXES] + [f"scale_factor_{i}" if i == j else f"misalignment_{i}{j}" for i, j in ELEMENTS]
-)
+NAMES = np.array([*BIAS_NAMES] + [f"scale_factor_{i}" if i == j else f"misalignment_{i}{j}" for i, j in ELEMENTS])
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
 IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
 UNKNOWN = 0.05  # standard uncertainty, g or relative, beyond which a bias or scale factor is called undetermined
@@ -146,7 +159,7 @@ def fit(
 def triangle(values: Values) -> Values:
     """Return L of the nine values: (3, 3) array."""
     L = np.zeros((3, 3))
-    L[ROWS, COLUMNS] = values[3:]
+    L[ROWS, COLUMNS] = values[TRIANGLE]
     return L
 
 
@@ -235,7 +248,7 @@ def _fitted(rows: Orientations, gravity_g: float, prior: Prior, by_limit: Mask, 
     limits = dict.fromkeys(NAMES[by_limit].tolist(), limit)
     model = AccelerometerModel(rows.rests, PLACED, gravity_g, noise, known_by_limit=limits, wander=rows.by_hand)
     values = _start(rows.rests.reading, gravity_g, tilted=not by_limit.any())
-    state = State(values[:3], triangle(values))
+    state = State(values[BIAS], triangle(values))
     equations = model.equations(state)
     ScaledColumns.of(equations.base).require_full_rank(NAMES.tolist())
     known = Prior(0.0, prior.time) if not rows.by_hand else prior
@@ -336,7 +349,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         reason = f"{len(count)} readings of a continuous turn are too many equations to draw; it is made for rests"
         return replace(complete, budget={**(complete.budget or {}), KEY: {"trials": 0, "reason": reason}})
     steps = quadratic_results(solved.columns / share[:, None], curvature(solved.model, solved.fit), np.diag(share**2))
-    estimate, every = np.concatenate([calibration.bias, calibration.matrix.ravel()]), np.eye(len(count))
+    estimate, every = calibration.parameters.values, np.eye(len(count))
 
     def results(drawn: Values) -> Values:
         errors = np.pad(drawn / white[solved.rows], ((0, 0), (0, len(white) - len(count))))
@@ -347,13 +360,14 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
 
 def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]]:
     """Return b, S and T with their uncertainties; ``L_ij = T_ij S_j``."""
-    values = np.concatenate([solved.fit.state.bias, solved.fit.state.matrix.ravel()])[PLACE]
+    values = base_values(solved.fit.state.bias, solved.fit.state.matrix)[PLACE]
     S, J = np.diag(solved.fit.state.matrix)[COLUMNS], np.eye(9)
+    L, of_L = values[TRIANGLE], J[TRIANGLE, TRIANGLE]
     for k, (i, j) in enumerate(ELEMENTS):
         if i != j:
-            values[3 + k] /= S[k]
-            J[3 + k, 3 + k], J[3 + k, 3 + ELEMENTS.index((j, j))] = 1.0 / S[k], -values[3 + k] / S[k]
-    units = ["g"] * 3 + ["1" if i == j else "rad" for i, j in ELEMENTS]
+            L[k] /= S[k]
+            of_L[k, k], of_L[k, ELEMENTS.index((j, j))] = 1.0 / S[k], -L[k] / S[k]
+    units = [*base_units("accelerometer")[BIAS]] + ["1" if i == j else "rad" for i, j in ELEMENTS]
     named = zip(NAMES.tolist(), zip(values.tolist(), units, strict=True), strict=True)
     return stage_parameters(dict(named), J @ covariance[np.ix_(PLACE, PLACE)] @ J.T)
 

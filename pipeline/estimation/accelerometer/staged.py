@@ -52,7 +52,17 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.model.effects import effect
-from pipeline.records import AXES, Contribution, FittedEffect, Recording, SensorCalibration, Values
+from pipeline.records import (
+    AXES,
+    BASE,
+    BASE_COUNT,
+    Contribution,
+    FittedEffect,
+    Recording,
+    SensorCalibration,
+    Values,
+    base_values,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -220,7 +230,7 @@ class Corrected:
     def vector(self) -> Values:
         """Return bias, matrix, c and the last stage's parameters in one vector."""
         parameters = [value for value, _ in self.values.values()]
-        return np.concatenate([self.bias, np.diag(1.0 / self.k).ravel(), self.c, parameters])
+        return np.concatenate([base_values(self.bias, np.diag(1.0 / self.k)), self.c, parameters])
 
 
 def follow(extremes: Extremes, names: Sequence[str], start: Corrected | None = None) -> Corrected:
@@ -291,10 +301,11 @@ def fit(
         map_ = _linear_map(sinusoids, theta, chain)
         scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, np.concatenate([turn.reading for turn in turns]))
+    after_c = BASE_COUNT + len(found.c)
     result = staged_result(
         name,
         found.steps,
-        stage_parameters(found.values, scatter.covariance[15:, 15:]),
+        stage_parameters(found.values, scatter.covariance[after_c:, after_c:]),
         np.linalg.norm(after, axis=1) - gravity_g,
         (len(after), sum(part.recording.samples for turn in turns for part in turn.parts)),
         noise,
@@ -310,7 +321,7 @@ def fit(
         effects=(FittedEffect(ASYMMETRY, asymmetry),) if last else (),
         convergence=certificate_of(sinusoids),
     )
-    kept = slice(0, 15 if last else 12)
+    kept = slice(0, after_c) if last else BASE
     if estimator.as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
     motions = used_motions([part for turn in turns for part in turn.parts])

@@ -47,7 +47,18 @@ from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import Part, noise_of_fit, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
-from pipeline.records import AXES, Index, Mask, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import (
+    AFTER_BASE,
+    AXES,
+    BASE,
+    BIAS,
+    Index,
+    Mask,
+    Recording,
+    SensorCalibration,
+    StageResult,
+    Values,
+)
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
@@ -122,7 +133,7 @@ def fit(
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(turns.rate, axis=1)
     result = StageResult(
         name=NAME,
-        parameters=stage_parameters(_values(factors), (scatter.covariance + of_bias)[12:, 12:]),
+        parameters=stage_parameters(_values(factors), (scatter.covariance + of_bias)[AFTER_BASE, AFTER_BASE]),
         residual_rms=float(np.sqrt(np.mean(error**2))),
         correction={"steps": [{"subtract": previous.bias.tolist()}, {"matrix": matrix.tolist()}]},
         details={
@@ -143,18 +154,17 @@ def fit(
         stages=(*previous.stages, result),
         convergence=certificate(U, Y - U @ A.T, columns.condition, columns.rank),
     )
-    kept = slice(0, 12)
-    lines = [scatter.of(kept)]
+    lines = [scatter.of(BASE)]
     if np.any(of_bias):
-        before = np.inf if previous.freedom is None else float(previous.freedom[:3].min())
-        lines.append(replace(scatter_contribution(of_bias[kept, kept], before), source="bias of the stage before"))
+        before = np.inf if previous.freedom is None else float(previous.freedom[BIAS].min())
+        lines.append(replace(scatter_contribution(of_bias[BASE, BASE], before), source="bias of the stage before"))
     theta = np.column_stack([previous.bias, A])
 
     def results(errors: Values) -> Values:
         plain = of_channels(theta.ravel() + errors)
         return plain if as_printed else with_matrix(plain)
 
-    return budgeted(found, reference, fit.results(kept), noise, lines, settings, results)
+    return budgeted(found, reference, fit.results(BASE), noise, lines, settings, results)
 
 
 def factorise(A: Values) -> Factors:
@@ -192,7 +202,7 @@ def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_prin
             [channels[:, 0], calibration_matrix(channels[:, 1:], as_printed=as_printed).ravel(), found]
         )
 
-    x, y, z = np.split(derivative(results, theta, np.full(12, STEP)), 3, axis=1)
+    x, y, z = np.split(derivative(results, theta, np.full(theta.size, STEP)), 3, axis=1)
     if not from_rests and previous.covariance is not None:
         for channel, J in enumerate((x, y, z)):
             of_bias += previous.covariance[channel, channel] * np.outer(J @ lever, J @ lever)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation.design import BASE_NAMES
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
@@ -25,7 +24,7 @@ from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
 from pipeline.estimation.stages import FitStage
-from pipeline.records import Recording, SensorCalibration
+from pipeline.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -71,15 +70,15 @@ def fit(
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     fit_model = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
     model, fitted, outlying = fit_robustly(model, fit_model, recordings)
-    moved, faces = np.zeros(12), settings["procedure"].get("faces")
+    moved, faces = np.zeros(BASE_COUNT), settings["procedure"].get("faces")
     for _ in range(MOVED_TIMES if faces and model.moves else 0):
         moved = model.accelerometer_errors(fitted)
         model = model_of(recordings, None, noise, settings, moved=moved)
         assert model is not None  # noqa: S101
         model, fitted, outlying = fit_robustly(model, partial(fit_model, start=fitted.state), recordings)
-    moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(fitted.covariance))[3:]
+    moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(fitted.covariance))[MATRIX]
     if np.any(u > UNKNOWN):
-        weak = [name for name, one in zip(BASE_NAMES[3:], u, strict=True) if one > UNKNOWN]
+        weak = [name for name, one in zip(MATRIX_NAMES, u, strict=True) if one > UNKNOWN]
         raise NotObservableError(
             f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u.max()):.2g} "
             f"(standard uncertainty), as if all were about one axis: {advice}"

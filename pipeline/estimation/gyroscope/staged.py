@@ -34,7 +34,7 @@ from pipeline.estimation.stages import FitStage, apply_correction, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import Part, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
-from pipeline.records import AXES, Mask, Recording, SensorCalibration, Values, motion_at_rest
+from pipeline.records import AFTER_BASE, AXES, BASE, Mask, Recording, SensorCalibration, Values, motion_at_rest
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def fit(
     here = theta.T.ravel()
     correction = (previous.stages[-1].correction or {}) if previous and previous.stages else {}
     found = follow(response, [name], correction.get("steps", []))
-    x, y, z = np.split(derivative(chain, here, np.full(12, STEP)), 3, axis=1)
+    x, y, z = np.split(derivative(chain, here, np.full(here.size, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
     reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings["table"])
     noise = noise_of_fit(samples.parts, reference, residuals, design, prior)
@@ -186,7 +186,7 @@ def fit(
     result = staged_result(
         name,
         found.steps,
-        stage_parameters(found.values, scatter.covariance[12:, 12:]),
+        stage_parameters(found.values, scatter.covariance[AFTER_BASE, AFTER_BASE]),
         error,
         (len(after), sum(part.recording.samples for part in samples.parts)),
         noise,
@@ -201,13 +201,12 @@ def fit(
         stages=(*(previous.stages if previous else ()), result),
         convergence=certified(0.0, condition, columns, columns) | {"closed_form": True},
     )
-    kept = slice(0, 12)
 
     def results(errors: Values) -> Values:
-        return np.array([chain(here + e)[kept] for e in errors])
+        return np.array([chain(here + e)[BASE] for e in errors])
 
     reference = replace(reference, K=np.asarray(np.linalg.solve(matrix, np.eye(3))))
-    return budgeted(calibration, reference, map_.results(kept), noise, [scatter.of(kept)], settings, results)
+    return budgeted(calibration, reference, map_.results(BASE), noise, [scatter.of(BASE)], settings, results)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ import scipy
 from pipeline.estimation.multi_position.faces_and_turns import Faces, faces_of
 from pipeline.estimation.multi_position.model import Block, Equations, State, effect_readings, motion_of, stacked
 from pipeline.estimation.rest_means import HELD_OUT, Rests, rests_of
+from pipeline.records import BASE_COUNT, base_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -70,7 +71,7 @@ class AccelerometerModel:
         self.rests, self.gravity, self.held, self.faces = rests, gravity_g, held, faces
         self.noise = noise
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
-        self.directions = directions if faces is None else np.eye(12)
+        self.directions = directions if faces is None else np.eye(BASE_COUNT)
         self.known_by_limit = {} if known_by_limit is None or faces is not None else known_by_limit
         self.rests_equations = len(rests.time)
         self.stretches = len(rests.time) if wander else 0
@@ -105,7 +106,7 @@ class AccelerometerModel:
             u = np.array(list(self.known_by_limit.values()))
             angles = self.directions[:, [COLUMN[name] for name in self.known_by_limit]].T
             of_limits = Block(
-                -angles @ np.concatenate([state.bias, state.matrix.ravel()]) / u,
+                -angles @ base_values(state.bias, state.matrix) / u,
                 angles / u[:, None],
                 lambda term: np.zeros((len(u), len(term.values))),
                 self.gravity * u,

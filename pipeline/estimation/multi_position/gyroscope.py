@@ -40,6 +40,7 @@ from pipeline.estimation.multi_position.model import Block, Equations, State, ef
 from pipeline.estimation.multi_position.moves import Gravity, Moves, moves_of, observed_rests, tangents, to_the_end
 from pipeline.estimation.stages import given_calibration, is_given
 from pipeline.model.kinematics import skew
+from pipeline.records import BASE, BASE_COUNT, BIAS, MATRIX
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -82,7 +83,7 @@ class GyroscopeModel:
         self.rests, self.force = rests.select(~rests.held_out), gravity.force[~rests.held_out]
         self.moves, self.turns = moves if moves is not None and moves.count >= fewest else None, turns
         self.kinds = 1 if self.moves is None else 2
-        self.directions = np.eye(12)[:, : 3 if self.moves is None and turns is None else 12]
+        self.directions = np.eye(BASE_COUNT)[:, BIAS if self.moves is None and turns is None else BASE]
         self.rests_equations = 3 * len(self.rests.time)
         self.of_moves = slice(self.rests_equations, self.rests_equations + (2 * self.moves.count if self.moves else 0))
         self.gravity = float(np.median(np.linalg.norm(gravity.force, axis=1)))
@@ -160,8 +161,8 @@ class GyroscopeModel:
         S = S + ratio**2 * np.einsum("cnk,cmk->nm", H, H)
         rng = np.random.default_rng(0)
         drawn = rng.standard_normal((DRAWS, n)) @ cholesky(S).T  # continuous in S, as eigenvectors are not
-        errors = draw_normal(rng, covariance[:12, :12], DRAWS)
-        for part in (slice(0, 3), slice(3, 12)):  # the wander reduces the degrees of freedom of the bias
+        errors = draw_normal(rng, covariance[BASE, BASE], DRAWS)
+        for part in (BIAS, MATRIX):  # the wander reduces the degrees of freedom of the bias
             least = min(float(freedom[part].min()), MANY)
             errors[:, part] *= np.sqrt(least / rng.chisquare(least, (DRAWS, 1)))
         drawn += errors @ block.base.T
@@ -179,8 +180,8 @@ class GyroscopeModel:
         residual, motion = self._rate_at_rest(rests, self.force, state)
         error = np.sqrt(rests.share[:, None]) * self.white
         m = len(rests.time)
-        base = np.zeros((m, 3, 12))
-        base[:, :, :3] = np.eye(3) / error[:, :, None]
+        base = np.zeros((m, 3, BASE_COUNT))
+        base[:, :, BIAS] = np.eye(3) / error[:, :, None]
         bias = np.zeros((3, m, 3, m))
         for c in range(3):
             bias[c, np.arange(m), c, np.arange(m)] = self.white[c] / error[:, c]
@@ -191,7 +192,7 @@ class GyroscopeModel:
 
         return Block(
             (residual / error).ravel(),
-            base.reshape(3 * m, 12),
+            base.reshape(3 * m, BASE_COUNT),
             columns,
             error.ravel(),
             bias.reshape(3, 3 * m, m),
@@ -247,7 +248,7 @@ class GyroscopeModel:
         directions = np.median(error) * self.gravity * np.radians(WD).reshape(n, -1)  # by errors of a typical white one
         return Block(
             np.einsum("kij,kj->ki", W, apart).ravel() - shared @ gravity.moved,
-            (W @ base).reshape(n, 12),
+            (W @ base).reshape(n, BASE_COUNT),
             columns,
             error,
             bias.reshape(3, n, moves.count),
@@ -261,10 +262,10 @@ class GyroscopeModel:
     def accelerometer_errors(self, fitted: Fit) -> Values:
         """Return the estimate of the accelerometer's errors of bias and matrix from the moves: (12,) array."""
         equations = self.equations(fitted.state)
-        shared = np.zeros((len(equations.residual), 12))
+        shared = np.zeros((len(equations.residual), BASE_COUNT))
         shared[self.of_moves] = self._of_moves(fitted.state).shared
         white, _ = equations.whitened(fitted.noise, np.column_stack([shared, equations.residual]))
-        return np.asarray(-self.at_rests.root @ (white[:, :12].T @ white[:, 12]))
+        return np.asarray(-self.at_rests.root @ (white[:, :-1].T @ white[:, -1]))
 
     def _turned(self, state: State) -> tuple[Motion, Values, Values]:
         """Return the motion of all samples of the moves, ``v = y - b - z`` and A."""

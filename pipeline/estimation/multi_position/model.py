@@ -45,7 +45,7 @@ import scipy
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import SURE, Prior, Setting, block_covariance, selection_grid
 from pipeline.estimation.least_squares import cholesky
-from pipeline.records import Index, Mask, Motion, Noise, Values
+from pipeline.records import BIAS, Index, Mask, Motion, Noise, Values, matrix_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -234,7 +234,7 @@ def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
     count = model.directions.shape[1]
     change = model.directions @ step[:count]
     terms, taken = design.stepped(state.terms, step[count:])
-    moved = State(state.bias + change[:3], state.matrix + change[3:].reshape(3, 3), tuple(terms))
+    moved = State(state.bias + change[BIAS], state.matrix + matrix_of(change), tuple(terms))
     return moved, np.concatenate([step[:count], taken])
 
 

@@ -48,6 +48,7 @@ from pipeline.estimation.rest_means import ROLE, Rests, rest_means, rests_of, so
 from pipeline.model.effects import effect
 from pipeline.model.kinematics import turn_by_vector
 from pipeline.model.measurement import compensate
+from pipeline.records import BASE, BASE_COUNT, BIAS, MATRIX, matrix_of
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.signal.rests import Rest
 
@@ -302,10 +303,10 @@ def gravity_of(
     recordings: Sequence[Recording], rests: Rests, accelerometer: SensorCalibration, moved: Values | None = None
 ) -> Gravity:
     """Return gravity at the rests of the accelerometer; ``moved``: see ``observed_rests``."""
-    covariance = np.zeros((12, 12)) if accelerometer.covariance is None else accelerometer.covariance[:12, :12]
-    root, moved = root_of(covariance), np.zeros(12) if moved is None else moved
+    root = root_of(accelerometer.parameters.covariance[BASE, BASE])
+    moved = np.zeros(BASE_COUNT) if moved is None else moved
     accelerometer = replace(
-        accelerometer, bias=accelerometer.bias + moved[:3], matrix=accelerometer.matrix + moved[3:].reshape(3, 3)
+        accelerometer, bias=accelerometer.bias + moved[BIAS], matrix=accelerometer.matrix + matrix_of(moved)
     )
     effects = [e for e in accelerometer.effects if not effect(e.name).moves]
 
@@ -330,7 +331,7 @@ def gravity_of(
     spread = np.sqrt(noise * white + max(between, default=0.0) ** 2)
     unsure = np.linalg.norm(force, axis=1) * np.radians(rests.creep_error) * 0.5 * rests.length
     v = rests.reading - accelerometer.bias
-    shared = -accelerometer.matrix @ root[:3] + np.einsum("mj,ijp->mip", v, root[3:].reshape(3, 3, -1))
+    shared = -accelerometer.matrix @ root[BIAS] + np.einsum("mj,ijp->mip", v, root[MATRIX].reshape(3, 3, -1))
     return Gravity(force, ends[0], ends[1], spread, unsure, root, shared, creeping, np.linalg.pinv(root) @ moved)
 
 

@@ -41,7 +41,7 @@ from pipeline.estimation.uncertainty_budget import (
     scatter_contribution,
 )
 from pipeline.model.effects import effect
-from pipeline.records import Contribution, Noise, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import Contribution, Noise, Recording, SensorCalibration, StageResult, Values, base_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -237,7 +237,7 @@ def _with_monte_carlo(
     solvers = [quadratic_results(X, H, np.asarray(np.linalg.pinv(c, hermitian=True), float)) for c in covariances]
     weight, place = np.array([w for _, w, _ in fitted.hypotheses]), _places(model, fitted)
     effects = [value for term in fitted.state.terms for value in term.values]
-    estimate = np.concatenate([fitted.state.bias, fitted.state.matrix.ravel(), effects])
+    estimate = np.concatenate([base_values(fitted.state.bias, fitted.state.matrix), effects])
 
     def draw(rng: np.random.Generator, count: int) -> Values:
         chosen, steps = rng.choice(len(weight), count, p=weight), np.empty((count, p))

@@ -40,6 +40,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth, unit_of
 from pipeline.model.effects.formula_effect import DeclaredEffect
 from pipeline.model.kinematics import skew, turn_by_vector
+from pipeline.records import MATRIX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -180,13 +181,13 @@ def errors_in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Va
     exp([theta_k]x) exp([phi]x)``. With G the derivative of all parameters with respect to phi and A the matrix that
     takes the mean of the rotations, the map is ``1 - G (A G)^-1 A`` (S-transformation; Baarda, Publ. Geodesy 5, 1973).
 
-    ``values``: (3 m,) rotations of the unit, deg, the parameters ``at``; parameters 3 to 12 are K, row by row.
+    ``values``: (3 m,) rotations of the unit, deg, the parameters ``at``; those of the matrix are K, row by row.
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s that only fits of mountings pay)
 
     steps = Rotation.from_rotvec(STEP_DEG * np.eye(3), degrees=True)
     G, mean = np.zeros((count, 3)), np.zeros((3, count))
-    G[3:12] = np.stack([np.radians(1.0) * (K @ turn).ravel() for turn in skew(np.eye(3))], axis=1)
+    G[MATRIX] = np.stack([np.radians(1.0) * (K @ turn).ravel() for turn in skew(np.eye(3))], axis=1)
     theta = values.reshape(-1, 3)
     moved = [(Rotation.from_rotvec(t, degrees=True) * steps).as_rotvec(degrees=True) - t for t in theta]
     G[at] = np.concatenate([change.T for change in moved]) / STEP_DEG

@@ -90,7 +90,7 @@ def test_of_three_cross_axis_terms_the_length_of_gravity_tells_only_the_sum() ->
     unit = hand_held("mpu6050", 4, {"accelerometer.cross_axis_nonlinearity": None})
     found = fitted(unit, ["cross_axis_nonlinearity"])
     assert found.covariance is not None
-    names = found.parameter_names()
+    names = found.parameters.names
     three = [names.index(f"cross_axis_nonlinearity.K_{term}") for term in ("x_yz", "y_zx", "z_xy")]
     own = found.covariance[np.ix_(three, three)]
     limit = unit.settings["sensor"]["accelerometer"]["effects"]["cross_axis_nonlinearity"]
