@@ -262,7 +262,7 @@ def _rates_and_gravity(moves: Sequence[Move], followed: tuple[str, float, float]
     if followed is not None and 1.0 / DECISIVE_RATIO < abs(followed[1]) < DECISIVE_RATIO:
         return (
             f"the rates have the unit of the table's: the gyroscope's {followed[0]} reads {followed[1]:.3f} of it; "
-            f"with uncalibrated scale factors they turn gravity to within {declared:.2g} deg in {over}, of {way:.0f} deg"
+            f"uncalibrated, they turn gravity to within {declared:.2g} deg in {over}, of {way:.0f} deg"
         )
     if others[best] <= FITS_DEG and DECISIVE_RATIO * others[best] <= declared:
         return (
