@@ -140,6 +140,11 @@ class DataSheet(Section):
     known_temperature: KnownTemperature = KnownTemperature()
     accept_implausible: bool = False
 
+    def stated(self, name: str) -> float | None:
+        """Return a figure that the sensor's file states; None for a figure of ``generic``."""
+        found: float | None = None if name in self.assumed else getattr(self, name)
+        return found
+
 
 class Sensor(Section):
     """A sensor model."""

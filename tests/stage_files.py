@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.records import Recording
+    from pipeline.settings import Settings
 
 
 def write_pack(path: Path, files: dict[str, Any]) -> Path:
@@ -36,7 +37,7 @@ def load_recordings(path: Path) -> list[Recording]:
     return from_parquet(path.read_bytes(), str(path))
 
 
-def export_all(document: dict[str, Any], settings: dict[str, Any], folder: Path) -> list[Path]:
+def export_all(document: dict[str, Any], settings: Settings, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in exports(document, settings).items():
         (folder / name).write_text(text, encoding="utf-8")

@@ -122,8 +122,9 @@ def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:
         parts = sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS)
         if len(parts) > 1:
             from pipeline.commands.readings import grouped  # noqa: PLC0415  (imports Hydra: 0.3 s)
+            from pipeline.settings import Ingest  # noqa: PLC0415  (as above)
 
-            recordings = grouped(logs, dict(profile.ingest))
+            recordings = grouped(logs, Ingest.model_validate({"name": "of the log", **profile.ingest}))
             if len(recordings) > 1:
                 raise ConfigurationError(f"{len(recordings)} recordings are named; apply reads one", str(logs[1]))
             return [recordings[0][part] for part in parts]
@@ -143,4 +144,4 @@ def _profile(calibration: Path, ingest: str | None, log: Path) -> LogProfile:
     sensor = document.get("sensor")
     known = (CONFIGS / "sensor" / f"{sensor}.yaml").is_file()
     config = config_of_log(log, ingest, sensor if known else None)
-    return LogProfile(config["ingest"], profile.axis_maps)
+    return LogProfile(config.ingest, profile.axis_maps)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.commands import parser_of
 from pipeline.commands.readings import Reading, campaign_of, config_of_log, grouped, recordings_of_files
@@ -30,6 +30,7 @@ from pipeline.profile_detection.recording_facts import as_text, counted, facts, 
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.records import SENSORS
 from pipeline.run_progress import Countdown
+from pipeline.settings import Ingest
 
 if TYPE_CHECKING:
     import argparse
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from pipeline.profile_detection.proposal import Proposal
     from pipeline.profile_detection.recording_facts import Line
     from pipeline.records import Recording
+    from pipeline.settings import Sensor
 
 SEARCHED_BYTES = 1 << 25  # of a log, for its layout
 MOST_IN_FULL = 3  # logs of one layout
@@ -145,8 +147,8 @@ def main(argv: Sequence[str]) -> int:
     _print_refused(refused)
     unknown = [(r.reading, layout) for r in refused if r.reading for layout in _layouts(r.reading, r.code)]
     if unknown:
-        sensor = unknown[0][0].settings["sensor"]
-        _print_proposals(propose([layout for _, layout in unknown], sensor), sensor, arguments.save)
+        sensor_model = unknown[0][0].sensor_model
+        _print_proposals(propose([layout for _, layout in unknown], sensor_model), sensor_model, arguments.save)
     elif arguments.save:
         print(f"{arguments.save} was not written: no profile is proposed")
     return 2 if refused else 0
@@ -242,30 +244,29 @@ def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Name
     profile, sensor = arguments.ingest, arguments.sensor
     config = config_of_log(files[0], profile, sensor, campaign=campaign)
     if arguments.range:
-        ranges = settings_of_ranges(config["sensor"], arguments.range)
+        ranges = settings_of_ranges(config.sensor, arguments.range)
         config = config_of_log(files[0], profile, sensor, ranges, campaign)
-    read_with = f"ingest={config['ingest']['name']}" + (f", sensor={sensor}" if sensor else "")
-    ingest, sensor_config = config["ingest"], config["sensor"] if sensor else {}
-    return [Reading.alone(group, ingest, sensor_config, read_with) for group in grouped(files, ingest)]
+    ingest, sensor_model = config.ingest, config.sensor if sensor else None
+    read_with = f"ingest={ingest.name}" + (f", sensor={sensor}" if sensor else "")
+    return [Reading.alone(group, ingest, sensor_model, read_with) for group in grouped(files, ingest)]
 
 
 def _logs_of_campaign(files: Sequence[Path], campaign: Campaign, units: Sequence[str]) -> list[Reading]:
     """Return logs that are no recordings of a campaign, read by its settings."""
     one, *others = (campaign.units[unit].config for unit in units)
-    if any(one[section] != other[section] for other in others for section in ("ingest", "sensor")):
+    if any((one.ingest, one.sensor) != (other.ingest, other.sensor) for other in others):
         message = "the units are read by different settings (ingest, sensor): choose one by --unit"
         raise ConfigurationError(message, str(campaign.directory / "units.csv"))
-    ingest, sensor = one["ingest"], one["sensor"]
-    names = f"ingest={ingest['name']}, sensor={sensor['name']}"
+    names = f"ingest={one.ingest.name}, sensor={one.sensor.name}"
     read_with = f"campaign {campaign.name}, as no recording of a unit: {names}"
-    return [Reading.alone(group, ingest, sensor, read_with) for group in grouped(files, ingest)]
+    return [Reading.alone(group, one.ingest, one.sensor, read_with) for group in grouped(files, one.ingest)]
 
 
 def _check_log(reading: Reading) -> Outcome:
     """Return content and notes of a log that is checked alone, or its refusal."""
     try:
         recording = reading.checked()
-        return Outcome(_described(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), [])
+        return Outcome(_described(reading, [*_topics(reading), *facts(recording, reading.sensor_model)]), [])
     except PipelineError as error:
         return _refusal_of(reading, error)
 
@@ -367,30 +368,29 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
 def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
     """Return the recordings of a unit that exist."""
     config = campaign.units[unit].config
-    sections = {key: config[key] for key in ("table", "sensor", "ingest")}
-    used = ", ".join(f"{key}={config[key]['name']}" for key in ("ingest", "sensor", "table"))
+    used = f"ingest={config.ingest.name}, sensor={config.sensor.name}, table={config.table.name}"
     found = {}
-    for name, files in recording_files(config["procedure"], config["ingest"], campaign.folder(unit)).items():
-        procedure = {**config["procedure"], "recordings": {name: config["procedure"]["recordings"][name]}}
-        place = f"unit {unit} of campaign {campaign.name}, recording {name}"
-        found[name] = Reading(files, {"procedure": procedure, **sections}, f"{place}: {used}")
+    for name, files in recording_files(config.procedure, config.ingest, campaign.folder(unit)).items():
+        entry = config.procedure.recordings[name]
+        settings = config.replaced(procedure=config.procedure.replaced(recordings={name: entry}))
+        place = f"unit {unit} of campaign {campaign.name}, recording {name}: {used}"
+        found[name] = Reading(files, name, entry, settings, place, of_campaign=True)
     return found
 
 
 def _facts_of_recording(reading: Reading, campaign: Campaign, checked: Sequence[Recording]) -> list[Line]:
     """Return the content of a recording after ingest, and the parts if ingest cuts it."""
-    ((name, entry),) = reading.settings["procedure"]["recordings"].items()
     parts = [
         r
         for r in checked
-        if campaign.recorded / r.source["file"] == reading.files[0] and r.source.get("session") == entry.get("session")
+        if campaign.recorded / r.source["file"] == reading.files[0] and r.source.get("session") == reading.entry.session
     ]
-    if [part.name for part in parts] == [name]:
-        return [*_topics(reading), *facts(parts[0], reading.settings["sensor"])]
+    if [part.name for part in parts] == [reading.name]:
+        return [*_topics(reading), *facts(parts[0], reading.sensor_model)]
     whole = reading.recording()
     notes = dict.fromkeys(n for r in (whole, *parts) for n in r.notes if n.code != "N-SEGMENT")
     segments = [f"{p.name}: {n.detail}" for p in parts for n in p.notes if n.code == "N-SEGMENT"]
-    lines = facts(replace(whole, notes=tuple(notes)), reading.settings["sensor"])
+    lines = facts(replace(whole, notes=tuple(notes)), reading.sensor_model)
     return _topics(reading) + lines + [("segments" if i == 0 else "", text) for i, text in enumerate(segments)]
 
 
@@ -414,15 +414,15 @@ def _refusal_of(reading: Reading, error: PipelineError) -> Outcome:
 
 def _recipe(reading: Reading, parts: int) -> str:
     """Return the settings with which all parts of a log that was restarted are used."""
-    ((name, entry),) = reading.settings["procedure"]["recordings"].items()
-    if "file" not in entry:
+    name, entry = reading.name, reading.entry
+    if not reading.of_campaign:
         return "To use all parts, check the file where it lies in your campaign: check then prints the settings."
-    if entry.get("windows"):
+    if entry.windows:
         return (
             "The procedure cuts this recording into windows, and its time falls back within it. Write a file for each "
             "window, or one file whose time never falls back (docs/by_hand.md, Parts)."
         )
-    here = {k: v for k, v in entry.items() if v is not None or k == "axis"}
+    here = {k: v for k, v in entry.json_value.items() if v is not None or k == "axis"}
     lines = [f"procedure.recordings.{name}.session=1"]
     for part in range(2, parts + 1):
         values = ", ".join(f"{k}: {json.dumps(v)}" for k, v in (here | {"session": part}).items())
@@ -458,7 +458,7 @@ def _layouts(reading: Reading, code: str) -> list[Log]:
     return layouts
 
 
-def _print_proposals(proposals: Sequence[Proposal], sensor: Mapping[str, Any], save: Path | None) -> None:
+def _print_proposals(proposals: Sequence[Proposal], sensor_model: Sensor | None, save: Path | None) -> None:
     """Print each proposed profile and the files as it reads them; with ``save``, write the only one."""
     if save is not None and len(proposals) > 1:
         raise ConfigurationError(f"{len(proposals)} profiles are proposed and --save writes one: check fewer files")
@@ -466,10 +466,10 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: Mapping[str, Any], s
     for proposal in proposals:
         if proposal.complete:
             print("WITH THE PROFILE PROPOSED BELOW:\n")
-            ingest = proposal.ingest(name, sensor)
+            ingest = Ingest.model_validate(proposal.ingest(name, sensor_model or {}))
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for number, group in enumerate(groups):
-                outcome = _check_log(Reading.alone(group, ingest, sensor, "the proposed profile"))
+                outcome = _check_log(Reading.alone(group, ingest, sensor_model, "the proposed profile"))
                 if number < MOST_IN_FULL or outcome.refused:
                     print(f"{outcome.text}\n")
             if len(groups) > MOST_IN_FULL:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import textwrap
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.commands import parser_of
 from pipeline.config.options import LARGEST_CONFIG
@@ -12,6 +13,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.exports import formats
 from pipeline.exports.conversion import convert
 from pipeline.exports.reading import CALIBRATION, ImportedCalibration, counts_of, format_of, read_any
+from pipeline.exports.sensors import SensorFigures
 from pipeline.files import CONFIGS
 from pipeline.io.yaml_file import read_yaml
 from pipeline.records import SENSORS
@@ -42,12 +44,12 @@ def main(argv: Sequence[str]) -> int:
     add("--from", dest="source_format", metavar="FORMAT", help="format of IN, if name and content are ambiguous")
     add("--to", dest="target_format", metavar="FORMAT", help="format of OUT, if it differs from the name")
     arguments = parser.parse_args(argv)
-    imported = read_any(arguments.source, arguments.source_format, counts_of(sensor_config(arguments.sensor)))
-    config = sensor_config(arguments.sensor, imported)
+    imported = read_any(arguments.source, arguments.source_format, counts_of(sensor_figures(arguments.sensor)))
+    sheets = sensor_figures(arguments.sensor, imported)
     format_name = format_of(arguments.target.name if arguments.target_format is None else arguments.target_format)
     if arguments.target.exists() and arguments.source.exists() and arguments.target.samefile(arguments.source):
         raise ConfigurationError("OUT is the file IN: choose another name", str(arguments.target))
-    files, lost = convert(imported, format_name, arguments.target, config)
+    files, lost = convert(imported, format_name, arguments.target, sheets)
     print(f"{arguments.source} ({imported.format_name}): {' and '.join(imported.sensors)}")
     for note in imported.notes:
         print(f"  {note}")
@@ -62,8 +64,8 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def sensor_config(sensor: str | None, imported: ImportedCalibration | None = None) -> dict[str, Any]:
-    """Return the file of a sensor model, named by ``sensor`` or by the calibration; empty if neither names one."""
+def sensor_figures(sensor: str | None, imported: ImportedCalibration | None = None) -> dict[str, SensorFigures]:
+    """Return what a sensor's file states, named by ``sensor`` or by the calibration; empty if neither names one."""
     name = sensor or (imported.document or {}).get("sensor") if imported else sensor
     file = CONFIGS / "sensor" / f"{name}.yaml"
     if name is None or (sensor is None and not file.is_file()):
@@ -72,4 +74,5 @@ def sensor_config(sensor: str | None, imported: ImportedCalibration | None = Non
         known = ", ".join(sorted(path.stem for path in file.parent.glob("*.yaml")))
         raise ConfigurationError(f"--sensor {name}: no such sensor; known: {known}")
     content = read_yaml(file, LARGEST_CONFIG)
-    return {s: content[s] for s in SENSORS if content.get(s)}
+    keys = [key.name for key in fields(SensorFigures)]
+    return {s: SensorFigures(**{key: content[s].get(key) for key in keys}) for s in SENSORS if content.get(s)}

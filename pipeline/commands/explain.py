@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.commands import parser_of
-from pipeline.commands.convert import sensor_config
+from pipeline.commands.convert import sensor_figures
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
 from pipeline.exports.conversion import explain_board, explain_calibration
@@ -56,7 +56,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     file = Path(arguments.campaign)
     if is_published(file) and not _is_diagnosis(_json(file)):
-        counts = counts_of(sensor_config(arguments.sensor))
+        counts = counts_of(sensor_figures(arguments.sensor))
         try:
             sys.stdout.write(explain_calibration(read_any(file, arguments.format, counts)))
         except InputError as error:

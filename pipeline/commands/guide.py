@@ -106,21 +106,19 @@ def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline guide RECORDING...``."""
     arguments = _parser().parse_args(argv)
     source = _source(arguments)
-    faces = source.config["procedure"].get("faces")
+    config, faces = source.config, source.config.procedure.faces
     if faces and (arguments.goal or arguments.gyroscope_goal):
-        name = source.config["procedure"]["name"]
         raise ConfigurationError(
-            f"procedure {name} needs given faces and turns, whatever their uncertainty: leave out --goal and "
-            "--gyroscope-goal, or take --procedure multi_position"
+            f"procedure {config.procedure.name} needs given faces and turns, whatever their uncertainty: leave out "
+            "--goal and --gyroscope-goal, or take --procedure multi_position"
         )
-    sensor_config = source.config["sensor"]["accelerometer"]
-    gravity = float(source.config["table"].get("gravity_g") or 1.0)
-    goal = 1e-3 * arguments.goal if arguments.goal else default_goal(sensor_config, gravity, arguments.dwell)
+    data_sheet, gravity = config.sensor.accelerometer, config.table.gravity_g
+    goal = 1e-3 * arguments.goal if arguments.goal else default_goal(data_sheet, gravity, arguments.dwell)
     goals = Goals(goal, arguments.gyroscope_goal)
     if arguments.goal is None and not faces:
-        name = source.config["sensor"]["name"]
-        print(f"goal: {1e3 * goal:g} mg, what 24 rests 45 deg apart reach with the noise of the sensor file {name}")
-    left_out = source.config["effects"]["accelerometer"]
+        what = f"what 24 rests 45 deg apart reach with the noise of the sensor file {config.sensor.name}"
+        print(f"goal: {1e3 * goal:g} mg, {what}")
+    left_out = config.effects.accelerometer
     if left_out and not faces:
         names = left_out if isinstance(left_out, str) else ", ".join(left_out)
         print(f"the accelerometer is forecast without its configured effects: {names}")
@@ -128,11 +126,11 @@ def main(argv: Sequence[str]) -> int:
         missing = [str(f) for f in source.files if not f.exists()]
         if missing:
             raise ConfigurationError(f"there is no file {', '.join(missing)}; --follow waits for one")
-        advice = _advice(source.read(growing=False), source.config, goals, arguments.dwell)
+        advice = _advice(source.read(growing=False), config, goals, arguments.dwell)
         print("\n".join([*(rest.text for rest in advice.rests), *_held_out(source), *advice.words]))
         return 0
-    if source.folder is not None and any(e.get("windows") for e in source.config["procedure"]["recordings"].values()):
-        name = source.config["procedure"]["name"]
+    if source.folder is not None and any(entry.windows for entry in config.procedure.recordings.values()):
+        name = config.procedure.name
         raise ConfigurationError(f"procedure {name} states windows, so the recording must be complete: omit --follow")
     for line in _held_out(source):
         print(line, flush=True)
@@ -188,9 +186,8 @@ def _by_hand(config: Settings) -> Settings:
 
 def _held_out(source: Source) -> list[str]:
     """Return which rests are held out of the fit, and why; empty for a procedure of given faces and turns."""
-    procedure = source.config["procedure"]
-    every = int(procedure.get("holdout_every") or 0)
-    if procedure.get("faces"):
+    every = source.config.procedure.holdout_every
+    if source.config.procedure.faces:
         return []
     entries = [entry for entry, _ in source.entries().values()]
     if any(part.role == "validation" for entry in entries for part in [entry, *(entry.windows or ())]):
@@ -232,8 +229,8 @@ class Goals(NamedTuple):
 
 
 def _advice(recordings: Sequence[Recording], config: Settings, goals: Goals, dwell: float) -> Advice:
-    if config["procedure"].get("faces"):
-        done, words = next_face_or_turn(recordings, config["procedure"], dwell)
+    if config.procedure.faces:
+        done, words = next_face_or_turn(recordings, config.procedure, dwell)
         return Advice(done, [], words)
     unit = fitted_by_hand(recordings, config, gyroscope=goals.gyroscope is not None)
     progress = progress_of(unit, config, dwell)
@@ -272,8 +269,7 @@ def _next_turn(
     now = f"expanded uncertainty of the gyroscope's matrix: {expanded:.2g} % (goal {goal:g} %)"
     if expanded <= goal:
         return True, [now, "enough: both goals are reached"]
-    gravity = float(config["table"].get("gravity_g") or 1.0)
-    turn = most_informative_turn(found, float(np.sqrt(2.0)) * progress.error / gravity)
+    turn = most_informative_turn(found, float(np.sqrt(2.0)) * progress.error / config.table.gravity_g)
     return False, [now, f"next: {turn.in_words(dwell)}"]
 
 

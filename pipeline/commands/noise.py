@@ -11,6 +11,7 @@ from pipeline.commands.readings import Reading, config_of_log
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.exports import ExportedUnit, export, formats
+from pipeline.exports.sensors import SensorFigures
 from pipeline.files import json_text, write_atomically
 from pipeline.records import AXES, SENSORS
 from pipeline.report.noise_section import remarks, term_rows
@@ -45,8 +46,8 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigurationError(f"-o is {target.name}, which is no format of noise; expected {listed}")
     log: Path = arguments.log
     config = config_of_log(log, arguments.ingest, arguments.sensor)
-    ingest, sensor_config = config["ingest"], config["sensor"] if arguments.sensor else {}
-    recording = Reading.alone([log], ingest, sensor_config, role="static").checked()
+    sensor_model = config.sensor if arguments.sensor else None
+    recording = Reading.alone([log], config.ingest, sensor_model, role="static").checked()
     noise = identify_noise([recording])
     print("\n\n".join(_table_of(sensor, noise[sensor]) for sensor in SENSORS).replace(MINUS, "-"))
     if target is None:
@@ -55,13 +56,12 @@ def main(argv: Sequence[str]) -> int:
     document["inputs"] = [{"rate_hz": round(1.0 / recording.interval, 6)}]
     text = json_text(noise)
     if target.suffix != ".json":
-        sensor_file = {s: config["sensor"][s] if arguments.sensor else {} for s in SENSORS}
+        sheets = {s: SensorFigures.of(sensor_model.of(s)) for s in SENSORS} if sensor_model else {}
         identified = {s: any(axis["terms"] for axis in (noise[s]["axes"] or {}).values()) for s in SENSORS}
-        missing = [s for s in SENSORS if not identified[s] and not sensor_file[s]]
+        missing = [s for s in SENSORS if not identified[s] and s not in sheets]
         if missing:
             raise ConfigurationError(f"the log holds no noise of the {' and '.join(missing)}: state --sensor", str(log))
-        settings = {"sensor": sensor_file, "table": {"gravity_g": 1.0}}
-        (text,) = export(target.name, ExportedUnit(document, settings)).values()
+        (text,) = export(target.name, ExportedUnit(document, sheets)).values()
     write_atomically(target, text)
     print(f"written: {target}", file=sys.stderr)
     return 0

@@ -8,7 +8,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 from pipeline.config.compose import Composer
 from pipeline.config.options import Problem, nearest
@@ -18,13 +18,15 @@ from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES, candidate_files, 
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
+from pipeline.settings import RecordingFile, Settings
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.config.campaign import Campaign
     from pipeline.records import Recording
-    from pipeline.settings import Settings
+    from pipeline.settings import Ingest, Sensor
 
 DEFAULT_PROFILE = "canonical_csv"
 SEARCHED_FOLDERS = 4  # from the folder of the log upwards: a campaign is above raw/<unit>/
@@ -32,25 +34,36 @@ SEARCHED_FOLDERS = 4  # from the folder of the log upwards: a campaign is above 
 
 @dataclass
 class Reading:
-    """Files that are read as one recording, and the sections of the configuration for it."""
+    """Files that are read as one recording, and the settings for it."""
 
     files: list[Path]
-    settings: Mapping[str, Any]
-    read_with: str  # profile, sensor and place in a campaign, in words
+    name: str
+    entry: RecordingFile
+    settings: Settings  # sections ``procedure``, ``table``, ``ingest``, and ``sensor`` where it is known
+    read_with: str = ""  # profile, sensor and place in a campaign, in words
+    of_campaign: bool = False  # whether it is a recording of a campaign's unit
 
     @classmethod
     def alone(
         cls,
         files: list[Path],
-        ingest: Mapping[str, Any],
-        sensor: Mapping[str, Any],
+        ingest: Ingest,
+        sensor_model: Sensor | None,
         read_with: str = "",
-        role: str = "rests",
+        role: Literal["rests", "static"] = "rests",
     ) -> Reading:
-        """Return the reading of files that belong to no campaign, without a table."""
-        recordings = {files[0].stem: {"role": role, "axis": None}}
-        settings = {"procedure": {"recordings": recordings}, "table": {}, "sensor": sensor, "ingest": ingest}
-        return cls(files, settings, read_with)
+        """Return the reading of files that belong to no campaign, without a table; None: no sensor is stated."""
+        name, hand = files[0].stem, shipped_settings(procedure="multi_position", table="hand")
+        entry = RecordingFile(file=files[0].name, role=role, axis=None, optional=False)
+        procedure = hand.procedure.replaced(recordings={name: entry})
+        known = {"sensor": sensor_model} if sensor_model else {}
+        settings = Settings.with_sections(procedure=procedure, table=hand.table, ingest=ingest, **known)
+        return cls(files, name, entry, settings, read_with)
+
+    @property
+    def sensor_model(self) -> Sensor | None:
+        """The sensor; None if it is not stated."""
+        return self.settings.sensor if "sensor" in self.settings.model_fields_set else None
 
     @property
     def has_topics(self) -> bool:
@@ -59,18 +72,18 @@ class Reading:
 
     def recording(self) -> Recording:
         """Return the recording, without checks."""
-        ((name, entry),) = self.settings["procedure"]["recordings"].items()
-        table = read_table(self.files, self.settings["ingest"], session=entry.get("session"))
-        return to_recording(name, entry, table, self.settings["sensor"], checks_of(self.settings["ingest"]))
+        ingest, entry = self.settings.ingest, self.entry
+        table = read_table(self.files, ingest, session=entry.session)
+        return to_recording(self.name, entry, table, self.sensor_model or {}, checks_of(ingest))
 
     def checked(self) -> Recording:
         """Return the recording after the checks of a single recording."""
         return check_recordings([self.recording()], self.settings)[0]
 
 
-def grouped(files: Sequence[Path], ingest: Mapping[str, Any]) -> list[list[Path]]:
+def grouped(files: Sequence[Path], ingest: Ingest) -> list[list[Path]]:
     """Return the files of each recording: one, or one for each part of the profile."""
-    parts, of_messages = [part["file"] for part in parts_of(ingest)], bool((ingest.get("mcap") or {}).get("parts"))
+    parts, of_messages = [part["file"] for part in parts_of(ingest)], bool(ingest.mcap.get("parts"))
     groups: dict[Path, list[Path]] = {}
     for file in files:
         if not parts or (file.suffix.lower() in SUFFIXES[1:] and not of_messages):
@@ -103,7 +116,7 @@ def recordings_of_files(
     known: dict[Path, tuple[str, list[str]]] = {}  # file to its unit and recordings
     for unit in units:
         config, folder = campaign.units[unit].config, campaign.folder(unit)
-        for name, candidates in candidate_files(config["procedure"], config["ingest"]).items():
+        for name, candidates in candidate_files(config.procedure, config.ingest).items():
             for file in (folder / f for parts in candidates for f in parts):
                 for path in {absolute(file), file.resolve()}:
                     owner, names = known.setdefault(path, (unit, []))

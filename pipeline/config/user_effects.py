@@ -141,7 +141,7 @@ def with_given(settings: Settings, campaign: Path) -> Settings:
     sensor as in ``calibrations/<unit>.json``. ``effects``: the effects of the file that the sensor causes. Raises
     ``Problem``.
     """
-    from pipeline.exports.reading import counts_of, read_any  # noqa: PLC0415  (only for this method)
+    from pipeline.exports.reading import read_any  # noqa: PLC0415  (only for this method)
     from pipeline.model.effects import owner_of  # noqa: PLC0415  (as above)
     from pipeline.model.effects.base import Owner  # noqa: PLC0415  (as above)
 
@@ -152,7 +152,7 @@ def with_given(settings: Settings, campaign: Path) -> Settings:
         raise Problem(f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null")
     file = campaign / method.file.replace("{unit}", settings.unit)
     try:
-        content = read_any(file, method.format, counts_of(settings.sensor))
+        content = read_any(file, method.format, {s: settings.sensor.of(s).counts_per_unit for s in SENSORS})
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
     except PipelineError as error:
         raise Problem(f"method.file: {error}") from error

@@ -6,7 +6,8 @@ and how ``convert`` reads it), and the text of the file in Jinja2. The text has 
     accelerometer, gyroscope   ``sensors.ExportedSensor`` in the units of the format, None if it is not calibrated
     sensors                    the calibrated sensors, by name
     remarks                    convention, omitted quantities, the remaining error, the held-out errors
-    unit, document, settings   name of the unit, its calibration, the sections ``sensor`` and ``table``
+    unit, document             name of the unit, its calibration
+    sheets, gravity_g          figures of each sensor (``sensors.SensorFigures``); local gravity, g
 
 and the functions of ``sensors.FUNCTIONS``. The name of the template without ``.j2`` is the name of the format and, by
 default, of its file. Formats are listed nowhere else.
@@ -32,7 +33,15 @@ import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from pipeline.errors import ConfigurationError
-from pipeline.exports.sensors import FACTORS, FUNCTIONS, ExportedSensor, before_use, noise_figures, plain
+from pipeline.exports.sensors import (
+    FACTORS,
+    FUNCTIONS,
+    ExportedSensor,
+    SensorFigures,
+    before_use,
+    noise_figures,
+    plain,
+)
 from pipeline.model.checked import Check, WrongValueError, each, fields, one_of
 from pipeline.model.compensation import OF_THE_PAST, SMOOTHING_S, Steps, circular
 from pipeline.model.effects import effect_of
@@ -44,6 +53,8 @@ from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from pipeline.settings import Settings
 
 JSON = dict[str, Any]
 TEMPLATES = Path(__file__).parent / "templates"
@@ -129,7 +140,8 @@ class ExportedUnit:
     """A unit to export: its documents, as in ``exports``, and quantities that several formats need."""
 
     document: JSON
-    settings: Mapping[str, Any]
+    sheets: Mapping[str, SensorFigures]  # by sensor, without those of unknown sensors
+    gravity_g: float = 1.0
     validation: JSON | None = None
     diagnosis: JSON | None = None
 
@@ -141,26 +153,23 @@ class ExportedUnit:
     @cached_property
     def noise_figures(self) -> dict[str, JSON]:
         """Noise parameters of each sensor, with their origin and intervals."""
-        return {s: noise_figures(s, self.settings, self.document) for s in SENSORS}
+        return {s: noise_figures(s, self.sheets.get(s), self.document) for s in SENSORS}
 
     def sensors(self, declared: Format) -> dict[str, ExportedSensor]:
         """Return the calibrated sensors in the units of a format."""
-        configs = self.settings.get("sensor") or {}
         units = declared.units
-        return {
-            s: ExportedSensor(c, units[s], configs.get(s) or {}) for s, c in self.calibrations.items() if s in units
-        }
+        return {s: ExportedSensor(c, units[s], self.sheets.get(s)) for s, c in self.calibrations.items() if s in units}
 
 
 def exports(
-    calibration: JSON, settings: Mapping[str, Any], validation: JSON | None = None, diagnosis: JSON | None = None
+    calibration: JSON, settings: Settings, validation: JSON | None = None, diagnosis: JSON | None = None
 ) -> dict[str, str]:
     """Return the texts of a calibration in every format, by file name.
 
-    ``calibration, validation, diagnosis``: the published documents of the unit; ``settings``: the sections ``sensor``
-    and ``table`` of its configuration.
+    ``calibration, validation, diagnosis``: the published documents of the unit.
     """
-    exported = ExportedUnit(calibration, settings, validation, diagnosis)
+    sheets = {s: SensorFigures.of(settings.sensor.of(s)) for s in SENSORS}
+    exported = ExportedUnit(calibration, sheets, settings.table.gravity_g, validation, diagnosis)
     return {file: text for format_name in formats() for file, text in export(format_name, exported).items()}
 
 
@@ -191,7 +200,8 @@ def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> s
         sensors=sensors,
         unit=exported.document["unit"],
         document=exported.document,
-        settings=exported.settings,
+        sheets=exported.sheets,
+        gravity_g=exported.gravity_g,
         remarks=_remarks(declared, sensors, exported),
     )
 

@@ -7,6 +7,7 @@ equation, the order of its operations, its signs, and a worked example.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.exports import ExportedUnit, export, formats, text_of
 from pipeline.exports.reading import CALIBRATION, ImportedCalibration, counts_of, read_any
-from pipeline.exports.sensors import FACTORS, SI, ExportedSensor, before_use
+from pipeline.exports.sensors import FACTORS, SI, ExportedSensor, SensorFigures, before_use
 from pipeline.files import json_text, write_atomically
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect_of
@@ -69,32 +70,36 @@ def _part(calibration: SensorCalibration) -> JSON:
     return part
 
 
-def settings_of(imported: ImportedCalibration, config: Mapping[str, Any]) -> JSON:
-    """Return the settings for exports: the configuration of the sensor, with the noise that the file states."""
-    sensor: JSON = {s: dict(config.get(s) or {}) for s in SENSORS}
+def with_noise(sheets: Mapping[str, SensorFigures], imported: ImportedCalibration) -> dict[str, SensorFigures]:
+    """Return the figures of the sensors, with the noise that an imported file states."""
+    found = dict(sheets)
     for s, unit in SI.items():
         density, walk = (imported.noise.get(f"{s}_{what}") for what in ("noise_density", "random_walk"))
         if density is not None and walk is not None:
-            sensor[s] |= {"noise_density": np.sqrt(2.0) * density / FACTORS[unit], "wander_time_s": WALK_S}  # one-sided
-            sensor[s]["noise_origin"] = f"as {imported.format_name} states it"
-            sensor[s]["bias_wander"] = walk / FACTORS[unit] * np.sqrt(WALK_S / 2.0)
-    return {"sensor": sensor, "table": {"gravity_g": 1.0}}
+            found[s] = replace(
+                sheets.get(s, SensorFigures()),
+                noise_density=np.sqrt(2.0) * density / FACTORS[unit],  # one-sided
+                bias_wander=walk / FACTORS[unit] * np.sqrt(WALK_S / 2.0),
+                wander_time_s=WALK_S,
+                noise_origin=f"as {imported.format_name} states it",
+            )
+    return found
 
 
 def convert(
-    imported: ImportedCalibration, format_name: str, target: Path, config: Mapping[str, Any]
+    imported: ImportedCalibration, format_name: str, target: Path, sheets: Mapping[str, SensorFigures]
 ) -> tuple[list[Path], list[str]]:
     """Write a calibration in a format; return the files and the losses, in sentences.
 
     ``target``: the file; if the format has a file for each sensor, their endings are added to its stem.
-    ``config``: configuration of each sensor, for counts and noise; may be empty.
+    ``sheets``: figures of each sensor, for counts and noise.
     """
-    document, settings = document_of(imported), settings_of(imported, config)
+    document = document_of(imported)
     if format_name == CALIBRATION:
         write_atomically(target, json_text(document))
         return [target], ["the noise densities and random walks"] if imported.noise else []
     try:
-        texts = export(format_name, ExportedUnit(document, settings), target.name)
+        texts = export(format_name, ExportedUnit(document, with_noise(sheets, imported)), target.name)
     except KeyError as missing:
         quantity = str(missing.args[0]).replace("_", " ")
         raise ConfigurationError(
@@ -109,15 +114,15 @@ def convert(
     files = [target.with_name(name) for name in texts]
     for file, text in zip(files, texts.values(), strict=True):
         write_atomically(file, text)
-    return files, lost(imported, format_name, files[0], config)
+    return files, lost(imported, format_name, files[0], sheets)
 
 
-def lost(imported: ImportedCalibration, format_name: str, file: Path, config: Mapping[str, Any]) -> list[str]:
+def lost(imported: ImportedCalibration, format_name: str, file: Path, sheets: Mapping[str, SensorFigures]) -> list[str]:
     """Read a written file back, and return the losses in sentences."""
     declared = formats()[format_name][0]
     if not declared.read_back:
         return [f"bias and matrix: {format_name} is for {declared.equation}"]
-    back = read_any(file, format_name, counts_of(config))
+    back = read_any(file, format_name, counts_of(sheets))
     lines = []
     if back.axis_maps != imported.axis_maps:
         maps = ", ".join(f"{s} {' '.join(m)}" for s, m in imported.axis_maps.items())
@@ -130,7 +135,7 @@ def lost(imported: ImportedCalibration, format_name: str, file: Path, config: Ma
             f"{s}: {line}"
             for line in _differences(calibration, back.sensors[s], all_effects=declared.effects == ["all"])
         ]
-        exported = ExportedSensor(calibration, declared.units[s], {})
+        exported = ExportedSensor(calibration, declared.units[s], None)
         lines += [f"{s}: {line}" for line in exported.left_by_matrix(declared.matrix.get(s, "full"))]
     if imported.noise and not back.noise:
         lines.append("the noise densities and random walks")

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.exports import Format
+    from pipeline.exports.sensors import SensorFigures
     from pipeline.records import Values
 
 CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.json``
@@ -135,9 +136,9 @@ def _stated_axes(remarks: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {s: stated.get(s) or stated.get("sensor") or STRAIGHT for s in SENSORS} if stated else {}
 
 
-def counts_of(config: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return the counts per g or deg/s in the configuration of each sensor; None if not stated."""
-    return {s: (config.get(s) or {}).get("counts_per_unit") for s in SENSORS}
+def counts_of(sheets: Mapping[str, SensorFigures]) -> dict[str, float | None]:
+    """Return the counts per g or deg/s of each sensor; None if not stated."""
+    return {s: sheets[s].counts_per_unit if s in sheets else None for s in SENSORS}
 
 
 def format_of(words: str) -> str:

@@ -18,6 +18,7 @@ are not included.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from math import comb
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import SensorCalibration, Values
+    from pipeline.settings import DataSheet
 
 JSON = dict[str, Any]
 FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
@@ -42,11 +44,27 @@ AVERAGING_S = 1.0  # averaging time of the effective density in remarks
 INSTABILITY_FLOOR = 2.0 * np.log(2.0) / np.pi  # Allan variance of a bias instability of 1 (IEEE Std 952)
 
 
-def noise(settings: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, float | None]:
+@dataclass(frozen=True)
+class SensorFigures:
+    """The figures of a sensor that exports need; None: its file does not state them."""
+
+    counts_per_unit: float | None = None  # counts per g or deg/s
+    noise_density: float | None = None  # one-sided, g/sqrt(Hz) or deg/s/sqrt(Hz)
+    bias_wander: float | None = None  # standard deviation, g or deg/s
+    wander_time_s: float | None = None  # its correlation time
+    noise_origin: str | None = None  # in words, of figures from another program's file
+
+    @classmethod
+    def of(cls, data_sheet: DataSheet) -> SensorFigures:
+        """Return the figures of a sensor in the configuration of a unit."""
+        return cls(**{f.name: getattr(data_sheet, f.name) for f in fields(cls) if f.name != "noise_origin"})
+
+
+def noise(sheets: Mapping[str, SensorFigures], document: Mapping[str, Any]) -> dict[str, float | None]:
     """Return Kalibr's four noise parameters in m/s^2 and rad/s; None for unknown ones."""
     parameters: dict[str, float | None] = {}
     for sensor in SENSORS:
-        figures = noise_figures(sensor, settings, document)
+        figures = noise_figures(sensor, sheets.get(sensor), document)
         for name, key in (("noise_density", "white"), ("random_walk", "walk")):
             value = figures[key]
             parameters[f"{sensor}_{name}"] = None if value is None else float(value * FACTORS[SI[sensor]])
@@ -59,24 +77,26 @@ def nearest_density(effective: Mapping[str, Any]) -> JSON:
     return min(densities, key=lambda d: abs(np.log(d["averaging_time_s"] / AVERAGING_S)))
 
 
-def noise_figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, Any]) -> JSON:
+def noise_figures(sensor: str, sheet: SensorFigures | None, document: Mapping[str, Any]) -> JSON:
     """Return white noise and walk of a sensor in g or deg/s, their intervals (or None), origins and doubts.
 
-    Raises ``KeyError`` without a measurement and a configuration.
+    Raises ``KeyError`` without a measurement and figures of the noise.
     """
     identified = (document.get("noise") or {}).get(sensor) or {}
     of_axes = (identified.get("axes") or {}).values()
     axes = [axis["terms"] for axis in of_axes if axis["terms"]]
-    keys = ("noise_density", "bias_wander", "wander_time_s")
-    density, wander, time = (settings["sensor"][sensor].get(k) if axes else settings["sensor"][sensor][k] for k in keys)
+    if not axes and (sheet is None or sheet.wander_time_s is None):
+        raise KeyError("noise_density" if sheet is None else "bias_wander")
+    sheet = sheet or SensorFigures()
+    density, wander, time = sheet.noise_density, sheet.bias_wander, sheet.wander_time_s
     white = None if density is None else density / np.sqrt(2.0)
     walk = None if wander is None or not time else wander * np.sqrt(2.0 / time)
-    origin = settings["sensor"][sensor].get("noise_origin")  # another program's file
-    figures: JSON = {"white": white, "white_interval": None, "white_origin": origin or "of the sensor's configuration"}
+    origin = sheet.noise_origin or "of the sensor's configuration"
+    figures: JSON = {"white": white, "white_interval": None, "white_origin": origin}
     figures |= {"walk": walk, "walk_interval": None}
     doubts = [identified.get("doubts"), *(axis.get("doubts") for axis in of_axes)]
     figures["doubts"] = list(dict.fromkeys(doubt for of_part in doubts for doubt in of_part or []))
-    figures["walk_origin"] = origin or "for the bias wander of the sensor's configuration"
+    figures["walk_origin"] = sheet.noise_origin or "for the bias wander of the sensor's configuration"
     if not axes:
         return figures
     of_white, walks = zip(*map(_white_and_walk, axes), strict=True)
@@ -143,15 +163,15 @@ class ExportedSensor:
         Counts per g or deg/s.
     """
 
-    def __init__(self, calibration: SensorCalibration, unit: str, config: Mapping[str, Any]) -> None:
-        self.calibration, self.name, self.unit, self.config = calibration, calibration.sensor, unit, config
+    def __init__(self, calibration: SensorCalibration, unit: str, sheet: SensorFigures | None) -> None:
+        self.calibration, self.name, self.unit, self.sheet = calibration, calibration.sensor, unit, sheet
         self.factor = FACTORS[unit]
         self.bias, self.matrix = calibration.bias * self.factor, calibration.matrix
         self.K: Values = np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)))
         of_sensor = [e for e in calibration.effects if owner_of(e) == Owner.SENSOR]
         self.effects = {e.name: e.values for e in of_sensor}
         self.bench_effects = [e.name for e in calibration.effects if e not in of_sensor]
-        self.counts = config.get("counts_per_unit")
+        self.counts = None if sheet is None else sheet.counts_per_unit
 
     @property
     def bias_after_matrix(self) -> Values:
@@ -209,8 +229,10 @@ class ExportedSensor:
 
     @property
     def noise_density(self) -> float:
-        """White noise in the configuration of the sensor, unit/sqrt(Hz); 0 if it is not stated."""
-        return float((self.config["noise_density"] or 0.0) * self.factor)
+        """White noise by the sensor's file, unit/sqrt(Hz); 0 if it states none. ``KeyError`` without a file."""
+        if self.sheet is None:
+            raise KeyError("noise_density")
+        return float((self.sheet.noise_density or 0.0) * self.factor)
 
     @property
     def temperature_polynomials(self) -> tuple[Values, Values]:

@@ -163,14 +163,10 @@ def tried(candidates: Sequence[Sequence[str]]) -> str:
 
 
 def of_one_sensor(procedure: Mapping[str, Any], files: Collection[str]) -> str:
-    """Return advice for a unit with one sensor, if all recordings of one sensor are missing; else empty.
-
-    Recordings of a sensor that the settings already leave out are optional.
-    """
+    """Return advice for a unit with one sensor, if all recordings of one sensor are missing; else empty."""
     entries = procedure["recordings"].items()
     there = {sensor: [n in files for n, e in entries if e["role"] == sensor] for sensor in TRIADS}
-    required = {e["role"] for _, e in entries if not e.get("optional", False)}
-    lacking = [sensor for sensor, found in there.items() if found and not any(found) and sensor in required]
+    lacking = [sensor for sensor, found in there.items() if found and not any(found)]
     others = any(any(found) for found in there.values())
     return f"; of a unit without {lacking[0]}, set method.{lacking[0]}=null" if len(lacking) == 1 and others else ""
 

@@ -48,8 +48,8 @@ from pipeline.preprocessing.reference_scale import (
     check_intervals,
     check_scale_of_motion,
     check_scale_of_turn,
+    doubt_of_angle,
     doubt_of_scale,
-    doubts_of_angle,
 )
 from pipeline.records import Note, median, once
 
@@ -100,8 +100,7 @@ def check_turns(
         check_scale_of_turn(recording, limits)
     check_intervals([r for r in recordings if r.samples >= FEWEST], limits)
     gyroscope = _Gyroscope(turns)
-    doubts = doubts_of_angle(turns, limits)
-    found = {r.name: _check_turn(r, gyroscope, limits, doubts.get(r.name)) for r in turns}
+    found = {r.name: _check_turn(r, gyroscope, limits) for r in turns}
     return _with_notes(recordings, found), {name: delay for name, (_, delay) in found.items() if delay is not None}
 
 
@@ -193,9 +192,7 @@ def _slopes(recording: Recording) -> Values:
     return np.stack([gain, median(reading - gain * rate[:, None])])
 
 
-def _check_turn(
-    recording: Recording, gyroscope: _Gyroscope, limits: Limits, of_angle: str | None
-) -> tuple[list[Note], Delay | None]:
+def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> tuple[list[Note], Delay | None]:
     channels, axis = [*of_table(recording)], axis_index(recording)
     if any(alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels):
         rate, angle = (limits.column(recording, name) for name in ("table_rate", "table_angle"))
@@ -210,7 +207,7 @@ def _check_turn(
         channels.append(of_gravity(recording, phase, channels))
     notes, delay = _compare(recording, channels, limits)
     ends = float(recording.time[0]), float(recording.time[-1])
-    for doubt in filter(None, (doubt_of_scale(recording, limits), of_angle)):
+    for doubt in filter(None, (doubt_of_scale(recording, limits), doubt_of_angle(recording, limits))):
         notes.append(Note("N-REFERENCE", recording.samples, 0, 0, doubt, *ends))
     return notes, delay
 

@@ -184,51 +184,21 @@ def check_scale_of_motion(recording: Recording, size: Values | None, limits: Lim
     )
 
 
-class _Gear(NamedTuple):
-    """Ratio of the table's angle to gravity's, its standard uncertainty, and the deviation by stated accuracies."""
-
-    ratio: float
-    spread: float
-    allowed: float
-    turns: int = 1
-
-    @property
-    def in_doubt(self) -> bool:
-        return abs(self.ratio - 1.0) > self.allowed + SIGNIFICANT * self.spread
-
-    def __str__(self) -> str:
-        of_turns = f" of {self.turns} turns" if self.turns > 1 else ""
-        return (
-            f"turns {self.ratio:.6g} times as far as gravity does in the readings{of_turns} (standard "
-            f"uncertainty {self.spread:.2g}; the stated accuracy allows {self.allowed:.2g}): are the encoder's counts "
-            "a turn and the gear's ratio right? The matrix of the gyroscope is wrong by as much"
-        )
-
-
-def doubts_of_angle(turns: Sequence[Recording], limits: Limits) -> dict[str, str]:
-    """Return the doubts that the angle of turns differs from gravity's by a factor: an encoder's counts, a gear.
-
-    The turns of a unit are judged together. Where their mean is in no doubt, one of them can be: the others may be
-    about other axes of the table.
-    """
-    gears = {}
-    for turn in turns:
-        if (found := _gear(turn)) is not None and turn.table_angle is not None:
-            of_stops = limits.angle_stated_deg / float(np.ptp(turn.table_angle))
-            gears[turn.name] = _Gear(*found, limits.rate_stated + of_stops + SAME_ANGLE)
-    if len(gears) > 1 and (together := _together([*gears.values()])).in_doubt:
-        gears = dict.fromkeys(gears, together)
-    columns = {turn.name: limits.column(turn, "table_angle") for turn in turns}
-    return {name: f"{columns[name]} {gear}" for name, gear in gears.items() if gear.in_doubt}
-
-
-def _together(gears: Sequence[_Gear]) -> _Gear:
-    """Return the weighted mean of ratios; its uncertainty is at least that by their scatter (Birge ratio)."""
-    ratios, spreads, allowed, _ = np.array(gears).T
-    information = float(np.sum(spreads**-2))
-    mean = float(spreads**-2 @ ratios) / information
-    birge = float(np.sqrt(np.sum(((ratios - mean) / spreads) ** 2) / (len(gears) - 1)))
-    return _Gear(mean, max(birge, 1.0) / np.sqrt(information), float(allowed.max()), len(gears))
+def doubt_of_angle(recording: Recording, limits: Limits) -> str | None:
+    """Return the doubt that a turn's angle differs from gravity's by a factor: an encoder's counts, a gear."""
+    found = _gear(recording)
+    if found is None:
+        return None
+    ratio, spread = found
+    assert recording.table_angle is not None  # noqa: S101
+    allowed = limits.rate_stated + limits.angle_stated_deg / float(np.ptp(recording.table_angle)) + SAME_ANGLE
+    if abs(ratio - 1.0) <= allowed + SIGNIFICANT * spread:
+        return None
+    return (
+        f"{limits.column(recording, 'table_angle')} turns {ratio:.6g} times as far as gravity does in the readings "
+        f"(standard uncertainty {spread:.2g}; the stated accuracy allows {allowed:.2g}): are the encoder's counts a "
+        "turn and the gear's ratio right? The matrix of the gyroscope is wrong by as much"
+    )
 
 
 def _gear(recording: Recording) -> tuple[float, float] | None:

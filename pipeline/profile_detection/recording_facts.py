@@ -145,9 +145,12 @@ def _table(recording: Recording) -> list[Line]:
     if recording.table_rate is not None:
         rate = recording.table_rate
         text = f"rate {_number(float(rate.min()))} to {_number(float(rate.max()))} deg/s"
-        if (followed := _of_table_rate(recording)) is not None:
-            axis, share, correlation = followed
-            text += f" (the gyroscope's {axis} reads {share:.3f} of it, correlation {correlation:.4f})"
+        if recording.gyroscope is not None and np.ptp(rate) > 1.0:
+            correlations = [float(np.corrcoef(rate, w)[0, 1]) if np.ptp(w) else 0.0 for w in recording.gyroscope.T]
+            axis = int(np.argmax(np.abs(correlations)))
+            if abs(correlations[axis]) > 0.9:
+                slope = float(np.polyfit(rate, recording.gyroscope[:, axis], 1)[0])
+                text += f" (the gyroscope's {AXES[axis]} reads {slope:.3f} of it, correlation {correlations[axis]:.4f})"
         texts.append(text if np.any(rate) else "rate 0 deg/s")
     if recording.table_attitude is not None:
         texts.append("attitude")
@@ -157,23 +160,6 @@ def _table(recording: Recording) -> list[Line]:
     if texts and recording.table_attitude is None and not _turns(recording):
         texts.append("it does not change: the table did not turn, or its encoder is not connected")
     return [("table", "; ".join(texts))] if texts else []
-
-
-def _of_table_rate(recording: Recording) -> tuple[str, float, float] | None:
-    """Return the axis of the gyroscope that follows the table, the share of the table's rate that it reads, and r.
-
-    The rate is the logged one, or the derivative of the logged angle. None if no axis follows it.
-    """
-    rate = recording.table_rate
-    if rate is None and recording.table_angle is not None and recording.samples > 1:
-        rate = np.gradient(recording.table_angle, recording.time)
-    if rate is None or recording.gyroscope is None or np.ptp(rate) <= 1.0:
-        return None
-    correlations = [float(np.corrcoef(rate, w)[0, 1]) if np.ptp(w) else 0.0 for w in recording.gyroscope.T]
-    axis = int(np.argmax(np.abs(correlations)))
-    if abs(correlations[axis]) <= 0.9:
-        return None
-    return AXES[axis], float(np.polyfit(rate, recording.gyroscope[:, axis], 1)[0]), correlations[axis]
 
 
 def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> str:
@@ -234,17 +220,14 @@ def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]
     centre = sphere(np.array(means))[0] if len(means) >= FEWEST_RESTS_FOR_A_SPHERE else np.zeros(3)
     moves = moves_of(force - centre, recording.gyroscope[part], recording.time[part])
     if moves:
-        return [("units", _rates_and_gravity(moves, _of_table_rate(recording)))]
+        return [("units", _rates_and_gravity(moves))]
     if recording.table_rate is not None:
         return []
     return [("units", "no move between rests turns gravity, so the unit of the rates cannot be checked")]
 
 
-def _rates_and_gravity(moves: Sequence[Move], followed: tuple[str, float, float] | None) -> str:
-    """State the misfit of the integrated rates to the rotation of gravity, also for other units and other axes.
-
-    ``followed``: of ``_of_table_rate``; it determines the unit where the moves do not.
-    """
+def _rates_and_gravity(moves: Sequence[Move]) -> str:
+    """State the misfit of the integrated rates to the rotation of gravity, also for other units and other axes."""
     scales = (1.0, DEGREES, 1 / DEGREES)
     declared, *others = misfit_deg(moves, scales)
     best = int(np.argmin(others))
@@ -258,11 +241,6 @@ def _rates_and_gravity(moves: Sequence[Move], followed: tuple[str, float, float]
             f"the rates agree with the rotation of gravity to within {declared:.2g} deg in {over}; that is "
             f"{declared / way:.1%} of the {way:.0f} deg turned through, with uncalibrated scale factors and biases; "
             f"in another unit the rates miss by {others[best]:.0f} deg"
-        )
-    if followed is not None and 1.0 / DECISIVE_RATIO < abs(followed[1]) < DECISIVE_RATIO:
-        return (
-            f"the rates have the unit of the table's: the gyroscope's {followed[0]} reads {followed[1]:.3f} of it; "
-            f"uncalibrated, they turn gravity to within {declared:.2g} deg in {over}, of {way:.0f} deg"
         )
     if others[best] <= FITS_DEG and DECISIVE_RATIO * others[best] <= declared:
         return (

@@ -13,9 +13,8 @@ not written, and the report states the reason.
 from __future__ import annotations
 
 import re
-from functools import reduce
 from itertools import repeat
-from operator import getitem
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
@@ -207,7 +206,7 @@ def _wanted(document: JSON, stated: Certificate) -> Iterator[tuple[str, str, str
         "serial in units.csv": document["administrativeData"]["items"][0]["identifications"][0]["value"],
     }
     for what, clause, key in ASKED:
-        yield what, clause, key, known[key] if key in known else reduce(getitem, key.split(".")[1:], stated)
+        yield what, clause, key, known[key] if key in known else attrgetter(key.partition(".")[2])(stated)
     if any(r["name"] == "accelerometer" for r in results):
         accuracy = conditions[0]["accuracy of local gravity, g"]
         yield "accuracy of local gravity", "7.8.4.1 a", "table.gravity_accuracy_g", accuracy is not None

@@ -23,8 +23,9 @@ from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import measured, number, percent, plain, unit_text
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
+    from pipeline.settings import DataSheet
 
 JSON = dict[str, Any]
 GATE = LINEAR_TO  # delta BIC, strong evidence: A. E. Raftery, Sociological Methodology 25 (1995) 139, table 6
@@ -45,7 +46,7 @@ SIGNALS = {
 }
 
 
-def limit_rows(sensor: str, found: JSON, sensor_config: Mapping[str, Any]) -> list[JSON]:
+def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
     """Return the upper limits of each effect that was not selected as text, and as share of the sensor file's limit.
 
     ``share`` is None where the sensor file has no limit; the largest come first. ``excluded``: whether the recordings
@@ -56,7 +57,7 @@ def limit_rows(sensor: str, found: JSON, sensor_config: Mapping[str, Any]) -> li
         effect = catalogue().get(name)
         stated: dict[str, float] = {}
         if effect is not None:
-            values = parameter_limits(effect, sensor, sensor_config.get("effects") or {}).tolist()
+            values = parameter_limits(effect, sensor, data_sheet.effects).tolist()
             stated = dict(zip((p.name for p in effect.parameters(sensor)), values, strict=True))
         text = ", ".join(f"{number(v, 2)} {unit_text(unit)}".rstrip() for unit, v in largest_by_unit(limits).items())
         shares = {key: v["value"] / stated[key] for key, v in limits.items() if np.isfinite(stated.get(key, np.inf))}

@@ -12,13 +12,12 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
 from pipeline.estimation.noise_terms import UNITS, allan_variance, each_term
-from pipeline.model.sensor_file import as_stated
 from pipeline.records import AXES, SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, chart, sentences
 from pipeline.report.numbers import number, percent, plain
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from pipeline.settings import DataSheet
 
 JSON = dict[str, Any]
 # Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
@@ -29,16 +28,15 @@ SURE = 0.9  # probability of a set of terms above which no other set is named
 SYMBOLS = dict(zip(UNITS, "QNBKGRA", strict=True))
 
 
-def allan(sensor: str, noise: JSON | None, sensor_config: Mapping[str, Any], wander: JSON | None) -> Figure | None:
+def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON | None) -> Figure | None:
     """Draw the Allan deviation of each axis; None where no noise was identified.
 
-    ``noise``: the sensor's part of ``noise`` in its calibration; ``sensor_config``: the sensor's section of the
-    configuration; ``wander``: the bias wander in the fit of the diagnosis.
+    ``noise``: the sensor's part of ``noise`` in its calibration; ``wander``: the bias wander by the diagnosis.
     """
     axes = {a: part for a, part in ((noise or {}).get("axes") or {}).items() if part["terms"]}
     if not noise or not axes:
         return None
-    unit, layers, sensor_config = SENSOR_UNITS[sensor], list[Layer](), as_stated(sensor_config)
+    unit, layers, density = SENSOR_UNITS[sensor], list[Layer](), data_sheet.stated("noise_density")
     for axis, part in axes.items():
         curve, colour = {k: np.array(v) for k, v in part["allan"].items()}, AXES.index(axis)
         layers += [
@@ -47,17 +45,17 @@ def allan(sensor: str, noise: JSON | None, sensor_config: Mapping[str, Any], wan
             Dots(curve["tau_s"], curve["deviation"], colour),
         ]
     legend, tau = list(AXES_LEGEND), np.array(next(iter(axes.values()))["allan"]["tau_s"])
-    if sensor_config.get("noise_density"):
+    if density:
         legend.append(("c3", "sensor file"))
-        white = {"value": float(sensor_config["noise_density"]) / np.sqrt(2.0)}
-        time = {"value": float(sensor_config.get("wander_time_s") or DEFAULT_TIME_S)}
-        stated = {"value": float(sensor_config.get("bias_wander") or 0.0), "correlation_time_s": time}
+        white = {"value": density / np.sqrt(2.0)}
+        time = {"value": data_sheet.stated("wander_time_s") or DEFAULT_TIME_S}
+        stated = {"value": data_sheet.stated("bias_wander") or 0.0, "correlation_time_s": time}
         variance = allan_variance("white", white, tau) + allan_variance("gauss_markov", stated, tau)
         layers.append(Line(tau, np.sqrt(variance), 3, "dashed"))
     mean = np.mean([part["allan"]["deviation"] for part in axes.values()], axis=0)
     finding, caption, description = sentences(
         "allan",
-        **_white(axes, sensor_config),
+        **_white(axes, density),
         unit=unit,
         noise=noise,
         wander=wander,
@@ -129,13 +127,13 @@ def _text(part: JSON | None) -> str:
     return text
 
 
-def _white(axes: JSON, sensor_config: Mapping[str, Any]) -> JSON:
-    """Return the white noise, its ratio to the sensor file's white noise with a likely cause, and the other terms."""
+def _white(axes: JSON, density: float | None) -> JSON:
+    """Return the white noise, its ratio to the sensor file's density with a likely cause, and the other terms."""
     terms = [part["terms"] for part in axes.values()]
     names = {name for t in terms for name, _ in each_term(t)}
     densities = [t["white"]["value"] for t in terms if t["white"]["value"]]
     white = float(np.sqrt(np.mean(np.square(densities)))) if densities else None
-    stated = float(sensor_config.get("noise_density") or 0.0) / np.sqrt(2.0)
+    stated = (density or 0.0) / np.sqrt(2.0)
     ratio, cause = white / stated if white and stated else None, ""
     if ratio and ratio > FAR:
         cause = ": vibration at rest, another range, or a column in another unit"

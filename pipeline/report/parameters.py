@@ -28,7 +28,9 @@ from pipeline.report.numbers import plain
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
+
+    from pipeline.settings import DataSheet, Sensor
 
 JSON = dict[str, Any]
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
@@ -131,23 +133,24 @@ def _elements(part: JSON, matrix: np.ndarray, J: np.ndarray) -> Callable[[str, i
     return element
 
 
-def parameter_rows(sensor: str, part: JSON, sensor_config: Mapping[str, Any]) -> list[JSON]:
+def parameter_rows(sensor: str, part: JSON, data_sheet: DataSheet) -> list[JSON]:
     """Return bias, scale factor errors, cross-axis terms and effects.
 
     A row has ``p``, ``name``, ``limit`` (or None), ``share`` of the limit, and ``beyond``: whether the calibration
-    counts it as beyond the sensor file's limit. ``part``: the sensor's part of the calibration; ``sensor_config``: the
-    sensor's section of the configuration, with the limits.
+    counts it as beyond the sensor file's limit. ``part``: the sensor's part of the calibration.
     """
     fitted = fitted_parameters(part)
     beyond = {entry["parameter"] for entry in part.get("beyond_limits") or []}
-    limits = {
-        name: limit for name, _, _, _, limit, *_ in limited_effects(sensor, part, sensor_config.get("effects") or {})
-    }
-    found = [(p, p.words.capitalize(), sensor_config.get("bias")) for p in fitted[BIAS]]
+    limits = {name: limit for name, _, _, _, limit, *_ in limited_effects(sensor, part, data_sheet.effects)}
+    found: list[tuple[Parameter, str, float | None]] = [
+        (p, p.words.capitalize(), data_sheet.bias) for p in fitted[BIAS]
+    ]
     for p in sensor_errors(part):
         kind, _, axes = p.name.rpartition("_")
-        name = f"Cross-axis sensitivity {axes}" if kind == "cross_axis" else f"Scale factor error {axes}"
-        found.append((p, name, sensor_config.get(kind)))
+        if kind == "cross_axis":
+            found.append((p, f"Cross-axis sensitivity {axes}", data_sheet.cross_axis))
+        else:
+            found.append((p, f"Scale factor error {axes}", data_sheet.scale_factor))
     for p in fitted[AFTER_BASE]:
         held = is_held(p.name, {"value": p.value, "unit": p.unit, "standard_uncertainty": p.standard_uncertainty})
         name = f"{p.words} (not determined, fixed at 0)" if held else p.words
@@ -205,17 +208,15 @@ def sheet_columns(row: JSON) -> dict[str, str]:
     return {k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in COLUMNS)}
 
 
-def unit_parameters(calibration: JSON, sensor_configs: Mapping[str, Any] | None) -> list[tuple[Any, ...]]:
+def unit_parameters(calibration: JSON, sensor_model: Sensor) -> list[tuple[Any, ...]]:
     """Return a row with the columns ``PARAMETERS`` for each parameter of a unit; none for a failed unit.
 
-    These are the fitted parameters, and the elements of P that a sensor file limits. ``sensor_configs``: the section
-    ``sensor`` of the configuration.
+    These are the fitted parameters, and the elements of P that a sensor file limits.
     """
     rows = []
     for sensor in [s for s in SENSORS if calibration.get(s)]:
         fitted = fitted_parameters(calibration[sensor])
-        sensor_config = (sensor_configs or {}).get(sensor) or {}
-        limits = {row["p"]: row for row in parameter_rows(sensor, calibration[sensor], sensor_config)}
+        limits = {row["p"]: row for row in parameter_rows(sensor, calibration[sensor], sensor_model.of(sensor))}
         limits = {p: row for p, row in limits.items() if row["limit"]}
         for p in dict.fromkeys([*fitted, *limits]):
             row = limits.get(p) or {"name": None, "limit": None, "beyond": False}

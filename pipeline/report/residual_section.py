@@ -31,8 +31,9 @@ from pipeline.signal.encoder_rate import rate_by_angle
 from pipeline.signal.filters import filtered
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
+    from pipeline.settings import Table
 
 JSON = dict[str, Any]
 BINS = 36  # of a covariate, and of a turn: 10 deg each
@@ -60,11 +61,8 @@ class Residual:
         return self.reading - self.predicted
 
 
-def residuals(sensor: str, part: JSON, recordings: list[Recording], table: Mapping[str, Any]) -> list[Residual]:
-    """Return the residuals of the recordings for a sensor whose motion is known.
-
-    ``part``: the sensor's part of the calibration; ``table``: this section of the unit's configuration.
-    """
+def residuals(sensor: str, part: JSON, recordings: list[Recording], table: Table) -> list[Residual]:
+    """Return the residuals of the recordings for a sensor whose motion is known; ``part``: of its calibration."""
     calibration = SensorCalibration.from_json(sensor, part)
     out = []
     for recording in recordings:

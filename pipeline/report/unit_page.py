@@ -132,16 +132,16 @@ def _sensor(
 ) -> JSON:
     """Return what the template shows of a calibrated sensor, from its parts of validation and diagnosis."""
     part, table = calibration[sensor], settings.table
-    sensor_config = settings.sensor.of(sensor)
+    data_sheet = settings.sensor.of(sensor)
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
-    limits, kind = limit_rows(sensor, found, sensor_config), css_class(found.get("verdict"))
+    limits, kind = limit_rows(sensor, found, data_sheet), css_class(found.get("verdict"))
     kind = "warn" if found.get("failed") else kind
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
     far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
-    parameters, run = parameter_rows(sensor, part, sensor_config), settings.stated.run
+    parameters, run = parameter_rows(sensor, part, data_sheet), settings.stated.run
     return {
         "held_out": held_out,
         "before": first.get("rms_error"),
@@ -152,7 +152,7 @@ def _sensor(
         "model_figures": [measurement_and_model(sensor, r, noise) for r in traces],
         "held_out_figures": held_out_figures(sensor, calibration, held_out, recordings, table),
         "residual_figures": residual_figures(sensor, traces, noise),
-        "noise_figure": allan(sensor, at_rest, sensor_config, found.get("wander")),
+        "noise_figure": allan(sensor, at_rest, data_sheet, found.get("wander")),
         "noise_terms": term_rows(at_rest),
         "noise_remarks": remarks(at_rest),
         "matrix": fitted_parameters(part)[MATRIX],
@@ -171,7 +171,7 @@ def _sensor(
         "implausible": sentences(sensor, part),
         "beyond": beyond_uncertainty(part),
         "kind": "warn" if not held_out.get("held_out", True) else "" if (far or likely) and kind == "good" else kind,
-        "of_rests": table.get("motion") == "none" and not logged,
+        "of_rests": table.motion == "none" and not logged,
         "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), run)
         if (run := settings.stated.run)
@@ -181,7 +181,7 @@ def _sensor(
 
 def _shown(settings: Settings) -> JSON:
     """Return the settings that the page shows: what determines the results, and its digest."""
-    sections = {k: v.json_value for k, v in settings.items() if k not in ("stated", "certificate")}
+    sections = settings.only(settings.model_fields_set - {"stated", "certificate"})
     return dict(sorted({**sections, "config_sha256": settings.stated.config_sha256}.items()))
 
 

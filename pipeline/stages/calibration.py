@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Fit
-    from pipeline.settings import Board, Settings
+    from pipeline.settings import Board, DataSheet, Settings
     from pipeline.stages.batch import Job
 
 MOVE = "record turns of 100 deg/s and more about all axes"
@@ -123,15 +123,15 @@ def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
     return found
 
 
-def judged(sensor: str, fit: dict[str, Any], sensor_config: Mapping[str, Any]) -> dict[str, Any]:
+def judged(sensor: str, fit: dict[str, Any], data_sheet: DataSheet) -> dict[str, Any]:
     """Add to a fit the parameters beyond the sensor file's limits, and those that only the limits determine.
 
     Which of those beyond are implausible depends on their uncertainty, and on what the configuration accepts.
     """
-    found = implausible(sensor, fit, sensor_config)
-    accepted = sensor_config["accept_implausible"]
+    found = implausible(sensor, fit, data_sheet)
+    accepted = data_sheet.accept_implausible
     lists = {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
-    lists |= {"beyond_limits": beyond_limits(sensor, fit, sensor_config)}
+    lists |= {"beyond_limits": beyond_limits(sensor, fit, data_sheet)}
     return fit | lists | {"not_determined": not_determined(fit)}
 
 

@@ -68,7 +68,7 @@ def summary(
         "row": summary_row(calibration["unit"], *documents, stated.row),
         "failure": failure,
         "state": unit_state(*documents, stated.overrides, stated.sections),
-        "parameters": unit_parameters(calibration, sensor),
+        "parameters": [] if sensor is None else unit_parameters(calibration, sensor),
         "sha256": digests_of_entries(calibration.get("inputs") or ()),
     }
 

@@ -39,7 +39,7 @@ class StoredUnit:
     def files(self) -> UnitFiles:
         """Files of the recordings."""
         directory = Path(self.job.run["directory"])
-        folder = directory / self.job.units[self.unit]["procedure"]["folder"]
+        folder = directory / self.job.units[self.unit].procedure.folder
         return UnitFiles(directory, folder, self.job.inputs.get("recordings"))
 
     @cached_property

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -422,24 +421,6 @@ def test_slow_full_turns_of_a_table_are_no_rests_and_no_contradiction(
     words = Checked(capsys, tmp_path / "slow.csv").words
     assert "no move between rests turns gravity" in words
     assert re.search(r"rests 2, 7\.9\d* to 7\.9\d* s long", words)
-
-
-@pytest.mark.parametrize("logged", ["table_rate", "table_angle"])
-def test_an_encoder_determines_the_unit_of_rates_whose_scale_factor_hides_it_over_many_turns(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], logged: str
-) -> None:
-    """A scale factor error of 4 % over seven turns is 100 deg: gravity then tells no unit from another."""
-    rng, rate = np.random.default_rng(7), 100.0
-    speed = np.concatenate([np.zeros(500), np.full(2550, 100.0), np.zeros(500)])  # deg/s: seven turns and 30 deg
-    turned = np.cumsum(speed) / rate
-    angle, n = np.radians(turned), len(turned)
-    force = np.column_stack([np.zeros(n), np.sin(angle), np.cos(angle)]) + 2e-3 * rng.standard_normal((n, 3))
-    gyro = np.column_stack([1.04 * speed, np.zeros(n), np.zeros(n)]) + 0.05 * rng.standard_normal((n, 3))
-    log = {"table_rate": speed, "table_angle": turned}[logged]
-    turns = Recording("t", "gyroscope", "x", 10_000_000 * np.arange(n), accelerometer=force, gyroscope=gyro)
-    write_canonical_csv(tmp_path / "t.csv", replace(turns, **{logged: log}))
-    words = Checked(capsys, tmp_path / "t.csv").words
-    assert "the rates have the unit of the table's: the gyroscope's x reads 1.040 of it" in words
 
 
 def test_a_wrong_unit_of_few_moves_and_swapped_axes_are_told(

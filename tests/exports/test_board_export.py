@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -13,6 +13,9 @@ from test_formats import document, settings
 
 from pipeline.exports import exports
 from pipeline.exports.conversion import explain_board
+
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
 
 __all__ = ["settings"]
 PLACE = [0.03, -0.02, 0.01]
@@ -40,7 +43,7 @@ def on_board() -> dict[str, Any]:
     return document({}) | {"unit": "A", "board": {"name": "B7", "reference": "A", "chips": chips}}
 
 
-def test_poses_are_those_of_the_chips(on_board: dict[str, Any], settings: dict[str, Any]) -> None:
+def test_poses_are_those_of_the_chips(on_board: dict[str, Any], settings: Settings) -> None:
     text = exports(on_board, settings)["board.yaml"]
     chain = yaml.safe_load(text)
     assert list(chain) == ["imu0", "imu1"]
@@ -54,7 +57,7 @@ def test_poses_are_those_of_the_chips(on_board: dict[str, Any], settings: dict[s
 
 
 def test_the_static_transform_places_the_chip_in_the_axes_of_the_reference(
-    on_board: dict[str, Any], settings: dict[str, Any]
+    on_board: dict[str, Any], settings: Settings
 ) -> None:
     line = re.search(r"static_transform_publisher .*", exports(on_board, settings)["board.yaml"])
     assert line
@@ -66,7 +69,7 @@ def test_the_static_transform_places_the_chip_in_the_axes_of_the_reference(
     np.testing.assert_allclose(Rotation.from_quat(quaternion).apply([0.0, -1.0, 0.0]), [1.0, 0.0, 0.0], atol=1e-9)
 
 
-def test_only_the_reference_of_a_board_has_the_file(settings: dict[str, Any]) -> None:
+def test_only_the_reference_of_a_board_has_the_file(settings: Settings) -> None:
     other = document({}) | {"board": {"name": "B7", "reference": "A", "chips": {}}}
     assert "board.yaml" not in exports(document({}), settings)
     assert "board.yaml" not in exports(other, settings)

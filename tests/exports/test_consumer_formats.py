@@ -11,6 +11,7 @@ import pytest
 import yaml
 from pydantic import TypeAdapter
 from stage_files import export_all
+from unit_settings import settings_of
 
 from pipeline import load_calibration
 from pipeline.exports import Format, formats
@@ -24,13 +25,8 @@ MATRIX = {
     "gyroscope": np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0.005, 0.998]]),
 }
 COUNTS = {"accelerometer": 16384.0, "gyroscope": 131.0}
-SETTINGS: dict[str, Any] = {
-    "sensor": {
-        s: {"noise_density": 1e-3, "bias_wander": 1e-4, "wander_time_s": 100.0, "counts_per_unit": COUNTS[s]}
-        for s in SENSORS
-    },
-    "table": {"gravity_g": 1.0},
-}
+SHEET = {"noise_density": 1e-3, "bias_wander": 1e-4, "wander_time_s": 100.0}
+SETTINGS = settings_of(sensor={s: SHEET | {"counts_per_unit": COUNTS[s]} for s in BIAS})
 
 
 def effect(name: str, **values: float) -> FittedEffect:

@@ -20,6 +20,8 @@ from pipeline.exports.reading import read_any
 from pipeline.exports.sensors import lower_times_rotation
 from pipeline.model.effects import effect
 from pipeline.records import FittedEffect, SensorCalibration
+from pipeline.settings import Settings
+from pipeline.simulation.description import shipped_settings
 
 FILES = {
     *("ardupilot.param", "azure_kinect.json", "basalt_imu.json", "betaflight.txt", "calibration.h", "dlio.yaml"),
@@ -59,9 +61,8 @@ def document(effects: dict[str, dict[str, float]], seed: int = 3) -> dict[str, A
 
 
 @pytest.fixture
-def settings() -> dict[str, Any]:
-    root = Path(__file__).parents[2] / "configs" / "sensor" / "mpu6050.yaml"
-    return {"sensor": {"name": "mpu6050", **yaml.safe_load(root.read_text())}, "table": {"gravity_g": 1.0}}
+def settings() -> Settings:
+    return shipped_settings(sensor="mpu6050")
 
 
 def samples(n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -70,7 +71,7 @@ def samples(n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_the_template_of_the_documentation_adds_a_format_whose_file_is_named_by_the_unit(
-    tmp_path: Path, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run writes the file; convert takes the format from the name of OUT, writes OUT, and reads it by its keys."""
     shutil.copytree(exports.TEMPLATES, tmp_path / "templates")
@@ -129,13 +130,13 @@ def test_a_wrong_declaration_is_refused_by_its_key(
         formats.cache_clear()
 
 
-def test_every_format_writes_its_file(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_every_format_writes_its_file(tmp_path: Path, settings: Settings) -> None:
     written = export_all(document({}), settings, tmp_path / "U1")
     assert {p.name for p in written} >= FILES
     assert all(p.stat().st_size > 300 for p in written)
 
 
-def test_kalibrs_own_equation_predicts_the_reading(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_kalibrs_own_equation_predicts_the_reading(tmp_path: Path, settings: Settings) -> None:
     made = document({"gyroscope": {"g_sensitivity": 0.1}})
     export_all(made, settings, tmp_path)
     imu = yaml.safe_load((tmp_path / "kalibr.yaml").read_text())["imu0"]
@@ -166,7 +167,7 @@ def test_a_factor_of_a_matrix_is_lower_triangular_times_a_rotation() -> None:
     assert (np.diag(L) > 0).all()
 
 
-def test_what_a_format_cannot_carry_is_said_in_it(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_what_a_format_cannot_carry_is_said_in_it(tmp_path: Path, settings: Settings) -> None:
     made = document({"accelerometer": {"lever_arm": 0.05, "hysteresis": 1e-3}})
     made |= {"gyroscope": None, "not_calibrated": {"gyroscope": "the recording holds no turn"}}
     export_all(made, settings, tmp_path)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from stage_files import export_all
+from unit_settings import settings_of
 
 from pipeline import load_calibration
 from pipeline.exports.sensors import ExportedSensor
@@ -20,13 +21,8 @@ MATRIX = {
     "gyroscope": np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0.005, 0.998]]),
 }
 SENSITIVITY = np.array([[0.1, -0.02, 0.03], [0.0, 0.08, -0.05], [0.01, 0.02, -0.09]])
-SETTINGS: dict[str, Any] = {
-    "sensor": {
-        s: {"noise_density": 1e-3, "bias_wander": 1e-4, "wander_time_s": 100.0, "counts_per_unit": 16384.0}
-        for s in BIAS
-    },
-    "table": {"gravity_g": 1.0},
-}
+SHEET = {"noise_density": 1e-3, "bias_wander": 1e-4, "wander_time_s": 100.0}
+SETTINGS = settings_of(sensor={s: SHEET | {"counts_per_unit": 16384.0} for s in BIAS})
 
 
 def document(*, sensitive: bool = False) -> dict[str, Any]:
@@ -137,7 +133,7 @@ def test_an_autopilots_axis_by_axis_correction_leaves_what_its_header_says(
 
 def test_the_diagonal_that_stands_for_a_matrix_is_the_best_one() -> None:
     c = SensorCalibration("accelerometer", BIAS["accelerometer"], MATRIX["accelerometer"])
-    found = ExportedSensor(c, "g", {})
+    found = ExportedSensor(c, "g", None)
     scale, error = found.scale, found.scale_error
     K = np.linalg.inv(MATRIX["accelerometer"])
     for change in (0.0, 1e-3, -1e-3):

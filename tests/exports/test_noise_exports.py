@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,13 +11,14 @@ import pytest
 import yaml
 from scipy.signal import lfilter
 from stage_files import export_all
+from unit_settings import settings_of
 
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_terms import allan_variance, each_term
 from pipeline.exports import ExportedUnit, export
-from pipeline.exports.conversion import document_of, settings_of
+from pipeline.exports.conversion import document_of, with_noise
 from pipeline.exports.reading import read_any
-from pipeline.exports.sensors import INSTABILITY_FLOOR, noise
+from pipeline.exports.sensors import INSTABILITY_FLOOR, SensorFigures, noise
 from pipeline.records import SENSORS, Recording, SensorCalibration
 
 if TYPE_CHECKING:
@@ -27,7 +29,8 @@ SIGMA = {"accelerometer": 3e-3, "gyroscope": 0.05}  # of a sample, g and deg/s
 WALK = {"accelerometer": 2e-5, "gyroscope": 8e-4}  # per sqrt(s)
 FACTOR = {"accelerometer": G0, "gyroscope": np.pi / 180.0}
 SHEET = {"noise_density": 1e-3, "bias_wander": 1e-4, "wander_time_s": 100.0, "counts_per_unit": 16384.0}
-SETTINGS: dict[str, Any] = {"sensor": dict.fromkeys(SENSORS, SHEET), "table": {"gravity_g": 1.0}}
+SETTINGS = settings_of(sensor=dict.fromkeys(SENSORS, SHEET))
+SHEETS = dict.fromkeys(SENSORS, SensorFigures.of(SETTINGS.sensor.gyroscope))
 
 
 def document(readings: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -80,7 +83,7 @@ def test_each_consumer_gets_the_noise_of_the_recording(measured: dict[str, Any],
 
 
 def test_the_variances_of_vins_are_those_of_the_integrals_of_the_recording(measured: dict[str, Any]) -> None:
-    text = export("vins.yaml", ExportedUnit(measured, SETTINGS))["vins.yaml"]
+    text = export("vins.yaml", ExportedUnit(measured, SHEETS))["vins.yaml"]
     vins, dt, steps = yaml.safe_load(text.replace("%YAML:1.0", "")), 1.0 / RATE, 2000
     velocity = bias = 0.0
     for _ in range(steps):  # integration_base.h: V noise V^T of the velocity and of the bias
@@ -93,16 +96,12 @@ def test_the_variances_of_vins_are_those_of_the_integrals_of_the_recording(measu
     assert vins["g_norm"] == pytest.approx(G0)
 
 
-def test_without_a_rest_the_configuration_is_exported_and_what_is_unknown_is_null(tmp_path: Path) -> None:
-    found = noise(SETTINGS, document())
+def test_without_a_rest_the_configuration_is_exported_and_what_is_unknown_is_null() -> None:
+    found = noise(SHEETS, document())
     assert found["gyroscope_noise_density"] == pytest.approx(1e-3 / np.sqrt(2.0) * np.pi / 180.0)
     assert found["gyroscope_random_walk"] == pytest.approx(1e-4 * np.sqrt(0.02) * np.pi / 180.0)
-    unknown = {
-        "sensor": {s: SHEET | {"noise_density": None, "bias_wander": None} for s in SENSORS},
-        "table": SETTINGS["table"],
-    }
-    export_all(document(), unknown, tmp_path)
-    text = (tmp_path / "kalibr_imu.yaml").read_text()
+    unknown = dict.fromkeys(SENSORS, SensorFigures(wander_time_s=100.0))
+    text = export("kalibr_imu.yaml", ExportedUnit(document(), unknown))["kalibr_imu.yaml"]
     assert yaml.safe_load(text)["accelerometer_noise_density"] is None
     assert "# accelerometer, white: not known; null has to be replaced." in text
 
@@ -111,7 +110,7 @@ def test_a_walk_that_was_not_seen_is_at_most_its_upper_limit() -> None:
     rng = np.random.default_rng(2)
     quiet = document({s: SIGMA[s] * rng.standard_normal((SAMPLES, 3)) for s in SENSORS})
     limits = [quiet["noise"]["gyroscope"]["axes"][a]["terms"]["random_walk"]["upper_limit"] for a in "xyz"]
-    loud = {"sensor": {s: SHEET | {"bias_wander": 10.0} for s in SENSORS}, "table": SETTINGS["table"]}
+    loud = {s: replace(sheet, bias_wander=10.0) for s, sheet in SHEETS.items()}
     found = noise(loud, quiet)["gyroscope_random_walk"]
     assert found == pytest.approx(np.sqrt(np.mean(np.square(limits))) * np.pi / 180.0)
     text = export("kalibr_imu.yaml", ExportedUnit(quiet, loud))["kalibr_imu.yaml"]
@@ -130,7 +129,7 @@ def test_a_process_is_white_or_a_walk_by_its_correlation_time_and_flicker_meets_
         made = document() | {
             "noise": {"accelerometer": {"source": "static", "length_s": 1e3, "axes": {"x": terms(**given)}}}
         }
-        found = noise(SETTINGS, made)
+        found = noise(SHEETS, made)
         return tuple(found[f"accelerometer_{k}"] / G0 for k in ("noise_density", "random_walk"))  # type: ignore[return-value,operator]
 
     for time in (0.01, 30.0):
@@ -158,7 +157,7 @@ def test_a_simulated_short_process_is_exported_as_its_plateau() -> None:
     made = document(dict.fromkeys(SENSORS, values))
     names = {name for name, _ in each_term(made["noise"]["gyroscope"]["axes"]["x"]["terms"])}
     assert "gauss_markov" in names
-    found = noise(SETTINGS, made)["gyroscope_noise_density"]
+    found = noise(SHEETS, made)["gyroscope_noise_density"]
     seconds = values.reshape(-1, 50, 3).mean(axis=1)  # means over 1 s scatter by the density
     assert found == pytest.approx(np.radians(seconds.std()), rel=0.05)
 
@@ -166,14 +165,12 @@ def test_a_simulated_short_process_is_exported_as_its_plateau() -> None:
 def test_noise_that_no_composition_fits_is_exported_as_doubtful() -> None:
     drive = np.random.default_rng(4).standard_normal((SAMPLES, 3))
     shaken = lfilter([1.0], [1.0, -1.6, 0.95], drive, axis=0)  # a resonance, as of vibration
-    text = export("kalibr_imu.yaml", ExportedUnit(document(dict.fromkeys(SENSORS, shaken)), SETTINGS))[
-        "kalibr_imu.yaml"
-    ]
+    text = export("kalibr_imu.yaml", ExportedUnit(document(dict.fromkeys(SENSORS, shaken)), SHEETS))["kalibr_imu.yaml"]
     assert "# gyroscope, in doubt: no composition fits the spectrum" in text
 
 
 def test_a_conversion_keeps_the_densities(measured: dict[str, Any], tmp_path: Path) -> None:
     export_all(measured, SETTINGS, tmp_path)
     found = read_any(tmp_path / "kalibr.yaml")
-    again = noise(settings_of(found, {}), document_of(found))
-    assert again == pytest.approx(noise(SETTINGS, measured), rel=1e-9)
+    again = noise(with_noise({}, found), document_of(found))
+    assert again == pytest.approx(noise(SHEETS, measured), rel=1e-9)

@@ -168,20 +168,6 @@ def test_missing_files_are_named_together_with_what_was_tried(tmp_path: Path, ca
     assert caught.value.file == str(tmp_path)
 
 
-@pytest.mark.parametrize("optional", ["", "accel_x"])
-def test_a_sensor_that_the_settings_leave_out_is_not_advised_to_be_left_out(
-    tmp_path: Path, canonical: dict[str, Any], optional: str
-) -> None:
-    """With ``method.accelerometer=null`` its recordings are optional; held-out motion is still missing."""
-    wanted = procedure("gyro_x", "accel_x", "validation")
-    for name, role in (("gyro_x", "gyroscope"), ("accel_x", "accelerometer"), ("validation", "validation")):
-        wanted["recordings"][name] |= {"role": role, "optional": name == optional}
-    write_canonical_csv(tmp_path / "gyro_x.csv", make_recording())
-    with pytest.raises(MissingInputError, match=r"validation \(tried") as caught:
-        read_recordings(wanted, canonical, SENSOR, tmp_path)
-    assert ("set method.accelerometer=null" in caught.value.message) == (not optional)
-
-
 def test_missing_folder_is_named(tmp_path: Path, canonical: dict[str, Any]) -> None:
     with pytest.raises(MissingInputError, match="the folder does not exist"):
         read(tmp_path / "nowhere", canonical)

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from unit_settings import settings_of
 
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import Note, Recording, SensorCalibration, StageResult
+from pipeline.settings import Settings, Stated
 
 SIGMA = {"accelerometer": 0.003, "gyroscope": 0.05}
 EFFECT = 0.004  # quadratic nonlinearity of the accelerometer, g/g^2, which the calibration does not know
@@ -21,7 +23,7 @@ class Unit:
     validation: dict[str, Any]
     diagnosis: dict[str, Any]
     recordings: list[Recording]
-    settings: dict[str, Any]
+    settings: Settings
 
     @property
     def arguments(self) -> tuple[Any, ...]:
@@ -228,11 +230,10 @@ def build_unit(samples: int = 1500, held_out_samples: int = 2000) -> Unit:
         },
         diagnosis={s: diagnosis_of(s) for s in ("accelerometer", "gyroscope")},
         recordings=recordings,
-        settings={
-            "unit": "U1",
-            "sensor": {"name": "mpu6050", "accelerometer": SHEET, "gyroscope": {**SHEET, "bias": 20.0}},
-            "table": {"name": "acutronic", "gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None},
-        },
+        settings=settings_of(
+            sensor={"name": "mpu6050", "accelerometer": SHEET, "gyroscope": {**SHEET, "bias": 20.0}},
+            table={"name": "acutronic"},
+        ).replaced(stated=Stated()),
     )
 
 

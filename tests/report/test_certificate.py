@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.report.certificate import STAMP, certificate
 from pipeline.report.certificate import certificate_page as render
-from pipeline.settings import Certificate
+from pipeline.settings import Certificate, Settings, Stated
 
 from .conftest import Unit, build_unit
 
@@ -62,12 +62,12 @@ def unit() -> Unit:
     return made
 
 
-def settings_of(unit: Unit, stated: dict[str, Any], **table: Any) -> dict[str, Any]:
-    return unit.settings | {
-        "table": unit.settings["table"] | {"gravity_accuracy_g": 1e-5} | table,
-        "certificate": Certificate.model_validate(stated).model_dump(),
-        "row": {"serial": "S1", "date": "2026-02-03"},
-    }
+def settings_of(unit: Unit, stated: dict[str, Any], **table: Any) -> Settings:
+    return unit.settings.replaced(
+        table=unit.settings.table.replaced(**{"gravity_accuracy_g": 1e-5} | table),
+        certificate=Certificate.model_validate(stated),
+        stated=Stated(row={"serial": "S1", "date": "2026-02-03"}),
+    )
 
 
 def report_of(unit: Unit, stated: dict[str, Any], **table: Any) -> dict[str, Any]:

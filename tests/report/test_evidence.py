@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from unit_settings import sheet_of
 
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.records import Recording
@@ -150,7 +151,7 @@ def noise_at_rest(samples: int, sigma: float = 0.003, interval: float = 0.12) ->
 
 def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_is_inflated() -> None:
     noise = noise_at_rest(900)
-    sheet = {"noise_density": 0.003 * np.sqrt(2 * 0.12), "bias_wander": 1e-4, "wander_time_s": 100.0}
+    sheet = sheet_of(noise_density=0.003 * np.sqrt(2 * 0.12), bias_wander=1e-4)
     wander = {"ratio": 0.3, "time_s": 50.0, "standard_deviation": 9e-4, "expected": 1e-4, "inflated": True}
     figure = allan("accelerometer", noise, sheet, wander)
     assert figure is not None
@@ -164,7 +165,7 @@ def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_
     )
     assert [text for _, text in figure.legend[3:]] == ["sensor file"]
     assert figure.svg.count('class="band') == 3
-    calm = allan("accelerometer", noise, sheet | {"noise_density": 1e-3}, wander | {"inflated": False})
+    calm = allan("accelerometer", noise, sheet.replaced(noise_density=1e-3), wander | {"inflated": False})
     assert calm is not None
     assert "inflated" not in calm.caption
     assert "1.5 × the value of the sensor file" in calm.finding
@@ -189,7 +190,7 @@ def test_the_rows_of_the_noise_give_intervals_or_upper_limits_and_say_what_is_to
 
 
 def test_noise_alone_stays_below_the_dashes_of_the_harmonics(unit: Unit) -> None:
-    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings["table"])[0]
+    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings.table)[0]
     rng, sigma = np.random.default_rng(21), np.full(3, SIGMA["accelerometer"])
     level = harmonic_noise(found, sigma, np.zeros(3), 100.0)
     above = 0
@@ -203,7 +204,7 @@ def test_noise_alone_stays_below_the_dashes_of_the_harmonics(unit: Unit) -> None
 
 
 def test_the_covariate_that_matters_comes_first_and_says_its_size(unit: Unit) -> None:
-    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings["table"])
+    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings.table)
     rng, sigma = np.random.default_rng(6), SIGMA["accelerometer"]
     noise = {"white": [sigma] * 3, "wander": [1e-4] * 3, "correlation_time_s": 100.0}
     made = []
@@ -228,7 +229,7 @@ def test_the_covariate_that_matters_comes_first_and_says_its_size(unit: Unit) ->
 
 
 def test_a_harmonic_above_the_noise_is_named(unit: Unit) -> None:
-    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings["table"])
+    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings.table)
     findings = [f.finding for f in residual_figures("accelerometer", found, None)]
     assert any(re.match(r"accel_\w: 2 cycles a turn on \w, 0.00\d+ g, above the noise", f) for f in findings)
 
@@ -275,7 +276,7 @@ def test_every_figure_of_the_page_says_its_finding(unit: Unit) -> None:
 )
 def test_white_noise_far_from_the_data_sheet_gets_a_likely_cause(factor: float, cause: str) -> None:
     noise = noise_at_rest(2000, factor * 1e-3 * np.sqrt(0.5 / 0.01), 0.01)
-    figure = allan("accelerometer", noise, {"noise_density": 1e-3}, None)
+    figure = allan("accelerometer", noise, sheet_of(noise_density=1e-3), None)
     assert figure is not None
     assert cause in figure.finding
     assert ("filter" in figure.finding) == (factor < 1.0)

@@ -9,12 +9,15 @@ from stage_files import documents, write_pack
 from pipeline.config.compose import Composer
 from pipeline.io.arrow import to_parquet
 from pipeline.pack import Pack
+from pipeline.settings import Stated
 from pipeline.stages import batch
+from pipeline.unit import STEPS
 
 
 def test_a_unit_that_fails_in_the_fit_shows_its_files_and_rests(tmp_path: Path) -> None:
     recordings = [r for r in hand_held("mpu6050", 3).recordings if r.role == "rests"]
-    part = Composer(tmp_path).unit("U1", ["procedure=multi_position", "sensor=mpu6050"]) | {"config_sha256": "0"}
+    settings = Composer(tmp_path).unit("U1", ["procedure=multi_position", "sensor=mpu6050"])
+    part = settings.replaced(stated=Stated(config_sha256="0")).only(STEPS["report"].settings)
     (tmp_path / "part.json").write_text(json.dumps({"units": {"U1": part}}))
     failure = {"unit": "U1", "stage": "fit/accelerometer", "code": "not_observable", "message": "alike", "file": None}
     files = {name: {} for name in batch.INPUTS["report"]} | {"calibration": {"U1.failed.json": failure}}

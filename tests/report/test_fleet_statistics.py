@@ -10,6 +10,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from scipy import stats
+from unit_settings import settings_of
 
 from pipeline.report.fleet import _missing_effects, fleet_statistics, parameter_table, write_parameters
 from pipeline.report.parameters import unit_parameters
@@ -153,7 +154,8 @@ def test_the_table_holds_every_parameter_with_its_uncertainty_and_unit(tmp_path:
     p = {f"b_{a}": {"value": 0.5, "unit": "g/degC", "expanded_uncertainty": 0.05} for a in "xyz"}
     document = {"accelerometer": fit | {"effects": [{"name": "bias_temperature", "parameters": p}]}, "gyroscope": None}
     rows = [{"unit": "U1", "lot": None, "pass": True, "accelerometer_error_after": 0.5}, {"unit": "U2"}]
-    write_parameters(tmp_path / "p.parquet", rows, parameter_table({"U1": unit_parameters(document, {}), "U2": []}))
+    parameters = unit_parameters(document, settings_of().sensor)
+    write_parameters(tmp_path / "p.parquet", rows, parameter_table({"U1": parameters, "U2": []}))
     table = pq.read_table(tmp_path / "p.parquet")
     first, second = table.to_pylist()
     assert first["accelerometer_bias_y"] == 2.0

@@ -21,7 +21,8 @@ from pipeline.report.chart import Figure, Panel, Samples, chart
 from pipeline.report.fleet import parameter_table, write_summary
 from pipeline.report.parameters import COLUMNS, summary_row, unit_parameters
 from pipeline.report.unit_page import render
-from pipeline.settings import Certificate
+from pipeline.settings import Certificate, Stated
+from pipeline.simulation.description import shipped_settings
 from pipeline.stages.calibration import judged
 
 from .conftest import SHEET, Unit, build_unit
@@ -104,11 +105,13 @@ def test_every_picture_has_a_text_alternative(page: str) -> None:
 
 def test_what_users_write_is_escaped(unit: Unit) -> None:
     hostile = "<script>alert(1)</script>"
+    table = unit.settings.table.replaced(name=hostile)
+    settings = unit.settings.replaced(table=table, stated=Stated(row={"note": hostile}))
     calibration = unit.calibration | {"unit": hostile, "software": {hostile: "1"}}
-    page = render(calibration, unit.validation, unit.diagnosis, unit.recordings, unit.settings | {"note": hostile})
+    page = render(calibration, unit.validation, unit.diagnosis, unit.recordings, settings)
     assert hostile not in page
     failed = calibration | {"status": "failed", "error": {"code": "bad_input", "message": hostile, "file": hostile}}
-    assert hostile not in render(failed, None, None, [], {})
+    assert hostile not in render(failed, None, None, [], settings)
     assert hostile not in campaign_page.render(hostile, [], [{"unit": hostile, "message": hostile, "code": "x"}])
 
 
@@ -202,9 +205,9 @@ def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_sum
 
 def test_every_place_counts_the_same_units_beyond_the_sensor_files_limits(unit: Unit, tmp_path: Path) -> None:
     """Two of four units: one by its bias, one by a cross-axis sensitivity; one is turned on the table, one is sound."""
-    sheet = {**SHEET, "bias": 0.1, "scale_factor": 0.1, "cross_axis": 0.02, "accept_implausible": 0}
-    settings = {**unit.settings, "sensor": {**unit.settings["sensor"], "accelerometer": sheet}}
-    settings |= {"certificate": Certificate(name="blank").model_dump()}
+    sheet = unit.settings.sensor.accelerometer.replaced(bias=0.1, scale_factor=0.1, cross_axis=0.02)
+    sensor = unit.settings.sensor.replaced(accelerometer=sheet)
+    settings = unit.settings.replaced(sensor=sensor, certificate=Certificate(name="blank"))
     turned = np.array([[0.995, -0.0998749, 0.0], [0.0998749, 0.995, 0.0], [0.0, 0.0, 1.0]])
     skew = np.eye(3) + 0.06 * (np.eye(3)[[1, 0, 2]] - np.diag([0.0, 0.0, 1.0]))
     given = {"turned": (0.0, turned), "biased": (-0.25, np.eye(3)), "sound": (0.0, np.eye(3)), "skew": (0.0, skew)}
@@ -220,10 +223,10 @@ def test_every_place_counts_the_same_units_beyond_the_sensor_files_limits(unit: 
     write_summary(folder / "summary.csv", summaries)
     read = read_summary(folder)
     assert [row["unit"] for row in read if row["accelerometer_beyond_limits"]] == counted
-    fitted = parameter_table({name: unit_parameters(c, {"accelerometer": sheet}) for name, c in found.items()})
+    fitted = parameter_table({name: unit_parameters(c, sensor) for name, c in found.items()})
     index = Text(campaign_page.render("bench", summaries, [], parameters=fitted)).text
     assert "accelerometer, beyond the sensor file's limits: biased , skew " in index
-    ((chart_of_units, _),) = campaign_page.strips(summaries, fitted)
+    (chart_of_units, _), _ = campaign_page.strips(summaries, fitted)
     assert "2 of 4 units are beyond the sensor file's limits; farthest: skew" in chart_of_units.finding
     told = outcome(folder, {}, of_this_run=False)
     assert "accelerometer, beyond the sensor file's limits: biased, skew\n" in told
@@ -301,10 +304,9 @@ def test_nothing_missing_is_not_green_beside_an_error_far_above_the_noise(
 
 
 def test_a_sensor_judged_on_the_samples_of_its_fit_is_marked_on_both_pages(unit: Unit) -> None:
-    validation, settings = copy.deepcopy((unit.validation, unit.settings))
+    validation, settings = copy.deepcopy(unit.validation), shipped_settings(table="hand").replaced(stated=Stated())
     reason = "no held-out recording holds readings of the gyroscope; judged on the samples of the fit"
     validation["gyroscope"] |= {"held_out": False, "reason": reason, "samples": 13}
-    settings["table"] = {"name": "none", "motion": "none"}
     page = render(unit.calibration, validation, unit.diagnosis, [], settings)
     card = re.search(r'<div class="card ([^"]*)">\s*<h2>Gyroscope</h2>(.*?)<a href', page, re.DOTALL)
     assert card is not None

@@ -1,10 +1,9 @@
 """Parameters with their uncertainties, read from a sensor's part of a calibration."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.linalg import polar
+from unit_settings import sheet_of
 
 from pipeline.model.calibration_file import beyond_limits, beyond_words
 from pipeline.records import FittedEffect, SensorCalibration
@@ -70,10 +69,10 @@ def test_a_parameter_far_to_either_side_is_beyond_its_limit_and_the_position_of_
     matrix, covariance = np.linalg.inv(K), np.eye(16)
     fit = SensorCalibration("gyroscope", np.array([0.0, sign * 5.0, 0.0]), matrix, (), (warm_up,), covariance)
     limits = {"bias": 2.0, "scale_factor": 0.03, "cross_axis": 0.02, "full_scale": 250.0}
-    config: dict[str, Any] = limits | {"effects": {"warm_up": 0.6, "warm_up_T": 600.0}}
+    sheet = sheet_of(**limits, effects={"warm_up": 0.6, "warm_up_T": 600.0})
     part = fit.to_json()
-    part |= {"beyond_limits": beyond_limits("gyroscope", part, config)}
-    rows = parameter_rows("gyroscope", part, config)
+    part |= {"beyond_limits": beyond_limits("gyroscope", part, sheet)}
+    rows = parameter_rows("gyroscope", part, sheet)
     assert {row["p"].name: row["share"] for row in rows if row["share"] > 1.0} == pytest.approx(
         {"bias_y": 2.5, "scale_factor_x": 2.0}
     )

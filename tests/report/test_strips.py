@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from scipy.linalg import polar
+from unit_settings import settings_of
 
 from pipeline.model.calibration_file import beyond_limits
 from pipeline.report.campaign_page import ENDS, strips
@@ -17,9 +18,8 @@ from pipeline.report.parameters import unit_parameters
 if TYPE_CHECKING:
     import pandas as pd
 
-SHEET: dict[str, Any] = {
-    "accelerometer": {"bias": 0.08, "scale_factor": 0.03, "cross_axis": 0.02, "full_scale": 2.0, "effects": {}}
-}
+SHEET = {"bias": 0.08, "scale_factor": 0.03, "cross_axis": 0.02, "full_scale": 2.0}
+SENSOR = settings_of(sensor={"accelerometer": SHEET}).sensor
 NAMES = ["Bias x", "Bias y", "Bias z", *(f"Scale factor error {a}" for a in "xyz")]
 NAMES += [f"Cross-axis sensitivity {axes}" for axes in ("xy", "xz", "yz")]
 
@@ -32,9 +32,9 @@ def campaign(count: int) -> tuple[list[dict[str, Any]], pd.DataFrame, np.ndarray
         bias, K = rng.normal(0.0, 0.06, 3), np.eye(3) + rng.normal(0.0, 0.01, (3, 3))
         part: dict[str, Any] = {"unit": "g", "bias": bias.tolist(), "matrix": np.linalg.inv(K).tolist(), "effects": []}
         part |= {"expanded_uncertainty": {"bias": [0.0] * 3, "matrix": [[0.0] * 3] * 3}}
-        part |= {"beyond_limits": beyond_limits("accelerometer", part, SHEET["accelerometer"])}
+        part |= {"beyond_limits": beyond_limits("accelerometer", part, SENSOR.accelerometer)}
         rows.append({"unit": f"U{i}", "status": "ok", "sensor": "mpu6050", "method": "staged"})
-        placed[f"U{i}"] = unit_parameters({"accelerometer": part, "gyroscope": None}, SHEET)
+        placed[f"U{i}"] = unit_parameters({"accelerometer": part, "gyroscope": None}, SENSOR)
         P = polar(K, side="left")[1]
         shares.append([*bias / 0.08, *(np.diag(P) - 1.0) / 0.03, *P[np.triu_indices(3, 1)] / 0.02])
     return rows, parameter_table(placed), np.array(shares)
