@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError
-from pipeline.estimation.monte_carlo import KEY
 from pipeline.estimation.uncertainty_budget import with_uncertainty
 from pipeline.model.measurement import Part, compensate
 from pipeline.records import (
     BASE_NAMES,
     FittedEffect,
+    MonteCarlo,
+    NotIncluded,
     Recording,
     SensorCalibration,
     UnitRecordings,
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from pipeline.records import StageResult
 
 SOURCE = "known effects"  # of the uncertainty budget
-# Values of a known parameter in a budget; others are 0.
-OF_KNOWN = {"degrees_of_freedom": None, "effective_degrees_of_freedom": None, "validated": True}
 
 
 def known_effects(sensor: str, settings: Mapping[str, Any]) -> tuple[FittedEffect, ...]:
@@ -95,22 +94,12 @@ def with_known(
     size, added = len(calibration.covariance), [p for effect in more for p in effect.parameters.values()]
     covariance = np.pad(calibration.covariance, (0, len(added)))
     freedom = np.pad(calibration.parameters.degrees_of_freedom, (0, len(added)), constant_values=np.inf)
-    budget = _of_parameters(calibration.budget, size, range(size + len(added)))
-    budget |= {"parameters": list(found.parameters.names), "units": list(found.parameters.units)}
-    if "estimate" in budget.get(KEY, {}):
-        budget[KEY]["estimate"] = found.parameters.values.tolist()
+    budget = calibration.budget.at([*range(size), *[None] * len(added)])
+    if isinstance(budget.monte_carlo, MonteCarlo):
+        budget = replace(budget, monte_carlo=replace(budget.monte_carlo, estimate=found.parameters.values))
     reason = f"no uncertainty of the known {_names(known)} is stated: zeros stand for it"
-    missing = [*calibration.budget["not_included"], {"source": SOURCE, "reason": reason}]
-    return with_uncertainty(found, covariance, freedom, budget, missing)
-
-
-def _of_parameters(value: Any, size: int, rows: Sequence[int], more: float | None = 0.0) -> Any:  # noqa: ANN401  (JSON)
-    """Return a budget of ``size`` parameters with those of ``rows``; a row from ``size`` on is a known parameter."""
-    if isinstance(value, dict):
-        return {key: _of_parameters(each, size, rows, OF_KNOWN.get(key, more)) for key, each in value.items()}
-    if isinstance(value, list) and len(value) == size and not isinstance(value[0], dict):
-        return [value[row] if row < size else more for row in rows]
-    return [_of_parameters(each, size, rows, more) for each in value] if isinstance(value, list) else value
+    budget = replace(budget, not_included=(*budget.not_included, NotIncluded(SOURCE, reason)))
+    return with_uncertainty(found, covariance, freedom, budget)
 
 
 def _names(known: Sequence[FittedEffect]) -> str:
@@ -129,10 +118,8 @@ def without_known(calibration: SensorCalibration, known: Sequence[FittedEffect])
             names += own.names
     rows = parameters.places(names)
     freedom = None if calibration.freedom is None else calibration.freedom[rows]
-    budget, covariance = (
-        _of_parameters(calibration.budget, len(parameters), rows.tolist()),
-        parameters.select(rows).covariance,
-    )
+    budget = calibration.budget and calibration.budget.at(rows.tolist())
+    covariance = parameters.select(rows).covariance
     return replace(calibration, effects=tuple(effects), covariance=covariance, freedom=freedom, budget=budget)
 
 

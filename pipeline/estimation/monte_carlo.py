@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.estimation.engine import Posterior, draw_normal
-from pipeline.records import AFTER_BASE, BIAS, MATRIX
+from pipeline.records import AFTER_BASE, BIAS, MATRIX, MONTE_CARLO, MonteCarlo
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 SEED = 101  # any number
 BATCH = 500  # trials drawn at a time, which bounds the memory
 TWO_DIGITS = 1_000_000  # trials
-KEY = "monte_carlo"
 NEWTONS = 6  # each squares the relative error of a step; one by a wide prior starts at some 0.5
 RANK = 3e-7  # of the largest singular value of unit columns, the root of 1e-13: the rounding of their products
 
@@ -96,7 +95,7 @@ def compare(
 
 def trials_of(settings: Mapping[str, Any]) -> int:
     """Return the number of trials by ``uncertainty.monte_carlo``; 0: none."""
-    return int((settings.get("uncertainty") or {}).get(KEY) or 0)
+    return int((settings.get("uncertainty") or {}).get(MONTE_CARLO) or 0)
 
 
 def through(posterior: Posterior, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
@@ -130,30 +129,27 @@ def with_trials(
             values = values + draw_normal(rng, source.covariance, len(values))
         drawn.append(values)
     estimate = calibration.parameters.values
-    budget = dict(calibration.budget or {})
-    expanded, digits = np.array(budget["expanded_uncertainty"]), 2 if trials >= TWO_DIGITS else 1
+    assert calibration.budget is not None  # noqa: S101  (see above)
+    expanded, digits = calibration.parameters.expanded_uncertainty, 2 if trials >= TWO_DIGITS else 1
     found = distribution_of(np.concatenate(drawn))
     against = compare(estimate, expanded, found, digits=digits)
     known = expanded > 0.0
-    validated = against.borne_out | ~known
-    budget[KEY] = {
-        "trials": trials,
-        "reason": None,
-        "seed": SEED,
-        "digits": digits,
-        "estimate": estimate.tolist(),
-        "expanded_uncertainty": expanded.tolist(),
-        "mean": found.estimate.tolist(),
-        "standard_uncertainty": found.standard_uncertainty.tolist(),
-        "low": found.symmetric[:, 0].tolist(),
-        "high": found.symmetric[:, 1].tolist(),
-        "tolerance": np.where(known, against.tolerance, 0.0).tolist(),
-        "d_low": against.low.tolist(),
-        "d_high": against.high.tolist(),
-        "validated": validated.tolist(),
-        "all_validated": bool(validated.all()),
-    }
-    return replace(calibration, budget=budget)
+    run = MonteCarlo(
+        trials=trials,
+        seed=SEED,
+        digits=digits,
+        estimate=estimate,
+        expanded_uncertainty=expanded,
+        mean=found.estimate,
+        standard_uncertainty=found.standard_uncertainty,
+        low=found.symmetric[:, 0],
+        high=found.symmetric[:, 1],
+        tolerance=np.where(known, against.tolerance, 0.0),
+        d_low=against.low,
+        d_high=against.high,
+        validated=against.borne_out | ~known,
+    )
+    return replace(calibration, budget=replace(calibration.budget, monte_carlo=run))
 
 
 def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Callable[[Values], Values]:

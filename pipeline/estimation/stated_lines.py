@@ -43,6 +43,7 @@ from pipeline.records import (
     SENSOR_UNITS,
     Contribution,
     Noise,
+    NotIncluded,
     Recording,
     SensorCalibration,
     Values,
@@ -89,18 +90,19 @@ def with_stated(
     lines += _rate_off_angle(calibration, recordings, settings.get("table") or {})
     lines += _of_bursts(calibration, recordings)
     known = {line.source.partition(" (")[0] for line in lines} | set(missing)
-    entries = [entry for entry in budget["not_included"] if entry["source"] not in known]
+    up_to: dict[str, dict[str, float]] = {}
+    entries = [entry for entry in budget.not_included if entry.source not in known]
     not_included = [_bounded(entry, settings.get("table") or {}, limits.get("clock_rate")) for entry in entries]
-    not_included += [{"source": source, "reason": reason} for source, reason in missing.items()]
-    if QUANTISATION in missing and noise is not None and noise.step is not None:
-        not_included[-1]["up_to"] = {"bias": 0.5 * float(noise.step.max())}
+    if noise is not None and noise.step is not None:
+        up_to = {QUANTISATION: {"bias": 0.5 * float(noise.step.max())}}
+    not_included += [NotIncluded(source, reason, up_to.get(source, {})) for source, reason in missing.items()]
     covariance = before + np.sum([line.covariance for line in lines], axis=0) if lines else before
-    old = np.array([np.inf if v is None else v for v in budget["effective_degrees_of_freedom"]])
+    old = calibration.parameters.degrees_of_freedom
     share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(before)), where=np.diag(before) > 0.0)
     freedom = np.where(np.diag(before) > 0.0, old * share**2, np.inf)
-    contributions = [*budget["contributions"], *(line.to_json() for line in lines)]
-    budget = {**budget, "contributions": contributions}
-    return with_uncertainty(calibration, covariance, freedom, budget, not_included)
+    every = (*budget.lines, *(line.line() for line in lines))
+    budget = replace(budget, lines=every, not_included=tuple(not_included))
+    return with_uncertainty(calibration, covariance, freedom, budget)
 
 
 def _rounding(noise: Noise | None, sensor: str) -> dict[str, str]:
@@ -118,7 +120,7 @@ def _counted_time(
     calibration: SensorCalibration, recordings: Sequence[Recording], limit_ppm: float | None
 ) -> list[Contribution]:
     """Return the line of an unstated time base, where times are a count of rows at the rate of the sensor's clock."""
-    unstated = any(map(_clock_unstated, (calibration.budget or {})["not_included"]))
+    unstated = calibration.budget and any(map(_clock_unstated, calibration.budget.not_included))
     used = (r for r in recordings if r.role in (calibration.sensor, "rests"))
     if not limit_ppm or not unstated or not any(note.code == "N-SYNTHTIME" for r in used for note in r.notes):
         return []
@@ -128,9 +130,8 @@ def _counted_time(
 
 def _of_bursts(calibration: SensorCalibration, recordings: Sequence[Recording]) -> list[Contribution]:
     """Return the line of samples in bursts, whose interval follows from their number and the duration."""
-    budget = calibration.budget or {}
-    timed = any(map(_clock_unstated, budget["not_included"]))
-    timed |= any(entry["source"] == TIME_BASE for entry in budget["contributions"])
+    timed = any(line.source == TIME_BASE for line in calibration.lines)
+    timed |= calibration.budget is not None and any(map(_clock_unstated, calibration.budget.not_included))
     used = [r.source["bursts"] for r in recordings if r.role in (calibration.sensor, "rests") and "bursts" in r.source]
     if not used or not timed:
         return []
@@ -155,20 +156,20 @@ def _rate_off_angle(
     return [clock_contribution(calibration, 1e6 * off / np.sqrt(3.0), RECTANGULAR, remark)]
 
 
-def _clock_unstated(entry: Mapping[str, Any]) -> bool:
-    return entry["source"] == TIME_BASE and "clock_accuracy_ppm is not stated" in entry["reason"]
+def _clock_unstated(entry: NotIncluded) -> bool:
+    return entry.source == TIME_BASE and "clock_accuracy_ppm is not stated" in entry.reason
 
 
-def _bounded(entry: Mapping[str, Any], table: Mapping[str, Any], limit_ppm: float | None) -> dict[str, Any]:
+def _bounded(entry: NotIncluded, table: Mapping[str, Any], limit_ppm: float | None) -> NotIncluded:
     """Return a source that is not included, with ``up_to`` where the size of its error has a known limit."""
-    if entry["source"] == GRAVITY and float(table.get("gravity_g") or 1.0) == 1.0:
-        return {"source": GRAVITY, "reason": IN_LOCAL_GRAVITY, "up_to": {"matrix": GRAVITY_ON_EARTH}}
+    if entry.source == GRAVITY and float(table.get("gravity_g") or 1.0) == 1.0:
+        return NotIncluded(GRAVITY, IN_LOCAL_GRAVITY, {"matrix": GRAVITY_ON_EARTH})
     if _clock_unstated(entry) and limit_ppm:
-        reason = f"{entry['reason']}; the sensor file states {limit_ppm:g} ppm for times by the sensor's own clock"
-        return {"source": TIME_BASE, "reason": reason, "up_to": {"matrix": 1e-6 * limit_ppm}}
-    if entry["reason"].startswith("not in the model"):  # Earth's rotation
-        return {**entry, "up_to": {"bias": EARTH_RATE_DPS}}
-    return dict(entry)
+        reason = f"{entry.reason}; the sensor file states {limit_ppm:g} ppm for times by the sensor's own clock"
+        return NotIncluded(TIME_BASE, reason, {"matrix": 1e-6 * limit_ppm})
+    if entry.reason.startswith("not in the model"):  # Earth's rotation
+        return replace(entry, up_to={"bias": EARTH_RATE_DPS})
+    return entry
 
 
 def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]:

@@ -32,14 +32,14 @@ from pipeline.records import (
     NORMAL,
     RECTANGULAR,
     SENSOR_UNITS,
+    Budget,
     Contribution,
     FittedEffect,
+    NotIncluded,
     SensorCalibration,
     Values,
     base_units,
     base_values,
-    coverage_factor,
-    finite,
 )
 
 if TYPE_CHECKING:
@@ -173,15 +173,10 @@ def combined(
             np.array([c.standard_uncertainty for c in contributions]),
             np.array([c.degrees_of_freedom for c in contributions]),
         )
-    head = {
-        "parameters": list(parameters.names),
-        "units": list(parameters.units),
-        "contributions": [c.to_json() for c in contributions],
-    }
     reasons = {**not_included, "repeatability": f"{NOT_STATED}, and compare"}
     lines = {c.source for c in contributions}
-    missing = [{"source": source, "reason": reason} for source, reason in reasons.items() if source not in lines]
-    return with_uncertainty(calibration, covariance, freedom, head, missing)
+    missing = tuple(NotIncluded(source, reason) for source, reason in reasons.items() if source not in lines)
+    return with_uncertainty(calibration, covariance, freedom, Budget(tuple(c.line() for c in contributions), missing))
 
 
 def budgeted(  # noqa: PLR0917  (what a fit on a table is)
@@ -233,10 +228,10 @@ def covariance_without_reference(calibration: SensorCalibration) -> Values:
     Both scale the matrix, ``dM = M e``, and the reference equally, so that held-out errors do not contain them.
     """
     out = calibration.parameters.covariance.copy()
-    for line in (calibration.budget or {}).get("contributions", ()):
-        if line["source"] in (GRAVITY, TIME_BASE):
+    for line in calibration.lines:
+        if line.source in (GRAVITY, TIME_BASE):
             shared = np.zeros(len(out))
-            shared[MATRIX] = np.sign(calibration.matrix.ravel()) * line["contribution"][MATRIX]
+            shared[MATRIX] = np.sign(calibration.matrix.ravel()) * line.standard_uncertainty[MATRIX]
             out -= np.outer(shared, shared)
     return out
 
@@ -247,12 +242,11 @@ def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Val
     ``shared``: a part of the readings' contribution that is also counted for the bench.
     """
     C = calibration.parameters.covariance
-    lines = (calibration.budget or {}).get("contributions", [])
     of_bench = np.zeros(len(C))
-    for line in lines:
-        part, whole = np.square(line["parts"].get(shared, 0.0)), np.square(line["contribution"])
+    for line in calibration.lines:
+        part, whole = np.square(line.parts.get(shared, 0.0)), np.square(line.standard_uncertainty)
         of_bench += np.where(part > BY_CHANCE * whole, part, 0.0)
-        of_bench += whole * (line["type"] == "B" and line["source"] != LIMIT)
+        of_bench += whole * (line.kind == "B" and line.source != LIMIT)
     share = np.clip(of_bench / np.maximum(np.diag(C), 1e-300), 0.0, 1.0)
     return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
 
@@ -288,25 +282,12 @@ def effect_parameters(
 
 
 def with_uncertainty(
-    calibration: SensorCalibration,
-    covariance: Values,
-    freedom: Values,
-    budget: Mapping[str, Any],
-    not_included: Sequence[Mapping[str, Any]],
+    calibration: SensorCalibration, covariance: Values, freedom: Values, budget: Budget
 ) -> SensorCalibration:
-    """Return a calibration with a new covariance, and with effects and budget that follow from it."""
-    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    factors = coverage_factor(freedom)
-    known = freedom[u > 0.0]
-    document = {
-        **budget,
-        "standard_uncertainty": u.tolist(),
-        "effective_degrees_of_freedom": finite(freedom),
-        "coverage_factor": factors.tolist(),
-        "expanded_uncertainty": (factors * u).tolist(),
-        "not_included": list(not_included),
-    }
-    expanded, effects = iter((factors * u).tolist()[AFTER_BASE]), []
+    """Return a calibration with a new budget and covariance, and with effects that follow from it."""
+    complete = replace(calibration, covariance=covariance, freedom=freedom).parameters
+    known = freedom[complete.standard_uncertainty > 0.0]
+    expanded, effects = iter(complete.expanded_uncertainty.tolist()[AFTER_BASE]), []
     for effect in calibration.effects:
         parameters = {n: {**p, "expanded_uncertainty": next(expanded) or None} for n, p in effect.parameters.items()}
         effects.append(replace(effect, parameters=parameters))
@@ -316,5 +297,5 @@ def with_uncertainty(
         covariance=covariance,
         degrees_of_freedom=float(known.min()) if len(known) else float("inf"),
         freedom=freedom,
-        budget=document,
+        budget=budget,
     )

@@ -1,4 +1,4 @@
-"""The calibration of one sensor after a stage of a fit, the lines of its uncertainty budget, and their JSON form.
+"""The calibration of one sensor after a stage of a fit, and its JSON form.
 
 reading = bias + matrix^-1 @ truth + effects + noise
 truth   = matrix @ (reading - bias - effects)
@@ -6,11 +6,12 @@ truth   = matrix @ (reading - bias - effects)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
+from pipeline.records.budget import Budget, BudgetLine, finite, unlimited
 from pipeline.records.parameters import (
     BASE_NAMES,
     BIAS,
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = 2  # of published documents; the keys of each version are in pipeline/schemas
 READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null
-NORMAL, RECTANGULAR = "normal", "rectangular"
-LIMIT = "misalignment not determined by the rests: limit of the sensor file"  # a source of the uncertainty budget
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class SensorCalibration:
     degrees_of_freedom: float = float("inf")  # smallest of all parameters
     converged: bool = True
     freedom: Values | None = None  # (p,), effective degrees of freedom; None: ``degrees_of_freedom`` for all
-    budget: dict[str, Any] | None = None  # as published; see pipeline.estimation.uncertainty_budget
+    budget: Budget | None = None
     convergence: dict[str, Any] | None = None
 
     @property
@@ -98,6 +97,11 @@ class SensorCalibration:
             np.zeros((len(names), len(names))) if self.covariance is None else self.covariance,
             np.full(len(names), self.degrees_of_freedom) if self.freedom is None else self.freedom,
         )
+
+    @property
+    def lines(self) -> tuple[BudgetLine, ...]:
+        """The lines of the budget; empty without a budget."""
+        return self.budget.lines if self.budget else ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the part of ``calibrations/<unit>.json`` for this sensor."""
@@ -120,13 +124,13 @@ class SensorCalibration:
             ],
             "converged": self.converged,
             "convergence": self.convergence,
-            "uncertainty_budget": self.budget,
+            "uncertainty_budget": self.budget and self.budget.to_json(parameters),
         }
 
     @classmethod
     def from_json(cls, sensor: str, data: dict[str, Any]) -> Self:
         """Return the object from the value of ``to_json``; null in the covariance: not known."""
-        freedom = data.get("effective_degrees_of_freedom")
+        freedom, budget = data.get("effective_degrees_of_freedom"), data.get("uncertainty_budget")
         covariance = np.array(data["covariance"]["values"], float)
         return cls(
             sensor=sensor,
@@ -137,8 +141,8 @@ class SensorCalibration:
             covariance=None if np.isnan(covariance).all() else np.nan_to_num(covariance, copy=False),
             degrees_of_freedom=float("inf") if data["degrees_of_freedom"] is None else data["degrees_of_freedom"],
             converged=data["converged"],
-            freedom=None if freedom is None else np.array([np.inf if nu is None else nu for nu in freedom]),
-            budget=data.get("uncertainty_budget"),
+            freedom=None if freedom is None else unlimited(freedom),
+            budget=budget and Budget.from_json(budget),
             convergence=data.get("convergence"),
         )
 
@@ -171,52 +175,3 @@ def calibrated(fits: Mapping[str, Fit]) -> dict[str, SensorCalibration | None]:
 def _shaped(values: Values) -> dict[str, Any]:
     """Return values of all parameters in the shapes of bias and matrix."""
     return {"bias": values[BIAS].tolist(), "matrix": matrix_of(values).tolist()}
-
-
-@dataclass(frozen=True)
-class Contribution:
-    """One line of an uncertainty budget: the share of one source (JCGM 100:2008, 8 and annex H)."""
-
-    source: str
-    kind: str  # A (from the scatter of these recordings) or B (from other knowledge)
-    distribution: str  # assumed for the input
-    covariance: Values  # (p, p), of the parameters, from this source only
-    degrees_of_freedom: Values  # (p,)
-    input_uncertainty: float | None = None  # standard uncertainty; None if the source is not a single quantity
-    input_unit: str = ""
-    independent: int = 1  # number of independent quantities with this uncertainty (stops of a table, axes)
-    parts: dict[str, Values] = field(default_factory=dict)  # known components, (p,) standard uncertainties
-    remark: str = ""
-
-    @property
-    def standard_uncertainty(self) -> Values:
-        """Standard uncertainty of each parameter from this source: (p,) array."""
-        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
-
-    def of(self, selected: slice) -> Contribution:
-        """Return the contribution to the selected parameters."""
-        parts = {name: values[selected] for name, values in self.parts.items()}
-        freedom = self.degrees_of_freedom[selected]
-        return replace(self, covariance=self.covariance[selected, selected], degrees_of_freedom=freedom, parts=parts)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the published line; the sensitivity is contribution / input uncertainty."""
-        contribution, u = self.standard_uncertainty, self.input_uncertainty
-        return {
-            "source": self.source,
-            "type": self.kind,
-            "distribution": self.distribution,
-            "standard_uncertainty": u,
-            "unit": self.input_unit,
-            "independent_inputs": self.independent,
-            "sensitivity": (contribution / u).tolist() if u else None,
-            "contribution": contribution.tolist(),
-            "degrees_of_freedom": finite(self.degrees_of_freedom),
-            "parts": {name: values.tolist() for name, values in self.parts.items()},
-            "remark": self.remark,
-        }
-
-
-def finite(values: Values) -> list[float | None]:
-    """Return a list for JSON, with None in place of values that are not finite."""
-    return [float(v) if np.isfinite(v) else None for v in values]

@@ -375,7 +375,8 @@ def _sensor_with_prior(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSO
     ]
     stage = StageResult("lot_prior", {}, None, None, {"lot": prior.lot, "siblings": prior.siblings})
     after = with_values(replace(fit, stages=(*fit.stages, stage)), found.values, lines)
-    budget = {**(after.budget or {}), "not_included": (part.get("uncertainty_budget") or {}).get("not_included", [])}
+    not_included = fit.budget.not_included if fit.budget else ()
+    budget = after.budget and replace(after.budget, not_included=not_included)
     added = {
         "parameters": [name for name, k in zip(fit.parameters.names, known, strict=True) if k],
         "mean": prior.predicted.mean.tolist(),

@@ -176,18 +176,18 @@ def _of_parameters(calibration: SensorCalibration, table: Mapping[str, Any]) -> 
     exact, so that the degrees of freedom of the remaining variance follow by Welch and Satterthwaite.
     """
     parameters, size = calibration.parameters, len(calibration.parameters)
-    lines = (calibration.budget or {}).get("contributions", ())
     out, nu = np.zeros((size + 1, size + 1)), np.full(size + 1, np.inf)
     if calibration.covariance is not None:
         covariance = covariance_without_reference(calibration)
+        of_lines = [line.parts for line in calibration.lines]
         total, remaining = np.diag(calibration.covariance), np.diag(covariance)
-        lack = np.sum([np.square(line["parts"][LACK_OF_FIT]) for line in lines if LACK_OF_FIT in line["parts"]], axis=0)
+        lack = np.sum([np.square(parts[LACK_OF_FIT]) for parts in of_lines if LACK_OF_FIT in parts], axis=0)
         scale = np.sqrt(np.clip(1.0 - lack / np.where(remaining > 0.0, remaining, 1.0), 0.0, 1.0)) * np.ones(size)
         out[:size, :size] = covariance * scale[:, None] * scale
         share = np.clip(remaining / np.where(total > 0.0, total, 1.0), 0.0, 1.0)
         with np.errstate(invalid="ignore"):  # of a parameter without variance
             nu[:size] = np.where(share > 0.0, np.maximum(parameters.degrees_of_freedom * share**2, 1.0), np.inf)
-    if calibration.sensor == "gyroscope" and not any(line["source"] == "table rate" for line in lines):
+    if calibration.sensor == "gyroscope" and not any(line.source == "table rate" for line in calibration.lines):
         out[size, size] = float(table.get("rate_accuracy") or 0.0) ** 2
     return out, nu
 

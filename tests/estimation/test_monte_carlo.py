@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
-from pipeline.records import LIMIT, SensorCalibration
+from pipeline.records import LIMIT, Budget, SensorCalibration
 from pipeline.report.pages import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
@@ -24,10 +25,10 @@ PARAMETERS = 12
 
 def stated(u: float, value: float = 0.0) -> SensorCalibration:
     """A calibration of which only bias x is uncertain, with a budget that says so."""
-    expanded = [1.96 * u, *[0.0] * (PARAMETERS - 1)]
-    return SensorCalibration(
-        "accelerometer", bias=np.array([value, 0.0, 0.0]), budget={"expanded_uncertainty": expanded}
-    )
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    covariance[0, 0] = u**2
+    bias = np.array([value, 0.0, 0.0])
+    return SensorCalibration("accelerometer", bias=bias, covariance=covariance, budget=Budget((), ()))
 
 
 def drawn(function: Any, u: float) -> Any:
@@ -42,7 +43,7 @@ def drawn(function: Any, u: float) -> Any:
 
 
 def test_a_linear_model_is_validated() -> None:
-    run = (with_trials(stated(0.02), drawn(lambda e: e, 0.02), 40_000).budget or {})["monte_carlo"]
+    run = with_trials(stated(0.02), drawn(lambda e: e, 0.02), 40_000).to_json()["uncertainty_budget"]["monte_carlo"]
     assert run["all_validated"]
     assert run["standard_uncertainty"][0] == pytest.approx(0.02, rel=0.02)
     assert run["high"][0] == pytest.approx(1.96 * 0.02, rel=0.02)
@@ -50,14 +51,14 @@ def test_a_linear_model_is_validated() -> None:
 
 def test_a_square_is_not_validated_and_its_interval_is_that_of_chi_squared() -> None:
     found = with_trials(stated(0.02), drawn(lambda e: 10.0 * e**2, 0.02), 40_000)
-    run = (found.budget or {})["monte_carlo"]
+    run = found.to_json()["uncertainty_budget"]["monte_carlo"]
     assert not run["validated"][0]
     assert run["high"][0] == pytest.approx(10.0 * 0.02**2 * 5.0239, rel=0.05)  # 97.5 % of chi squared, one degree
     assert run["low"][0] < 1e-5
 
 
 def test_the_same_run_gives_the_same_numbers() -> None:
-    first, second = (with_trials(stated(0.02), drawn(np.sinh, 0.02), 2000).budget for _ in range(2))
+    first, second = (with_trials(stated(0.02), drawn(np.sinh, 0.02), 2000).to_json() for _ in range(2))
     assert first == second
 
 
@@ -98,20 +99,22 @@ def test_methods_by_hand_and_on_a_table_run_it_beside_their_budget() -> None:
         reference_least_squares.fit("accelerometer", turns, None, asked(settings)),
     ]
     for calibration in found:
-        budget = calibration.budget or {}
+        budget = calibration.to_json()["uncertainty_budget"]
         run, U = budget["monte_carlo"], np.array(budget["expanded_uncertainty"])
         half = 0.5 * (np.array(run["high"]) - np.array(run["low"]))
         known = U > 0.0
         ratio = (half[known] / U[known]) / np.median(half[known] / U[known])
         assert np.abs(np.log(ratio)).max() < 0.5
-        page = monte_carlo_of(calibration.to_json()["uncertainty_budget"])
+        document = calibration.to_json()
+        assert SensorCalibration.from_json(calibration.sensor, json.loads(json.dumps(document))).to_json() == document
+        page = monte_carlo_of(document["uncertainty_budget"])
         assert page is not None
         assert page["rows"] == np.flatnonzero(known).tolist()
 
 
 def test_in_six_positions_the_squares_of_the_misalignments_are_in_both() -> None:
     unit = hand_held("mpu6050", 3, procedure="six_positions", holdout_every=0)
-    budget = nonlinear_least_squares.fit(unit.recordings, None, asked(unit.settings)).budget or {}
+    budget = nonlinear_least_squares.fit(unit.recordings, None, asked(unit.settings)).to_json()["uncertainty_budget"]
     run, u = budget["monte_carlo"], np.array(budget["standard_uncertainty"])
     known = u > 0.0
     shift = np.array(run["mean"]) - run["estimate"]  # half the variance of a misalignment, which is not corrected
@@ -122,4 +125,7 @@ def test_in_six_positions_the_squares_of_the_misalignments_are_in_both() -> None
 
 def test_without_the_switch_there_is_no_run() -> None:
     unit = hand_held("mpu6050", 3)
-    assert "monte_carlo" not in (nonlinear_least_squares.fit(unit.recordings, None, unit.settings).budget or {})
+    assert (
+        "monte_carlo"
+        not in nonlinear_least_squares.fit(unit.recordings, None, unit.settings).to_json()["uncertainty_budget"]
+    )

@@ -90,10 +90,11 @@ def test_a_mounting_is_as_uncertain_for_the_gyroscope_as_gravity_leaves_it() -> 
     by_gravity = fit("accelerometer", recordings, None, settings())
     found = fit("gyroscope", recordings, None, settings())
     assert by_gravity.covariance is not None
-    assert found.budget is not None
     of_turns = np.sqrt(np.diag(by_gravity.covariance)[12:]).reshape(6, 3)[3:]
     across = ~np.eye(3, dtype=bool)  # a rotation about the turn axis does not change the rate
-    (line,) = (entry for entry in found.budget["contributions"] if entry["source"] == "mounting")
+    (line,) = (
+        entry for entry in found.to_json()["uncertainty_budget"]["contributions"] if entry["source"] == "mounting"
+    )
     of_matrix = np.array(line["contribution"][3:12]).reshape(3, 3)[across]
     assert of_matrix.max() < 1.2 * np.radians(of_turns[across].max())
     assert of_matrix.min() > 0.5 * np.radians(of_turns[across].min())
@@ -118,8 +119,7 @@ def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(
         assert (held_part["value"], held_part["expanded_uncertainty"]) == (0.0, None)
         assert across["expanded_uncertainty"] > 1.9 * wider[-1] > 0.0 == wider[-2]
         assert tilted.stages[-1].parameters["table_tilt.d_x"]["standard_uncertainty"] is None
-        assert tilted.budget is not None
-        why = {line["source"]: line["reason"] for line in tilted.budget["not_included"]}
+        why = {line["source"]: line["reason"] for line in tilted.to_json()["uncertainty_budget"]["not_included"]}
         assert why["levelling"].startswith("table_tilt estimates the component across the shaft alone")
         assert abs(d[1]) < 4.0 * wider[-1]  # the part across the shaft is estimated; the truth is 0
         whole["table"]["levelling_deg"] = 0.1

@@ -44,13 +44,13 @@ def sheet(**stated: Any) -> dict[str, Any]:
 
 
 def line(found: SensorCalibration, source: str) -> dict[str, Any]:
-    lines = (found.budget or {})["contributions"]
+    lines = found.to_json()["uncertainty_budget"]["contributions"]
     return next(entry for entry in lines if entry["source"] == source)
 
 
 def test_what_is_not_stated_is_named_with_the_key_that_states_it(fitted: Any) -> None:
     found = with_stated(*fitted, sheet())
-    left = {entry["source"]: entry["reason"] for entry in (found.budget or {})["not_included"]}
+    left = {entry["source"]: entry["reason"] for entry in found.to_json()["uncertainty_budget"]["not_included"]}
     assert "sensor.gyroscope.repeatability_bias" in left["repeatability"]
     assert "no accuracy of the thermometer" in left["temperature"]
     assert np.array_equal(found.covariance, fitted[0].covariance)
@@ -73,7 +73,7 @@ def test_repeatability_adds_in_quadrature_and_has_infinite_degrees_of_freedom(fi
     assert u[:3] == pytest.approx(np.hypot(was[:3], 0.02))
     diagonal = [3, 7, 11]
     assert u[diagonal] == pytest.approx(np.hypot(was[diagonal], 3e-4 * np.diag(before.matrix)), rel=1e-9)
-    assert "repeatability" not in {e["source"] for e in (found.budget or {})["not_included"]}
+    assert "repeatability" not in {e["source"] for e in found.to_json()["uncertainty_budget"]["not_included"]}
     nu = 0.02**4 / was[0] ** 4 * before.freedom[0]
     assert found.freedom is not None
     assert found.freedom[0] > nu  # Welch and Satterthwaite: (u / u_A)^4 nu_A
@@ -96,12 +96,14 @@ def test_with_a_fitted_effect_only_the_thermometer_counts_by_what_was_found(fitt
     values = {f"b_T_{a}": {"value": v, "unit": "deg/s/degC"} for a, v in zip("xyz", (0.01, -0.02, 0.03), strict=True)}
     calibration, recordings = fitted
     size = 15
-    budget = {**(calibration.budget or {}), "contributions": []}
-    budget["effective_degrees_of_freedom"] = [None] * size
     covariance = np.zeros((size, size))
     covariance[:12, :12] = calibration.covariance
     warm = replace(
-        calibration, covariance=covariance, budget=budget, effects=(FittedEffect("bias_temperature", values),)
+        calibration,
+        covariance=covariance,
+        freedom=np.full(size, np.inf),
+        budget=replace(calibration.budget, lines=()),
+        effects=(FittedEffect("bias_temperature", values),),
     )
     found = with_stated(warm, recordings, sheet(accuracy=0.5))
     assert line(found, "temperature (bias)")["contribution"][:3] == pytest.approx([0.005, 0.01, 0.015])
@@ -110,7 +112,7 @@ def test_with_a_fitted_effect_only_the_thermometer_counts_by_what_was_found(fitt
 def test_without_a_thermometer_in_the_recordings_that_is_said(fitted: Any) -> None:
     cold = [replace(r, temperature=None) for r in fitted[1]]
     found = with_stated(fitted[0], cold, sheet(accuracy=0.5))
-    left = {entry["source"]: entry["reason"] for entry in (found.budget or {})["not_included"]}
+    left = {entry["source"]: entry["reason"] for entry in found.to_json()["uncertainty_budget"]["not_included"]}
     assert left["temperature"] == "the recordings hold no temperature"
 
 
@@ -125,7 +127,7 @@ def by_angle(sensor: str, *, counted: bool, **table: float) -> tuple[SensorCalib
     turns = [replace(r, table_rate=None, notes=(note,) if counted else ()) for r in turns]
     config = settings(**table) | {"sensor": {sensor: {**SHEETS[sensor], "effects": {"clock_rate": LIMIT_PPM}}}}
     found = with_stated(reference_least_squares.fit(sensor, turns, None, config), turns, config)
-    return found, {entry["source"]: entry for entry in (found.budget or {})["not_included"]}
+    return found, {entry["source"]: entry for entry in found.to_json()["uncertainty_budget"]["not_included"]}
 
 
 def test_rows_counted_at_a_stated_rate_have_the_error_of_the_sensors_clock() -> None:
@@ -159,13 +161,15 @@ def test_the_interval_of_samples_in_bursts_is_as_uncertain_as_their_number_leave
     added = found.covariance - with_stated(fit, plain, config).covariance
     m = fit.matrix.ravel()
     assert added[3:12, 3:12] == pytest.approx(3e-4**2 * np.outer(m, m), rel=1e-6, abs=1e-12)
-    assert any(entry["source"] == "time base" for entry in found.budget["not_included"])
+    assert any(entry["source"] == "time base" for entry in found.to_json()["uncertainty_budget"]["not_included"])
     stated = settings(clock_accuracy_ppm=20.0) | {"sensor": config["sensor"]}
     both = with_stated(reference_least_squares.fit("gyroscope", turns, None, stated), turns, stated)
     assert line(both, "interval of bursts")["standard_uncertainty"] == pytest.approx(300.0)
     rated = [replace(r, source=t.source) for r, t in zip(bench.turns_at([60.0, -60.0]), turns, strict=False)]
     by_rate = with_stated(reference_least_squares.fit("gyroscope", rated, None, config), rated, config)
-    assert "interval of bursts" not in {entry["source"] for entry in by_rate.budget["contributions"]}
+    assert "interval of bursts" not in {
+        entry["source"] for entry in by_rate.to_json()["uncertainty_budget"]["contributions"]
+    }
 
 
 def test_a_rate_that_is_not_the_change_of_its_angle_is_in_the_uncertainty() -> None:

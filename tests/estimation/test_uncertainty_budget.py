@@ -124,7 +124,7 @@ def test_what_a_wrong_table_does_to_a_fit_is_what_its_budget_says(
 ) -> None:
     recordings, stages = recordings_of(sensor), STAGES[method][sensor]
     found = run_stages(sensor, stages, recordings, settings(**{key: SMALL}))
-    lines = {line["source"]: line for line in found.budget["contributions"]}
+    lines = {line["source"]: line for line in found.to_json()["uncertainty_budget"]["contributions"]}
     stated = np.array(lines[source]["contribution"])[:12]
     squares = np.zeros(12)
     for change in WRONG[sensor, source, key]:
@@ -139,7 +139,7 @@ def test_a_wrong_azimuth_changes_a_gyroscope_on_a_table_with_a_place_as_the_budg
     stages, u, place = STAGES["reference"]["gyroscope"], 0.1, {"latitude_deg": 40.0, "azimuth_deg": 25.0}
     recordings = recordings_of("gyroscope")
     found = run_stages("gyroscope", stages, recordings, settings(**place, azimuth_accuracy_deg=u))
-    lines = {line["source"]: line["contribution"] for line in found.budget["contributions"]}
+    lines = {line["source"]: line["contribution"] for line in found.to_json()["uncertainty_budget"]["contributions"]}
     turned = run_stages("gyroscope", stages, recordings, settings(**place | {"azimuth_deg": 25.0 + u}))
     stated = np.array(lines["Earth's rotation"])
     assert np.abs(values(turned) - values(found)) == pytest.approx(stated, rel=5e-3, abs=5e-3 * stated.max())
@@ -152,7 +152,7 @@ def test_a_wrong_clock_changes_a_gyroscope_whose_table_logs_the_angle_alone_as_t
     stages, ppm = STAGES[method]["gyroscope"], 1000.0
     recordings = [replace(r, table_rate=None) for r in recordings_of("gyroscope")]
     found = run_stages("gyroscope", stages, recordings, settings(clock_accuracy_ppm=ppm))
-    stated = next(line for line in found.budget["contributions"] if line["source"] == "time base")["contribution"]
+    stated = next(line for line in found.lines if line.source == "time base").standard_uncertainty
     slow = [replace(r, time_ns=np.round(r.time_ns / (1.0 + 1e-6 * ppm)).astype(np.int64)) for r in recordings]
     change = values(run_stages("gyroscope", stages, slow, settings())) - values(found)
     assert np.abs(change) == pytest.approx(stated, rel=5e-3, abs=1e-4 * max(stated))
@@ -162,7 +162,7 @@ def test_a_wrong_clock_changes_a_gyroscope_whose_table_logs_the_angle_alone_as_t
     aligned = [replace(r, source={"table_clock": {"drift_ppm": ppm}}) for r in slow]
     right = run_stages("gyroscope", stages, aligned, settings())
     assert values(right) == pytest.approx(values(found), abs=2e-7)
-    missing = {entry["source"]: entry["reason"] for entry in right.budget["not_included"]}
+    missing = {entry["source"]: entry["reason"] for entry in right.to_json()["uncertainty_budget"]["not_included"]}
     assert "table's own clock" in missing["time base"]
 
 
@@ -191,12 +191,12 @@ def test_the_lines_of_a_budget_add_up_to_what_the_calibration_states() -> None:
 
 def test_what_nobody_has_stated_is_named_and_left_out() -> None:
     found = run_stages("accelerometer", ["reference_least_squares"], recordings_of("accelerometer", 8e-4), settings())
-    missing = {entry["source"]: entry["reason"] for entry in found.budget["not_included"]}
+    missing = {entry["source"]: entry["reason"] for entry in found.to_json()["uncertainty_budget"]["not_included"]}
     assert missing["levelling"] == "table.levelling_deg is not stated"
     assert {"table angle", "local gravity", "wobble of the table's axes", "repeatability", "temperature"} <= set(
         missing
     )
-    assert [line["source"] for line in found.budget["contributions"]] == ["noise of the readings"]
+    assert [line.source for line in found.lines] == ["noise of the readings"]
 
 
 @pytest.mark.parametrize(("counts_per_unit", "own_line"), [(16384.0, False), (200.0, True)])
@@ -211,8 +211,8 @@ def test_rounding_is_a_part_of_the_noise_only_where_the_noise_reaches_half_a_cou
         for r in recordings_of("accelerometer", 8e-4)
     ]
     found = run_stages("accelerometer", ["reference_least_squares"], recordings, config)
-    lines = {line["source"]: line for line in found.budget["contributions"]}
-    missing = {entry["source"]: entry["reason"] for entry in found.budget["not_included"]}
+    lines = {line["source"]: line for line in found.to_json()["uncertainty_budget"]["contributions"]}
+    missing = {entry["source"]: entry["reason"] for entry in found.to_json()["uncertainty_budget"]["not_included"]}
     assert ("quantisation" in lines) == own_line
     assert ("quantisation" in missing) != own_line
     if own_line:

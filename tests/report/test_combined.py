@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from pipeline.records import Contribution, SensorCalibration
+from pipeline.records import Budget, Contribution, SensorCalibration
 from pipeline.report.combined import combined_calibrations, repeatability
 
 TRUTH = np.concatenate([[0.02, -0.01, 0.03], np.eye(3).ravel()])
@@ -24,7 +24,7 @@ def document(unit: str, values: np.ndarray, own_u: float = OWN_U, **changes: Any
     ]
     found = SensorCalibration(
         "accelerometer", values[:3], values[3:].reshape(3, 3), covariance=own + bench, degrees_of_freedom=50.0,
-        budget={"contributions": [line.to_json() for line in lines]},
+        budget=Budget(tuple(line.line() for line in lines), ()),
     )  # fmt: skip
     inputs = [{"file": f"{unit}.csv", "sha256": unit}]
     same = {"status": "ok", "sensor": "mpu6050", "method": "m", "table": "t"}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.records import Contribution, FittedEffect, SensorCalibration
+from pipeline.records import Budget, Contribution, FittedEffect, SensorCalibration
 from pipeline.report.combined import calibration_with_prior, estimates, priors_of
 
 TRUTH = np.concatenate([[0.02, -0.01, 0.03], np.eye(3).ravel()])
@@ -46,7 +46,7 @@ def document(
     found = SensorCalibration(
         SENSOR, values[:3], values[3:12].reshape(3, 3), effects=fitted, covariance=own + bench,
         freedom=np.full(size, 50.0 * 10.0**2), degrees_of_freedom=5000.0,
-        budget={"contributions": [line.to_json() for line in lines], "not_included": []},
+        budget=Budget(tuple(line.line() for line in lines), ()),
     )  # fmt: skip
     same = {"sensor": "mpu6050", "table": "t", "procedure": "p", "methods": {SENSOR: "m"}}
     return {"unit": unit, **same, SENSOR: found.to_json(), "gyroscope": None}

@@ -61,7 +61,7 @@ def coverage(kind: str, limit: float, units: int, seed: int) -> dict[str, Any]:
             continue
         L = np.linalg.cholesky((M.T @ M)[::-1, ::-1])[::-1, ::-1].T  # L^T L = M^T M
         error = np.concatenate([found.bias - bias, (found.matrix - L).ravel()])[LOWER]
-        inside.append(np.abs(error) < np.array((found.budget or {})["expanded_uncertainty"])[LOWER])
+        inside.append(np.abs(error) < np.array(found.to_json()["uncertainty_budget"]["expanded_uncertainty"])[LOWER])
         by_limit += bool(found.stages[-1].details["known_by_limit"])
     shares = {name: float(np.mean(np.array(inside)[:, own])) for name, own in KINDS.items()}
     return {"units": units, "refused": units - len(inside), "by limit": by_limit} | shares

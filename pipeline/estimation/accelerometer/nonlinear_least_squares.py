@@ -26,7 +26,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE, Prior
 from pipeline.estimation.least_squares import ScaledColumns
-from pipeline.estimation.monte_carlo import KEY, quadratic_results, through, trials_of, with_trials
+from pipeline.estimation.monte_carlo import quadratic_results, through, trials_of, with_trials
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, AccelerometerModel, limit_of_misalignment
 from pipeline.estimation.multi_position.fit import Fit
 from pipeline.estimation.multi_position.fit import fit as fit_model
@@ -59,6 +59,7 @@ from pipeline.records import (
     MATRIX,
     Mask,
     Noise,
+    NoMonteCarlo,
     Recording,
     SensorCalibration,
     Values,
@@ -347,7 +348,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         return complete
     if len(count) > MOST_ROWS:
         reason = f"{len(count)} readings of a continuous turn are too many equations to draw; it is made for rests"
-        return replace(complete, budget={**(complete.budget or {}), KEY: {"trials": 0, "reason": reason}})
+        return replace(complete, budget=complete.budget and replace(complete.budget, monte_carlo=NoMonteCarlo(reason)))
     steps = quadratic_results(solved.columns / share[:, None], curvature(solved.model, solved.fit), np.diag(share**2))
     estimate, every = calibration.parameters.values, np.eye(len(count))
 

@@ -345,7 +345,7 @@ def test_misalignments_within_the_limit_are_covered_where_few_rests_do_not_deter
         calibration = fit([recording], None, _settings())
         limited += bool(calibration.stages[-1].details["known_by_limit"])
         truth = np.concatenate([BIAS, L.ravel()])[FITTED]
-        U = np.array(calibration.budget["expanded_uncertainty"])[FITTED]
+        U = np.array(calibration.to_json()["uncertainty_budget"]["expanded_uncertainty"])[FITTED]
         inside.append(np.abs(_vector(calibration) - truth) < U)
     assert limited > 10
     assert np.mean(inside) > 0.93
