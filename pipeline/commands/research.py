@@ -32,8 +32,9 @@ def study(argv: Sequence[str]) -> int:
     from pipeline.run_progress import Countdown  # noqa: PLC0415
     from pipeline.study.cases import FAMILIES  # noqa: PLC0415  (not needed for a comparison with the thesis)
     from pipeline.study.page import DIAGRAM, page  # noqa: PLC0415
+    from pipeline.study.result import cases_of  # noqa: PLC0415
     from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study  # noqa: PLC0415
-    from pipeline.study.scores import accepted, answer_scores, cases_of, family_scores, reliability_diagram  # noqa: PLC0415
+    from pipeline.study.scores import accepted, answer_scores, family_scores, reliability_diagram  # noqa: PLC0415
 
     parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder for the truth and the results")

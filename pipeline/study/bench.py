@@ -48,13 +48,14 @@ from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS, Recording, Values
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.simulation.session import Streams, random_environment
 from pipeline.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, Case
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
+    from pipeline.settings import DataSheet
 
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}
 OF_WHITE = {"ar_06": 0.6, "ar_09": 0.9}  # coefficient of the autoregression
@@ -75,11 +76,11 @@ GAUSS_MARKOV = ("normal", "wander")  # families of noise for which lambda is kno
 
 def recordings_of(case: Case) -> list[Recording]:
     """Return the recordings of a case, without its truth."""
-    sensor_configs = read_config("sensor", case.model)
+    sensor_model = shipped_settings(sensor=case.model).sensor
     noise_settings = {
         sensor: {
-            "bias_wander": case.wander * sensor_configs[sensor]["bias_wander"],
-            "noise_density": 0.0 if case.noise in OF_WHITE else sensor_configs[sensor]["noise_density"],
+            "bias_wander": case.wander * sensor_model.of(sensor).bias_wander,
+            "noise_density": 0.0 if case.noise in OF_WHITE else sensor_model.of(sensor).noise_density,
         }
         for sensor in SENSORS
     }
@@ -109,7 +110,7 @@ def recordings_of(case: Case) -> list[Recording]:
         ]
     rng = np.random.default_rng([case.seed, case.number, 1])
     for sensor in SENSORS:
-        recordings = _with_noise(recordings, sensor, case, sensor_configs[sensor], rng)
+        recordings = _with_noise(recordings, sensor, case, sensor_model.of(sensor), rng)
     if case.shape:
         recordings = _with_shape(recordings, case)
     if case.noise == "cold":
@@ -120,19 +121,19 @@ def recordings_of(case: Case) -> list[Recording]:
 
 
 def _with_noise(
-    recordings: list[Recording], sensor: str, case: Case, sensor_config: Mapping[str, Any], rng: np.random.Generator
+    recordings: list[Recording], sensor: str, case: Case, data_sheet: DataSheet, rng: np.random.Generator
 ) -> list[Recording]:
     """Add noise that the simulator does not have to one sensor, continuous over all recordings of the unit."""
     first = min(float(r.time[0]) for r in recordings)
     last = max(float(r.time[-1]) for r in recordings)
-    noise, interval, wander = case.noise, _interval(case), sensor_config["bias_wander"]
+    noise, interval, wander = case.noise, _interval(case), data_sheet.bias_wander
     count = int((last - first) / interval) + 2
     if noise in OF_WHITE:
         drive = np.sqrt(1.0 - OF_WHITE[noise] ** 2) * rng.standard_normal((count, 3))
         drive[0] = rng.standard_normal(3)
-        added = _white(sensor_config) * scipy.signal.lfilter([1.0], [1.0, -OF_WHITE[noise]], drive, axis=0)
+        added = _white(data_sheet) * scipy.signal.lfilter([1.0], [1.0, -OF_WHITE[noise]], drive, axis=0)
     elif noise == "random_walk":
-        step = wander * np.sqrt(interval / sensor_config["wander_time_s"])
+        step = wander * np.sqrt(interval / data_sheet.wander_time_s)
         added = np.cumsum(step * rng.standard_normal((count, 3)), axis=0)
     elif noise == "one_over_f":
         shape = np.concatenate([[0.0], 1.0 / np.sqrt(np.fft.rfftfreq(count)[1:])])
@@ -148,9 +149,9 @@ def _interval(case: Case) -> float:
     return INTERVAL_BY_HAND_S if case.rests else INTERVAL_S
 
 
-def _white(sensor_config: Mapping[str, Any]) -> float:
+def _white(data_sheet: DataSheet) -> float:
     """Return the standard deviation of one sample's white noise."""
-    return float(sensor_config["noise_density"] * np.sqrt(0.5 / INTERVAL_S))
+    return float(data_sheet.noise_density * np.sqrt(0.5 / INTERVAL_S))
 
 
 def _with_shape(recordings: list[Recording], case: Case) -> list[Recording]:
@@ -195,20 +196,18 @@ def signals_left(case: Case) -> dict[str, float]:
     for name in case.hidden:
         others = {other: values for other, values in case.hidden.items() if other != name}
         signals.append(reading(recordings) - reading(_used(replace(case, hidden=others))))
-    sensor_config = read_config("sensor", case.model)[case.sensor]
-    gravity = read_config("table", "acutronic")["gravity_g"]
+    bench = shipped_settings(sensor=case.model, table="acutronic")
+    data_sheet, gravity = bench.sensor.of(case.sensor), bench.table.gravity_g
     motions = [motion for r in recordings if (motion := reference_motion(r, gravity)) is not None]
     time = np.concatenate([r.time for r in recordings])
     base = np.concatenate([truth(case.sensor, motion) for motion in motions])
     columns = np.column_stack([np.ones(len(time)), base, *signals])
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    white, n = _white(sensor_config), len(time)
+    white, n = _white(data_sheet), len(time)
     each = Blocks(np.arange(n), np.ones(n), time, np.zeros(n), np.zeros(n, np.int64))
-    noise = GaussMarkov(
-        each, [Setting(case.wander * sensor_config["bias_wander"] / white, sensor_config["wander_time_s"])]
-    )
+    noise = GaussMarkov(each, [Setting(case.wander * data_sheet.bias_wander / white, data_sheet.wander_time_s)])
     products = noise.products(columns / size)[0] * np.outer(size, size) / white**2
-    rounding = 3 * n / (6.0 * sensor_config["counts_per_unit"] ** 2 * white**2)
+    rounding = 3 * n / (6.0 * data_sheet.counts_per_unit**2 * white**2)
     found = dict.fromkeys(case.hidden, -rounding)
     for column in range(4, len(size)):  # its squared norm minus that of its projection
         others_of_axis = [*range(4), *(c for c in range(4 + (column - 4) % 3, len(size), 3) if c != column)]

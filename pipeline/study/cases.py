@@ -35,10 +35,10 @@ from pipeline.estimation.uncertainty_budget import DITHERED
 from pipeline.files import CONFIGS
 from pipeline.model.effects import effect
 from pipeline.records import SENSORS, Values
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from pipeline.settings import DataSheet
 
 NOISES = ("white", "normal", "wander", "random_walk", "one_over_f", "ar_06", "ar_09")
 SHAPES = ("gear_mesh", "temperature_step", "saturation", "exponential", "band")
@@ -271,11 +271,12 @@ AT_REST = (
 def sensor_files(interval_s: float) -> list[str]:
     """Return the shipped sensor files whose rounding to counts is noise: white noise dithers it in both sensors."""
 
-    def dithered(figures: Mapping[str, Any]) -> bool:
-        return bool(figures["noise_density"] * np.sqrt(0.5 / interval_s) * figures["counts_per_unit"] >= DITHERED)
+    def dithered(data_sheet: DataSheet) -> bool:
+        return bool(data_sheet.noise_density * np.sqrt(0.5 / interval_s) * data_sheet.counts_per_unit >= DITHERED)
 
     names = sorted(path.stem for path in (CONFIGS / "sensor").glob("*.yaml"))
-    return [name for name in names if all(dithered(read_config("sensor", name)[sensor]) for sensor in SENSORS)]
+    models = {name: shipped_settings(sensor=name).sensor for name in names}
+    return [name for name, model in models.items() if all(dithered(model.of(sensor)) for sensor in SENSORS)]
 
 
 def observable(model: str, sensor: str, procedure: str) -> list[str]:

@@ -30,8 +30,8 @@ from pipeline.verdicts import Verdict
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from pipeline.study.result import ScoredCase
 
-JSON = dict[str, Any]
 Rows = list[list[Any]]
 LISTED = 40  # cases on the page that miss a goal
 OF_SIZE = ("single", "small", "tiny")
@@ -40,12 +40,12 @@ BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))  # of lambda; a se
 DIAGRAM = "reliability.svg"
 
 
-def page(cases: Sequence[JSON], command: str) -> str:
+def page(cases: Sequence[ScoredCase], command: str) -> str:
     """Return the page; ``command``: the command that reproduces it."""
     answers, families = table_of(cases), [*accepted(cases), *family_scores(cases)]
     text: str = template("study.md").render(
         command=command,
-        code=" and ".join(sorted({f"`{case['code']}`" for case in cases if "code" in case})) or "unknown",
+        code=" and ".join(sorted({f"`{case.code}`" for case in cases if case.code})) or "unknown",
         families=[score.cells for score in families],
         answers=[score.cells for score in answer_scores(cases)],
         false=false_selections(cases),
@@ -57,27 +57,28 @@ def page(cases: Sequence[JSON], command: str) -> str:
         instead=instead(answers),
         shapes=of_shapes(cases),
         misses=_misses(cases, families),
-        faults=[[case["key"], case["error"]] for case in cases if "error" in case],
+        faults=[[case.key, case.error] for case in cases if case.error],
         sizes=_sensor_file_sizes(),
     )
     return text
 
 
-def table_of(cases: Iterable[JSON]) -> pd.DataFrame:
+def table_of(cases: Iterable[ScoredCase]) -> pd.DataFrame:
     """Return a row for each diagnosis of a unit with one hidden effect, or with effects left out of the catalogue."""
-    used = [c for c in cases if "error" not in c and (c["left_out"] or len(c["hidden"]) == 1)]
-    return pd.DataFrame(used, columns=["family", "model", "sensor"]).assign(
-        hidden=[(case["left_out"] or list(case["hidden"]))[0] for case in used],
+    used = [c for c in cases if not c.error and (c.left_out or len(c.hidden) == 1)]
+    keys = ["family", "model", "sensor"]
+    return pd.DataFrame([[getattr(case, key) for key in keys] for case in used], columns=keys).assign(
+        hidden=[(case.left_out or list(case.hidden))[0] for case in used],
         said=[_said(case) for case in used],
-        left_out=np.array([bool(case["left_out"]) for case in used], bool),
-        alone=np.array([case["selected"] == list(case["hidden"]) for case in used], bool),
+        left_out=np.array([bool(case.left_out) for case in used], bool),
+        alone=np.array([case.selected == list(case.hidden) for case in used], bool),
         first=[first_is_right(case) for case in used],
         warned=["yes" if warned(case) else "no" for case in used],
     )
 
 
-def _said(case: JSON) -> str:
-    return " + ".join(case["selected"]) or "nothing"
+def _said(case: ScoredCase) -> str:
+    return " + ".join(case.selected) or "nothing"
 
 
 def found_at(answers: pd.DataFrame) -> Rows:
@@ -101,14 +102,14 @@ def instead(answers: pd.DataFrame) -> Rows:
     return [[sensor, f"`{name}`", *rest, count] for (sensor, name, *rest), count in counts.items()]
 
 
-def by_signal(cases: Iterable[JSON]) -> Rows:
+def by_signal(cases: Iterable[ScoredCase]) -> Rows:
     """Return the share of the hidden effects that were selected, by bins of their lambda."""
     found = pd.DataFrame(
         [
-            (signal, any(named(case, name, selected) for selected in case["selected"]))
+            (signal, any(named(case, name, selected) for selected in case.selected))
             for case in cases
-            if "error" not in case and not case["left_out"] and case["family"] != "unseen"
-            for name, signal in (case.get("signal_left") or {}).items()
+            if not case.error and not case.left_out and case.family != "unseen"
+            for name, signal in case.signal_left.items()
         ],
         columns=["left", "selected"],
     )
@@ -121,11 +122,11 @@ def by_signal(cases: Iterable[JSON]) -> Rows:
     return rows
 
 
-def of_shapes(cases: Sequence[JSON]) -> Rows:
+def of_shapes(cases: Sequence[ScoredCase]) -> Rows:
     """Return a row for each form of unknown physics: the answers, and their effect on the held-out error."""
     rows = []
-    for family in sorted({case["family"] for case in cases if case["shape"] and "error" not in case}):
-        of_family = [case for case in cases if case["family"] == family and "error" not in case]
+    for family in sorted({case.family for case in cases if case.shape and not case.error}):
+        of_family = [case for case in cases if case.family == family and not case.error]
         outcomes = Counter(map(_outcome, of_family))
         name, count = Counter(map(_said, of_family)).most_common(1)[0]
         gone = "".join(f"{100 * mean.value:.0f} % (n = {mean.total})" for mean in mean_excess_gone(of_family))
@@ -134,24 +135,24 @@ def of_shapes(cases: Sequence[JSON]) -> Rows:
     return rows
 
 
-def _outcome(case: JSON) -> str:
+def _outcome(case: ScoredCase) -> str:
     if warned(case):
-        return "unexplained" if case["verdict"] == Verdict.UNEXPLAINED else "other warning"
-    if not case["selected"]:
+        return "unexplained" if case.verdict == Verdict.UNEXPLAINED else "other warning"
+    if not case.selected:
         return "nothing"
     return "answered" if outside_answered(case) else "silent"
 
 
-def _misses(cases: Sequence[JSON], scores: Sequence[Score]) -> Rows:
-    by_key = {key: case for case in cases for key in (case["key"], f"{case['key']} {case['sensor']}")}
+def _misses(cases: Sequence[ScoredCase], scores: Sequence[Score]) -> Rows:
+    by_key = {key: case for case in cases for key in (case.key, f"{case.key} {case.sensor}")}
     keys = [key for score in scores if score.goal for key in score.misses]
     rows = []
     for key in keys[:LISTED]:
         case = by_key[key]
-        left = case.get("signal_left") or {}
-        hidden = " + ".join(f"{n} ({left[n]:.0f})" if n in left else n for n in case["hidden"]) or "nothing"
-        unit = f"{case['model']} {case['sensor']} {case['procedure']}"
-        rows.append([key, unit, hidden, case.get("error") or (" + ".join(case["selected"]) or case["verdict"])])
+        left = case.signal_left
+        hidden = " + ".join(f"{n} ({left[n]:.0f})" if n in left else n for n in case.hidden) or "nothing"
+        unit = f"{case.model} {case.sensor} {case.procedure}"
+        rows.append([key, unit, hidden, case.error or (" + ".join(case.selected) or case.verdict)])
     more = len(keys) - len(rows)
     return [*rows, *([[f"and {more} more", "", "", ""]] if more else [])]
 

@@ -19,7 +19,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.config import code_digest
 from pipeline.errors import CannotCalibrateError, ConfigurationError, PipelineError
@@ -83,8 +83,9 @@ def run_study(
 
 def code_of_study() -> list[str]:
     """Return the modules that determine a result: this one, and those that the steps of a run import by name."""
-    methods = [unit_row([f"method={method}"]).config["method"]["stages"] for method in METHODS]
-    tasks = [task for stages in methods for task in tasks_of({s: [*stages[s], "effects"] for s in SENSORS})]
+    methods = [unit_row([f"method={method}"]).config.method.stages for method in METHODS]
+    chains = [{s: [*(stages.of(s) or ()), "effects"] for s in SENSORS} for stages in methods]
+    tasks = [task for chain in chains for task in tasks_of(chain)]
     steps = {f"pipeline.stages.{STEPS[task.step].function.partition('.')[0]}" for task in tasks}
     return [__name__, *sorted(steps | {stage_module(t.sensor, t.stage) for t in tasks if t.sensor})]
 
@@ -126,7 +127,7 @@ def judge(case: Case) -> list[JSON]:
     for sensor in SENSORS if case.kind == "null" else (case.sensor,):
         result: JSON = {"key": case.key, "sensor": sensor} | scored(state, sensor)
         if case.kind == "null":
-            ranking = _part(state, sensor, state.diagnosis)["ranking"]
+            ranking = _part(state, sensor, "diagnosis")["ranking"]
             result["gains"] = {entry["effect"]: entry["delta_bic"] for entry in ranking}
         if whole:
             result["whole"] = scored(whole, sensor)
@@ -151,7 +152,7 @@ def diagnose_case(case: Case) -> tuple[ConfiguredUnit, UnitState]:
 
 def scored(state: UnitState, sensor: str) -> JSON:
     """Return the part of a sensor's diagnosis that a study scores; raises ``CannotCalibrateError`` without one."""
-    document = _part(state, sensor, state.diagnosis)
+    document = _part(state, sensor, "diagnosis")
     entries = {entry["effect"]: entry for entry in document["ranking"]}
     selected = [entries[name] for name in document["selected"]]
     return {
@@ -188,15 +189,15 @@ def held_out_errors(unit: ConfiguredUnit, state: UnitState, sensor: str, names: 
 
 def _error(state: UnitState, sensor: str) -> tuple[float, float]:
     """Return the held-out error of a sensor after its last stage, and the noise floor."""
-    part = _part(state, sensor, state.validation)
+    part = _part(state, sensor, "validation")
     last = part["steps"][-1]
     vector = last["vector_rms_error"] is not None and part["vector_noise_floor"] is not None
     return last["vector_rms_error" if vector else "rms_error"], part["vector_noise_floor" if vector else "noise_floor"]
 
 
-def _part(state: UnitState, sensor: str, document: JSON | None) -> JSON:
+def _part(state: UnitState, sensor: str, document: Literal["validation", "diagnosis"]) -> JSON:
     """Return the part of a sensor in a document of its unit."""
     fit = state.fits[sensor]
     if isinstance(fit, NotCalibrated):
         raise CannotCalibrateError(fit.reason)
-    return dict((document or {})[sensor])
+    return dict(getattr(state, document)[sensor])

@@ -1,7 +1,7 @@
 """Score a study: count the right diagnoses, as shares with n and a 95 % interval (Wilson's, by scipy).
 
-A *case* here is a dict with the truth of a unit and the diagnosis of one of its sensors. A selected look-alike counts
-as the hidden effect where the diagnosis states that it reproduces over 95 % of the other's signal.
+A *case* is the truth of a unit and the diagnosis of one of its sensors (``pipeline.study.result``). A selected
+look-alike counts as the hidden effect where the diagnosis states that it reproduces over 95 % of the other's signal.
 
 Answer sets, probabilities and upper limits of the posterior are scored, too. For them the truth of a case is the set of
 its hidden effects, or the empty set where nothing is hidden or observable; look-alikes do not count. An upper limit is
@@ -10,6 +10,7 @@ compared with each parameter of a hidden effect that was not selected.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,7 +25,8 @@ from pipeline.verdicts import Verdict
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-JSON = dict[str, Any]
+    from pipeline.study.result import ScoredCase
+
 Z = 1.96  # standard normal quantile of a 95 % interval
 OF_WHICH = "... of those in which each stands out (lambda >= 100)"
 # Families with effects of the catalogue at the usual size and wander.
@@ -37,26 +39,20 @@ STANDS_OUT = 100.0  # lambda: the largest that a selection needs
 DOUBTFUL = (Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT)
 
 
-def cases_of(truth: Iterable[JSON], results: Iterable[JSON]) -> list[JSON]:
-    """Return the cases that have both a truth and a result."""
-    known = {line["key"]: line for line in truth}
-    return [{**known[line["key"]], **line} for line in results if line["key"] in known]
-
-
-def named(case: JSON, hidden: str, name: str) -> bool:
+def named(case: ScoredCase, hidden: str, name: str) -> bool:
     """Return whether a selected effect is the hidden one or its declared look-alike."""
-    return name == hidden or case["look_alikes"].get(name, {}).get(hidden, 0.0) > ALIKE
+    return name == hidden or case.look_alikes.get(name, {}).get(hidden, 0.0) > ALIKE
 
 
-def first_is_right(case: JSON) -> bool:
+def first_is_right(case: ScoredCase) -> bool:
     """Return whether the hidden effect, or its declared look-alike, was selected first."""
-    return bool(case["selected"]) and named(case, next(iter(case["hidden"])), case["selected"][0])
+    return bool(case.selected) and named(case, next(iter(case.hidden)), case.selected[0])
 
 
-def exact(case: JSON) -> bool:
+def exact(case: ScoredCase) -> bool:
     """Return whether exactly the hidden effects, or their declared look-alikes, were selected."""
-    hidden = [name for name in case["hidden"] if name not in case["selected"]]
-    selected = [name for name in case["selected"] if name not in case["hidden"]]
+    hidden = [name for name in case.hidden if name not in case.selected]
+    selected = [name for name in case.selected if name not in case.hidden]
     for name in hidden:
         alike = next((s for s in selected if named(case, name, s)), None)
         if alike is None:
@@ -65,49 +61,50 @@ def exact(case: JSON) -> bool:
     return not selected
 
 
-def not_seen(case: JSON) -> bool:
+def not_seen(case: ScoredCase) -> bool:
     """Return whether an unobservable hidden effect is listed as not observable, and was not selected."""
-    name = next(iter(case["hidden"]))
-    return name in case["not_observable"] and name not in case["selected"]
+    name = next(iter(case.hidden))
+    return name in case.not_observable and name not in case.selected
 
 
-def warned(case: JSON) -> bool:
+def warned(case: ScoredCase) -> bool:
     """Return whether there is a warning: a doubtful verdict, a size beyond the limit, or more wander than expected."""
-    return bool(case["verdict"] in DOUBTFUL or not case["plausible"] or case["inflated"])
+    return bool(case.verdict in DOUBTFUL or not case.plausible or case.inflated)
 
 
-def outside_answered(case: JSON) -> bool:
+def outside_answered(case: ScoredCase) -> bool:
     """Return whether one of the answers is an effect outside the catalogue."""
-    return any(name.startswith(OTHER) for answer in case.get("answer_set") or [] for name in answer["effects"])
+    return any(name.startswith(OTHER) for answer in case.answer_set or [] for name in answer)
 
 
-def not_silent(case: JSON) -> bool:
+def not_silent(case: ScoredCase) -> bool:
     """Return whether no effect was selected, or with a warning; for effects that are not in the catalogue."""
-    return not case["selected"] or warned(case)
+    return not case.selected or warned(case)
 
 
-def hard_to_replace(case: JSON) -> bool:
+def hard_to_replace(case: ScoredCase) -> bool:
     """Return whether the complete catalogue names the removed effect first, and it has no look-alike above 0.95."""
-    name, whole = case["left_out"][0], case["whole"]
-    return bool(whole["selected"][:1] == [name]) and max(whole["look_alikes"][name].values(), default=0.0) <= ALIKE
+    name, whole = case.left_out[0], case.whole
+    if whole is None or whole.selected[:1] != [name]:
+        return False
+    return max(whole.look_alikes[name].values(), default=0.0) <= ALIKE
 
 
-def excess_gone(case: JSON) -> float | None:
+def excess_gone(case: ScoredCase) -> float | None:
     """Return the share of the held-out excess over the noise floor that was removed; None for an excess below 5 %."""
-    held = case.get("held_out")
-    if not held or held["before"] < (1.0 + EXCESS) * held["floor"]:
+    held = case.held_out
+    if held is None or held.before < (1.0 + EXCESS) * held.floor:
         return None
-    return float((held["before"] - held["after"]) / (held["before"] - held["floor"]))
+    return (held.before - held.after) / (held.before - held.floor)
 
 
-def stands_out(case: JSON) -> bool:
+def stands_out(case: ScoredCase) -> bool:
     """Return whether each hidden effect has lambda >= 100 (``signal_left``)."""
-    left = case.get("signal_left") or {}
-    return bool(left) and min(left.values()) >= STANDS_OUT
+    return bool(case.signal_left) and min(case.signal_left.values()) >= STANDS_OUT
 
 
 # Family, what is counted, how it is judged, goal.
-PLAN: list[tuple[str, str, Callable[[JSON], bool], str]] = [
+PLAN: list[tuple[str, str, Callable[[ScoredCase], bool], str]] = [
     ("single", "one effect at the sensor file's size: named first", first_is_right, ">= 98 %"),
     ("single", "... and nothing else named", exact, ""),
     ("small", "one effect, x0.3: named first", first_is_right, ""),
@@ -160,46 +157,46 @@ def share(name: str, right: pd.Series[bool], goal: str = "") -> list[Score]:
     return [Score(name, hits / total, total, goal, wilson(hits, total), misses)] if total else []
 
 
-def _judged(cases: Sequence[JSON], right: Callable[[JSON], bool]) -> pd.Series[bool]:
+def _judged(cases: Sequence[ScoredCase], right: Callable[[ScoredCase], bool]) -> pd.Series[bool]:
     """Return for each case whether ``right`` is true; False for a fault.
 
     A case is labelled with its key, and with its sensor where both sensors are scored.
     """
-    both = [family_of(case) == "null" and "error" not in case for case in cases]
-    labels = [f"{case['key']} {case['sensor']}" if b else case["key"] for case, b in zip(cases, both, strict=True)]
-    return pd.Series(["error" not in case and right(case) for case in cases], labels, dtype=bool)
+    both = [family_of(case) == "null" and not case.error for case in cases]
+    labels = [f"{case.key} {case.sensor}" if b else case.key for case, b in zip(cases, both, strict=True)]
+    return pd.Series([not case.error and right(case) for case in cases], labels, dtype=bool)
 
 
-def family_of(case: JSON) -> str:
+def family_of(case: ScoredCase) -> str:
     """Return the family of a case; one family for all noises with nothing hidden."""
-    return "null" if str(case["family"]).startswith("null") else str(case["family"])
+    return "null" if case.family.startswith("null") else case.family
 
 
-def accepted(cases: Sequence[JSON]) -> list[Score]:
+def accepted(cases: Sequence[ScoredCase]) -> list[Score]:
     """Return the share of the units that no step of a run refused."""
-    taken = pd.Series(["refused" not in case for case in cases], [case["key"] for case in cases], dtype=bool)
+    taken = pd.Series([not case.refused for case in cases], [case.key for case in cases], dtype=bool)
     return share("all families: no step of a run refuses the unit", taken, "100 %")
 
 
-def family_scores(cases: Sequence[JSON]) -> list[Score]:
+def family_scores(cases: Sequence[ScoredCase]) -> list[Score]:
     """Return the scores of every family that was run, and the share of the held-out excess that was removed."""
     found: list[Score] = []
     for family, name, right, goal in PLAN:
-        family_cases = [c for c in cases if c["family"] == family]
+        family_cases = [c for c in cases if c.family == family]
         if family == "removed":
-            family_cases = [c for c in family_cases if "error" in c or hard_to_replace(c)]
+            family_cases = [c for c in family_cases if c.error or hard_to_replace(c)]
         found += share(name, _judged(family_cases, right), goal)
         strong = [c for c in family_cases if stands_out(c)]
         if family in MAY_HIDE and len(strong) < len(family_cases):
             found += share(OF_WHICH, _judged(strong, right))
-    for family in sorted({c["family"] for c in cases if family_of(c) == "null"}):
-        family_cases = [c for c in cases if c["family"] == family]
+    for family in sorted({c.family for c in cases if family_of(c) == "null"}):
+        family_cases = [c for c in cases if c.family == family]
         name = f"nothing hidden, {family.removeprefix('null_')}: nothing selected"
-        found += share(name, _judged(family_cases, lambda case: not case["selected"]), ">= 99 %")
-    return found + mean_excess_gone(c for c in cases if c["family"] in IN_THE_CATALOGUE)
+        found += share(name, _judged(family_cases, lambda case: not case.selected), ">= 99 %")
+    return found + mean_excess_gone(c for c in cases if c.family in IN_THE_CATALOGUE)
 
 
-def false_selections(cases: Iterable[JSON]) -> list[list[Any]]:
+def false_selections(cases: Iterable[ScoredCase]) -> list[list[Any]]:
     """Return in how many units with nothing hidden an effect would pass some gates, on a table and by hand.
 
     A unit counts where the largest delta BIC of an effect, in either sensor, is above the gate. Below the gate in
@@ -208,13 +205,15 @@ def false_selections(cases: Iterable[JSON]) -> list[list[Any]]:
     Biometrika 26, 1934).
     """
     largest: dict[tuple[str, str], dict[str, float]] = {}
-    for case in (case for case in cases if "gains" in case):
+    for case in cases:
+        if case.gains is None:
+            continue
         gains = {"slow": [-np.inf], "other": [-np.inf]}
-        for name, gain in case["gains"].items():
-            gains["slow" if effect(name).of_the_room(case["sensor"]) else "other"].append(gain)
+        for name, gain in case.gains.items():
+            gains["slow" if effect(name).of_the_room(case.sensor) else "other"].append(gain)
         for kind, of_kind in gains.items():
-            units = largest.setdefault(("by hand" if case["rests"] else "on a table", kind), {})
-            units[case["key"]] = max(*of_kind, units.get(case["key"], -np.inf))
+            units = largest.setdefault(("by hand" if case.rests else "on a table", kind), {})
+            units[case.key] = max(*of_kind, units.get(case.key, -np.inf))
     rows = []
     for (recorded, kind), units in sorted(largest.items(), reverse=True):
         for gate in GATES:
@@ -225,9 +224,9 @@ def false_selections(cases: Iterable[JSON]) -> list[list[Any]]:
     return rows
 
 
-def mean_excess_gone(cases: Iterable[JSON]) -> list[Score]:
+def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[Score]:
     """Return the mean of ``excess_gone`` over the units that have it; an empty list for fewer than two units."""
-    gone = [excess_gone(case) for case in cases if "error" not in case]
+    gone = [excess_gone(case) for case in cases if not case.error]
     values = np.array([value for value in gone if value is not None])
     if len(values) < 2:
         return []
@@ -250,28 +249,32 @@ STYLE = (
 )
 
 
-def true_set(case: JSON) -> list[str]:
+def true_set(case: ScoredCase) -> list[str]:
     """Return the effects of the right answer."""
-    return [] if family_of(case) == "unseen" else sorted(case["hidden"])
+    return [] if family_of(case) == "unseen" else sorted(case.hidden)
 
 
-def in_the_set(case: JSON) -> bool:
+def in_the_set(case: ScoredCase) -> bool:
     """Return whether the truth is one of the answers."""
-    return true_set(case) in [sorted(answer["effects"]) for answer in case["answer_set"]]
+    return true_set(case) in [sorted(answer) for answer in case.answer_set or []]
 
 
-def best_is_exact(case: JSON) -> bool:
+def best_is_exact(case: ScoredCase) -> bool:
     """Return whether the most probable answer is the truth or its declared look-alikes."""
-    best = case["answer_set"][0]["effects"] if case["answer_set"] else []
-    return exact({**case, "selected": best, "hidden": true_set(case)})
+    return _is_exactly(case, case.answer_set[0] if case.answer_set else [])
 
 
-def answered(cases: Iterable[JSON]) -> list[JSON]:
+def _is_exactly(case: ScoredCase, effects: list[str]) -> bool:
+    """Return whether effects are exactly the truth of a set or its declared look-alikes."""
+    return exact(replace(case, selected=effects, hidden={name: [] for name in true_set(case)}))
+
+
+def answered(cases: Iterable[ScoredCase]) -> list[ScoredCase]:
     """Return the cases of families with answer sets, including faults."""
-    return [c for c in cases if family_of(c) in SETS and ("error" in c or "answer_set" in c)]
+    return [c for c in cases if family_of(c) in SETS and (c.error or c.answer_set is not None)]
 
 
-def answer_scores(cases: Sequence[JSON]) -> list[Score]:
+def answer_scores(cases: Sequence[ScoredCase]) -> list[Score]:
     """Return the scores of answer sets and upper limits: how often they contain the truth, and their sizes."""
     known = answered(cases)
     found = share("truth in the 95 % answer set", _judged(known, in_the_set), GOAL)
@@ -279,11 +282,11 @@ def answer_scores(cases: Sequence[JSON]) -> list[Score]:
         family_cases = [c for c in known if family_of(c) == family]
         found += share(f"... {family}", _judged(family_cases, in_the_set), "" if family == "triples" else FAMILY_GOAL)
     found += share("most probable answer: exactly the truth", _judged(known, best_is_exact))
-    found += share("... selected: exactly the truth", _judged(known, lambda c: exact({**c, "hidden": true_set(c)})))
+    found += share("... selected: exactly the truth", _judged(known, lambda c: _is_exactly(c, c.selected)))
     over = {size: ratios(cases, family) for family, (size, _) in LIMITS.items()}
     for size, each in over.items():
         found += share(f"upper limits at {size} x the detection size: above the truth", pd.Series(each >= 1.0), GOAL)
-    sizes = [len(case["answer_set"]) for case in known if "error" not in case]
+    sizes = [len(case.answer_set) for case in known if case.answer_set is not None]
     found += [Score("answers in a set, mean", float(np.mean(sizes)), len(sizes), f"<= {SIZE_GOAL:g}")] if sizes else []
     for size, goal in LIMITS.values():
         name = f"upper limit at {size} x the detection size over the truth, median"
@@ -292,31 +295,31 @@ def answer_scores(cases: Sequence[JSON]) -> list[Score]:
     return found
 
 
-def ratios(cases: Iterable[JSON], family: str) -> np.ndarray:
+def ratios(cases: Iterable[ScoredCase], family: str) -> np.ndarray:
     """Return the ratios of upper limits to true parameters of hidden effects that were not selected: (n,) array."""
     over = []
     for case in cases:
-        if case["family"] == family and "error" not in case:
-            (name, values), *_ = case["hidden"].items()
-            limits = list((case["upper_limit"].get(name) or {}).values())
-            over += [limit["value"] / abs(value) for limit, value in zip(limits, values, strict=False) if value]
+        if case.family == family and not case.error:
+            (name, values), *_ = case.hidden.items()
+            limits = case.upper_limit.get(name, [])
+            over += [limit / abs(value) for limit, value in zip(limits, values, strict=False) if value]
     return np.array(over)
 
 
-def reliability(cases: Sequence[JSON]) -> list[Score]:
+def reliability(cases: Sequence[ScoredCase]) -> list[Score]:
     """Return the share of true effects in each bin of stated probability; the name is the bin's mean probability."""
     pairs = [
         (probability, name in true_set(case))
         for case in answered(cases)
-        if "error" not in case
-        for name, probability in case["probability"].items()
+        if not case.error
+        for name, probability in case.probability.items()
     ]
     found = pd.DataFrame(pairs, columns=["stated", "true"]).astype({"stated": float, "true": bool})
     bins = found.groupby(pd.cut(found["stated"], [*EDGES[:-1], np.inf], right=False), observed=True)
     return [score for _, each in bins for score in share(repr(float(each["stated"].mean())), each["true"])]
 
 
-def reliability_diagram(cases: Sequence[JSON]) -> str:
+def reliability_diagram(cases: Sequence[ScoredCase]) -> str:
     """Return a chart of true shares against stated probabilities as an SVG file; empty without probabilities."""
     bins = reliability(cases)
     if not bins:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from pipeline.model.effects import catalogue
 from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, SIZES, Case, draw
+from pipeline.study.result import ScoredCase
 from pipeline.study.run import diagnose_case, judge, read_lines, scored
 from pipeline.study.scores import exact, first_is_right, in_the_set, not_seen, outside_answered
 
@@ -26,9 +27,9 @@ if TYPE_CHECKING:
 SEED = 2
 
 
-def said(case: Case) -> dict[str, Any]:
+def said(case: Case) -> ScoredCase:
     _, state = diagnose_case(case)
-    return case.to_json() | scored(state, case.sensor)
+    return ScoredCase.from_json(case.to_json() | scored(state, case.sensor))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -113,7 +114,7 @@ def test_nothing_is_found_where_nothing_is_hidden(family: str) -> None:
 @pytest.mark.parametrize("number", range(2))
 def test_what_cannot_be_seen_is_said_to_be_so(number: int) -> None:
     case = draw("unseen", number, SEED)
-    assert not_seen(case.to_json() | judge(case)[0])
+    assert not_seen(ScoredCase.from_json(case.to_json() | judge(case)[0]))
 
 
 def test_an_effect_that_nobody_knows_of_is_not_named() -> None:
@@ -127,9 +128,9 @@ def test_an_effect_that_nobody_knows_of_is_not_named() -> None:
 def test_a_bend_of_the_temperature_is_an_answer_beside_the_warm_up_that_it_looks_like(family: str, number: int) -> None:
     case = draw(family, number, 61)
     found = said(case)
-    assert found["selected"] == ["warm_up"]
-    assert outside_answered(found) if case.shape else found["verdict"] == "missing_effect"
-    assert not any(":" in name for name in found["probability"])
+    assert found.selected == ["warm_up"]
+    assert outside_answered(found) if case.shape else found.verdict == "missing_effect"
+    assert not any(":" in name for name in found.probability)
 
 
 def test_a_study_goes_on_where_it_was_interrupted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -171,4 +172,4 @@ def test_the_answer_set_holds_the_truth_beside_a_large_wander(number: int) -> No
     # 6: without the drift, a random walk explains its signal. 17: the bias wanders within a block of 300.
     case = draw("pairs_wander", number, 85)
     (said,) = judge(case)
-    assert in_the_set({**case.to_json(), **said})
+    assert in_the_set(ScoredCase.from_json({**case.to_json(), **said}))

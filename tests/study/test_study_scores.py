@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from pipeline.study.page import by_signal, confusions, found_at, instead, of_shapes, page, table_of
+from pipeline.study.result import ScoredCase, cases_of
 from pipeline.study.scores import (
     answer_scores,
-    cases_of,
     exact,
     excess_gone,
     false_selections,
@@ -35,57 +35,62 @@ def truth(*hidden: str, key: str = "single-00000", **more: Any) -> dict[str, Any
     return {"key": key, "family": key.partition("-")[0], "hidden": {name: [1.0] for name in hidden}, **case, **more}
 
 
+def case(*parts: dict[str, Any]) -> ScoredCase:
+    """Return the case of a truth and a result; a later part replaces values of an earlier one."""
+    return ScoredCase.from_json({key: value for part in parts for key, value in part.items()})
+
+
 def test_a_look_alike_counts_only_where_its_share_is_declared_over_95_percent() -> None:
     for share, right in ((0.96, True), (0.94, False)):
         alike = {"time_offset": {"low_pass_lag": share}}
-        assert first_is_right(truth("low_pass_lag") | said("time_offset", look_alikes=alike)) is right
+        assert first_is_right(case(truth("low_pass_lag"), said("time_offset", look_alikes=alike))) is right
 
 
 def test_an_exact_set_has_nothing_more_and_nothing_less() -> None:
-    assert exact(truth("a", "b") | said("b", "a"))
-    assert not exact(truth("a", "b") | said("a"))
-    assert not exact(truth("a") | said("a", "b"))
-    assert exact(truth("a", "b") | said("c", "b", look_alikes={"c": {"a": 0.99}}))
-    assert not exact(truth("a", "b") | said("b", look_alikes={"b": {"a": 0.99}}))
+    assert exact(case(truth("a", "b"), said("b", "a")))
+    assert not exact(case(truth("a", "b"), said("a")))
+    assert not exact(case(truth("a"), said("a", "b")))
+    assert exact(case(truth("a", "b"), said("c", "b", look_alikes={"c": {"a": 0.99}})))
+    assert not exact(case(truth("a", "b"), said("b", look_alikes={"b": {"a": 0.99}})))
 
 
 def test_a_false_selection_is_counted_once_a_unit_by_the_larger_gain_of_its_sensors() -> None:
     gains = [{"bias_drift": 11.0, "time_offset": 3.0}, {"bias_drift": 13.0, "g_sensitivity": 7.0}]
-    cases = [truth(rests=0) | said(gains=each) for each in gains]
-    cases.append(truth(rests=0) | said(key="null_normal-00001", gains={"warm_up": -9.0, "time_offset": -2.0}))
+    cases = [case(truth(rests=0), said(gains=each)) for each in gains]
+    cases.append(case(truth(rests=0), said(key="null_normal-00001", gains={"warm_up": -9.0, "time_offset": -2.0})))
     found = {(kind, gate): (n, count, share, ends) for _, kind, gate, n, count, share, ends in false_selections(cases)}
     assert [found["slow", gate][1] for gate in ("10", "12", "14")] == [1, 1, 0]
     assert [found["other", gate][1] for gate in ("4", "6", "8")] == [1, 1, 0]
     assert found["slow", "10"] == (2, 1, "50.00 %", "1.258 to 98.74 %")  # of a beta distribution: 1 - sqrt(0.975)
-    assert false_selections([truth() | said()]) == []
+    assert false_selections([case(truth(), said())]) == []
 
 
 def test_another_effect_is_silent_unless_a_warning_is_said() -> None:
-    assert not not_silent(truth() | said("b"))
+    assert not not_silent(case(truth(), said("b")))
     for warning in ({"verdict": "unexplained"}, {"plausible": False}, {"inflated": True}):
-        assert not_silent(truth() | said("b", **warning))
-    assert not_silent(truth() | said())
+        assert not_silent(case(truth(), said("b", **warning)))
+    assert not_silent(case(truth(), said()))
 
 
 def test_what_another_effect_replaces_is_no_test_of_a_warning() -> None:
-    case = truth("a", key="removed-00000", left_out=["a"])
+    removed = truth("a", key="removed-00000", left_out=["a"])
     for share, counts in ((0.96, False), (0.94, True)):
         whole = said("a", look_alikes={"a": {"b": share}})
-        assert hard_to_replace(case | said("b", whole=whole)) is counts
-        scores = family_scores([case | said("b", key=case["key"], whole=whole)])
+        assert hard_to_replace(case(removed, said("b", whole=whole))) is counts
+        scores = family_scores([case(removed, said("b", key=removed["key"], whole=whole))])
         assert [(s.value, s.total) for s in scores] == ([(0.0, 1)] if counts else [])
-    assert not hard_to_replace(case | said("b", whole=said("b")))
+    assert not hard_to_replace(case(removed, said("b", whole=said("b"))))
 
 
 def test_excess_is_counted_above_five_percent_of_the_floor() -> None:
-    assert excess_gone(said(held_out={"before": 1.04, "after": 1.0, "floor": 1.0})) is None
-    assert excess_gone(said(held_out={"before": 2.0, "after": 1.1, "floor": 1.0})) == pytest.approx(0.9)
+    assert excess_gone(case(truth(), said(held_out={"before": 1.04, "after": 1.0, "floor": 1.0}))) is None
+    assert excess_gone(case(truth(), said(held_out={"before": 2.0, "after": 1.1, "floor": 1.0}))) == pytest.approx(0.9)
 
 
 def test_a_unit_in_which_nothing_is_selected_counts_with_all_of_its_excess() -> None:
     held = [{"before": 2.0, "after": after, "floor": 1.0} for after in (1.0, 2.0)]
-    cases = [truth("a") | said(held_out=entry) for entry in held]
-    cases.append(truth(key="shape_band-00000", shape="band") | said(held_out=held[1]))
+    cases = [case(truth("a"), said(held_out=entry)) for entry in held]
+    cases.append(case(truth(key="shape_band-00000", shape="band"), said(held_out=held[1])))
     mean = family_scores(cases)[-1]
     assert (mean.value, mean.total) == (0.5, 2)
     assert mean.name.endswith("(least 0%)")
@@ -100,19 +105,19 @@ def test_a_fault_is_a_miss() -> None:
 
 
 def test_both_sensors_of_a_unit_count_where_nothing_is_hidden() -> None:
-    case = truth(key="null_white-00003")
-    lines = [said(key=case["key"]), said("a", key=case["key"], sensor="accelerometer")]
-    (score,) = family_scores(cases_of([case], lines))
+    null = truth(key="null_white-00003")
+    lines = [said(key=null["key"]), said("a", key=null["key"], sensor="accelerometer")]
+    (score,) = family_scores(cases_of([null], lines))
     assert (score.value, score.total, score.misses) == (0.5, 2, ("null_white-00003 accelerometer",))
 
 
 def test_tables_count_what_was_said() -> None:
     table = table_of(
         [
-            truth("a") | said("b"),
-            truth("a") | said("a"),
-            truth("a", key="tiny-00000") | said(),
-            truth("a", key="removed-00000", left_out=["a"]) | said("c", plausible=False),
+            case(truth("a"), said("b")),
+            case(truth("a"), said("a")),
+            case(truth("a", key="tiny-00000"), said()),
+            case(truth("a", key="removed-00000", left_out=["a"]), said("c", plausible=False)),
         ]
     )
     assert confusions(table) == [["gyroscope", "`a`", "b", 1], ["gyroscope", "`a`", "nothing", 1]]
@@ -124,7 +129,7 @@ def test_units_in_which_every_effect_stands_out_are_counted_by_themselves() -> N
     lefts = [({"a": 500.0, "b": 99.0}, ["a"]), ({"a": 500.0, "b": 100.0}, ["b", "a"])]
     keys = ["pairs-00000", "pairs-00001"]
     cases = [
-        truth("a", "b", key=key, signal_left=left) | said(*selected, key=key)
+        case(truth("a", "b", key=key, signal_left=left), said(*selected, key=key))
         for key, (left, selected) in zip(keys, lefts, strict=True)
     ]
     assert [(s.value, s.total) for s in family_scores(cases)] == [(0.5, 2), (1.0, 1)]
@@ -139,13 +144,13 @@ def test_a_form_of_unknown_physics_is_unexplained_warned_of_silently_replaced_or
     held = {"before": 2.0, "after": 1.2, "floor": 1.0}
     ways = [said(verdict="unexplained"), said("a", inflated=True), said("a"), said("a"), said()]
     ways.append(said("a") | answer(("a",), ("b", "other_temperature")))
-    case = truth(key="shape_band-00000", shape="band")
-    (row,) = of_shapes([case | way | {"held_out": held} for way in ways])
+    shape = truth(key="shape_band-00000", shape="band")
+    (row,) = of_shapes([case(shape, way, {"held_out": held}) for way in ways])
     assert row == ["shape band", 6, 1, 1, 1, 2, 1, "a (4)", "80 % (n = 6)"]
 
 
 def test_the_page_has_the_figures_the_code_and_the_cases_that_miss() -> None:
-    cases = [truth("g_sensitivity") | said("b", code="0123")]
+    cases = [case(truth("g_sensitivity"), said("b", code="0123"))]
     text = page(cases, "python -m pipeline study DIR")
     assert "| one effect at the sensor file's size: named first | 1 | 0.0 % | 0.0 to 79.3 % | >= 98 % |" in text
     assert "code being `0123`." in text
@@ -160,12 +165,12 @@ def answer(*sets: tuple[str, ...], **more: Any) -> dict[str, Any]:
 
 def test_the_truth_must_be_one_of_the_answers_by_its_own_name() -> None:
     pair = truth("b", "a") | said("a")
-    assert in_the_set(pair | answer(("a",), ("a", "b")))
-    assert not in_the_set(pair | answer(("a",), ("b",)) | {"look_alikes": {"a": {"b": 1.0}}})
-    assert in_the_set(truth("a", key="unseen-00000") | said() | answer(()))
-    assert not in_the_set(truth(key="null_white-00000") | said() | answer(("a",)))
+    assert in_the_set(case(pair, answer(("a",), ("a", "b"))))
+    assert not in_the_set(case(pair, answer(("a",), ("b",)), {"look_alikes": {"a": {"b": 1.0}}}))
+    assert in_the_set(case(truth("a", key="unseen-00000"), said(), answer(())))
+    assert not in_the_set(case(truth(key="null_white-00000"), said(), answer(("a",))))
     keys = ["pairs-00000", "pairs-00001"]
-    cases = [pair | answer(names) | {"key": key} for key, names in zip(keys, (("a", "b"), ("a",)), strict=True)]
+    cases = [case(pair, answer(names), {"key": key}) for key, names in zip(keys, (("a", "b"), ("a",)), strict=True)]
     shares = {s.name: (s.value, s.total) for s in answer_scores(cases)}
     assert shares["truth in the 95 % answer set"] == (0.5, 2)
     assert shares["most probable answer: exactly the truth"] == (0.5, 2)
@@ -175,15 +180,16 @@ def test_limits_are_counted_where_the_effect_was_not_selected() -> None:
     limits = {"a": {"p": {"value": 1.5, "unit": "g"}}}
     low = {"a": {"p": {"value": 0.5, "unit": "g"}}}
     cases = [
-        truth("a", key="limit_30-00000") | said() | answer((), upper_limit=each) for each in (limits, low, {}, limits)
+        case(truth("a", key="limit_30-00000"), said(), answer((), upper_limit=each))
+        for each in (limits, low, {}, limits)
     ]
     assert ratios(cases, "limit_30").tolist() == [1.5, 0.5, 1.5]
     assert [(s.value, s.total) for s in answer_scores(cases)] == [(pytest.approx(2 / 3), 3), (1.5, 3)]
 
 
 def test_said_probabilities_are_compared_with_the_share_that_is_true() -> None:
-    cases = [truth("a") | said() | answer((), probability={"a": p, "b": 0.02}) for p in (0.6, 0.6, 0.97)]
-    cases += [truth("b") | said() | answer((), probability={"a": 0.6, "b": 0.02})]
+    cases = [case(truth("a"), said(), answer((), probability={"a": p, "b": 0.02})) for p in (0.6, 0.6, 0.97)]
+    cases += [case(truth("b"), said(), answer((), probability={"a": 0.6, "b": 0.02}))]
     found = [(float(b.name), b.value, b.total) for b in reliability(cases)]
     assert found == [(pytest.approx(0.02), 0.25, 4), (pytest.approx(0.6), pytest.approx(2 / 3), 3), (0.97, 1.0, 1)]
     assert reliability_diagram(cases).count("<svg xmlns=") == 1
