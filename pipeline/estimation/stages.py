@@ -88,9 +88,8 @@ def stage_module(sensor: str, stage: str) -> str:
 
 def declared(sensor: str, stage: str) -> FitStage:
     """Return the declaration of a stage; raise ``ConfigurationError`` if there is no such stage of the sensor."""
-    module = stage_module(sensor, stage)
-    found: FitStage | None = getattr(import_module(module), "FIT_STAGES", {}).get(stage)
-    if found is None or sensor not in found.sensors:
+    found = _declaration(sensor, stage)
+    if found is None:
         raise ConfigurationError(
             f"no stage of the {sensor} is called {stage!r}: a stage is a module pipeline/estimation/{stage}.py, or for "
             f"one sensor pipeline/estimation/{sensor}/{stage}.py, with its declaration in FIT_STAGES"
@@ -98,10 +97,24 @@ def declared(sensor: str, stage: str) -> FitStage:
     return found
 
 
+def _declaration(sensor: str, stage: str) -> FitStage | None:
+    found: FitStage | None = getattr(import_module(stage_module(sensor, stage)), "FIT_STAGES", {}).get(stage)
+    return found if found is not None and sensor in found.sensors else None
+
+
+def declarations(calibration: SensorCalibration) -> dict[str, FitStage]:
+    """Return the declarations of the stages of a calibration's method, by name, in order.
+
+    A further result of a stage, such as ``faces``, has no declaration.
+    """
+    found = {stage.name: _declaration(calibration.sensor, stage.name) for stage in calibration.stages}
+    return {name: stage for name, stage in found.items() if stage is not None}
+
+
 def last_fit(calibration: SensorCalibration) -> FitStage:
     """Return the declaration of the last stage of a calibration's method, before the stage ``effects``."""
-    names = [stage.name for stage in calibration.stages if stage.name != "effects"]
-    return declared(calibration.sensor, names[-1]) if names else FitStage()
+    fits = [stage for name, stage in declarations(calibration).items() if name != "effects"]
+    return fits[-1] if fits else FitStage()
 
 
 def check_stages(sensor: str, stages: Sequence[str]) -> None:
@@ -145,7 +158,7 @@ def fit_stage(
         raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")
     if stage == GIVEN:
         return given_calibration(sensor, settings)
-    check_stages(sensor, [*(done.name for done in previous.stages), stage] if previous else [stage])
+    check_stages(sensor, [*declarations(previous), stage] if previous else [stage])
     module, of_both = import_module(stage_module(sensor, stage)), len(declared(sensor, stage).sensors) > 1
     fit = partial(module.fit, *((stage,) if len(module.FIT_STAGES) > 1 else (sensor,) if of_both else ()))
     for other in SENSORS:
@@ -166,7 +179,8 @@ def _fit_to_corrected(
     settings: Mapping[str, Any],
 ) -> SensorCalibration:
     """Return the fit to the readings less the known effects, which depend on bias and matrix, with these effects."""
-    sensor, held = previous.sensor, [s for s in previous.stages if declared(previous.sensor, s.name).known]
+    sensor, stages = previous.sensor, declarations(previous)
+    held = [s for s in previous.stages if s.name in stages and stages[s.name].known]
     before = without_known(previous, known)
     before = replace(before, stages=tuple(s for s in previous.stages if s not in held))
     at, passes = before, 0

@@ -16,6 +16,7 @@ from pipeline.estimation.multi_position.fit import fit
 from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, GyroscopeModel, model_of
 from pipeline.estimation.multi_position.model import NoiseHypothesis, State
 from pipeline.estimation.noise import estimate_noise, noise_of
+from pipeline.estimation.stages import fit_stage, last_fit
 from pipeline.signal.rests import find_rests
 from pipeline.signal.segments import multiples, turns_by_hand
 from pipeline.validation.attitude import gravity_direction
@@ -42,6 +43,17 @@ def test_both_matrices_are_full_and_within_their_uncertainty(whole: Session, sen
     assert not whole.fit(sensor).stages[-1].details["departures"]
     assert np.all(u > 0.0)
     assert np.all(np.abs(error) < stats.t.ppf(1.0 - 1e-3 / 24, freedom) * u)
+
+
+def test_stages_after_the_faces_and_the_diagnosis_know_the_method_that_fitted_them(whole: Session) -> None:
+    """The result ``faces`` of nonlinear_least_squares is no stage of a method: it has no declaration."""
+    faces = whole.fit("accelerometer")
+    assert [stage.name for stage in faces.stages] == ["nonlinear_least_squares", "faces"]
+    assert last_fit(faces).free
+    settings = whole.settings | {"effects": {"accelerometer": ["quadratic_nonlinearity"], "gyroscope": []}}
+    found = fit_stage("accelerometer", "effects", whole.recordings, faces, settings)
+    assert [effect.name for effect in found.effects] == ["quadratic_nonlinearity"]
+    assert last_fit(found).free
 
 
 def test_a_face_is_known_to_the_hand_and_the_length_of_gravity_to_the_noise(whole: Session) -> None:
