@@ -3,7 +3,7 @@
     nice python benchmarks/by_hand.py FOLDER [--times 5]
 
 FOLDER holds ``accelerometer.txt`` and ``gyroscope.txt``. Prints the least of some runs for each part: both fits from
-the recording in memory (rests, accelerometer, gyroscope), and the gyroscope with g-sensitivity.
+the recording in memory (noise, rests, accelerometer, gyroscope), and the gyroscope with g-sensitivity.
 """
 
 from __future__ import annotations
@@ -11,21 +11,25 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.effects import fit as fit_effects
-from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.io.read import read_recordings
-from pipeline.simulation.description import read_config
+from pipeline.one_unit import unit_row
+from pipeline.unit import Task, UnitState, run_checked, run_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.records import SensorCalibration
+
+LAYERS = [
+    "sensor=generic", "table=hand", "procedure=multi_position", "ingest=xsens_mti_multi_position",
+    f"table.gravity_g={9.81744 / 9.80665}", "effects.gyroscope=[g_sensitivity]",
+]  # fmt: skip
+METHOD = {"accelerometer": ["nonlinear_least_squares"], "gyroscope": ["rests_and_moves"]}
 
 
 def least(times: int, work: Callable[[], Any]) -> tuple[float, Any]:
@@ -44,25 +48,20 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--times", type=int, default=5)
     options = parser.parse_args()
-    settings: dict[str, Any] = {
-        "sensor": read_config("sensor", "generic"),
-        "table": read_config("table", "hand") | {"gravity_g": 9.81744 / 9.80665},
-        "procedure": read_config("procedure", "multi_position"),
-        "method": {"as_printed": False},
-        "effects": {"accelerometer": [], "gyroscope": ["g_sensitivity"]},
-    }
-    ingest = read_config("ingest", "canonical_csv") | read_config("ingest", "xsens_mti_multi_position")
+    settings = unit_row(LAYERS).config
     read, recordings = least(
-        1, lambda: read_recordings(settings["procedure"], ingest, settings["sensor"], options.folder)
+        1, lambda: read_recordings(settings.procedure, settings.ingest, settings.sensor, options.folder)
     )
 
-    def both() -> SensorCalibration:
-        nonlinear_least_squares.fit(recordings, None, settings)
-        return rests_and_moves.fit(recordings, None, settings)
+    def both() -> UnitState:
+        return run_checked(list(map(replace, recordings)), METHOD, settings)  # no quantity is known of a copy
 
-    fits, gyroscope = least(options.times, both)
-    effects, _ = least(options.times, lambda: fit_effects("gyroscope", recordings, gyroscope, settings))
-    print(f"reading {read:.2f} s, both fits {fits:.2f} s, effect g_sensitivity {effects:.2f} s")
+    def effects(unit: UnitState) -> UnitState:
+        return run_steps(replace(unit), iter([Task("fit", "gyroscope", "effects")]), lambda _: settings)
+
+    fits, unit = least(options.times, both)
+    more, _ = least(options.times, lambda: effects(unit))
+    print(f"reading {read:.2f} s, both fits with their noise {fits:.2f} s, effect g_sensitivity {more:.2f} s")
 
 
 if __name__ == "__main__":

@@ -20,20 +20,22 @@ import argparse
 import os
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from pipeline.estimation.stages import fit_stage
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion
+from pipeline.records import SENSORS, NotCalibrated
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription, shipped_settings
+from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration
+    from pipeline.settings import Settings
 
 COURSE = {
     "step_deg": 15.0,
@@ -66,21 +68,15 @@ CONDITIONS = ("white", "wander", "table")
 APPROXIMATIONS: dict[tuple[Any, ...], np.ndarray] = {}
 
 
-def settings_of(condition: str, table: str, procedure: str) -> dict[str, Any]:
-    sensor = {k: dict(v) if isinstance(v, dict) else v for k, v in read_config("sensor", "mpu6050").items()}
+def settings_of(condition: str, table: str, procedure: str) -> Settings:
+    shipped = shipped_settings(sensor="mpu6050", table="hand" if procedure == HAND else table, procedure=procedure)
+    sensor, stated = shipped.sensor, shipped.table
     if condition == "white":
-        for name in ("accelerometer", "gyroscope"):
-            sensor[name]["bias_wander"] = 0.0
-    stated = read_config("table", "hand" if procedure == HAND else table)
+        sensor = sensor.replaced(**{s: sensor.of(s).replaced(bias_wander=0.0) for s in SENSORS})
     if condition != "table":
-        stated = stated | dict.fromkeys(ACCURACIES, 0.0)
-    return {
-        "sensor": sensor,
-        "table": stated,
-        "procedure": {"holdout_every": 0},
-        "method": {"as_printed": False},
-        "effects": EFFECTS,
-    }
+        stated = stated.replaced(**dict.fromkeys(ACCURACIES, 0.0))
+    fitted = shipped.procedure.replaced(holdout_every=0)
+    return shipped.replaced(sensor=sensor, table=stated, procedure=fitted, effects=shipped.effects.replaced(**EFFECTS))
 
 
 def simulated(condition: str, table: str, procedure: str, seed: int, number: int) -> tuple[list[Recording], JSON]:
@@ -97,12 +93,14 @@ def simulated(condition: str, table: str, procedure: str, seed: int, number: int
     return simulate_unit(unit, seed, number)
 
 
-def calibrated(sensor: str, stages: tuple[str, ...], recordings: list[Recording], settings: JSON) -> SensorCalibration:
-    """Run the stages, each on the result of the one before."""
-    before = None
-    for name in stages:
-        before = fit_stage(sensor, name, recordings, before, settings)
-    return cast("SensorCalibration", before)
+def calibrated(
+    sensor: str, stages: tuple[str, ...], recordings: list[Recording], settings: Settings
+) -> SensorCalibration:
+    """Run the steps filter and fit, with these stages."""
+    found = run_checked(recordings, {sensor: stages}, settings).fits[sensor]
+    if isinstance(found, NotCalibrated):
+        raise TypeError(found.reason)
+    return found
 
 
 def noise_free(recordings: list[Recording], sensor: str, hidden: JSON) -> list[Recording]:
@@ -123,7 +121,7 @@ def frame_of(matrix: np.ndarray) -> np.ndarray:
     return Q * np.sign(np.diag(Q.T @ matrix))
 
 
-def true_values(method: str, recordings: list[Recording], settings: JSON, hidden: JSON) -> np.ndarray:
+def true_values(method: str, recordings: list[Recording], settings: Settings, hidden: JSON) -> np.ndarray:
     _, sensor, stages = METHODS[method]
     matrix = np.array(hidden[sensor]["matrix"])
     if "staged" in method:
@@ -137,7 +135,7 @@ def true_values(method: str, recordings: list[Recording], settings: JSON, hidden
     return np.concatenate([hidden[sensor]["bias"], matrix.ravel()])
 
 
-def judged(method: str, recordings: list[Recording], settings: JSON, hidden: JSON) -> np.ndarray:
+def judged(method: str, recordings: list[Recording], settings: Settings, hidden: JSON) -> np.ndarray:
     """Return error over expanded uncertainty of each parameter; NaN where a parameter is not estimated."""
     _, sensor, stages = METHODS[method]
     part = calibrated(sensor, stages, recordings, settings).to_json()

@@ -29,10 +29,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.estimation.stages import fit_stage
 from pipeline.report.combined import calibration_with_prior, estimates, priors_of
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription, shipped_settings
+from pipeline.unit import run_checked
 
 JSON = dict[str, Any]
 STEPS_DEG = {72: 15.0, 36: 30.0, 18: 60.0, 12: 90.0}  # positions to the angle between stops
@@ -42,7 +42,9 @@ NOMINAL = np.concatenate([[0.01, -0.02, 0.015], np.eye(3).ravel()])
 SENSOR, METHOD = "accelerometer", "reference_least_squares"
 
 
-def calibrated(truth: np.ndarray, positions: int, table: JSON, direction: np.ndarray, numbers: list[int]) -> JSON:
+def calibrated(
+    truth: np.ndarray, positions: int, orthogonality: float, direction: np.ndarray, numbers: list[int]
+) -> JSON:
     """Return the published part of a simulated unit, as far as the prior reads it."""
     unit = UnitDescription(
         f"U{numbers[1]}",
@@ -52,11 +54,9 @@ def calibrated(truth: np.ndarray, positions: int, table: JSON, direction: np.nda
         recordings=["accel_x", "accel_y", "accel_z"],
     )
     recordings, _ = simulate_unit(unit, *numbers)
-    settings = {
-        "sensor": read_config("sensor", "mpu6050"), "table": table, "procedure": {"holdout_every": 0},
-        "method": {"as_printed": False}, "effects": {SENSOR: []},
-    }  # fmt: skip
-    part = fit_stage(SENSOR, METHOD, recordings, None, settings).to_json()
+    shipped = shipped_settings(sensor="mpu6050", table="acutronic")
+    settings = shipped.replaced(table=shipped.table.replaced(orthogonality_deg=orthogonality))
+    part = run_checked(recordings, {SENSOR: [METHOD]}, settings).fits[SENSOR].to_json()
     same = {"sensor": "mpu6050", "table": "acutronic", "procedure": "three_axis_turns", "methods": {SENSOR: METHOD}}
     return {"unit": unit.unit, **same, SENSOR: part, "gyroscope": None}
 
@@ -70,9 +70,8 @@ class Units:
 
     def __init__(self, truths: np.ndarray, positions: int, orthogonality: float, seed: int) -> None:
         direction = orthogonality * np.random.default_rng([seed, 7]).standard_normal((3, 2))
-        table = read_config("table", "acutronic") | {"orthogonality_deg": orthogonality}
         self.truths = truths
-        self.documents = [calibrated(t, positions, table, direction, [seed, i]) for i, t in enumerate(truths)]
+        self.documents = [calibrated(t, positions, orthogonality, direction, [seed, i]) for i, t in enumerate(truths)]
 
     def moved(self, truths: np.ndarray) -> list[JSON]:
         """Return the documents of units with other parameters, with the same errors."""

@@ -33,26 +33,27 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-import yaml
 from scipy import stats
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
-from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.config import load_campaign
 from pipeline.io.read import read_recordings
+from pipeline.one_unit import unit_of_campaign, unit_row
+from pipeline.records import SENSORS
 from pipeline.signal.rests import find_rests
 from pipeline.signal.segments import cut
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription, shipped_settings
+from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pipeline.records import Recording
+    from pipeline.settings import Settings
 
-ROOT = Path(__file__).parents[1]
-PUBLISHED = ROOT / "data" / "published"
+METHOD = {"accelerometer": ["nonlinear_least_squares"], "gyroscope": ["rests_and_moves"]}
 FEWEST = 250.0  # deg by the raw rate, its bias included: a move that counts as a turn by 360 deg
 HAND = {
     "ferraris": {"interval_s": 0.02, "course": {"dwell_s": 4.0}},
@@ -109,10 +110,11 @@ class Estimate(NamedTuple):
         return (reading - self.bias[1] - force @ self.sensitivity.T) @ self.matrix[1].T
 
 
-def ours(recordings: list[Recording], settings: dict[str, Any]) -> Estimate:
+def ours(recordings: list[Recording], settings: Settings) -> Estimate:
     began = time.process_time()
-    found = [fit.fit(recordings, None, settings) for fit in (nonlinear_least_squares, rests_and_moves)]
+    fits = run_checked(recordings, METHOD, settings).fits
     cpu = time.process_time() - began
+    found = [fits[sensor] for sensor in SENSORS]
     return Estimate(tuple(f.bias for f in found), tuple(f.matrix for f in found), np.zeros((3, 3)), cpu)
 
 
@@ -192,15 +194,9 @@ def against_truth(found: Estimate, truth: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def settings_of(procedure: str, sensor: str) -> dict[str, Any]:
-    return {
-        "sensor": read_config("sensor", sensor),
-        "table": read_config("table", "hand"),
-        "procedure": read_config("procedure", procedure)
-        | {"holdout_every": 0},  # all rests are for the fit, as for peers
-        "method": {"as_printed": False},
-        "effects": {"accelerometer": [], "gyroscope": []},
-    }
+def settings_of(procedure: str, sensor: str) -> Settings:
+    shipped = shipped_settings(sensor=sensor, table="hand", procedure=procedure)
+    return shipped.replaced(procedure=shipped.procedure.replaced(holdout_every=0))  # all rests are for the fit
 
 
 def sections_of(whole: Recording) -> dict[str, Recording]:
@@ -251,12 +247,6 @@ def held_out(found: Estimate, recordings: list[Recording]) -> tuple[np.ndarray, 
     return np.array(sizes), np.array(angles)
 
 
-def profile(name: str, folder: Path) -> dict[str, Any]:
-    """Return an ingest configuration with the defaults that it leaves out."""
-    plain, own = read_config("ingest", "canonical_csv"), yaml.safe_load((folder / f"{name}.yaml").read_text())
-    return plain | own | {"csv": plain["csv"] | own["csv"]}
-
-
 def ratio(mine: np.ndarray, theirs: np.ndarray) -> str:
     """Return the geometric mean of a ratio, with its 95 % interval over pairs."""
     logs = np.log(mine / theirs)
@@ -299,19 +289,23 @@ def public(title: str, recordings: list[Recording], estimates: dict[str, Estimat
     return [*lines, ""]
 
 
-def read(folder: Path, ingest: dict[str, Any], sensor: str) -> list[Recording]:
-    return read_recordings(read_config("procedure", "multi_position"), ingest, read_config("sensor", sensor), folder)
+def read(config: Settings, folder: Path) -> list[Recording]:
+    return read_recordings(config.procedure, config.ingest, config.sensor, folder)
+
+
+def published(unit: str) -> tuple[Settings, list[Recording]]:
+    """Return the settings of a unit of the campaign, and its recordings uncut."""
+    found = unit_of_campaign(load_campaign({"campaign": "published"}), unit)
+    return found.row.config, read(found.row.config, found.files.folder)
 
 
 def wearable(program: Path | None) -> list[str]:
-    (whole,) = read(
-        PUBLISHED / "raw" / "wearable", profile("imucal_session", PUBLISHED / "configs" / "ingest"), "generic"
-    )
-    own = yaml.safe_load((PUBLISHED / "configs" / "procedure" / "ferraris_held_out.yaml").read_text())
-    parts = cut(whole, own["recordings"]["recording"]["windows"])
+    config, (whole,) = published("wearable")
+    own = config.procedure
+    parts = cut(whole, own.recordings["recording"].windows)
     fitted, kept = ([p for p in parts if (p.role == "validation") == out] for out in (False, True))
     settings = settings_of("ferraris", "generic")
-    settings["procedure"] |= {"turns": own["turns"], "faces": own["faces"]}
+    settings = settings.replaced(procedure=settings.procedure.replaced(turns=own.turns, faces=own.faces))
     found: dict[str, Estimate | None] = {"this product": ours(fitted, settings)}
     found["imucal"] = imucal({name: whole.select(slice(*span)) for name, span in SECTIONS.items()}, 102.4)
     if program:
@@ -320,9 +314,7 @@ def wearable(program: Path | None) -> list[str]:
 
 
 def mpu6050(program: Path | None) -> list[str]:
-    recordings = read(
-        PUBLISHED / "raw" / "mpu6050", profile("mpu6050_multi_position", ROOT / "configs" / "ingest"), "mpu6050"
-    )
+    _, recordings = published("mpu6050")
     kept = [r for r in recordings if r.role == "validation"]
     fitted = [r for r in recordings if r.role != "validation"]
     found: dict[str, Estimate | None] = {"this product": ours(recordings, settings_of("multi_position", "mpu6050"))}
@@ -332,7 +324,8 @@ def mpu6050(program: Path | None) -> list[str]:
 
 
 def xsens(folder: Path, program: Path) -> list[str]:
-    (whole,) = read(folder, profile("xsens_mti_multi_position", ROOT / "configs" / "ingest"), "generic")
+    layers = ["sensor=generic", "table=hand", "procedure=multi_position", "ingest=xsens_mti_multi_position"]
+    (whole,) = read(unit_row(layers).config, folder)
     split = int(np.searchsorted(whole.time - whole.time[0], XSENS_FIT_S))
     first, last = whole.select(slice(0, split)), whole.select(slice(split, None))
     found = {"this product": ours([first], settings_of("multi_position", "generic"))}

@@ -30,12 +30,11 @@ from pipeline.planning.guide import (
     progress_of,
     propose,
 )
-from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import NotCalibrated
 from pipeline.settings import RecordingFile
 from pipeline.signal.rests import WINDOW_S, find_rests
-from pipeline.signal.segments import cut
 from pipeline.simulation.description import BY_HAND
+from pipeline.unit import Task, UnitFiles, UnitState, run_steps
 
 if TYPE_CHECKING:
     import argparse
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
     from pipeline.records import Recording, Values
     from pipeline.settings import Settings
     from pipeline.signal.rests import Rest
-    from pipeline.unit import UnitState
 
 POLL_S = 1.0  # between two readings of a growing log: short against a rest
 STILL_RESTING_S = 1.0  # from the end of a rest to that of the log, below which the rest may continue
@@ -85,21 +83,22 @@ class Source:
         return {g[0].stem: (RecordingFile(file=g[0].stem, role="rests", axis=None, optional=False), g) for g in groups}
 
     def read(self, *, growing: bool) -> list[Recording]:
-        """Return the recordings; of a growing log the complete rows or chunks."""
+        """Return the recordings after ingest, of which no turn is held out; of a growing log the complete rows."""
         entries, ingest = self.entries(), self.config.ingest
         if growing and ingest.mcap:
             ingest = ingest.replaced(mcap={**ingest.mcap, "allow_truncated": True})
-        procedure = self.config.procedure.replaced(recordings={n: entry for n, (entry, _) in entries.items()})
+        named = {name: entry for name, (entry, _) in entries.items()}
+        procedure = self.config.procedure.replaced(recordings=named, turns=None)
         settings = self.config.replaced(ingest=ingest, procedure=procedure)
-        recordings = []
+        whole = []
         with tempfile.TemporaryDirectory() as folder:
             for name, (entry, files) in entries.items():
-                whole = [complete_rows(f, Path(folder)) for f in files] if growing else files
-                table, windows = read_table(whole, ingest), entry.windows
-                role = "rests" if entry.role == "session" and not windows else entry.role
+                table = read_table([complete_rows(f, Path(folder)) for f in files] if growing else files, ingest)
+                role = "rests" if entry.role == "session" and not entry.windows else entry.role
                 read = to_recording(name, entry.replaced(role=role), table, self.config.sensor, checks_of(ingest))
-                recordings += cut(read, windows) if windows else [read]
-        return check_recordings(recordings, settings) if recordings else []
+                whole.append(read)
+        unit = UnitState("unit", UnitFiles(Path(), Path(), recordings=whole))
+        return run_steps(unit, iter([Task("ingest")]), lambda _: settings).checked or [] if whole else []
 
 
 def main(argv: Sequence[str]) -> int:
