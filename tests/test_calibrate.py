@@ -1,6 +1,6 @@
 """``pipeline.calibrate`` and ``calibrate_unit``: what they take, return and refuse.
 
-Their figures against those of runs: ``tests/workflow/test_one_chain.py``.
+Their figures against those of runs: ``tests/workflow/test_own_effects.py``, ``tests/study/test_one_chain.py``.
 """
 
 from __future__ import annotations
