@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from pipeline.pack import Pack
-    from pipeline.records import Fit, Recording, UnitRecordings
+    from pipeline.records import Fit, Recording, UnitRecordings, Validation
     from pipeline.settings import Settings
 
 
@@ -36,16 +36,16 @@ STEPS = {  # in the order of a run
     "filter": Step("filter.filter_recordings", ("checked",), ("sensor", "filter"), "recordings"),
     # once for each stage of the method of each sensor; the stage ``effects`` reads the section ``effects``, too
     "fit": Step("fit.fit", ("recordings", "fits"), (*BENCH, "method", "uncertainty"), "fits"),
-    "validate": Step("validate.held_out_document", ("unit", "recordings", "fits"), (*BENCH, "limits"), "validation"),
+    "validate": Step("validate.validate_unit", ("unit", "recordings", "fits"), (*BENCH, "limits"), "validated"),
     "diagnose": Step(
         "diagnose.diagnose_unit",
-        ("unit", "recordings", "fits", "validation"),
+        ("unit", "recordings", "fits", "validated"),
         (*BENCH, "effects", "method", "diagnosis"),
         "diagnosed",
     ),
     "calibration": Step(
         "calibration.calibration_document",
-        ("unit", "checked", "fits", "validation"),
+        ("unit", "checked", "fits", "validated"),
         (*BENCH, "method", "ingest", "stated"),
         "calibration",
     ),
@@ -81,12 +81,17 @@ class UnitState:
     checked: list[Recording] | None = None
     recordings: UnitRecordings | None = None
     fits: dict[str, Fit] = field(default_factory=dict)  # by sensor, after the last stage so far
-    validation: dict[str, Any] | None = None  # ``validations/<unit>.json``
+    validated: Validation | None = None
     diagnosed: Any = None  # ``pipeline.stages.diagnose.Diagnosis``
     calibration: dict[str, Any] | None = None  # ``calibrations/<unit>.json``
     exports: dict[str, str] | None = None  # ``exports/<unit>/``: text by file
     pages: dict[str, Any] | None = None  # page and certificates, by their path below ``reports/``
     summary: dict[str, Any] | None = None
+
+    @property
+    def validation(self) -> dict[str, Any] | None:
+        """``validations/<unit>.json``."""
+        return None if self.validated is None else self.validated.to_json()
 
     @property
     def diagnosis(self) -> dict[str, Any] | None:

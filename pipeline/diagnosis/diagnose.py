@@ -21,7 +21,7 @@ from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
 from pipeline.model.effects import catalogue, effect
-from pipeline.records import MATRIX, Noise, Recording, SensorCalibration
+from pipeline.records import MATRIX, Noise, Recording, SensorCalibration, SensorValidation
 from pipeline.validation.heldout import last_error, static_error
 from pipeline.validation.samples import HeldOutCase
 from pipeline.verdicts import Verdict
@@ -45,18 +45,18 @@ def diagnose(
     settings: Mapping[str, Any],
     accelerometer: SensorCalibration | None = None,
     *,
-    validation: Mapping[str, Any] | None = None,
+    validation: SensorValidation | None = None,
     gravity: Mapping[str, Any] | None = None,
-    moves: Mapping[str, Any] | None = None,
+    moves: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
     """Return a sensor's part of ``diagnoses/<unit>.json``; ``pipeline/schemas/diagnosis.json`` describes it.
 
     ``calibration``: the fits start from its effects. ``recordings``: all of the unit; those of role ``validation`` take
     no part in the selection. ``settings``: sections ``sensor``, ``table`` and ``effects``; by hand also ``procedure``.
     ``accelerometer``: the unit's other calibration, which a gyroscope by hand needs for the direction of gravity.
-    ``validation``: the sensor's part of ``validations/<unit>.json``; without it, a free fit replaces the calibration.
-    ``gravity``: for a gyroscope, the diagnosis of the accelerometer. ``moves``: for a gyroscope by hand, the part
-    ``gravity_direction`` of ``validations/<unit>.json``.
+    ``validation``: of the calibration; without it, a free fit replaces the calibration.
+    ``gravity``: for a gyroscope, the diagnosis of the accelerometer. ``moves``: for a gyroscope by hand,
+    ``Validation.moves_error``.
     """
     sensor = calibration.sensor
     by_hand = is_multi_position(sensor, recordings)
@@ -69,8 +69,6 @@ def diagnose(
     elif not by_hand:  # an accelerometer's fit is no prior of its own mountings
         accelerometer = None
     case = Case(calibration, recordings, noise, settings, accelerometer, configured)
-    largest = (moves or {}).get("largest_expected_rms_deg")
-    moved = (moves["rms_deg"]["after"], largest) if moves and largest is not None else None
     full = (settings.get("diagnosis") or {}).get("depth") == "full"
 
     def judge(findings: Findings | None, document: dict[str, Any]) -> tuple[dict[str, Any], bool]:
@@ -81,7 +79,7 @@ def diagnose(
             doubts += _doubts_of_gravity(gravity, case)
         elif not leaning.keys() & {*configured, *document["selected"]}:
             doubts += _doubts_of_axes(leaning, calibration)
-        evidence = replace(evidence, doubts=doubts, moves=moved)
+        evidence = replace(evidence, doubts=doubts, moves=moves)
         document = judged(document, evidence)
         return document, full or may_be_unknown(document["verdict"], evidence)
 
@@ -98,11 +96,12 @@ def diagnose(
     return document
 
 
-def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
+def held_out_of(validation: SensorValidation) -> HeldOut | None:
     """Return the last error of a sensor's validation; None without held-out motion or without an interval."""
-    if not part or not part.get("held_out") or not part.get("expected_rms_error"):
+    error = validation.steps[-1].rms_error
+    if not validation.held_out or validation.expected_rms_error is None or error is None:
         return None
-    return HeldOut(float(part["steps"][-1]["rms_error"]), *map(float, part["expected_rms_error"]))
+    return HeldOut(error, *validation.expected_rms_error)
 
 
 def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = True) -> list[str]:
@@ -117,7 +116,7 @@ def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = Tru
 
 
 def evidence_of(
-    document: Mapping[str, Any], case: Case, validation: Mapping[str, Any] | None, findings: Findings | None
+    document: Mapping[str, Any], case: Case, validation: SensorValidation | None, findings: Findings | None
 ) -> Evidence:
     """Return the evidence for the verdict on ``document``, the diagnosis by the selection alone.
 
@@ -152,7 +151,7 @@ def evidence_of(
         findings.left_over_noise if findings else None,
         published=published,
         static=HeldOut(static[0], *static[1]) if static else None,
-        agreement=(validation or {}).get("agreement"),
+        agreement=validation.agreement if validation else None,
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=[

@@ -17,6 +17,8 @@ from pipeline.verdicts import Verdict
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from pipeline.records import Agreement
+
 EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
 MOSTLY = 0.5  # least share of the residual's excess that selected effects explain if the residual has another cause too
 BELIEVED = 3  # most effects at once; a selection takes more only to imitate physics outside the catalogue
@@ -66,7 +68,7 @@ class Evidence:
     moves: tuple[float, float] | None = None  # rms error of held-out moves and its largest expected value, deg
     free: HeldOut | None = None  # of a free fit of the same recordings; filtered ones against the filtered reference
     full: HeldOut | None = None  # of the free fit with the selected effects
-    agreement: Mapping[str, Any] | None = None  # of matrix and held-out motion (``pipeline.validation.heldout``)
+    agreement: Agreement | None = None
     static: HeldOut | None = None  # mean of the static recording, by the unit's calibration
     doubts: Sequence[str] = ()  # contradictions of the reference, from the checks of the recordings
     approximations: Sequence[str] = ()  # errors of the method's bias and matrix (``pipeline.diagnosis.method_errors``)
@@ -130,7 +132,7 @@ class Evidence:
     @property
     def disagrees(self) -> bool:
         """Whether held-out motion contradicts the matrix and the selection found nothing."""
-        return bool(self.agreement and self.found == Verdict.NOTHING_MISSING and self.agreement["p_value"] < DISAGREES)
+        return bool(self.agreement and self.found == Verdict.NOTHING_MISSING and self.agreement.p_value < DISAGREES)
 
     @property
     def given(self) -> bool:

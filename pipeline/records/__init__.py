@@ -66,6 +66,15 @@ from pipeline.records.recording import (
     once_of_log,
     rate_of_attitude,
 )
+from pipeline.records.validation import (
+    Agreement,
+    LimitCheck,
+    OverTemperature,
+    SensorValidation,
+    StepErrors,
+    TemperatureBin,
+    Validation,
+)
 
 __all__ = [
     "AFTER_BASE",
@@ -87,6 +96,7 @@ __all__ = [
     "SCHEMA_VERSION",
     "SENSORS",
     "SENSOR_UNITS",
+    "Agreement",
     "Budget",
     "BudgetLine",
     "Contribution",
@@ -94,6 +104,7 @@ __all__ = [
     "FittedEffect",
     "Index",
     "Integers",
+    "LimitCheck",
     "Mask",
     "MonteCarlo",
     "Motion",
@@ -102,11 +113,16 @@ __all__ = [
     "NotCalibrated",
     "NotIncluded",
     "Note",
+    "OverTemperature",
     "Parameters",
     "Recording",
     "SensorCalibration",
+    "SensorValidation",
     "StageResult",
+    "StepErrors",
+    "TemperatureBin",
     "UnitRecordings",
+    "Validation",
     "Values",
     "WanderLikelihood",
     "base_units",

@@ -21,7 +21,7 @@ from pipeline.io.channel_table import axis_maps
 from pipeline.io.quality_flags import GAP
 from pipeline.model.calibration_file import beyond_limits, implausible, not_determined
 from pipeline.pack import FAILED
-from pipeline.records import SCHEMA_VERSION, SENSORS, NotCalibrated, Recording, calibrated
+from pipeline.records import SCHEMA_VERSION, SENSORS, NotCalibrated, Recording, Validation, calibrated
 from pipeline.stages.unit_files import StoredUnit
 from pipeline.version import VERSION
 
@@ -40,14 +40,14 @@ def calibration_document(
     unit: str,
     checked: list[Recording],
     fits: Mapping[str, Fit],
-    validation: Mapping[str, Any],
+    validated: Validation,
     settings: Settings,
 ) -> dict[str, Any]:
     """Return ``calibrations/<unit>.json``: the fits, noise at rest, inputs and software.
 
     Raises ``CannotCalibrateError`` if no sensor is calibrated.
     """
-    reasons = not_calibrated(fits, validation, settings)
+    reasons = not_calibrated(fits, validated, settings)
     if len(reasons) == len(SENSORS):
         told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
         raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
@@ -67,12 +67,12 @@ def calibration_document(
     return document
 
 
-def not_calibrated(fits: Mapping[str, Fit], validation: Mapping[str, Any], settings: Settings) -> dict[str, str]:
+def not_calibrated(fits: Mapping[str, Fit], validated: Validation, settings: Settings) -> dict[str, str]:
     """Return the sensors that are not calibrated, each with the reason."""
     reasons = {sensor: fit.reason for sensor, fit in fits.items() if isinstance(fit, NotCalibrated)}
     if not settings.method.as_printed:  # printed errata are shown as they are; the verdict is left_by_method
-        fitted = {sensor: validation[sensor] for sensor in SENSORS if sensor not in reasons}
-        reasons |= {s: v["worse_than_raw"] for s, v in fitted.items() if v and v["worse_than_raw"]}
+        fitted = {sensor: part for sensor, part in validated.sensors.items() if sensor not in reasons}
+        reasons |= {s: part.worse_than_raw for s, part in fitted.items() if part and part.worse_than_raw}
     return reasons
 
 
@@ -101,7 +101,7 @@ def _on_board(job: Job, unit: str, board: Board) -> dict[str, Any]:
 def _chip(job: Job, unit: str) -> Chip:
     """Return a chip of a board, with the recordings and calibrations of its unit."""
     stored, settings = StoredUnit(job, unit), job.units[unit]
-    reasons = not_calibrated(stored.fits, stored.validation, settings)
+    reasons = not_calibrated(stored.fits, stored.validated, settings)
     found = {s: None if s in reasons else c for s, c in calibrated(stored.fits).items()}
     return Chip(unit, stored.checked, found, settings.sensor)
 

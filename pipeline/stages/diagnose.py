@@ -10,7 +10,7 @@ from pipeline.diagnosis.formula_discovery import effect_file
 from pipeline.errors import omission
 from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
-from pipeline.records import SCHEMA_VERSION, calibrated
+from pipeline.records import SCHEMA_VERSION, Validation, calibrated
 from pipeline.stages.unit_files import StoredUnit
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def diagnose_unit(
     unit: str,
     recordings: UnitRecordings,
     fits: Mapping[str, Fit],
-    validation: Mapping[str, Any],
+    validated: Validation,
     settings: Settings,
 ) -> Diagnosis:
     """Diagnose which physical effects the models of both sensors lack.
@@ -50,7 +50,7 @@ def diagnose_unit(
             continue
         try:
             gravity = made.document.get("accelerometer")
-            found = _diagnosed(calibration, known, recordings, noises[sensor], settings, validation, gravity)
+            found = _diagnosed(calibration, known, recordings, noises[sensor], settings, validated, gravity)
         except Exception as error:  # noqa: BLE001  (the calibration does not depend on its diagnosis)
             made.omissions.append(omission(error, unit, f"diagnose/{sensor}"))
             found = without_diagnosis(sensor, settings, made.omissions[-1])
@@ -74,7 +74,7 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
     recordings: UnitRecordings,
     noise: Noise,
     settings: Settings,
-    validation: Mapping[str, Any],
+    validated: Validation,
     gravity: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Return the diagnosis of one sensor, with its effective noise; ``gravity``: diagnosis of the accelerometer."""
@@ -85,9 +85,9 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
         noise,
         settings,
         known["accelerometer"],
-        validation=validation[sensor],
+        validation=validated.sensors[sensor],
         gravity=gravity,
-        moves=validation["gravity_direction"] if sensor == "gyroscope" else None,
+        moves=validated.moves_error if sensor == "gyroscope" else None,
     )
     other = next(c for s, c in known.items() if s != sensor)
     found["effective_noise"] = effective_noise(calibration, filtered, noise, settings.table, found, other=other)

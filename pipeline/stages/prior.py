@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import DamagedFileError
 from pipeline.exports import exports
 from pipeline.pack import DOCUMENTS, STAGE_OF, Pack, as_bytes, new_pack
-from pipeline.records import SENSORS, fit_from_json
+from pipeline.records import SENSORS, Validation, fit_from_json
 from pipeline.report.combined import Estimate, Prior, calibration_with_prior, priors_of, with_card
 from pipeline.stages.batch import record_output
 from pipeline.stages.summary import failed_files
@@ -57,10 +57,11 @@ def prior_unit(job: Job, unit: str, settings: Settings) -> Files:
     files: Files = {}
     if document:
         fits = {s: fit_from_json(s, document[s] or {"not_calibrated": ""}) for s in SENSORS}
+        before = Validation.from_json(validation).sensors
         after = held_out_errors(StoredUnit(job, unit).recordings, fits, settings)
         for sensor in [s for s in priors if not priors[s].refused]:
-            errors = {"without": validation[sensor], "with": after[sensor]}
-            rms = {name: part["steps"][-1]["rms_error"] if part["held_out"] else None for name, part in errors.items()}
+            errors = {"without": before[sensor], "with": after[sensor]}
+            rms = {k: part.steps[-1].rms_error if part and part.held_out else None for k, part in errors.items()}
             document["lot_prior"][sensor]["held_out_rms_error"] = rms
         files[f"combined/{unit}.json"] = document
         written = exports(document, settings, validation, diagnosis)

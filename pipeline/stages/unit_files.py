@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.io.arrow import from_parquet, to_parquet
 from pipeline.pack import INCOMPLETE, Pack
-from pipeline.records import SENSORS, Noise, UnitRecordings, fit_from_json
+from pipeline.records import SENSORS, Noise, UnitRecordings, Validation, fit_from_json
 from pipeline.unit import UnitFiles
 
 if TYPE_CHECKING:
@@ -64,6 +64,11 @@ class StoredUnit:
             return {sensor: fit_from_json(sensor, self._json("previous"))} if "previous" in self.job.inputs else {}
         return {sensor: fit_from_json(sensor, self._json(sensor)) for sensor in SENSORS}
 
+    @property
+    def validated(self) -> Validation:
+        """Errors on held-out motion."""
+        return Validation.from_json(self.validation)
+
     @cached_property
     def validation(self) -> dict[str, Any]:
         """``validations/<unit>.json``."""
@@ -99,7 +104,7 @@ FILES: dict[str, Callable[[str, Any], Files]] = {
     "ingest": lambda unit, recordings: {f"{unit}.parquet": to_parquet(recordings)},
     "filter": _files_of_filter,
     "fit": lambda unit, fit: {f"{unit}.json": fit.to_json()},
-    "validate": lambda unit, document: {f"{unit}.json": document},
+    "validate": lambda unit, validated: {f"{unit}.json": validated.to_json()},
     "diagnose": lambda unit, found: (
         {f"{unit}.json": found.document}
         | found.effect_files

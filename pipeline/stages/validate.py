@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.estimation.noise import required_noises
-from pipeline.records import SCHEMA_VERSION, calibrated
+from pipeline.records import SensorValidation, Validation, calibrated
 from pipeline.validation.attitude import attitude, gravity_direction
 from pipeline.validation.heldout import validate
 
@@ -16,29 +16,29 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
 
 
-def held_out_document(
-    unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings
-) -> dict[str, Any]:
-    """Return ``validations/<unit>.json``: the errors on held-out motion after each step of both fits."""
+def validate_unit(unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings) -> Validation:
+    """Return the errors on held-out motion after each step of both fits."""
     filtered, found = recordings.filtered, calibrated(fits)
-    document: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "unit": unit} | held_out_errors(
-        recordings, fits, settings
+    noise = recordings.noises.get("gyroscope")
+    return Validation(
+        unit,
+        held_out_errors(recordings, fits, settings),
+        attitude(found["accelerometer"], found["gyroscope"], filtered),
+        gravity_direction(**found, recordings=filtered, noise=noise, settings=settings),
     )
-    document["attitude"] = attitude(found["accelerometer"], found["gyroscope"], filtered)
-    document["gravity_direction"] = gravity_direction(
-        **found, recordings=filtered, noise=recordings.noises.get("gyroscope"), settings=settings
-    )
-    return document
 
 
-def held_out_errors(recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings) -> dict[str, Any]:
-    """Return the part of each sensor in ``validations/<unit>.json``; None for a sensor without a calibration."""
+def held_out_errors(
+    recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings
+) -> dict[str, SensorValidation | None]:
+    """Return the errors of each sensor; None for a sensor without a calibration."""
     known = calibrated(fits)
     noises = required_noises(recordings, settings.sensor, known)
-    found = {}
+    found: dict[str, SensorValidation | None] = {}
     for sensor, calibration in known.items():
         other = next(c for s, c in known.items() if s != sensor)
-        found[sensor] = calibration and validate(
-            calibration, recordings.filtered, noises[sensor], settings, other=other
-        )
+        if calibration is None:
+            found[sensor] = None
+        else:
+            found[sensor] = validate(calibration, recordings.filtered, noises[sensor], settings, other=other)
     return found

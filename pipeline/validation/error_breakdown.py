@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from pipeline.model.effects.base import truth
 from pipeline.model.effects.mounting import SEPARATOR, Mounting
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, linear_truth, solve
-from pipeline.records import FittedEffect, Motion, SensorCalibration, Values
+from pipeline.records import FittedEffect, Motion, SensorCalibration, StepErrors, Values
 from pipeline.validation.samples import OTHER, Samples
 
 if TYPE_CHECKING:
@@ -35,9 +35,7 @@ if TYPE_CHECKING:
 SPLINE_DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s are followed to 1e-4 deg/s at 0.12 s
 
 
-def error_breakdown(
-    calibration: SensorCalibration, samples: Sequence[Samples]
-) -> tuple[list[dict[str, Any]], list[str]]:
+def error_breakdown(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[list[StepErrors], list[str]]:
     """Return the errors after each step, and notes on effects that the samples cannot show."""
     stages = [(f"stage:{stage.name}", stage.correction) for stage in calibration.stages if stage.correction is not None]
     figures = [
@@ -54,12 +52,9 @@ def error_breakdown(
         else:
             shown.append(fitted)
         figures.append(_figures(f"+ {fitted.name}", [_with_effects(calibration, shown, s) for s in samples]))
-    raw, directed = figures[0]["mean_abs_error"], all(direction_known(calibration, s) for s in samples)
-    for row in figures:
-        row["change_percent"] = 100.0 * (raw - row["mean_abs_error"]) / raw if raw else None
-        if not directed:
-            row["vector_rms_error"] = None
-    return figures, notes
+    raw, directed = figures[0][0], all(direction_known(calibration, s) for s in samples)
+    rows = [replace(row, change_percent=100.0 * (raw - mean) / raw if raw else None) for mean, row in figures]
+    return rows if directed else [replace(row, vector_rms_error=None) for row in rows], notes
 
 
 def last_step(calibration: SensorCalibration, samples: Samples) -> Corrected | None:
@@ -90,22 +85,23 @@ def _uncorrected(samples: Samples, readings: Values) -> Corrected:
     return readings, samples.magnitude, None if samples.motion is None else truth(samples.sensor, samples.motion)
 
 
-def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
+def _figures(name: str, corrected: Sequence[Corrected]) -> tuple[float, StepErrors]:
+    """Return the mean absolute error of the magnitude, and all errors."""
     error = np.concatenate([np.linalg.norm(vector, axis=1) - magnitude for vector, magnitude, _ in corrected])
     known = np.isfinite(error)
     differences = [vector - true for vector, _, true in corrected if true is not None]
     off = np.concatenate(differences)[known] if len(differences) == len(corrected) else None
     error = error[known]
-    return {
-        "name": name,
-        "mean_abs_error": float(np.mean(np.abs(error))),
-        "sum_abs_error": float(np.sum(np.abs(error))),
-        "max_error": float(np.max(error)),
-        "min_error": float(np.min(error)),
-        "rms_error": float(np.sqrt(np.mean(error**2))),
-        "change_percent": None,
-        "vector_rms_error": None if off is None else float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
-    }
+    mean = float(np.mean(np.abs(error)))
+    return mean, StepErrors(
+        name,
+        mean,
+        float(np.sum(np.abs(error))),
+        float(np.max(error)),
+        float(np.min(error)),
+        float(np.sqrt(np.mean(error**2))),
+        vector_rms_error=None if off is None else float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+    )
 
 
 def _lack(fitted: FittedEffect, samples: Samples) -> str | None:

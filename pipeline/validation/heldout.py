@@ -28,6 +28,7 @@ of local gravity and of the time base are the same in calibration and reference.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +43,16 @@ from pipeline.io.quality_flags import STUCK
 from pipeline.model.effects import bench_priors, effect_of
 from pipeline.model.effects.base import unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
-from pipeline.records import AXES, MATRIX
+from pipeline.records import (
+    AXES,
+    MATRIX,
+    Agreement,
+    LimitCheck,
+    OverTemperature,
+    SensorValidation,
+    StepErrors,
+    TemperatureBin,
+)
 from pipeline.signal.rests import Rest
 from pipeline.validation.error_breakdown import (
     direction_known,
@@ -65,7 +75,6 @@ FEWEST_SAMPLES = 5  # of the t-test
 BIN_DEGC = 5.0  # a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
 SWEEP_DEGC = 2 * BIN_DEGC  # fills two bins; a unit that warms up on the bench changes by less
 FEWEST_IN_BIN = 10  # samples of a bin that is shown
-FIGURES = ("mean_abs_error", "sum_abs_error", "max_error", "min_error", "rms_error", "change_percent")
 
 
 def validate(
@@ -75,16 +84,10 @@ def validate(
     settings: Mapping[str, Any],
     *,
     other: SensorCalibration | None = None,
-) -> dict[str, Any]:
-    """Return a sensor's part of ``validations/<unit>.json``; see ``HeldOutCase`` for the arguments.
+) -> SensorValidation:
+    """Return the errors of a sensor on held-out motion; see ``HeldOutCase`` for the arguments.
 
-    The part has ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor,
-    vector_noise_floor, steps`` of the published file, and ``held_out`` (false: the samples of the fit are used),
-    ``reason`` (why), ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why
-    the calibration must not be used, or None), ``agreement`` (of the matrix and held-out motion),
-    ``over_temperature`` (``residuals_over_temperature``; only where the temperature was swept), ``limits``, ``pass``.
-    ``vector_rms_error`` is the root of the mean squared length of the difference to the reference. Raises
-    ``ConfigurationError`` if a limit's name is unknown.
+    Raises ``ConfigurationError`` if a limit's name is unknown.
     """
     case, sensor = HeldOutCase(calibration, recordings, noise, settings, other), calibration.sensor
     samples, reason = case.held_out_samples(), None
@@ -97,56 +100,38 @@ def validate(
         elif samples := case.fit_samples():
             reason += "; judged on the samples of the fit"
     count = int(sum(s.known.sum() for s in samples))
-    no_figures: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
-    part: dict[str, Any] = {
-        "unit": unit_of(sensor),
-        "held_out": reason is None,
-        "reason": reason,
-        "samples": count,
-        "noise": {
-            "white": noise.white.tolist(),
-            "wander": noise.wander.tolist(),
-            "correlation_time_s": noise.correlation_time,
-            "source": noise.source,
-            "wander_source": noise.wander_source,
-            "correlation_time_source": noise.time_source,
-        },
-        "noise_floor": None,
-        "vector_noise_floor": None,
-        "reference_rms": None,
-        "steps": [{"name": name, **no_figures} for name in ("raw", "calibrated")],
-        "notes": [],
-        "expected_rms_error": None,
-        "worse_than_raw": None,
-        "agreement": None,
-    }
+    part = SensorValidation(
+        unit_of(sensor), reason is None, reason, count, noise, (StepErrors("raw"), StepErrors("calibrated"))
+    )
     if count:
-        part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
-        part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
-        part["steps"], part["notes"] = error_breakdown(calibration, samples)
+        steps, notes = error_breakdown(calibration, samples)
+        floor, vector_floor = noise_floors(calibration, samples)
+        part = replace(
+            part,
+            noise_floor=floor,
+            vector_noise_floor=vector_floor,
+            reference_rms=float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2))),
+            steps=tuple(steps),
+            over_temperature=_over_temperature(case, samples, held_out=part.held_out),
+        )
         parts = [linearized(calibration, s) for s in samples if s.known.any()]
         complete = [p for p in parts if p is not None]
         if len(complete) == len(parts):
-            part["expected_rms_error"] = expected = _expected(case, samples, complete)
-            part["notes"] += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
-            if part["held_out"]:
-                part["agreement"] = _agreement(case, samples, complete)
-                part["worse_than_raw"] = _worse_than_raw(case, samples, expected[1])
+            expected = _expected(case, samples, complete)
+            part = replace(part, expected_rms_error=expected)
+            notes += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
+            if part.held_out:
+                agreement = _agreement(case, samples, complete)
+                part = replace(part, agreement=agreement, worse_than_raw=_worse_than_raw(case, samples, expected[1]))
         else:
             names = left_out(calibration, samples)
             verb = "is" if len(names) == 1 else "are"
-            part["notes"].append(
+            notes.append(
                 f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
             )
-        bins = residuals_over_temperature(calibration, samples)
-        samples_of = "the held-out samples" if part["held_out"] else "the samples of the fit"
-        if bins is None and part["held_out"] and _is_swept(recordings):
-            bins, samples_of = residuals_over_temperature(calibration, case.fit_samples()), "the samples of the fit"
-        if bins:
-            part["over_temperature"] = {"samples_of": samples_of, "bins": bins}
+        part = replace(part, notes=tuple(notes))
     limits = (settings.get("limits") or {}).get(sensor) or {}
-    part["limits"], part["pass"] = _check_limits(calibration, part["steps"][-1], limits)
-    return part
+    return replace(part, limits=_check_limits(calibration, part.steps[-1], limits))
 
 
 EARTH_LEFT_OUT = (
@@ -155,14 +140,23 @@ EARTH_LEFT_OUT = (
 )
 
 
+def _over_temperature(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) -> OverTemperature | None:
+    """Return the errors over temperature, of the fit's samples if the held-out ones (``held_out``) sweep none."""
+    bins, of_fit = residuals_over_temperature(case.calibration, samples), not held_out
+    if bins is None and held_out and _is_swept(case.recordings):
+        bins, of_fit = residuals_over_temperature(case.calibration, case.fit_samples()), True
+    return (
+        OverTemperature("the samples of the fit" if of_fit else "the held-out samples", tuple(bins)) if bins else None
+    )
+
+
 def residuals_over_temperature(
     calibration: SensorCalibration, samples: Sequence[Samples]
-) -> list[dict[str, Any]] | None:
+) -> list[TemperatureBin] | None:
     """Return the errors of the magnitude after the last step, in bins of the temperature of the sensor.
 
-    The mean of a bin (``mean_error``, g or deg/s) shows the remaining dependence on the temperature; ``rms_error``
-    also contains the noise. ``temperature_degc`` is a mean. None where the temperature is not recorded, or its range is
-    below ``SWEEP_DEGC``.
+    The mean of a bin shows the remaining dependence on the temperature. None where the temperature is not recorded, or
+    its range is below ``SWEEP_DEGC``.
     """
     temperatures, errors = [np.zeros(0)], [np.zeros(0)]
     for each in samples:
@@ -177,12 +171,12 @@ def residuals_over_temperature(
         return None
     number = np.floor(warmth / BIN_DEGC)
     return [
-        {
-            "temperature_degc": float(warmth[in_bin].mean()),
-            "mean_error": float(error[in_bin].mean()),
-            "rms_error": float(np.sqrt(np.mean(error[in_bin] ** 2))),
-            "samples": int(in_bin.sum()),
-        }
+        TemperatureBin(
+            float(warmth[in_bin].mean()),
+            float(error[in_bin].mean()),
+            float(np.sqrt(np.mean(error[in_bin] ** 2))),
+            int(in_bin.sum()),
+        )
         for each in np.unique(number)
         if (in_bin := number == each).sum() >= FEWEST_IN_BIN
     ]
@@ -195,7 +189,7 @@ def _is_swept(recordings: Sequence[Recording]) -> bool:
     return len(warmth) > 0 and bool(np.ptp(warmth) >= SWEEP_DEGC)
 
 
-def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> list[float]:
+def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> tuple[float, float]:
     """Return the interval of the last step's rms error; ``parts``: the samples with their derivatives.
 
     Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
@@ -205,10 +199,10 @@ def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[Lin
     fitted_s = sum(float(r.time[-1] - r.time[0]) for r in fitted)
     low, high = expected_rms_error(case.calibration, parts, case.noise, case.settings, fitted_s)
     earth = EARTH_RATE_DPS if any(s.earth_left_out for s in samples) else 0.0
-    return [max(low - earth, 0.0), high + earth]
+    return max(low - earth, 0.0), high + earth
 
 
-def static_error(case: HeldOutCase) -> tuple[float, list[float]] | None:
+def static_error(case: HeldOutCase) -> tuple[float, tuple[float, float]] | None:
     """Return the error of the mean of the static recording, and its interval as a held-out rest; None without one.
 
     The heading is unknown, so Earth's rotation widens the interval of a gyroscope twice: its component in the bias, and
@@ -220,10 +214,10 @@ def static_error(case: HeldOutCase) -> tuple[float, list[float]] | None:
         return None
     error, (low, high) = judged
     turning = 2.0 * EARTH_RATE_DPS if case.calibration.sensor == "gyroscope" else 0.0
-    return error, [max(low - turning, 0.0), high + turning]
+    return error, (max(low - turning, 0.0), high + turning)
 
 
-def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> tuple[float, list[float]] | None:
+def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> tuple[float, tuple[float, float]] | None:
     """Return the rms error of samples after the last step and its interval; None without samples or interval."""
     errors = [last_error_of_magnitude(case.calibration, s) for s in samples]
     parts = [linearized(case.calibration, s) for s in samples if s.known.any()]
@@ -234,10 +228,8 @@ def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> tuple[float, li
     return float(np.sqrt(np.nanmean(error**2))), _expected(case, samples, complete)
 
 
-def _agreement(
-    case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[LinearizedSamples]
-) -> dict[str, Any] | None:
-    """Return ``p_value``, and of the element that differs most ``reads``, ``of``, ``error`` and its U.
+def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> Agreement | None:
+    """Return how the matrix agrees with held-out motion.
 
     None where no held-out motion has a vector reference, the method fixes elements of the matrix, a filter was applied,
     or an effect moves the motion in time. ``held_out``: the samples of the held-out recordings; ``parts``: the same
@@ -284,8 +276,7 @@ def _agreement(
     p_value = float(fdtrc(9, min(freedom, 1e9), float(error @ np.linalg.solve(C, error)) / 9.0))
     u = np.sqrt(np.diag(C))
     worst = int(np.argmax(np.abs(error) / u))
-    axes = {"reads": AXES[worst // 3], "of": AXES[worst % 3]}
-    return {"p_value": p_value, **axes, "error": float(error[worst]), "expanded_uncertainty": 2.0 * float(u[worst])}
+    return Agreement(p_value, AXES[worst // 3], AXES[worst % 3], float(error[worst]), 2.0 * float(u[worst]))
 
 
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
@@ -349,16 +340,16 @@ def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: floa
 
 
 def _check_limits(
-    calibration: SensorCalibration, last: Mapping[str, Any], limits: Mapping[str, float | None]
-) -> tuple[list[dict[str, Any]], bool | None]:
-    """Return each limit with its figure, and whether all are kept (None: there is no limit).
+    calibration: SensorCalibration, last: StepErrors, limits: Mapping[str, float | None]
+) -> tuple[LimitCheck, ...]:
+    """Return each limit with its figure.
 
     A limit that is null is not checked; a figure that is not known does not pass.
     """
-    extremes = [abs(v) for v in (last["max_error"], last["min_error"]) if v is not None]
+    extremes = [abs(v) for v in (last.max_error, last.min_error) if v is not None]
     figures = {
-        "held_out_rms_error": last["rms_error"],
-        "held_out_mean_abs_error": last["mean_abs_error"],
+        "held_out_rms_error": last.rms_error,
+        "held_out_mean_abs_error": last.mean_abs_error,
         "held_out_max_abs_error": max(extremes, default=None),
         "bias": float(np.max(np.abs(calibration.bias))),
         "scale_factor": float(np.max(np.abs(np.diag(calibration.matrix) - 1.0))),
@@ -370,5 +361,5 @@ def _check_limits(
         if limit is not None:
             value = figures[name]
             passes = value is not None and bool(value <= limit)
-            checks.append({"name": name, "limit": float(limit), "value": value, "pass": passes})
-    return checks, (all(c["pass"] for c in checks) if checks else None)
+            checks.append(LimitCheck(name, float(limit), value, passes))
+    return tuple(checks)

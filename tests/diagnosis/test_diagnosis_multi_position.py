@@ -17,7 +17,7 @@ from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.noise import estimate_noise
-from pipeline.validation.heldout import validate
+from tests.published import validate
 
 NAMED = [
     ("mpu6050", "accelerometer", "scale_factor_asymmetry"),

@@ -13,10 +13,11 @@ from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged, verdic
 from pipeline.estimation.stages import declared
 from pipeline.one_unit import unit_of_recordings
 from pipeline.outcome import commands_of
-from pipeline.records import Note, Recording
+from pipeline.records import Agreement, Note, Recording, StepErrors
 from pipeline.report.parameters import summary_row
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
+from tests.published import TESTED
 
 INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
 REFERENCE, OF_STAGED, OF_HAND = (
@@ -33,7 +34,7 @@ MISSING = replace(NOTHING, found="missing_effect", selected=("g_sensitivity",), 
 STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, **OF_STAGED)
 
 
-OFF = {"p_value": 1e-5, "reads": "x", "of": "y", "error": 3e-4, "expanded_uncertainty": 1e-4}
+OFF = Agreement(p_value=1e-5, reads="x", of="y", error=3e-4, expanded_uncertainty=1e-4)
 BEYOND = replace(MISSING, implausible=("g_sensitivity",))
 
 
@@ -56,7 +57,7 @@ def held_out(after: float) -> dict[str, float]:
         (replace(NOTHING, published=BELOW), "floor_in_doubt", "estimate is too large"),
         (replace(NOTHING, static=ABOVE), "reference_in_doubt", "static"),
         (replace(NOTHING, agreement=OFF), "reference_in_doubt", "x reads +0.0003 of the truth along y"),
-        (replace(NOTHING, agreement={**OFF, "p_value": 1e-3}), "nothing_missing", ""),
+        (replace(NOTHING, agreement=replace(OFF, p_value=1e-3)), "nothing_missing", ""),
         (replace(MISSING, agreement=OFF), "missing_effect", ""),
         (replace(NOTHING, over_noise=0.1), "floor_in_doubt", "0.1 times the noise"),
         (replace(MISSING, published=ABOVE, free=ABOVE, full=INSIDE), "missing_effect", ""),
@@ -165,12 +166,11 @@ def test_of_an_unexplained_sensor_only_what_held_out_motion_confirms_is_offered(
 
 
 def test_only_held_out_errors_with_an_interval_decide() -> None:
-    part = {"held_out": True, "steps": [{"rms_error": 2.0}], "expected_rms_error": [0.5, 1.5]}
+    part = replace(TESTED, steps=(StepErrors("calibrated", rms_error=2.0),), expected_rms_error=(0.5, 1.5))
     found = held_out_of(part)
     assert found is not None
     assert found.above
-    assert held_out_of(None) is held_out_of(part | {"held_out": False}) is None
-    assert held_out_of(part | {"expected_rms_error": None}) is None
+    assert held_out_of(replace(part, held_out=False)) is held_out_of(replace(part, expected_rms_error=None)) is None
 
 
 def test_a_note_on_the_turns_of_one_sensor_does_not_concern_the_other() -> None:

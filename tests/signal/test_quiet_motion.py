@@ -14,7 +14,7 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording
 from pipeline.signal.quiet_motion import creep_of_readings, posterior_creep_rates
 from pipeline.signal.rests import Rest, find_rests
-from pipeline.validation.heldout import validate
+from tests.published import validate
 
 QUIET = {"accelerometer": 3e-4, "gyroscope": 0.01}  # white noise of a sample, g and deg/s
 

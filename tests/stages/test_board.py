@@ -14,6 +14,7 @@ from pipeline.settings import Board, Sensor
 from pipeline.simulation.description import shipped_settings
 from pipeline.stages.batch import Job
 from pipeline.stages.calibration import _on_board
+from tests.published import TESTED, validation_document
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,10 +26,10 @@ def test_the_reference_of_a_board_says_how_the_others_sit(tmp_path: Path) -> Non
     pair = draw_chip(rng, np.eye(3), np.zeros(3)), draw_chip(rng, np.eye(3), place)
     chips = hand_board(rng, pair, by_hand(rng, rests=24))
     names = [chip.unit for chip in chips]
-    kept = {"worse_than_raw": None}
+    kept = dict.fromkeys(("accelerometer", "gyroscope"), TESTED)
     files = {
         "ingest": {f"{c.unit}.parquet": to_parquet(c.recordings) for c in chips},
-        "validate": {f"{n}.json": {"accelerometer": kept, "gyroscope": kept} for n in names} | {f"lost{FAILED}": {}},
+        "validate": {f"{n}.json": validation_document(n, kept) for n in names} | {f"lost{FAILED}": {}},
     }
     for sensor in ("accelerometer", "gyroscope"):
         files[sensor] = {f"{c.unit}.json": c.calibrations[sensor].to_json() for c in chips}

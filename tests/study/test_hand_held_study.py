@@ -32,7 +32,7 @@ from pipeline.estimation.multi_position.selection import Selection
 from pipeline.estimation.noise import estimate_noise
 from pipeline.io.read import read_recordings
 from pipeline.simulation.description import read_config
-from pipeline.validation.heldout import validate
+from tests.published import validate
 
 if TYPE_CHECKING:
     from pathlib import Path

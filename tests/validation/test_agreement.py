@@ -54,7 +54,7 @@ def held_out(sensor: str, change: np.ndarray, configured: tuple[str, ...] = (), 
 @pytest.mark.parametrize("sensor", ["accelerometer", "gyroscope"])
 def test_held_out_motion_of_the_same_unit_agrees(sensor: str) -> None:
     part, _ = held_out(sensor, np.zeros((3, 3)))
-    assert part["agreement"]["p_value"] > 1e-3
+    assert part.agreement.p_value > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -62,17 +62,18 @@ def test_held_out_motion_of_the_same_unit_agrees(sensor: str) -> None:
 )
 def test_a_matrix_that_changed_between_fit_and_held_out_motion_is_doubted(change: np.ndarray, size: float) -> None:
     part, (found, recordings, noise, settings) = held_out("gyroscope", change)
-    low, high = part["expected_rms_error"]
-    assert low < part["steps"][-1]["rms_error"] < high  # the size of the error does not show it
-    told = part["agreement"]
-    assert told["p_value"] < DISAGREES
-    assert abs(told["error"]) == pytest.approx(size, abs=2.0 * told["expanded_uncertainty"])
-    row, column = ("xyz".index(told[key]) for key in ("reads", "of"))
-    assert change[row, column] == pytest.approx(told["error"], abs=2.0 * told["expanded_uncertainty"])
+    low, high = part.expected_rms_error
+    assert low < part.steps[-1].rms_error < high  # the size of the error does not show it
+    told = part.agreement
+    assert told.p_value < DISAGREES
+    assert abs(told.error) == pytest.approx(size, abs=2.0 * told.expanded_uncertainty)
+    assert change["xyz".index(told.reads), "xyz".index(told.of)] == pytest.approx(
+        told.error, abs=2.0 * told.expanded_uncertainty
+    )
     said = diagnose(found, recordings, noise, settings, None, validation=part)
     assert said["verdict"] == "reference_in_doubt"
-    assert f"the calibrated {told['reads']} reads" in said["reason"]
-    assert diagnose(found, recordings, noise, settings, None, validation=part | {"agreement": None})["verdict"] == (
+    assert f"the calibrated {told.reads} reads" in said["reason"]
+    assert diagnose(found, recordings, noise, settings, None, validation=replace(part, agreement=None))["verdict"] == (
         "nothing_missing"
     )
 
@@ -84,7 +85,7 @@ def test_held_out_motion_that_does_not_move_says_nothing_of_the_matrix() -> None
     held = replace(still, name="validation", role="validation", table_attitude=attitude, table_rate=attitude[:, 1])
     noise = estimate_noise("gyroscope", recordings, SETTINGS["sensor"]["gyroscope"])
     found = reference_least_squares.fit("gyroscope", recordings, None, SETTINGS)
-    assert validate(found, [*recordings, held], noise, SETTINGS)["agreement"] is None
+    assert validate(found, [*recordings, held], noise, SETTINGS).agreement is None
 
 
 def test_effects_of_the_calibration_are_no_disagreement() -> None:
@@ -92,4 +93,4 @@ def test_effects_of_the_calibration_are_no_disagreement() -> None:
     part, (found, *_) = held_out("gyroscope", np.zeros((3, 3)), hidden[1:], hidden[0])
     assert isinstance(found, SensorCalibration)
     assert [e.name for e in found.effects] == ["g_sensitivity"]
-    assert part["agreement"]["p_value"] > 1e-3
+    assert part.agreement.p_value > 1e-3

@@ -14,7 +14,7 @@ from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import compensate, predicted_reading
 from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, StageResult
 from pipeline.signal.filters import apply_filter
-from pipeline.validation.heldout import validate
+from tests.published import validate
 
 DT = 0.05
 SENSORS = ("accelerometer", "gyroscope")

@@ -23,11 +23,11 @@ def samples(low: float, high: float, *, warm: bool = True) -> Samples:
 def test_a_slope_that_is_not_modelled_is_the_mean_residual_of_the_bins() -> None:
     found = residuals_over_temperature(SensorCalibration("accelerometer"), [samples(10.0, 40.0)])
     assert found is not None
-    assert [b["temperature_degc"] for b in found] == pytest.approx([12.5, 17.5, 22.5, 27.5, 32.5, 37.5], abs=0.1)
+    assert [b.temperature_degc for b in found] == pytest.approx([12.5, 17.5, 22.5, 27.5, 32.5, 37.5], abs=0.1)
     for b in found:
-        assert b["mean_error"] == pytest.approx(SLOPE * (b["temperature_degc"] - 25.0), abs=4e-5)
-        assert b["rms_error"] >= abs(b["mean_error"])
-    assert sum(b["samples"] for b in found) >= 399
+        assert b.mean_error == pytest.approx(SLOPE * (b.temperature_degc - 25.0), abs=4e-5)
+        assert b.rms_error >= abs(b.mean_error)
+    assert sum(b.samples for b in found) >= 399
 
 
 def test_a_slope_that_is_modelled_leaves_noise() -> None:
@@ -35,8 +35,8 @@ def test_a_slope_that_is_modelled_leaves_noise() -> None:
     effect = FittedEffect("bias_temperature", {k: {"value": v, "unit": "g/degC"} for k, v in values.items()})
     found = residuals_over_temperature(SensorCalibration("accelerometer", effects=(effect,)), [samples(10, 40)])
     assert found is not None
-    assert max(abs(b["mean_error"]) for b in found) < 5e-5
-    assert [b["rms_error"] for b in found] == pytest.approx([1e-4] * 6, rel=0.3)
+    assert max(abs(b.mean_error) for b in found) < 5e-5
+    assert [b.rms_error for b in found] == pytest.approx([1e-4] * 6, rel=0.3)
 
 
 def test_a_temperature_that_was_not_swept_or_not_recorded_gives_none() -> None:

@@ -1,6 +1,7 @@
 """Stage calibration: a sensor whose calibration does harm is null with the reason; a unit without any has failed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from pipeline.config.compose import Composer
 from pipeline.io.arrow import to_parquet
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.stages import batch
+from tests.published import TESTED, validation_document
 
 HARM = "the calibration makes held-out motion worse"
 
@@ -19,12 +21,12 @@ HARM = "the calibration makes held-out motion worse"
 def run_stage(folder: Path, harmed: list[str], absent: list[str], *, as_printed: bool = False) -> dict[str, Any]:
     """Run the stage on one unit and return its files by name."""
     settings = [f"method.as_printed={str(as_printed).lower()}"]
-    part = Composer(folder).unit("U1", settings) | {"config_sha256": "0"}
+    part = Composer(folder).unit("U1", settings).json_value
     (folder / "part.json").write_text(json.dumps({"units": {"U1": part}}))
-    said = {s: None if s in absent else {"worse_than_raw": HARM if s in harmed else None} for s in SENSORS}
+    parts = {s: None if s in absent else replace(TESTED, worse_than_raw=HARM if s in harmed else None) for s in SENSORS}
     files: dict[str, Any] = {
         "ingest": {"U1.parquet": to_parquet(record(Session(1))[:1])},
-        "validate": {"U1.json": said},
+        "validate": {"U1.json": validation_document("U1", parts)},
     }
     for sensor in SENSORS:
         fit = {"not_calibrated": "no angle is logged"} if sensor in absent else SensorCalibration(sensor).to_json()

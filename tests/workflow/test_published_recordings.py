@@ -14,7 +14,7 @@ from pipeline.config.campaign import load_campaign
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.io.read import read_recordings
-from pipeline.validation.heldout import validate
+from tests.published import validate
 
 from .conftest import ROOT, Bench
 

@@ -16,7 +16,7 @@ from pipeline.estimation.multi_position.accelerometer import model_of
 from pipeline.estimation.multi_position.model import selection_hypotheses
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of
 from pipeline.estimation.noise import estimate_noise
-from pipeline.validation.heldout import validate
+from tests.published import validate
 
 if TYPE_CHECKING:
     from pipeline.records import SensorCalibration

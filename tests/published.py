@@ -1,0 +1,27 @@
+"""Parts of the documents that a run publishes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.records import Noise, SensorValidation, StepErrors, Validation
+from pipeline.validation import heldout
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+NOISE = Noise(np.zeros(3), np.zeros(3), 100.0, "static")
+STEPS = StepErrors("raw"), StepErrors("calibrated")
+TESTED = SensorValidation("", held_out=True, reason=None, samples=9, noise=NOISE, steps=STEPS)
+
+
+def validation_document(unit: str, parts: Mapping[str, SensorValidation | None]) -> dict[str, Any]:
+    """Return ``validations/<unit>.json``, without attitude and moves."""
+    return Validation(unit, parts, {"reason": ""}, {"reason": ""}).to_json()
+
+
+def validate(*arguments: Any, **keywords: Any) -> dict[str, Any]:
+    """Return a sensor's part of ``validations/<unit>.json``."""
+    return heldout.validate(*arguments, **keywords).to_json()
