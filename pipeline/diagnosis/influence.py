@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import Design, Term, placed
-from pipeline.estimation.gates import MIN_DELTA_BIC
+from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import Fit, design_at
 from pipeline.estimation.observations import without_each_recording
@@ -59,7 +59,7 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     for name in names:
         term, index = slices[name][0], np.arange(slices[name][1].start, slices[name][1].stop)
         shares = _shares_of_blocks(selection, design, products, term, index)
-        least = DETERMINED * _weakest(products, index)
+        least, gate = DETERMINED * _weakest(products, index), min_delta_bic(term.effect, observations.sensor)
         recordings: list[JSON] = []
         for k, part in enumerate(observations.parts):
             entry: JSON = {"recording": part.name, "share": float(shares[of_block == k].sum())}
@@ -71,7 +71,7 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
                 "effect": name,
                 "recordings": recordings,
                 "seconds": _stretches(observations, shares, of_block),
-                "depends_on": [r["recording"] for r in recordings if (r["delta_bic_without"] or 0.0) < MIN_DELTA_BIC],
+                "depends_on": [r["recording"] for r in recordings if (r["delta_bic_without"] or 0.0) < gate],
             }
         )
     return found

@@ -2,7 +2,7 @@
 
 An effect is not observable if it needs a quantity that the recordings lack, if base and configured effects explain its
 signal (less than 1e-3 of its columns remains), or if it would be below the noise even with all its parameters at the
-sensor's limits. Then the mean gain in 2 log L is below the gate ``k log N + 10``:
+sensor's limits. Then the mean gain in 2 log L is below that at which it passes (``pipeline.estimation.gates``):
 
     turns on a table    lambda = sum_j limit_j^2 H_jj,  with the whitened products H of its columns
     rests and moves     f n log(1 + lambda / n),  with the factor f of the gain and n equations
@@ -11,8 +11,8 @@ For turns this is the largest lambda under those noise hypotheses that are likel
 the effect a random walk is likelier, and would hide it.
 
 lambda of a bias drift grows as the square of the time between the first and the last rest. So the necessary time is
-known. (With 20 rests of an MPU-6050 in 110 s lambda is 12; the gate is 167. Of simulated drifts of half the limit, 0 of
-4 are found in 4 minutes, 14 of 16 in 8, and 16 of 16 in 11.)
+known. (With 20 rests of an MPU-6050 in 110 s lambda is 12; the gate is 358. Of simulated drifts of half the limit, 0 of
+4 are found in 4 minutes, 4 of 16 in 8, 10 of 16 in 11, and 15 of 16 in 14.)
 """
 
 from __future__ import annotations
@@ -142,17 +142,20 @@ def _reason(this: Effect, selection: Selection) -> str:
 def _faint(this: Effect, selection: Selection) -> str:
     """Return why turns would not show an effect at its limits; empty if they would, or if it was seen."""
     limits, score = selection.limits.get(this.name), selection.alone.get(this.name)
-    if limits is None or not np.all(np.isfinite(limits)) or score is None or passes(score, len(selection.candidates)):
+    if limits is None or not np.all(np.isfinite(limits)) or score is None:
+        return ""
+    sensor, candidates = selection.observations.sensor, len(selection.candidates)
+    if passes(score, sensor, candidates):
         return ""
     ranking, chosen = selection.ranking, selection.chosen()
-    gate = min_gain(score.parameters, ranking.samples, len(selection.candidates))
+    gate = min_gain(this, sensor, score.parameters, ranking.samples, candidates)
     for j in ranking.indices(this.name):
         seen = ranking.visibility(j, limits)[1:] >= gate
         if seen.any():
             likely = ranking.log_likelihoods([*chosen, j])[1:]
             if likely[seen].max() > likely.max() + LEAST_WEIGHT:
                 return ""
-    return f"{at_its_limit(this, selection.observations.sensor, limits[0])} be below the noise"
+    return f"{at_its_limit(this, sensor, limits[0])} be below the noise"
 
 
 def not_observable_by_hand(selection: by_hand.Selection, configured: Sequence[str]) -> dict[str, str]:
@@ -183,13 +186,13 @@ def _reason_by_hand(this: Effect, selection: by_hand.Selection) -> str:
     if score is None:
         seen = "rests and moves by hand" if model.kinds > 1 else "rests"
         return f"in {seen} bias and matrix explain all that it would add"
-    return "" if passes(score, len(selection.candidates)) else _faint_by_hand(this, score, selection)
+    return "" if passes(score, model.sensor, len(selection.candidates)) else _faint_by_hand(this, score, selection)
 
 
 def _faint_by_hand(this: Effect, score: Score, selection: by_hand.Selection) -> str:
     """Return why rests and moves would not show an effect at its limits; empty if they would."""
     n, rests = len(selection.fits[0].residual), selection.model.rests
-    gate = min_gain(score.parameters, n, len(selection.candidates))
+    gate = min_gain(this, selection.model.sensor, score.parameters, n, len(selection.candidates))
     scored = selection.last if this.name in selection.last.visible else selection.first
     if scored.visible[this.name] >= gate:
         return ""

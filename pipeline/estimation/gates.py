@@ -3,7 +3,8 @@
     delta BIC > g   and   m p < 0.01,    g = max(10 or, of a slow effect, 16; 2e-4 G), at most 30
 
 where p is the p-value of the likelihood ratio, m the number of candidates (Bonferroni), and G the gain in 2 log L of
-the effects that are already selected, whose equations are of first order.
+the effects that are already selected, whose equations are of first order. A slow effect depends on time and temperature
+alone: wander of the bias that the noise model does not describe has a similar signal.
 """
 
 from __future__ import annotations
@@ -13,37 +14,39 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from pipeline.model.effects import effect
+
 if TYPE_CHECKING:
     from pipeline.estimation.ranking import Score
+    from pipeline.model.effects.base import Effect
 
 MIN_DELTA_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
-MIN_DELTA_BIC_OF_SLOW = 16.0  # of a bias that follows time or temperature: unmodelled wander has a similar signal
+MIN_DELTA_BIC_OF_SLOW = 16.0  # of a slow effect, see above
 MAX_MIN_DELTA_BIC = 30.0  # largest delta BIC that is required after effects with a large gain
 ERROR_OF_FIRST_ORDER = 2e-4  # of the gain in 2 log L of effects: the error of their equations of first order
 MAX_FALSE_PROBABILITY = 0.01  # of a false selection by chance, over all candidates
 MAX_FALSE_DEPENDENCE = 1e-3  # probability that a complete model seems to depend on a covariate, over all tests
 
 
-def min_delta_bic(*, slow: bool = False, selected_gain: float = 0.0) -> float:
+def min_delta_bic(this: Effect, sensor: str, selected_gain: float = 0.0) -> float:
     """Return the delta BIC above which an effect may be selected.
 
-    ``slow``: whether it is a bias that follows time or temperature. ``selected_gain``: gain in 2 log L of the effects
-    that are already selected.
+    ``selected_gain``: G, 0 if no effect is selected.
     """
-    least = MIN_DELTA_BIC_OF_SLOW if slow else MIN_DELTA_BIC
+    least = MIN_DELTA_BIC_OF_SLOW if this.of_the_room(sensor) else MIN_DELTA_BIC
     return float(np.clip(ERROR_OF_FIRST_ORDER * selected_gain, least, MAX_MIN_DELTA_BIC))
 
 
-def passes(score: Score, candidates: int, *, slow: bool = False, selected_gain: float = 0.0) -> bool:
+def passes(score: Score, sensor: str, candidates: int, selected_gain: float = 0.0) -> bool:
     """Return whether the evidence for one of so many candidates suffices to select it; see ``min_delta_bic``."""
-    enough = score.delta_bic > min_delta_bic(slow=slow, selected_gain=selected_gain)
-    return enough and score.p_value * candidates < MAX_FALSE_PROBABILITY
+    enough = score.delta_bic > min_delta_bic(effect(score.name), sensor, selected_gain)
+    return bool(enough and score.p_value * candidates < MAX_FALSE_PROBABILITY)
 
 
-def min_gain(parameters: int, equations: float, candidates: int) -> float:
-    """Return the gain in 2 log L at which one of so many candidates passes: ``max(k log N + 10, chi^2_k(1 - 0.01/m))``.
+def min_gain(this: Effect, sensor: str, parameters: int, equations: float, candidates: int) -> float:
+    """Return the gain in 2 log L at which the first effect passes: ``max(k log N + g, chi^2_k(1 - 0.01/m))``.
 
-    ``parameters``: k, its number. ``equations``: N, the number of readings that are compared with the model.
+    ``parameters``: k. ``equations``: N, the number of readings that are compared with the model. ``candidates``: m.
     """
     by_chance = float(scipy.special.chdtri(parameters, MAX_FALSE_PROBABILITY / candidates))
-    return max(parameters * float(np.log(equations)) + MIN_DELTA_BIC, by_chance)
+    return max(parameters * float(np.log(equations)) + min_delta_bic(this, sensor), by_chance)

@@ -1,20 +1,14 @@
 """Select the effects that the recordings show: forward selection with backward drop.
 
-In each round every candidate is scored at its best noise setting. The best candidate is accepted if
-
-    delta BIC > 10   and   m p < 0.01
-
-where p is the p-value of the likelihood ratio and m the number of candidates (Bonferroni). A bias that depends on time
-or temperature needs a delta BIC of 16, because wander that the noise model does not describe has a similar signal. The
-equations of selected effects are of first order: a further effect must gain 1/5000 of their gain, or 30. While the
-residual exceeds twice the noise, an effect must also explain 5 % of the excess, because any small effect slightly
-improves a model that lacks a large one.
+In each round every candidate is scored at its best noise setting. The best candidate is accepted if it passes the gate
+(``pipeline.estimation.gates``). While the residual exceeds twice the noise, an effect must also explain 5 % of the
+excess, because any small effect slightly improves a model that lacks a large one.
 
 After each acceptance the model is fitted, and if the columns have changed, all are computed again. A set with a time
 constant is refused if the recordings do not determine it: the constant may grow until bias and drift have the same
-signal. A selected effect is dropped if its delta BIC has become negative, and exchanged if another one is better by a
-delta BIC of more than 10. If no candidate passes although the wander seems three times that of a static recording or
-of the sensor file, two effects may mask each other: then all pairs are scored once.
+signal. A selected effect is dropped if its delta BIC has become negative, and exchanged if another one passes the gate
+in its place and is better by a delta BIC of more than 10. If no candidate passes although the wander seems three times
+that of a static recording or of the sensor file, two effects may mask each other: then all pairs are scored once.
 """
 
 from __future__ import annotations
@@ -209,7 +203,8 @@ class Selection:
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
-        values = {s.name: s.delta_bic - (0.0 if s.plausible else MIN_DELTA_BIC) for s in scores if self._passes(s)}
+        passing = [s for s in scores if self._passes(s, self.names)]
+        values = {s.name: s.delta_bic - (0.0 if s.plausible else MIN_DELTA_BIC) for s in passing}
         if not values:
             return None
         best = max(values, key=lambda name: values[name])
@@ -219,19 +214,18 @@ class Selection:
         name = best if best in DELAYS else tied[0]
         return next(s for s in scores if s.name == name)
 
-    def _passes(self, score: Score, partners: Sequence[int] = ()) -> bool:
+    def _passes(self, score: Score, selected: Sequence[str], partners: Sequence[int] = ()) -> bool:
         """Return whether a candidate passes the gate; a lag cannot be negative, nor be distinguished from a delay.
 
-        ``partners``: indices of candidates that were in the model of the score in addition to the selected effects.
+        ``selected``: effects in the model of the score. ``partners``: indices of further candidates that were in it.
         """
-        second_delay = score.name in DELAYS and any(name in DELAYS for name in self.names)
+        second_delay = score.name in DELAYS and any(name in DELAYS for name in selected)
         negative_lag = score.name == DELAYS[1] and score.values[0] <= 0
-        if second_delay or negative_lag or not self._possible(score.name, self.names):
+        if second_delay or negative_lag or not self._possible(score.name, selected):
             return False
-        slow = effect(score.name).of_the_room(self.observations.sensor)
         gain = 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
-        significant = passes(score, len(self.candidates), slow=slow, selected_gain=gain)
-        return bool(score.admissible and significant and self._matters(score, partners))
+        significant = passes(score, self.observations.sensor, len(self.candidates), gain)
+        return score.admissible and significant and self._matters(score, selected, partners)
 
     def _possible(self, name: str, selected: Sequence[str]) -> bool:
         """Return whether an effect can be added: it contains no effect of the model, nor is contained in one."""
@@ -240,11 +234,11 @@ class Selection:
         others = [*selected, *(term.effect.name for term in self.base.terms)]
         return not any(name in effect(other).contains or other in effect(name).contains for other in others)
 
-    def _matters(self, score: Score, partners: Sequence[int]) -> bool:
+    def _matters(self, score: Score, names: Sequence[str], partners: Sequence[int]) -> bool:
         """Return whether an effect explains a significant part of a residual that is far above the noise."""
         if self.noise is None:
             return True
-        selected = [*self.ranking.of_effects(self.names), *partners]
+        selected = [*self.ranking.of_effects(names), *partners]
         floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
         residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
         drop = score.drop / self.ranking.samples
@@ -323,8 +317,8 @@ class Selection:
             others = [n for n in self.names if n != name]
             scores = self._given(others)
             delta_bic = scores.pop(name).delta_bic if name in scores else float("-inf")
-            able = (s for s in scores.values() if s.admissible and not effect(s.name).moves)
-            rival = next((s for s in able if self._possible(s.name, others)), None)
+            passing = (s for s in scores.values() if not effect(s.name).moves and self._passes(s, others))
+            rival = next(passing, None)
             if rival is not None and rival.delta_bic > delta_bic + MIN_DELTA_BIC:
                 if self._accept(self._replaced(name, rival)):
                     self._refit()
@@ -384,6 +378,6 @@ class Selection:
         for member, partner in ((j, k), (k, j)):
             name = ranking.candidates[member].effect.name
             steps[name] = next(s for s in ranking.scores([partner], self.limits) if s.name == name)
-            if not self._passes(steps[name], [partner]) or steps[name].p_value * number >= MAX_FALSE_PROBABILITY:
+            if not self._passes(steps[name], [], [partner]) or steps[name].p_value * number >= MAX_FALSE_PROBABILITY:
                 return
         self._accept(steps)

@@ -1,14 +1,14 @@
 """Compute detection limits: the smallest size of each effect that a selection would find, without a recording.
 
 The parameters of an effect are in proportion to their limits, with random signs. Every probability is the mean over the
-signs. An effect is found if its gain in 2 log L passes the gate of the selection. It is named if no look-alike i, which
-explains a part of its signal, has the better BIC. With N readings, k parameters and m candidates:
+signs. An effect is found if its gain in 2 log L passes the gate, ``pipeline.estimation.gates.min_gain``. It is named if
+no look-alike i, which explains a part of its signal, has the better BIC. With N readings and k parameters:
 
 Turns on a table (``TurntableLimits``), with many readings. Given the base, under the noise setting t, let ``a^2
 lambda_t`` be the whitened sum of squares of a signal of size a, and ``T_t = s^-2 tr(C_t^-1 C)`` that of noise alone:
 
     log L_t(a) = -N/2 log [(T_t + a^2 lambda_t) / N] - penalty_t,    g(a) = 2 [max_t log L_t(0) - max_t log L_t(a)]
-    P(found) = P(chi^2_k(g) > max(k log N + 10, quantile of chi^2_k at 1 - 0.01/m))
+    P(found) = P(chi^2_k(g) > min_gain)
 
 with the covariance C of the noise by the sensor file, C_t of setting t and white noise s. So a wander that can explain
 the effect takes it up. The difference of two BICs is normal with mean ``g_i - (k - k_i) (log N - 1)`` and variance ``4
@@ -199,7 +199,7 @@ class TurntableLimits(DetectionLimits):
         order = sorted(self.names, key=lambda name: (name in DELAYS[1:], self.names.index(name)))
         rank = {i: order.index(self.candidates[i].effect.name) for i in (j, *shares)}
         tie = np.array([0.0 if rank[i] < rank[j] else 1.0 for i in shares])[:, None]  # the first of equals is selected
-        gate = min_gain(k, self.ranking.samples, len(self.names))
+        gate = min_gain(self.candidates[j].effect, self.sensor, k, self.ranking.samples, len(self.names))
 
         def found(share: float) -> Values:
             return np.asarray(1.0 - scipy.special.chndtr(gate, k, self._gain(share**2 * signal)))
@@ -284,7 +284,7 @@ class RestLimits(DetectionLimits):
         shares = {i: float(np.sum(squares[2][self.hypothesis])) / power for i, squares in explained.items() if i != j}
         shares = {i: min(share, 1.0) for i, share in shares.items() if share > PARTLY}
         k, log_n = self._parameters(j), float(np.log(self.equations))
-        gate = min_gain(k, self.equations, len(self.names))
+        gate = min_gain(self.candidates[j].effect, self.sensor, k, self.equations, len(self.names))
 
         def bic(share: float, i: int) -> Values:
             rss, drop = (a + 2.0 * share * b + share**2 * c for a, b, c in (total, explained[i]))

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import first
+from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_delta_bic
 from pipeline.estimation.posterior import prior_limit
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, parameter_limits
 from pipeline.records import AXES, SENSOR_UNITS, Values
-from pipeline.report.axis import LINEAR_TO
 from pipeline.report.chart import Dots, Figure, Layer, Line, Panel, chart, sentences
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import measured, number, percent, plain, unit_text
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pipeline.settings import DataSheet
 
 JSON = dict[str, Any]
-GATE = LINEAR_TO  # delta BIC, strong evidence: A. E. Raftery, Sociological Methodology 25 (1995) 139, table 6
 CLOSE = 0.8  # share of the selected effect's delta BIC above which another effect is named as a rival
 MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart or its caption shows
 EXCLUDED = 0.5  # of the upper limit by the prior alone, below which the recordings exclude an effect: convention
@@ -109,7 +108,7 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
         return None
     helpful = [r for r in entries if _evidence(r) > 0 or r["effect"] in selected][:MOST]
     shown = helpful if len(helpful) >= FEWEST else entries[:FEWEST]
-    rows = [_ranking_row(r, selected) for r in shown]
+    rows = [_ranking_row(r, selected, passes=_passes(r, sensor)) for r in shown]
     brackets = _brackets(shown, selected)
     best = max((r for r in entries if r["effect"] not in selected), key=_evidence, default=None)
     value = _evidence(next((r for r in entries if r["effect"] == (selected or [None])[0]), {}))
@@ -119,26 +118,35 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
         value=value,
         best=best,
         close=best is not None and _evidence(best) > CLOSE * value,
-        passes=best is not None and _evidence(best) > GATE,
+        passes=best is not None and _passes(best, sensor),
+        slow=MIN_DELTA_BIC_OF_SLOW,
         brackets=brackets,
         others=len(entries) - len(shown),
         hidden=first([plain(h["effect"]) for h in hidden], MOST_HIDDEN),
     )
     figure = Figure(f"{sensor}-ranking", finding, caption)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"
-    return bars(figure, rows, label, levels={f"threshold {GATE:g}": GATE}, kind="symlog", brackets=brackets)
+    return bars(
+        figure, rows, label, levels={f"threshold {MIN_DELTA_BIC:g}": MIN_DELTA_BIC}, kind="symlog", brackets=brackets
+    )
 
 
 def _evidence(entry: JSON) -> float:
     return float(entry.get("delta_bic") or 0.0)
 
 
-def _ranking_row(entry: JSON, selected: Sequence[str]) -> Point:
+def _passes(entry: JSON, sensor: str) -> bool:
+    """Return whether the evidence for an effect passes the gate of a first selection."""
+    this = catalogue().get(entry["effect"])
+    return _evidence(entry) > (min_delta_bic(this, sensor) if this else MIN_DELTA_BIC)
+
+
+def _ranking_row(entry: JSON, selected: Sequence[str], *, passes: bool) -> Point:
     value, alike, chosen = _evidence(entry), entry.get("look_alikes") or [], entry["effect"] in selected
-    beyond = value > GATE and not entry.get("plausible", True)
+    beyond = passes and not entry.get("plausible", True)
     label = plain(entry["effect"]) + ", selected" * chosen + ", departs from the data sheet" * beyond
     note = "like " + ", ".join(f"{plain(a['effect'])} {percent(a['share'])}" for a in alike) if alike else ""
-    return Point(label, value, 2 if chosen else 4 if value > GATE else 3, note=note)
+    return Point(label, value, 2 if chosen else 4 if passes else 3, note=note)
 
 
 def _brackets(shown: Sequence[JSON], selected: Sequence[str]) -> list[dict[int, str]]:

@@ -27,9 +27,9 @@ where
     C : covariance of the true white noise and bias wander (``pipeline.estimation.gauss_markov``)
     P : the projection, in the metric C^-1, onto bias, truth and the signals of the other hidden effects
 
-A test with known noise and equation gains lambda in 2 log L on average. A selection of k parameters needs a gain of
-k log N + 10 (40 to 100). The rounding to whole counts differs between the two simulations and adds c^2 / 6 per sample
-on average, where c is one count; this is subtracted.
+A test with known noise and equation gains lambda in 2 log L on average. A selection needs a gain of 40 to 100
+(``pipeline.estimation.gates.min_gain``). The rounding to whole counts differs between the two simulations and adds
+c^2 / 6 per sample on average, where c is one count; this is subtracted.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ import numpy as np
 import scipy
 
 from pipeline.estimation.engine import scaled_inverse
-from pipeline.estimation.gates import MIN_DELTA_BIC
+from pipeline.estimation.gates import min_gain
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
-from pipeline.model.effects import effect
+from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS, Recording, Values
@@ -227,7 +227,8 @@ def at_detection(case: Case) -> Case:
         return case
     ((name, values),) = case.hidden.items()
     count = len(values)
-    gate = count * np.log(3.0 * sum(r.samples for r in _used(case))) + MIN_DELTA_BIC
+    samples = 3.0 * sum(r.samples for r in _used(case))
+    gate = min_gain(effect(name), case.sensor, count, samples, len(catalogue()))
     share = int(case.family.partition("_")[2]) / 100.0 * np.sqrt(gate / signals_left(case)[name])
     kept = [p.name == "time_constant" for p in effect(name).parameters(case.sensor)]
     return replace(case, hidden={name: np.where(kept, values, share * np.array(values)).tolist()})

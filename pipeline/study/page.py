@@ -12,6 +12,7 @@ from pipeline.model.effects import effect
 from pipeline.report.pages import template
 from pipeline.study.cases import FAINT, SIZES
 from pipeline.study.scores import (
+    GATES,
     Score,
     accepted,
     answer_scores,
@@ -48,7 +49,8 @@ def page(cases: Sequence[ScoredCase], command: str) -> str:
         code=" and ".join(sorted({f"`{case.code}`" for case in cases if case.code})) or "unknown",
         families=[score.cells for score in families],
         answers=[score.cells for score in answer_scores(cases)],
-        false=false_selections(cases),
+        by_gate=false_selections(cases),
+        gates=[f"> {gate:g}" for gate in GATES],
         reliable=[[f"{float(name):.2g}", *cells] for name, *cells, _ in (bin_.cells for bin_ in reliability(cases))],
         diagram=DIAGRAM,
         by_size=found_at(answers),

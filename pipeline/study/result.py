@@ -61,6 +61,7 @@ class ScoredCase(Diagnosed):
     left_out: list[str] = field(default_factory=list)
     shape: str = ""
     rests: int = 0
+    noise: str = "normal"
     signal_left: dict[str, float] = field(default_factory=dict)  # lambda of hidden effects
     gains: dict[str, float] | None = None  # delta BIC of each effect where nothing is hidden
     held_out: HeldOut | None = None

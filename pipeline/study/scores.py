@@ -18,6 +18,7 @@ import pandas as pd
 import scipy
 
 from pipeline.estimation.free_curves import OTHER
+from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
 from pipeline.model.effects import effect
 from pipeline.report.chart import Dots, Figure, Line, Panel, chart
 from pipeline.verdicts import Verdict
@@ -34,7 +35,8 @@ IN_THE_CATALOGUE = ("single", "pairs", "triples", "one_axis")
 MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "triples")
 ALIKE = 0.95  # share of a signal above which effects are look-alikes, as on the pages
 EXCESS = 0.05  # of the noise floor: smallest held-out excess that is counted
-GATES = (4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 20.0)  # delta BIC at which false selections are counted
+GATES = (6.0, 8.0, MIN_DELTA_BIC, 12.0, 14.0, MIN_DELTA_BIC_OF_SLOW, 18.0, 20.0)  # at which false selections count
+OF_SENSOR_FILE = ("white", "normal")  # noise of the families that the sensor file describes
 STANDS_OUT = 100.0  # lambda: the largest that a selection needs
 DOUBTFUL = (Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT)
 
@@ -200,27 +202,27 @@ def false_selections(cases: Iterable[ScoredCase]) -> list[list[Any]]:
     """Return in how many units with nothing hidden an effect would pass some gates, on a table and by hand.
 
     A unit counts where the largest delta BIC of an effect, in either sensor, is above the gate. Below the gate in
-    force, an effect that is not observable is not counted. Rows: recordings, effects (those that depend on time and
-    temperature alone, or the others), gate, n, count, share and its exact 95 % interval (Clopper and Pearson,
-    Biometrika 26, 1934).
+    force, an effect that is not observable is not counted. Rows: recordings, noise, effects (slow or others, see
+    ``pipeline.estimation.gates``), n, a count for each of ``GATES``, and the exact 95 % interval of the share at the
+    gate in force (Clopper and Pearson, Biometrika 26, 1934).
     """
-    largest: dict[tuple[str, str], dict[str, float]] = {}
+    largest: dict[tuple[str, str, str], dict[str, float]] = {}
     for case in cases:
         if case.gains is None:
             continue
         gains = {"slow": [-np.inf], "other": [-np.inf]}
         for name, gain in case.gains.items():
             gains["slow" if effect(name).of_the_room(case.sensor) else "other"].append(gain)
+        recorded, noise = "by hand" if case.rests else "on a table", case.noise in OF_SENSOR_FILE
         for kind, of_kind in gains.items():
-            units = largest.setdefault(("by hand" if case.rests else "on a table", kind), {})
+            units = largest.setdefault((recorded, "as the sensor file" if noise else "other", kind), {})
             units[case.key] = max(*of_kind, units.get(case.key, -np.inf))
     rows = []
-    for (recorded, kind), units in sorted(largest.items(), reverse=True):
-        for gate in GATES:
-            count, n = sum(gain > gate for gain in units.values()), len(units)
-            ends = scipy.stats.binomtest(count, n).proportion_ci(0.95, method="exact")
-            interval = f"{100.0 * ends.low:.3f} to {100.0 * ends.high:.2f} %"
-            rows.append([recorded, kind, f"{gate:g}", n, count, f"{100.0 * count / n:.2f} %", interval])
+    for (*row, kind), units in sorted(largest.items(), reverse=True):
+        counts = {gate: sum(gain > gate for gain in units.values()) for gate in GATES}
+        count = counts[MIN_DELTA_BIC_OF_SLOW if kind == "slow" else MIN_DELTA_BIC]
+        ends = scipy.stats.binomtest(count, len(units)).proportion_ci(0.95, method="exact")
+        rows.append([*row, kind, len(units), *counts.values(), f"{100 * ends.low:.3f} to {100 * ends.high:.2f} %"])
     return rows
 
 

@@ -62,7 +62,7 @@ def _found(planned: dict[str, dict[str, Any]], names: dict[str, str], factor: fl
             term = Term(effect(name), np.zeros(len(hidden[f"{sensor}.{name}"])))
             ranking = Ranking(observations, start, start, {name: term}, selection_grid(noise))
             score = ranking.scores([], {})[0]
-            found[sensor] += passes(score, len(catalogue()))
+            found[sensor] += passes(score, sensor, len(catalogue()))
     return found
 
 

@@ -29,7 +29,7 @@ def test_half_of_the_units_are_found_within_a_factor_of_the_planned_size_by_hand
             recordings, _ = simulate_unit(replace(POSITIONS, effects=hidden), 2, number)
             selection = select_by_hand("accelerometer", replace(rehearsal, recordings=recordings))
             score = selection.first.scores["quadratic_nonlinearity"]
-            found[factor] += passes(score, len(selection.candidates))
+            found[factor] += passes(score, "accelerometer", len(selection.candidates))
     assert found[FACTOR] >= MOST, found
     assert found[1.0 / FACTOR] <= UNITS - MOST, found
 

@@ -56,13 +56,13 @@ def test_an_exact_set_has_nothing_more_and_nothing_less() -> None:
 
 def test_a_false_selection_is_counted_once_a_unit_by_the_larger_gain_of_its_sensors() -> None:
     gains = [{"bias_drift": 11.0, "time_offset": 3.0}, {"bias_drift": 13.0, "g_sensitivity": 7.0}]
-    cases = [case(truth(rests=0), said(gains=each)) for each in gains]
-    cases.append(case(truth(rests=0), said(key="null_normal-00001", gains={"warm_up": -9.0, "time_offset": -2.0})))
-    found = {(kind, gate): (n, count, share, ends) for _, kind, gate, n, count, share, ends in false_selections(cases)}
-    assert [found["slow", gate][1] for gate in ("10", "12", "14")] == [1, 1, 0]
-    assert [found["other", gate][1] for gate in ("4", "6", "8")] == [1, 1, 0]
-    assert found["slow", "10"] == (2, 1, "50.00 %", "1.258 to 98.74 %")  # of a beta distribution: 1 - sqrt(0.975)
-    assert false_selections([case(truth(), said())]) == []
+    null = {"rests": 0, "noise": "normal"}
+    cases = [case(truth(**null), said(gains=each)) for each in gains]
+    cases.append(case(truth(**null), said(key="null_normal-00001", gains={"warm_up": -9.0, "time_offset": -2.0})))
+    slow, other = false_selections(cases)
+    assert slow == ["on a table", "as the sensor file", "slow", 2, 1, 1, 1, 1, 0, 0, 0, 0, "0.000 to 84.19 %"]
+    assert other == ["on a table", "as the sensor file", "other", 2, 1, 0, 0, 0, 0, 0, 0, 0, "0.000 to 84.19 %"]
+    assert false_selections([case(truth(), said())]) == []  # 84.19 %: 1 - sqrt(0.025)
 
 
 def test_another_effect_is_silent_unless_a_warning_is_said() -> None:
@@ -155,6 +155,10 @@ def test_the_page_has_the_figures_the_code_and_the_cases_that_miss() -> None:
     assert "| one effect at the sensor file's size: named first | 1 | 0.0 % | 0.0 to 79.3 % | >= 98 % |" in text
     assert "code being `0123`." in text
     assert "| single-00000 | mpu6050 gyroscope one_way | g_sensitivity | b |" in text
+    assert "False selections" not in text
+    null = case(truth(key="null_white-00000", rests=20, noise="white"), said(gains={"warm_up": 11.0}))
+    found = page([*cases, null], "python -m pipeline study DIR")
+    assert "| by hand | as the sensor file | slow | 1 | 1 | 1 | 1 | 0 |" in found
     assert "| mpu6050 | gyroscope | `g_sensitivity` | 0.1 | deg/s/g |" in text
 
 

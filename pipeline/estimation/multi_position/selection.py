@@ -1,11 +1,9 @@
 """Select effects by rests and moves: forward selection with backward drop, as in ``pipeline.estimation.selection``.
 
-    delta BIC > 10   and   m p < 0.01
-
-with the gain, delta BIC and p of ``model`` and m the number of candidates. After each acceptance all parameters
-are fitted and every column is computed again. An effect that would need more than ten times its limit in the sensor
-file is not accepted as an explanation of a few rests. A selected effect whose delta BIC has become negative is dropped.
-A selected effect that another one replaces with delta BIC > 10 is exchanged.
+The gate is the same (``pipeline.estimation.gates``), with the gain, delta BIC and p of ``model``. After each acceptance
+all parameters are fitted and every column is computed again. An effect that would need more than ten times its limit in
+the sensor file is not accepted as an explanation of a few rests. A selected effect is dropped if its delta BIC has
+become negative, and exchanged if another one passes the gate in its place and is better by a delta BIC of more than 10.
 
 The posterior over effects is computed for the linear problem of ``pipeline.estimation.evidence``: columns at the fit of
 the selected effects, and readings ``y = r + Z p`` with the residual r and their values p. As in the selection, white
@@ -209,14 +207,17 @@ class Selection:
 
     def _best(self, scored: Scored) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
-        passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s)]
+        passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s, self.names)]
         return max(passing, key=lambda s: s.delta_bic - (0.0 if s.plausible else MIN_DELTA_BIC), default=None)
 
-    def _passes(self, score: Score) -> bool:
-        fitted = [term.effect.name for term in self.fit.state.terms]
+    def _passes(self, score: Score, selected: Sequence[str]) -> bool:
+        """Return whether a candidate passes the gate; ``selected``: effects in the model of the score."""
+        fitted = [*selected, *(term.effect.name for term in self.base.state.terms)]
         if any(score.name in effect(name).contains or name in effect(score.name).contains for name in fitted):
             return False
-        return score.admissible and passes(score, len(self.candidates)) and self._possible(score)
+        gain = 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
+        significant = passes(score, self.model.sensor, len(self.candidates), gain)
+        return score.admissible and significant and self._possible(score)
 
     def _possible(self, score: Score) -> bool:
         """Return whether an effect needs no more than ten times its limits: beyond, it is no explanation."""
@@ -246,9 +247,9 @@ class Selection:
     def _exchange(self) -> bool:
         """Replace a selected effect by another one that explains significantly more."""
         for name in self.names:
-            scores = self._without(name).scores
+            scores, others = self._without(name).scores, [n for n in self.names if n != name]
             threshold = MIN_DELTA_BIC + (scores[name].delta_bic if name in scores else float("-inf"))
-            rivals = [s for s in scores.values() if s.name not in self.names and s.admissible and self._possible(s)]
+            rivals = [s for s in scores.values() if s.name not in self.names and self._passes(s, others)]
             rival = max(rivals, key=lambda s: s.delta_bic, default=None)
             if rival is not None and rival.delta_bic > threshold:
                 self._remove(name)
