@@ -23,7 +23,7 @@ from scipy.linalg import block_diag
 from pipeline.diagnosis.words import template
 from pipeline.estimation.generalized_least_squares import Fit, fit_terms
 from pipeline.estimation.observations import filtered_motion
-from pipeline.estimation.stages import declared
+from pipeline.estimation.stages import declarations
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import table_motion
@@ -48,8 +48,8 @@ def method_errors(
     and, for a given calibration, ``sensor``. Entries: ``name, meaning, size, unit, share, rms`` on the recordings of
     the fit (rms in the unit of the sensor), ``held_out_share`` and ``held_out_magnitude_share`` (or None).
     """
-    stages = [stage.name for stage in calibration.stages]
-    if not stages or declared(calibration.sensor, stages[-1]).reference:
+    stages = [*declarations(calibration).values()]
+    if not stages or stages[-1].reference:
         return []
     free, names = selection.base, [effect.name for effect in calibration.effects]
     fitted = {term.effect.name for term in free.terms}
