@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.turns import stop_and_go
 from pipeline.model.kinematics import table_motion
+from pipeline.records import once
 from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
 from pipeline.signal.quiet_motion import creep_of_rest, posterior_creep_rates
 from pipeline.signal.rests import Rest, find_rests, rests_from_table, usable
@@ -233,8 +234,9 @@ def rests_of(
 
 def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, Sequence[Rest]]) -> Rests:
     """Gather rests of some recordings, which ``chosen`` has by their index; none is held out."""
-    parts = [_of_recording(sensor, index, recordings[index], rests) for index, rests in chosen.items()]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    parts = {index: _of_recording(recordings[index], sensor, tuple(rests)) for index, rests in chosen.items()}
+    columns = {name: np.concatenate([part[name] for part in parts.values()]) for name in next(iter(parts.values()))}
+    columns["recording"] = np.repeat([*parts], [len(part["time"]) for part in parts.values()])
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
     return Rests(**columns, clock_shared=shared)
 
@@ -304,8 +306,9 @@ def _rests_on_table(recording: Recording, table: Mapping[str, Any]) -> list[Rest
     return [Rest(i, i + 1) for i in np.flatnonzero(sound_samples(recording, "accelerometer")).tolist()]
 
 
-def _of_recording(sensor: str, index: int, recording: Recording, rests: Sequence[Rest]) -> dict[str, Any]:
-    """Return the columns of ``Rests`` for one recording; rests without a valid sample are left out."""
+@once
+def _of_recording(recording: Recording, sensor: str, rests: tuple[Rest, ...]) -> dict[str, Any]:
+    """Return the columns of ``Rests``, but for ``recording``, without rests that have no valid sample."""
     means, counts = rest_means(recording, rests, sensor)
     kept = counts > 0
     span = np.array([[rest.start, rest.stop] for rest in rests], np.intp).reshape(-1, 2)[kept]
@@ -331,7 +334,6 @@ def _of_recording(sensor: str, index: int, recording: Recording, rests: Sequence
         "length": time[span[:, 1] - 1] - start + recording.interval,
         "time": np.array([time[s].mean() for s in inside]),
         "temperature": np.array([warmth[s].mean() for s in inside]),
-        "recording": np.full(len(span), index),
         "held_out": np.zeros(len(span), bool),
         "span": span,
         "creep": rate,
