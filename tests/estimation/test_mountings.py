@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pipeline.config.stage_settings import configuration
 from pipeline.estimation.effects import fit
 from pipeline.estimation.reference_least_squares import fit as fit_to_reference
 from pipeline.model.effects import effect, effect_of
@@ -38,7 +39,8 @@ def settings() -> dict[str, Any]:
     """Return settings of a table on which the unit is mounted anew for each turn."""
     table = {"angle_accuracy_deg": 0.0, "rate_accuracy": 0.0, "seat_deg": SEAT_DEG}
     quiet = [f"sensor.{s}.bias_wander=0" for s in K]  # the turns are made with white noise alone
-    whole = unit_row(["sensor=mpu6050", *(f"table.{key}={value}" for key, value in table.items()), *quiet]).config
+    row = unit_row(["sensor=mpu6050", *(f"table.{key}={value}" for key, value in table.items()), *quiet])
+    whole = configuration(row.config)
     white = {"accelerometer": 8e-4, "gyroscope": 0.01}  # of benches.py
     return {**whole, "noise": {s: Noise(np.full(3, w), np.zeros(3), 100.0, "rests") for s, w in white.items()}}
 

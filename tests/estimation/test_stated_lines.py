@@ -17,6 +17,7 @@ from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.io.arrow import to_parquet
 from pipeline.model.calibration_file import beyond_uncertainty
 from pipeline.records import FittedEffect, Noise, Note
+from pipeline.settings import Settings
 from pipeline.stages import batch
 from pipeline.stages.filter import filter_recordings
 from pipeline.stages.unit_files import FILES
@@ -220,7 +221,7 @@ def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:
     (tmp_path / "part.json").write_text(json.dumps({"units": {"U": part}}))
     stages = [tmp_path / "bias", tmp_path / "cholesky_lu"]
     ingested = write_pack(tmp_path / "ingest.zip", {"U.parquet": to_parquet([*turns, still])})
-    recordings = filter_recordings([*turns, still], settings() | {"filter": {"name": "none"}})
+    recordings = filter_recordings([*turns, still], Settings.of_sections(settings() | {"filter": {"name": "none"}}))
     filtered = write_pack(tmp_path / "filter.zip", FILES["filter"]("U", recordings))
     for stage, previous, last in zip(stages, ["", str(stages[0])], ["no", "yes"], strict=True):
         chosen = ["--sensor", "gyroscope", "--stage", stage.name, "--previous", previous, "--last", last]
