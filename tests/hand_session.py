@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
+from tests.published import diagnose
 
 if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration

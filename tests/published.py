@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.records import Noise, SensorValidation, StepErrors, Validation
+from pipeline.diagnosis.diagnose import diagnose as diagnosis_of
+from pipeline.records import Candidate, Noise, SensorValidation, StepErrors, Validation
 from pipeline.validation import heldout
 
 if TYPE_CHECKING:
@@ -25,3 +26,15 @@ def validation_document(unit: str, parts: Mapping[str, SensorValidation | None])
 def validate(*arguments: Any, **keywords: Any) -> dict[str, Any]:
     """Return a sensor's part of ``validations/<unit>.json``."""
     return heldout.validate(*arguments, **keywords).to_json()
+
+
+def candidate(name: str, **values: Any) -> Candidate:
+    """Return the evidence for an effect, with no figure but those given."""
+    none: dict[str, Any] = dict.fromkeys(("held_out_error_before", "held_out_error_after"))
+    rest = {"delta_bic": 0.0, "p_value": 1.0, "parameters": {}, "explained_share": 0.0, "look_alikes": []}
+    return Candidate(name, **{**none, **rest, "plausible": True, **values})
+
+
+def diagnose(*arguments: Any, **keywords: Any) -> dict[str, Any]:
+    """Return a sensor's part of ``diagnoses/<unit>.json``."""
+    return diagnosis_of(*arguments, **keywords).to_json()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis import multi_position, turntable
-from pipeline.diagnosis.findings import Case, Findings, document_of
+from pipeline.diagnosis.findings import Case, Findings, diagnosis_of
 from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
 from pipeline.errors import ConvergenceError, NotObservableError
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
@@ -21,7 +21,7 @@ from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
 from pipeline.model.effects import catalogue, effect
-from pipeline.records import MATRIX, Noise, Recording, SensorCalibration, SensorValidation
+from pipeline.records import MATRIX, Noise, Recording, SensorCalibration, SensorDiagnosis, SensorValidation
 from pipeline.validation.heldout import last_error, static_error
 from pipeline.validation.samples import HeldOutCase
 from pipeline.verdicts import Verdict
@@ -46,10 +46,10 @@ def diagnose(
     accelerometer: SensorCalibration | None = None,
     *,
     validation: SensorValidation | None = None,
-    gravity: Mapping[str, Any] | None = None,
+    gravity: SensorDiagnosis | None = None,
     moves: tuple[float, float] | None = None,
-) -> dict[str, Any]:
-    """Return a sensor's part of ``diagnoses/<unit>.json``; ``pipeline/schemas/diagnosis.json`` describes it.
+) -> SensorDiagnosis:
+    """Return the diagnosis of a sensor.
 
     ``calibration``: the fits start from its effects. ``recordings``: all of the unit; those of role ``validation`` take
     no part in the selection. ``settings``: sections ``sensor``, ``table`` and ``effects``; by hand also ``procedure``.
@@ -71,29 +71,29 @@ def diagnose(
     case = Case(calibration, recordings, noise, settings, accelerometer, configured)
     full = (settings.get("diagnosis") or {}).get("depth") == "full"
 
-    def judge(findings: Findings | None, document: dict[str, Any]) -> tuple[dict[str, Any], bool]:
-        """Return the document with its verdict, and whether to search for a formula outside the catalogue."""
-        evidence = evidence_of(document, case, validation, findings)
+    def judge(findings: Findings | None, found: SensorDiagnosis) -> tuple[SensorDiagnosis, bool]:
+        """Return the diagnosis with its verdict, and whether to search for a formula outside the catalogue."""
+        evidence = evidence_of(found, case, validation, findings)
         doubts = list(evidence.doubts)
         if by_gravity and gravity:
             doubts += _doubts_of_gravity(gravity, case)
-        elif not leaning.keys() & {*configured, *document["selected"]}:
+        elif not leaning.keys() & {*configured, *found.selected}:
             doubts += _doubts_of_axes(leaning, calibration)
         evidence = replace(evidence, doubts=doubts, moves=moves)
-        document = judged(document, evidence)
-        return document, full or may_be_unknown(document["verdict"], evidence)
+        found = judged(found, evidence)
+        return found, full or may_be_unknown(found.verdict, evidence)
 
     try:
         findings = procedure.findings(case)
     except NotObservableError as reason:
         return judge(None, _not_enough_data(sensor, configured, reason.message, procedure.NEEDED))[0]
-    document, unknown = judge(findings, document_of(findings, case))
+    diagnosis, unknown = judge(findings, diagnosis_of(findings, case))
     if unknown and findings.search:
         findings = findings.search() or findings
-        document, _ = judge(findings, document_of(findings, case))
-    if findings.deeper and (full or document["verdict"] != Verdict.NOTHING_MISSING):
-        document |= findings.deeper()
-    return document
+        diagnosis, _ = judge(findings, diagnosis_of(findings, case))
+    if findings.deeper and (full or diagnosis.verdict != Verdict.NOTHING_MISSING):
+        diagnosis = replace(diagnosis, further=findings.deeper())
+    return diagnosis
 
 
 def held_out_of(validation: SensorValidation) -> HeldOut | None:
@@ -116,9 +116,9 @@ def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = Tru
 
 
 def evidence_of(
-    document: Mapping[str, Any], case: Case, validation: SensorValidation | None, findings: Findings | None
+    found: SensorDiagnosis, case: Case, validation: SensorValidation | None, findings: Findings | None
 ) -> Evidence:
-    """Return the evidence for the verdict on ``document``, the diagnosis by the selection alone.
+    """Return the evidence for the verdict on ``found``, the diagnosis by the selection alone.
 
     The held-out errors of the free fits are computed only if that of the calibration is above its interval.
     """
@@ -140,14 +140,13 @@ def evidence_of(
     if case.noise is not None:
         static = static_error(HeldOutCase(case.calibration, recordings, case.noise, settings, case.accelerometer))
     accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")
-    selected = [entry for entry in document["ranking"] if entry["effect"] in document["selected"]]
     published = held_out_of(validation) if validation else error_of(free, smoothed=False)
     contradicted = published is not None and published.above
     return Evidence(
         sensor,
-        document["verdict"],
-        tuple(document["selected"]),
-        document["residual_over_noise"],
+        found.verdict,
+        tuple(found.selected),
+        found.residual_over_noise,
         findings.left_over_noise if findings else None,
         published=published,
         static=HeldOut(static[0], *static[1]) if static else None,
@@ -155,18 +154,18 @@ def evidence_of(
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=[
-            *doubts_of(sensor, recordings, seats=not _seats_explained(document, sensor, findings)),
+            *doubts_of(sensor, recordings, seats=not _seats_explained(found, sensor, findings)),
             *(findings.departures if findings else ()),
         ],
-        approximations=[error["name"] for error in document["method_errors"] if error["name"] in COMPARED],
-        unknown=[entry["covariate"] for entry in document["unexplained"] if not entry.get("explained_by")],
+        approximations=[error["name"] for error in found.method_errors if error["name"] in COMPARED],
+        unknown=[entry["covariate"] for entry in found.unexplained if not entry.get("explained_by")],
         beyond=[
             name.removeprefix(OTHER)
-            for name, probability in document["probability"].items()
+            for name, probability in found.probability.items()
             if name.startswith(OTHER) and probability > LIKELY
         ],
-        implausible=() if accepted else [entry["effect"] for entry in selected if not entry["plausible"]],
-        held_out=document.get("held_out"),
+        implausible=() if accepted else [entry.effect for entry in found.chosen if not entry.plausible],
+        held_out=found.details.get("held_out"),
         method=str(method.get(sensor) or ""),
         fit=last_fit(case.calibration),
         as_printed=bool(method.get("as_printed")),
@@ -175,27 +174,27 @@ def evidence_of(
     )
 
 
-def _seats_explained(document: Mapping[str, Any], sensor: str, findings: Findings | None) -> bool:
+def _seats_explained(found: SensorDiagnosis, sensor: str, findings: Findings | None) -> bool:
     """Return whether the fit explains why turns seem to have different mountings.
 
     Either mountings or zeros of the angle are in the model or selected. Or they were candidates of the accelerometer,
     were not selected, and the residual is noise: then another effect looked like a mounting to the checks.
     """
-    if any(effect(name).of_turns for name in (*document["configured"], *document["selected"])):
+    if any(effect(name).of_turns for name in (*found.configured, *found.selected)):
         return True
     residual = None if findings is None else findings.left_over_noise
     return sensor == "accelerometer" and residual is not None and residual <= EXPLAINED
 
 
-def _doubts_of_gravity(accelerometer: Mapping[str, Any], case: Case) -> list[str]:
+def _doubts_of_gravity(accelerometer: SensorDiagnosis, case: Case) -> list[str]:
     """Return why the mountings that the accelerometer determines may be wrong, from its diagnosis.
 
     A missing tilt of the table causes no doubt if it shifts no mounting by more than the mounting's uncertainty.
     """
     subject = "the accelerometer, which determines the mountings,"
-    if accelerometer["verdict"] in IN_DOUBT:
-        return [f"{subject} has the verdict {accelerometer['verdict']}"]
-    missing = [name for name in accelerometer["selected"] if of_the_angle(name)]
+    if accelerometer.verdict in IN_DOUBT:
+        return [f"{subject} has the verdict {accelerometer.verdict}"]
+    missing = [name for name in accelerometer.selected if of_the_angle(name)]
     if not missing or (missing == [TILT] and _tilt_is_within_uncertainty(case)):
         return []
     remedy = "an error of the table that shifts the mountings: add it to effects.accelerometer"
@@ -215,10 +214,9 @@ def _tilt_is_within_uncertainty(case: Case) -> bool:
     return bool(np.all(np.abs(after - before) < mountings.expanded_uncertainty))
 
 
-def _leaning(diagnosis: Mapping[str, Any] | None, fit: SensorCalibration | None) -> dict[str, float]:
+def _leaning(diagnosis: SensorDiagnosis | None, fit: SensorCalibration | None) -> dict[str, float]:
     """Return the largest tilt of a turn axis by each such effect that an accelerometer has or misses, deg."""
-    selected = (diagnosis or {}).get("selected", ())
-    parameters = {e["effect"]: e["parameters"] for e in (diagnosis or {}).get("ranking", ()) if e["effect"] in selected}
+    parameters = {e.effect: e.parameters for e in (diagnosis.chosen if diagnosis else ())}
     parameters |= {e.name: e.parameters for e in (fit.effects if fit else ())}
     return {name: max(abs(p["value"]) for p in parameters[name].values()) for name in LEANING if name in parameters}
 
@@ -236,37 +234,22 @@ def _doubts_of_axes(leaning: Mapping[str, float], calibration: SensorCalibration
     ]
 
 
-def without_diagnosis(sensor: str, settings: Mapping[str, Any], failure: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the document of a sensor whose diagnosis failed; ``failure``: its ``code`` and ``message``.
+def without_diagnosis(sensor: str, settings: Mapping[str, Any], failure: Mapping[str, Any]) -> SensorDiagnosis:
+    """Return the diagnosis of a sensor whose diagnosis failed; ``failure``: its ``code`` and ``message``.
 
     The verdict is ``not_enough_data``, because nothing is known of what is missing.
     """
     listed = (settings.get("effects") or {}).get(sensor)
     bug = failure["code"] == "internal_error"
     remedy = "report this fault with the traceback, which is in the log of the stage diagnose" if bug else ""
-    document = _not_enough_data(sensor, list(listed) if isinstance(listed, list) else [], "", remedy)
+    found = _not_enough_data(sensor, list(listed) if isinstance(listed, list) else [], "", remedy)
     reason = f"The diagnosis failed: {failure['message']}. The calibration does not depend on it."
-    return document | {"failed": failure["message"], "reason": reason, "not_observable": []}
+    return replace(found, details={"failed": failure["message"]}, reason=reason, not_observable={})
 
 
-def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> dict[str, Any]:
-    """Return the document for recordings that cannot show any effect; ``needed``: what to record."""
+def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> SensorDiagnosis:
+    """Return the diagnosis for recordings that cannot show any effect; ``needed``: what to record."""
     names = [name for name, each in catalogue().items() if sensor in each.sensors and name not in configured]
-    return {
-        "verdict": Verdict.NOT_ENOUGH_DATA,
-        "residual_over_noise": None,
-        "selected": [],
-        "ranking": [],
-        "probability": {},
-        "answer_set": [],
-        "upper_limit": {},
-        "to_distinguish": "",
-        "not_observable": [{"effect": name, "reason": reason} for name in names],
-        "unexplained": [],
-        "suggested_effect": None,
-        "method_errors": [],
-        "next_experiment": needed,
-        "override": "",
-        "configured": configured,
-        "wander": None,
-    }
+    return SensorDiagnosis(
+        Verdict.NOT_ENOUGH_DATA, configured, not_observable=dict.fromkeys(names, reason), next_experiment=needed
+    )

@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.measurement import linear_truth
-from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, Values
+from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, SensorDiagnosis, Values
 from pipeline.validation.error_breakdown import last_step
 from pipeline.validation.samples import Samples, samples_of_motion
 
@@ -35,7 +35,7 @@ def effective_noise(
     recordings: Sequence[Recording],
     noise: Noise,
     table: Mapping[str, Any],
-    found: Mapping[str, Any],
+    found: SensorDiagnosis,
     *,
     other: SensorCalibration | None = None,
 ) -> dict[str, Any] | None:
@@ -52,7 +52,7 @@ def effective_noise(
     if not errors:
         return None
     of_effects = {}
-    for name in found["selected"]:
+    for name in found.selected:
         of_effect = [(s.time, _of_effect(calibration, s, found, name)) for _, s in samples]
         if all(error is not None for _, error in of_effect):
             of_effects[name] = of_effect
@@ -88,13 +88,13 @@ def _error(calibration: SensorCalibration, samples: Samples) -> Values | None:
     return (np.linalg.norm(vector, axis=1) - magnitude)[:, None] if true is None else vector - true
 
 
-def _of_effect(calibration: SensorCalibration, samples: Samples, found: Mapping[str, Any], name: str) -> Values | None:
+def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDiagnosis, name: str) -> Values | None:
     """Return the error by an effect of the diagnosis: (n, 3); None if motion or parameters are unknown."""
-    entry = next((e for e in found["ranking"] if e["effect"] == name), None)
+    entry = next((e for e in found.ranking if e.effect == name), None)
     motion = samples.motion
-    if entry is None or motion is None or not entry.get("parameters"):
+    if entry is None or motion is None or not entry.parameters:
         return None
-    fitted = FittedEffect(name, entry["parameters"])
+    fitted = FittedEffect(name, entry.parameters)
     this = effect_of(fitted)
     if any(getattr(motion, need) is None for need in this.needs):
         return None

@@ -22,6 +22,7 @@ from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import ALIKE, EVIDENCE, INFLATED
 from pipeline.model.effects import effect
+from pipeline.records import Candidate, SensorDiagnosis
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -101,30 +102,31 @@ class Findings:
     deeper: Callable[[], dict[str, Any]] | None = None  # further entries of the document if something is missing
 
 
-def document_of(findings: Findings, case: Case) -> dict[str, Any]:
-    """Return a sensor's part of ``diagnoses/<unit>.json``, with the verdict by the selection alone."""
+def diagnosis_of(findings: Findings, case: Case) -> SensorDiagnosis:
+    """Return the diagnosis of a sensor, with the verdict by the selection alone."""
     listed = [name for name in case.configured if name in case.settings["effects"][case.sensor]]
     others = sorted(findings.alone.values(), key=lambda score: -score.delta_bic)
     unselected = [s.name for s in others if s.name not in findings.selected and s.name not in findings.hidden]
     ranking = [_entry(findings, name) for name in (*findings.selected, *unselected)]
     verdict = if_observable(findings.verdict, ranking, findings.hidden)
     override = f"effects.{case.sensor}=[{','.join([*listed, *findings.selected])}]"
-    return {
-        "verdict": verdict,
-        "residual_over_noise": findings.over_noise,
-        "selected": list(findings.selected),
-        "ranking": ranking,
+    more = dict(findings.more)
+    return SensorDiagnosis(
+        verdict=verdict,
+        configured=case.configured,
+        residual_over_noise=findings.over_noise,
+        selected=findings.selected,
+        ranking=ranking,
         **_probabilities(findings),
-        "not_observable": [{"effect": name, "reason": reason} for name, reason in findings.hidden.items()],
-        "unexplained": findings.unknown,
-        "suggested_effect": None,
-        "next_experiment": next_experiment(verdict, ranking, findings),
-        "override": override if findings.selected else "",
-        "configured": case.configured,
-        "wander": _wander(findings),
-        "method_errors": [],
-        **findings.more,
-    }
+        not_observable=findings.hidden,
+        unexplained=findings.unknown,
+        suggested_effect=more.pop("suggested_effect", None),
+        next_experiment=next_experiment(verdict, ranking, findings),
+        override=override if findings.selected else "",
+        wander=_wander(findings),
+        method_errors=more.pop("method_errors", ()),
+        details=more,
+    )
 
 
 def _probabilities(findings: Findings) -> dict[str, Any]:
@@ -146,7 +148,7 @@ def _probabilities(findings: Findings) -> dict[str, Any]:
     }
 
 
-def _entry(findings: Findings, name: str) -> dict[str, Any]:
+def _entry(findings: Findings, name: str) -> Candidate:
     """Return the entry of an effect in the ranking."""
     score = findings.steps.get(name) or findings.alone[name]
     if name in findings.selected:
@@ -159,18 +161,18 @@ def _entry(findings: Findings, name: str) -> dict[str, Any]:
     estimates, plausible = _estimates(findings, score)
     shares = findings.shares(name) if score.delta_bic > MIN_DELTA_BIC else {}
     alike = sorted(((share, other) for other, share in shares.items() if share > ALIKE), reverse=True)
-    return {
-        "effect": name,
-        "delta_bic": score.delta_bic,
-        "p_value": score.p_value,
-        "parameters": estimates,
-        "explained_share": float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
-        "held_out_error_before": before,
-        "held_out_error_after": after,
-        "look_alikes": [{"effect": other, "share": share} for share, other in alike],
-        "plausible": plausible,
-        **({"meaning": effect(name).meaning} if effect(name).definition else {}),
-    }
+    return Candidate(
+        effect=name,
+        delta_bic=score.delta_bic,
+        p_value=score.p_value,
+        parameters=estimates,
+        explained_share=float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
+        held_out_error_before=before,
+        held_out_error_after=after,
+        look_alikes=[{"effect": other, "share": share} for share, other in alike],
+        plausible=plausible,
+        meaning=effect(name).meaning if effect(name).definition else None,
+    )
 
 
 def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Any], bool]:

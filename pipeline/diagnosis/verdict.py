@@ -6,7 +6,7 @@ error is compared with its 99 % interval (``pipeline.validation.expected_error``
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.words import of_unknown, template
@@ -17,7 +17,7 @@ from pipeline.verdicts import Verdict
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.records import Agreement
+    from pipeline.records import Agreement, SensorDiagnosis
 
 EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
 MOSTLY = 0.5  # least share of the residual's excess that selected effects explain if the residual has another cause too
@@ -242,20 +242,21 @@ def decide(e: Evidence) -> tuple[Verdict, str]:
     return e.found, ""
 
 
-def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
-    """Return the document of a selection with the verdict by the evidence, its reason and the next experiment."""
+def judged(diagnosis: SensorDiagnosis, e: Evidence) -> SensorDiagnosis:
+    """Return the diagnosis of a selection with the verdict by the evidence, its reason and the next experiment."""
     verdict, reason = decide(e)
-    given, step = {"given": True} if e.given else {}, _next_step(verdict, document, e)
-    if given and verdict == Verdict.MISSING_EFFECT:
-        effects = ", ".join(document["selected"])
+    step = _next_step(verdict, diagnosis, e)
+    if e.given and verdict == Verdict.MISSING_EFFECT:
+        effects = ", ".join(diagnosis.selected)
         step = f"calibrate these recordings by a method that fits, with effects.{e.sensor}=[{effects}]"
-    decided = {
-        "verdict": verdict,
-        "reason": reason,
-        "next_experiment": step or document["next_experiment"],
-        "override": document["override"] if _offered(verdict, document, e) else "",
-    }
-    return document | given | decided
+    return replace(
+        diagnosis,
+        verdict=verdict,
+        reason=reason,
+        given=e.given,
+        next_experiment=step or diagnosis.next_experiment,
+        override=diagnosis.override if _offered(verdict, diagnosis, e) else "",
+    )
 
 
 def may_be_unknown(verdict: Verdict, e: Evidence) -> bool:
@@ -268,23 +269,23 @@ def may_be_unknown(verdict: Verdict, e: Evidence) -> bool:
     return verdict == Verdict.UNEXPLAINED or (verdict == Verdict.REFERENCE_IN_DOUBT and not e.doubts)
 
 
-def _offered(verdict: Verdict, document: Mapping[str, Any], e: Evidence) -> bool:
+def _offered(verdict: Verdict, diagnosis: SensorDiagnosis, e: Evidence) -> bool:
     """Return whether to offer the selected effects: if ``unexplained``, each must be plausible and help on held-out."""
     if e.given:
         return False
     if verdict != Verdict.UNEXPLAINED or e.implausible or e.too_many:
         return verdict == Verdict.MISSING_EFFECT
-    entries = [entry for entry in document["ranking"] if entry["effect"] in document["selected"]]
-    errors = [(entry["held_out_error_before"], entry["held_out_error_after"]) for entry in entries]
-    return bool(errors) and all(None not in pair and pair[1] ** 2 < (1.0 - HELPFUL) * pair[0] ** 2 for pair in errors)
+    errors = [(entry.held_out_error_before, entry.held_out_error_after) for entry in diagnosis.chosen]
+    lower = [a is not None and b is not None and b**2 < (1.0 - HELPFUL) * a**2 for a, b in errors]
+    return bool(lower) and all(lower)
 
 
-def _next_step(verdict: Verdict, document: Mapping[str, Any], e: Evidence) -> str:
+def _next_step(verdict: Verdict, diagnosis: SensorDiagnosis, e: Evidence) -> str:
     """Return the next step if it differs from the one that the selection proposes; empty otherwise."""
-    experiment = of_unknown(document["unexplained"], on_table=e.on_table)
+    experiment = of_unknown(diagnosis.unexplained, on_table=e.on_table)
     if verdict == Verdict.UNEXPLAINED and e.implausible:
         step = "check that every recording is of this unit in one mounting, and check its range and units"
-        return f"{step}; then {experiment}" if document["unexplained"] else step
+        return f"{step}; then {experiment}" if diagnosis.unexplained else step
     if verdict == Verdict.UNEXPLAINED != e.found:
         return experiment
     if verdict == Verdict.REFERENCE_IN_DOUBT:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.findings import Findings
+    from pipeline.records import Candidate
 
 MOST_ANSWERS = 4  # answers of an answer set that a sentence lists
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
@@ -129,7 +130,7 @@ def _experiment(name: str, *, on_table: bool) -> str:
     return this.experiment if on_table else this.experiment_by_hand or this.experiment
 
 
-def next_experiment(verdict: Verdict, ranking: Sequence[Mapping[str, Any]], findings: Findings) -> str:
+def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Findings) -> str:
     """Return the most informative next experiment as one sentence."""
     on_table = findings.on_table
     if verdict == Verdict.UNEXPLAINED:
@@ -140,10 +141,10 @@ def next_experiment(verdict: Verdict, ranking: Sequence[Mapping[str, Any]], find
             sets = [{"effects": names, "probability": min(p, CERTAIN)} for names, p in pair]
             return f"to distinguish {to_distinguish(sets, findings.sensor, on_table=on_table)}"
         return findings.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
-    entries = {entry["effect"]: entry for entry in ranking}
+    entries = {entry.effect: entry for entry in ranking}
 
     def alike(name: str) -> list[str]:
-        others = [a["effect"] for a in entries[name]["look_alikes"]]
+        others = [a["effect"] for a in entries[name].look_alikes]
         return [n for n in others if name not in getattr(catalogue().get(n), "contains", ())]
 
     name = next((n for n in findings.selected if alike(n)), findings.selected[0])

@@ -24,6 +24,7 @@ from pipeline.records.calibration import (
     calibrated,
     fit_from_json,
 )
+from pipeline.records.diagnosis import Candidate, SensorDiagnosis
 from pipeline.records.parameters import (
     AFTER_BASE,
     BASE,
@@ -99,6 +100,7 @@ __all__ = [
     "Agreement",
     "Budget",
     "BudgetLine",
+    "Candidate",
     "Contribution",
     "Fit",
     "FittedEffect",
@@ -117,6 +119,7 @@ __all__ = [
     "Parameters",
     "Recording",
     "SensorCalibration",
+    "SensorDiagnosis",
     "SensorValidation",
     "StageResult",
     "StepErrors",

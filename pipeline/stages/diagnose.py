@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.diagnose import diagnose, without_diagnosis
 from pipeline.diagnosis.effective_noise import effective_noise
@@ -10,7 +11,7 @@ from pipeline.diagnosis.formula_discovery import effect_file
 from pipeline.errors import omission
 from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
-from pipeline.records import SCHEMA_VERSION, Validation, calibrated
+from pipeline.records import SCHEMA_VERSION, SensorDiagnosis, Validation, calibrated
 from pipeline.stages.unit_files import StoredUnit
 
 if TYPE_CHECKING:
@@ -22,12 +23,20 @@ if TYPE_CHECKING:
     from pipeline.stages.batch import Job
 
 
-class Diagnosis(NamedTuple):
-    """``diagnoses/<unit>.json``, effect files of suggested formulas by name, and records of what could not be made."""
+@dataclass(frozen=True)
+class Diagnosis:
+    """The diagnosis of a unit."""
 
-    document: dict[str, Any]
-    effect_files: dict[str, str]
-    omissions: list[dict[str, Any]]
+    unit: str
+    sensors: dict[str, SensorDiagnosis | None] = field(default_factory=dict)  # None for a sensor without a calibration
+    effect_files: dict[str, str] = field(default_factory=dict)  # of suggested formulas, by name
+    omissions: list[dict[str, Any]] = field(default_factory=list)  # records of what could not be made
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """``diagnoses/<unit>.json``."""
+        parts = {sensor: found and found.to_json() for sensor, found in self.sensors.items()}
+        return {"schema_version": SCHEMA_VERSION, "unit": self.unit, **parts}
 
 
 def diagnose_unit(
@@ -43,29 +52,30 @@ def diagnose_unit(
     """
     noises = required_noises(recordings, settings.sensor, calibrated(fits))
     recordings, known = without_known_effects(recordings, calibrated(fits), settings)
-    made = Diagnosis({"schema_version": SCHEMA_VERSION, "unit": unit}, {}, [])
+    made = Diagnosis(unit)
     for sensor, calibration in known.items():
         if calibration is None:
-            made.document[sensor] = None
+            made.sensors[sensor] = None
             continue
         try:
-            gravity = made.document.get("accelerometer")
+            gravity = made.sensors.get("accelerometer")
             found = _diagnosed(calibration, known, recordings, noises[sensor], settings, validated, gravity)
         except Exception as error:  # noqa: BLE001  (the calibration does not depend on its diagnosis)
             made.omissions.append(omission(error, unit, f"diagnose/{sensor}"))
             found = without_diagnosis(sensor, settings, made.omissions[-1])
-        made.document[sensor] = found
-        if found.get("suggested_effect"):
-            found["suggested_file"] = f"{unit}_{sensor}_unknown.yaml"
-            made.effect_files[found["suggested_file"]] = effect_file(found["suggested_effect"], unit)
+        if found.suggested_effect:
+            file = f"{unit}_{sensor}_unknown.yaml"
+            made.effect_files[file] = effect_file(found.suggested_effect, unit)
+            found = replace(found, further={**found.further, "suggested_file": file})
+        made.sensors[sensor] = found
     return made
 
 
 def diagnose_without(job: Job, unit: str, settings: Settings, record: dict[str, Any]) -> Files:
     """Return the document of a unit without a diagnosis of either sensor."""
     known = calibrated(StoredUnit(job, unit).fits)
-    parts = {s: c and without_diagnosis(s, settings, record) for s, c in known.items()}
-    return {f"{unit}.json": {"schema_version": SCHEMA_VERSION, "unit": unit} | parts}
+    parts = {s: None if c is None else without_diagnosis(s, settings, record) for s, c in known.items()}
+    return {f"{unit}.json": Diagnosis(unit, parts).document}
 
 
 def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
@@ -75,8 +85,8 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
     noise: Noise,
     settings: Settings,
     validated: Validation,
-    gravity: Mapping[str, Any] | None,
-) -> dict[str, Any]:
+    gravity: SensorDiagnosis | None,
+) -> SensorDiagnosis:
     """Return the diagnosis of one sensor, with its effective noise; ``gravity``: diagnosis of the accelerometer."""
     sensor, filtered = calibration.sensor, recordings.filtered
     found = diagnose(
@@ -90,5 +100,5 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
         moves=validated.moves_error if sensor == "gyroscope" else None,
     )
     other = next(c for s, c in known.items() if s != sensor)
-    found["effective_noise"] = effective_noise(calibration, filtered, noise, settings.table, found, other=other)
-    return found
+    densities = effective_noise(calibration, filtered, noise, settings.table, found, other=other)
+    return replace(found, further={**found.further, "effective_noise": densities})

@@ -25,7 +25,6 @@ from bench_session import (
     values_of,
 )
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.observability import not_observable
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation import reference_least_squares
@@ -37,6 +36,7 @@ from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.kinematics import table_motion
 from pipeline.records import Noise, Recording, SensorCalibration
 from pipeline.signal.filters import apply_filter
+from tests.published import diagnose
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
 TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}

@@ -13,11 +13,10 @@ import pytest
 from hand_session import WARM, Unit, hand_held
 from hand_simulator import Hand, draw
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.noise import estimate_noise
-from tests.published import validate
+from tests.published import diagnose, validate
 
 NAMED = [
     ("mpu6050", "accelerometer", "scale_factor_asymmetry"),

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.diagnosis.effective_noise import effective_noise
-from pipeline.records import Noise, Recording, SensorCalibration
+from pipeline.records import Noise, Recording, SensorCalibration, SensorDiagnosis
+from pipeline.verdicts import Verdict
+from tests.published import candidate
 
 DT, N = 0.01, 60_000
 TABLE: dict[str, Any] = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
 WHITE = Noise(np.full(3, 0.05), np.zeros(3), 100.0, "static")
-NOTHING: dict[str, Any] = {"selected": [], "ranking": []}
+NOTHING = SensorDiagnosis(Verdict.NOTHING_MISSING, [])
 
 
 def turning(extra: np.ndarray[Any, Any] | float = 0.0, seed: int = 1) -> Recording:
@@ -73,7 +76,8 @@ def test_an_effect_of_the_diagnosis_has_the_share_of_its_own_error() -> None:
     recording = Recording(
         "validation", "validation", None, (t * 1e9).astype(np.int64), gyroscope=reading, table_attitude=attitude
     )
-    diagnosis = {"selected": ["g_sensitivity"], "ranking": [{"effect": "g_sensitivity", "parameters": parameters}]}
+    entry = candidate("g_sensitivity", parameters=parameters)
+    diagnosis = replace(NOTHING, selected=[entry.effect], ranking=[entry])
     noise = Noise(np.full(3, 0.005), np.zeros(3), 100.0, "static")
     found = effective_noise(SensorCalibration("gyroscope"), [recording], noise, TABLE, diagnosis)
     assert found is not None

@@ -14,7 +14,6 @@ import yaml
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Course, Session, record, values_of
 
 from pipeline.diagnosis import turntable
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.formula_discovery import (
     Discovery,
     discover,
@@ -36,6 +35,7 @@ from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.filters import smooth_temperature
+from tests.published import diagnose
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
 TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}

@@ -14,7 +14,8 @@ from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.stages import fit_stage
-from pipeline.records import Recording, SensorCalibration, StageResult
+from pipeline.records import Recording, SensorCalibration, SensorDiagnosis, StageResult
+from pipeline.verdicts import Verdict
 
 ABOVE = HeldOut(0.5, 0.01, 0.1)
 GIVEN = Evidence("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE, method="given", on_table=False)
@@ -25,14 +26,9 @@ SHEET = {"sensor": {"gyroscope": {"bias_wander": 0.01}}}
 SHIFT = np.array([0.0, 0.3, 0.0])
 RATE = np.tile([[30.0, 0.0, 0.0]], (50, 1))
 MOVES = [Recording("recording", "rests", None, np.arange(50) * 10**7, None, RATE)]
-DOCUMENT = {
-    "verdict": "missing_effect",
-    "selected": ["g_sensitivity"],
-    "next_experiment": "",
-    "override": "effects.gyroscope=[g_sensitivity]",
-    "ranking": [],
-    "unexplained": [],
-}
+MISSING = SensorDiagnosis(
+    Verdict.MISSING_EFFECT, [], selected=["g_sensitivity"], override="effects.gyroscope=[g_sensitivity]"
+)
 
 
 def given(**changes: np.ndarray) -> SensorCalibration:
@@ -120,8 +116,8 @@ def test_the_diagnosis_of_a_gyroscope_by_hand_keeps_the_given_accelerometer() ->
 
 def test_no_effect_is_offered_where_nothing_is_fitted() -> None:
     missing = replace(GIVEN, found="missing_effect", selected=("g_sensitivity",), published=None)
-    document = judged(DOCUMENT, missing)
-    assert document["verdict"] == "missing_effect"
-    assert document["override"] == ""
-    assert "by a method that fits, with effects.gyroscope=[g_sensitivity]" in document["next_experiment"]
-    assert judged(DOCUMENT, replace(missing, method="rests_and_moves"))["override"]
+    said = judged(MISSING, missing)
+    assert said.verdict == "missing_effect"
+    assert said.override == ""
+    assert "by a method that fits, with effects.gyroscope=[g_sensitivity]" in said.next_experiment
+    assert judged(MISSING, replace(missing, method="rests_and_moves")).override

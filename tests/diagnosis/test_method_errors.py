@@ -11,12 +11,12 @@ import pytest
 import yaml
 from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, Course, K, Session, record, values_of
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import fit_stage
 from pipeline.signal.filters import apply_filter
 from pipeline.validation.heldout import validate
+from tests.published import diagnose
 
 if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration

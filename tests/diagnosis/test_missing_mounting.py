@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.one_unit import unit_of_recordings
-from pipeline.records import SENSORS, Recording, SensorCalibration
+from pipeline.records import SENSORS, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
+from pipeline.verdicts import Verdict
+from tests.published import candidate, diagnose
 
 COURSE: dict[str, Any] = {
     "validation_s": 60.0, "static_s": 60.0, "warm_up_rest_s": 15.0, "step_deg": 15.0, "dwell_s": 1.5,
@@ -78,8 +79,8 @@ def test_a_lean_within_the_uncertainty_of_the_gyroscopes_matrix_is_no_doubt(
     assert fit.covariance is not None
     assert state.recordings is not None
     U = np.degrees(2.0 * np.sqrt(np.max(np.diag(fit.covariance)[3:12])))  # deg; 1e-3 of a matrix are 0.057 deg
-    lean = {"effect": "table_axis_nonorthogonality", "parameters": {"x_y": {"value": of_uncertainty * U}}}
-    gravity = {"verdict": "missing_effect", "selected": [lean["effect"]], "ranking": [lean]}
+    lean = candidate("table_axis_nonorthogonality", parameters={"x_y": {"value": of_uncertainty * U}})
+    gravity = SensorDiagnosis(Verdict.MISSING_EFFECT, [], selected=[lean.effect], ranking=[lean])
     noise = state.recordings.noises["gyroscope"]
     found = diagnose(fit, state.recordings.filtered, noise, unit.row.config, gravity=gravity)
     assert found["verdict"] == verdict, found["reason"]

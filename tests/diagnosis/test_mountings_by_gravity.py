@@ -17,8 +17,9 @@ from pipeline.diagnosis.findings import Case
 from pipeline.estimation.effects import mountings_by_gravity
 from pipeline.one_unit import unit_row
 from pipeline.preprocessing.checks import check_recordings
-from pipeline.records import SensorCalibration
+from pipeline.records import SensorCalibration, SensorDiagnosis
 from pipeline.simulation.campaign import simulate_unit
+from pipeline.verdicts import Verdict
 
 
 def test_an_effect_of_the_accelerometer_is_not_taken_for_mountings() -> None:
@@ -47,5 +48,5 @@ def test_a_tilt_that_shifts_no_mounting_is_no_doubt_about_the_gyroscope(tilt_deg
     recordings = check_recordings(recordings, settings)
     by_gravity = mountings_by_gravity(recordings, settings)
     case = Case(SensorCalibration("gyroscope"), recordings, None, settings, by_gravity, ["mounting"])
-    found = _doubts_of_gravity({"verdict": "missing_effect", "selected": ["table_tilt"]}, case)
+    found = _doubts_of_gravity(SensorDiagnosis(Verdict.MISSING_EFFECT, [], selected=["table_tilt"]), case)
     assert bool(found) is doubted

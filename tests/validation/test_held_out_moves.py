@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from hand_simulator import Hand, draw
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.validation.attitude import gravity_direction
 from pipeline.validation.heldout import validate
+from tests.published import diagnose
 
 
 def test_held_out_moves_beyond_noise_and_uncertainty_are_unexplained() -> None:

@@ -9,7 +9,6 @@ import pytest
 from ferraris_session import PROCEDURE, Session, held_out, in_parts, simulated
 from scipy import stats
 
-from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import NotObservableError
 from pipeline.estimation.gauss_markov import WHITE
 from pipeline.estimation.multi_position.fit import fit
@@ -20,6 +19,7 @@ from pipeline.estimation.stages import fit_stage, last_fit
 from pipeline.signal.rests import find_rests
 from pipeline.signal.segments import multiples, turns_by_hand
 from pipeline.validation.attitude import gravity_direction
+from tests.published import diagnose
 
 FACE = np.radians(PROCEDURE["faces"]["accuracy_deg"])
 OFF_DIAGONAL = [4, 5, 6, 8, 9, 10]
