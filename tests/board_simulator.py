@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.stages import fit_stage
 from pipeline.records import Recording
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -96,8 +97,8 @@ class TrueChip:
 
 
 def draw_chip(rng: np.random.Generator, axes: Array, place: Array, delay: float = 0.0) -> TrueChip:
-    sheet = read_config("sensor", "mpu6050")
-    bias = {s: 0.3 * sheet[s]["bias"] * rng.uniform(-1, 1, 3) for s in WHITE}
+    model = shipped_settings(sensor="mpu6050").sensor
+    bias = {s: 0.3 * model.of(s).bias * rng.uniform(-1, 1, 3) for s in WHITE}
     K = {s: np.eye(3) + 0.02 * rng.uniform(-1, 1, (3, 3)) for s in WHITE}
     K["accelerometer"] = np.tril(K["accelerometer"])  # in axes that it defines itself
     return TrueChip(axes, place, bias, K, delay)
@@ -117,25 +118,14 @@ def read(
     return found
 
 
-def settings_of(table: str) -> dict[str, Any]:
-    return {
-        "sensor": read_config("sensor", "mpu6050"),
-        "table": read_config("table", table),
-        "procedure": {"holdout_every": 3},
-        "effects": {"accelerometer": [], "gyroscope": []},
-        "limits": {},
-        "method": {"as_printed": False},
-    }
-
-
 def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path, noise: float = 1.0) -> list[Chip]:
     """Return the chips of a board that was moved by hand, calibrated each by itself."""
-    settings, found = settings_of("hand"), []
+    settings, found = settings_of(sensor="mpu6050", table="hand", procedure={"holdout_every": 3}), []
     for number, chip in enumerate(chips):
         readings = read(chip, felt(path, chip.place, shift=chip.delay), rng, float(np.diff(path.time).mean()), noise)
         recordings = [Recording("recording", "rests", None, np.round(path.time * 1e9).astype(np.int64), **readings)]
-        fits = {s: fit.fit(recordings, None, settings) for s, fit in HAND.items()}
-        found.append(Chip(f"chip{number}", recordings, fits, settings["sensor"]))
+        fits = {s: fit.fit(with_noise(recordings, settings), None, settings) for s, fit in HAND.items()}
+        found.append(Chip(f"chip{number}", recordings, fits, settings.sensor))
     return found
 
 
@@ -183,8 +173,8 @@ def table_board(rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict
 
     ``plans``: turn axis to the rates of the gyroscope's recordings; the accelerometer's turn slowly.
     """
-    settings, found = settings_of("acutronic"), []
-    settings["table"] = settings["table"] | table
+    settings = settings_of(sensor="mpu6050", table="acutronic", procedure={"holdout_every": 3})
+    settings, found = settings_of(settings, table=table), []
     paths = [("accelerometer", a, table_path(a, [SLOW, -SLOW], rate, 360.0 / SLOW)) for a in "xyz"]
     paths += [("gyroscope", a, table_path(a, rates, rate)) for a, rates in plans.items()]
     for number, chip in enumerate(chips):
@@ -196,6 +186,8 @@ def table_board(rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict
             name = ("accel_" if role == "accelerometer" else "gyro_") + axis
             recordings.append(Recording(name, role, axis, stamps, **readings, table_angle=path.info["angle"],
                                         table_rate=path.info["rate"]))  # fmt: skip
-        fits = {s: fit_stage(s, "reference_least_squares", recordings, None, settings) for s in WHITE}
-        found.append(Chip(f"chip{number}", recordings, fits, settings["sensor"]))
+        fits = {
+            s: fit_stage(s, "reference_least_squares", with_noise(recordings, settings), None, settings) for s in WHITE
+        }
+        found.append(Chip(f"chip{number}", recordings, fits, settings.sensor))
     return found

@@ -7,18 +7,20 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.signal.rests import find_rests
 from pipeline.signal.segments import cut, held_out_windows
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription, shipped_settings
 
 if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration
+    from pipeline.settings import Settings
 
-PROCEDURE = read_config("procedure", "ferraris")
+PROCEDURE = shipped_settings(procedure="ferraris").procedure
 FITS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 
 
@@ -28,10 +30,10 @@ class Session:
 
     recordings: list[Recording]
     truth: dict[str, Any]
-    settings: dict[str, Any]
+    settings: Settings
 
     def fit(self, sensor: str) -> SensorCalibration:
-        return FITS[sensor].fit(self.recordings, None, self.settings)
+        return FITS[sensor].fit(with_noise(self.recordings, self.settings), None, self.settings)
 
     def errors(self, sensor: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the error of bias and matrix, its standard uncertainty and degrees of freedom: (12,) arrays."""
@@ -47,21 +49,14 @@ def simulated(seed: int, *, model: str = "mpu6050", procedure: Any = None, **uni
     """Return a simulated unit; ``procedure`` replaces settings of the procedure, ``unit`` those of its description."""
     described = UnitDescription("U", sensor=model, table="hand", procedure="ferraris", **{"interval_s": 0.02, **unit})
     recordings, truth = simulate_unit(described, seed, 0)
-    settings = {
-        "sensor": read_config("sensor", model),
-        "table": read_config("table", "hand"),
-        "procedure": PROCEDURE | (procedure or {}),
-        "effects": {"accelerometer": [], "gyroscope": []},
-        "method": {"as_printed": False},
-        "limits": {},
-    }
+    settings = settings_of(settings_of(sensor=model, table="hand", procedure="ferraris"), procedure=procedure or {})
     return Session(recordings, truth, settings)
 
 
 def held_out(session: Session) -> Session:
     """Return the session with every second turn held out, as the stage ingest cuts it."""
     first, *others = session.recordings
-    parts = cut(first, held_out_windows(first, session.settings["procedure"]["turns"]), found=True)
+    parts = cut(first, held_out_windows(first, session.settings.procedure.turns), found=True)
     return replace(session, recordings=[*parts, *others])
 
 

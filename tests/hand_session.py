@@ -7,16 +7,18 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription
 from tests.published import diagnose
 
 if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration
+    from pipeline.settings import Settings
 
 METHODS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 WARM = {"warm_up": 25.0}  # degC in a session of some minutes: a unit that is heated
@@ -30,21 +32,21 @@ class Unit:
     ----------
     recordings : list of Recording
     truth : dict
-    settings : dict
+    settings : Settings
         As a stage reads them.
     """
 
     recordings: list[Recording]
     truth: dict[str, Any]
-    settings: dict[str, Any]
+    settings: Settings
 
     def calibrated(self, sensor: str) -> SensorCalibration:
-        return METHODS[sensor].fit(self.recordings, None, self.settings)
+        return METHODS[sensor].fit(with_noise(self.recordings, self.settings), None, self.settings)
 
     def diagnosed(self, sensor: str, configured: Any = (), calibration: SensorCalibration | None = None) -> Any:
         names = configured if isinstance(configured, str) else list(configured)
-        settings = {**self.settings, "effects": {**self.settings["effects"], sensor: names}}
-        noise = estimate_noise(sensor, self.recordings, settings["sensor"][sensor])
+        settings = settings_of(self.settings, effects={sensor: names})
+        noise = estimate_noise(sensor, self.recordings, settings.sensor.of(sensor))
         return diagnose(calibration or self.calibrated(sensor), self.recordings, noise, settings)
 
     def true_matrix(self, sensor: str) -> np.ndarray:
@@ -81,13 +83,7 @@ def hand_held(
     """Return a unit; ``effects`` maps ``sensor.effect`` to None for a size of the sensor file, at random."""
     parts = (tuple((effects or {}).items()), tuple((temperature or {}).items()), tuple(other.items()))
     recordings, truth = _simulated(model, seed, procedure, *parts)
-    settings = {
-        "sensor": read_config("sensor", model),
-        "table": read_config("table", "hand"),
-        "procedure": {"holdout_every": holdout_every},
-        "effects": {"accelerometer": [], "gyroscope": []},
-        "limits": {},
-    }
+    settings = settings_of(sensor=model, table="hand", procedure={"holdout_every": holdout_every})
     return Unit(recordings, truth, settings)
 
 

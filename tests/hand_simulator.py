@@ -10,12 +10,15 @@ in its last 0.3 s it may still turn at 0.7 to 3 deg/s, slowing down. In a rest t
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from unit_settings import settings_of
 
 from pipeline.records import Recording
-from pipeline.simulation.description import read_config
+
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
 
 Array = np.ndarray
 FINE = 4  # steps of the attitude's integral in a sample
@@ -72,7 +75,7 @@ class Drawn:
     bias: dict[str, Array]
     matrix: dict[str, Array]
     still: Array
-    settings: dict[str, Any]
+    settings: Settings
 
 
 def products(q: Array) -> Array:
@@ -168,19 +171,19 @@ def _steps(rate: Array, fine: float) -> Array:
 def _read(hand: Hand, rng: np.random.Generator, rate: Array, felt: Array, still: Array) -> Drawn:
     n, step = len(rate), 1.0 / hand.rate_hz
     time = np.arange(n) * step
-    sheets = read_config("sensor", "mpu6050")
+    settings = settings_of(sensor="mpu6050", table="hand", procedure={"holdout_every": 3})
     truths = {"accelerometer": felt, "gyroscope": rate}
     readings, biases, matrices = {}, {}, {}
     for sensor in ("accelerometer", "gyroscope"):
-        sheet = sheets[sensor]
-        bias = 0.5 * sheet["bias"] * rng.uniform(-1, 1, 3)
-        K = np.eye(3) + np.diag(0.6 * sheet["scale_factor"] * rng.uniform(-1, 1, 3))
-        K += 0.6 * sheet["cross_axis"] * rng.uniform(-1, 1, (3, 3)) * (1 - np.eye(3))
+        sheet = settings.sensor.of(sensor)
+        bias = 0.5 * sheet.bias * rng.uniform(-1, 1, 3)
+        K = np.eye(3) + np.diag(0.6 * sheet.scale_factor * rng.uniform(-1, 1, 3))
+        K += 0.6 * sheet.cross_axis * rng.uniform(-1, 1, (3, 3)) * (1 - np.eye(3))
         if sensor == "accelerometer":
             K = np.linalg.inv(np.tril(np.linalg.inv(K)))  # the calibration's own frame
         x = truths[sensor] @ K.T + bias
         x += _effects(sensor, hand, felt, time)
-        keep = np.exp(-step / sheet["wander_time_s"])
+        keep = np.exp(-step / sheet.wander_time_s)
         drive = hand.wander[sensor] * np.sqrt(1 - keep**2) * rng.standard_normal((n, 3))
         wander = np.empty((n, 3))
         level = hand.wander[sensor] * rng.standard_normal(3)
@@ -195,14 +198,6 @@ def _read(hand: Hand, rng: np.random.Generator, rate: Array, felt: Array, still:
         stamps = np.maximum.accumulate(stamps) + np.arange(n) * 1e-9
     recording = Recording("recording", "rests", None, np.round(stamps * 1e9).astype(np.int64) + 30_000_000_000,
                           accelerometer=readings["accelerometer"], gyroscope=readings["gyroscope"])  # fmt: skip
-    settings = {
-        "sensor": sheets,
-        "table": read_config("table", "hand"),
-        "procedure": {"holdout_every": 3},
-        "effects": {"accelerometer": [], "gyroscope": []},
-        "limits": {},
-        "method": {"as_printed": False},
-    }
     return Drawn(recording, biases, matrices, still, settings)
 
 

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from pipeline.estimation.noise import with_noises
 from pipeline.settings import SECTIONS, DataSheet, Procedure, Section, Sensor, Settings, Table
 from pipeline.simulation.description import shipped_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.records import Recording, UnitRecordings
 
 IDEAL_SHEET = {
     "full_scale": 1e6,
@@ -74,3 +80,8 @@ def _merged(content: Any, values: Any) -> Any:
     if not (isinstance(content, dict) and isinstance(values, dict)):
         return values
     return content | {name: _merged(content.get(name), value) for name, value in values.items()}
+
+
+def with_noise(recordings: Sequence[Recording], settings: Settings) -> UnitRecordings:
+    """Return recordings with their noise, as the step filter does."""
+    return with_noises(recordings, settings.sensor)

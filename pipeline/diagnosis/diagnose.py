@@ -18,16 +18,20 @@ from pipeline.errors import ConvergenceError, NotObservableError
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.free_curves import OTHER
+from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
 from pipeline.model.effects import catalogue, effect
 from pipeline.records import MATRIX, Noise, Recording, SensorCalibration, SensorDiagnosis, SensorValidation
+from pipeline.settings import Uncertainty
 from pipeline.validation.heldout import last_error, static_error
 from pipeline.validation.samples import HeldOutCase
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.settings import Effects, Settings
 
 
 IN_DOUBT = (
@@ -42,7 +46,7 @@ def diagnose(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
     noise: Noise | None,
-    settings: Mapping[str, Any],
+    settings: Settings,
     accelerometer: SensorCalibration | None = None,
     *,
     validation: SensorValidation | None = None,
@@ -52,24 +56,23 @@ def diagnose(
     """Return the diagnosis of a sensor.
 
     ``calibration``: the fits start from its effects. ``recordings``: all of the unit; those of role ``validation`` take
-    no part in the selection. ``settings``: sections ``sensor``, ``table`` and ``effects``; by hand also ``procedure``.
-    ``accelerometer``: the unit's other calibration, which a gyroscope by hand needs for the direction of gravity.
-    ``validation``: of the calibration; without it, a free fit replaces the calibration.
+    no part in the selection. ``accelerometer``: the unit's other calibration, which a gyroscope by hand needs for the
+    direction of gravity. ``validation``: of the calibration; without it, a free fit replaces the calibration.
     ``gravity``: for a gyroscope, the diagnosis of the accelerometer. ``moves``: for a gyroscope by hand,
     ``Validation.moves_error``.
     """
-    sensor = calibration.sensor
+    sensor, settings = calibration.sensor, settings.replaced(uncertainty=Uncertainty(monte_carlo=0))
     by_hand = is_multi_position(sensor, recordings)
     procedure = multi_position if by_hand else turntable
     configured = configured_effects(sensor, settings, [] if by_hand else recordings)
     by_gravity = sensor == "gyroscope" and MOUNTING in configured
     leaning = {} if by_hand or sensor == "accelerometer" else _leaning(gravity, accelerometer)
     if by_gravity:
-        accelerometer = mountings_by_gravity(recordings, settings)
+        accelerometer = _mountings_by_gravity(recordings, settings)
     elif not by_hand:  # an accelerometer's fit is no prior of its own mountings
         accelerometer = None
     case = Case(calibration, recordings, noise, settings, accelerometer, configured)
-    full = (settings.get("diagnosis") or {}).get("depth") == "full"
+    full = settings.diagnosis.depth == "full"
 
     def judge(findings: Findings | None, found: SensorDiagnosis) -> tuple[SensorDiagnosis, bool]:
         """Return the diagnosis with its verdict, and whether to search for a formula outside the catalogue."""
@@ -123,7 +126,6 @@ def evidence_of(
     The held-out errors of the free fits are computed only if that of the calibration is above its interval.
     """
     sensor, recordings, settings = case.sensor, case.recordings, case.settings
-    method = settings.get("method") or {}
     free, full = (findings.free, findings.full) if findings else (None, None)
 
     def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOut | None:
@@ -139,7 +141,7 @@ def evidence_of(
     static = None
     if case.noise is not None:
         static = static_error(HeldOutCase(case.calibration, recordings, case.noise, settings, case.accelerometer))
-    accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")
+    accepted = settings.sensor.of(sensor).accept_implausible
     published = held_out_of(validation) if validation else error_of(free, smoothed=False)
     contradicted = published is not None and published.above
     return Evidence(
@@ -166,9 +168,9 @@ def evidence_of(
         ],
         implausible=() if accepted else [entry.effect for entry in found.chosen if not entry.plausible],
         held_out=found.details.get("held_out"),
-        method=str(method.get(sensor) or ""),
+        method=settings.method.of(sensor) or "",
         fit=last_fit(case.calibration),
-        as_printed=bool(method.get("as_printed")),
+        as_printed=settings.method.as_printed,
         filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
         on_table=findings is None or findings.on_table,
     )
@@ -203,15 +205,19 @@ def _doubts_of_gravity(accelerometer: SensorDiagnosis, case: Case) -> list[str]:
 
 def _tilt_is_within_uncertainty(case: Case) -> bool:
     """Return whether a fitted tilt of the table shifts each mounting by gravity by less than its U."""
-    effects, fit = case.settings["effects"], case.accelerometer
-    listed = effects["accelerometer"]
-    with_tilt = {**effects, "accelerometer": [*([] if listed == AUTO else listed), TILT]}
-    other = mountings_by_gravity(case.recordings, {**case.settings, "effects": with_tilt})
+    effects, fit = case.settings.effects, case.accelerometer
+    listed = effects.accelerometer
+    with_tilt = effects.replaced(accelerometer=[*([] if listed == AUTO else listed), TILT])
+    other = _mountings_by_gravity(case.recordings, case.settings.replaced(effects=with_tilt))
     if fit is None or other is None or fit.covariance is None:
         return False
     before, after = ({e.name: e.values for e in each.effects}[MOUNTING] for each in (fit, other))
     mountings = fit.parameters.select(fit.parameters.of_effect(MOUNTING))
     return bool(np.all(np.abs(after - before) < mountings.expanded_uncertainty))
+
+
+def _mountings_by_gravity(recordings: Sequence[Recording], settings: Settings) -> SensorCalibration | None:
+    return mountings_by_gravity(with_noises(recordings, settings.sensor, ("accelerometer",)), settings)
 
 
 def _leaning(diagnosis: SensorDiagnosis | None, fit: SensorCalibration | None) -> dict[str, float]:
@@ -234,15 +240,15 @@ def _doubts_of_axes(leaning: Mapping[str, float], calibration: SensorCalibration
     ]
 
 
-def without_diagnosis(sensor: str, settings: Mapping[str, Any], failure: Mapping[str, Any]) -> SensorDiagnosis:
+def without_diagnosis(sensor: str, effects: Effects, failure: Mapping[str, Any]) -> SensorDiagnosis:
     """Return the diagnosis of a sensor whose diagnosis failed; ``failure``: its ``code`` and ``message``.
 
     The verdict is ``not_enough_data``, because nothing is known of what is missing.
     """
-    listed = (settings.get("effects") or {}).get(sensor)
+    listed = effects.of(sensor)
     bug = failure["code"] == "internal_error"
     remedy = "report this fault with the traceback, which is in the log of the stage diagnose" if bug else ""
-    found = _not_enough_data(sensor, list(listed) if isinstance(listed, list) else [], "", remedy)
+    found = _not_enough_data(sensor, [] if listed == AUTO else list(listed), "", remedy)
     reason = f"The diagnosis failed: {failure['message']}. The calibration does not depend on it."
     return replace(found, details={"failed": failure["message"]}, reason=reason, not_observable={})
 

@@ -23,7 +23,9 @@ from pipeline.validation.error_breakdown import last_step
 from pipeline.validation.samples import Samples, samples_of_motion
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
+
+    from pipeline.settings import Table
 
 
 AVERAGING_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
@@ -34,7 +36,7 @@ def effective_noise(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
     noise: Noise,
-    table: Mapping[str, Any],
+    table: Table,
     found: SensorDiagnosis,
     *,
     other: SensorCalibration | None = None,

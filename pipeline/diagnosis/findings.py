@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.ranking import Score
     from pipeline.records import Noise, Recording, SensorCalibration, Values
+    from pipeline.settings import DataSheet, Settings
     from pipeline.verdicts import Verdict
 
 
@@ -43,7 +44,7 @@ class Case:
     calibration: SensorCalibration
     recordings: Sequence[Recording]
     noise: Noise | None
-    settings: Mapping[str, Any]
+    settings: Settings
     accelerometer: SensorCalibration | None
     configured: list[str]  # effects in the model: those that the settings list, and those of the bench
 
@@ -55,13 +56,12 @@ class Case:
     @property
     def modelled(self) -> list[str]:
         """Effects in the model, and effects with known parameters."""
-        return [*self.configured, *(e.name for e in known_effects(self.sensor, self.settings))]
+        return [*self.configured, *(e.name for e in known_effects(self.sensor, self.settings.method))]
 
     @property
-    def sensor_config(self) -> Mapping[str, Any]:
-        """The sensor's section of the settings."""
-        found: Mapping[str, Any] = self.settings["sensor"][self.sensor]
-        return found
+    def data_sheet(self) -> DataSheet:
+        """The figures of the sensor."""
+        return self.settings.sensor.of(self.sensor)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class Findings:
 
 def diagnosis_of(findings: Findings, case: Case) -> SensorDiagnosis:
     """Return the diagnosis of a sensor, with the verdict by the selection alone."""
-    listed = [name for name in case.configured if name in case.settings["effects"][case.sensor]]
+    listed = [name for name in case.configured if name in case.settings.effects.of(case.sensor)]
     others = sorted(findings.alone.values(), key=lambda score: -score.delta_bic)
     unselected = [s.name for s in others if s.name not in findings.selected and s.name not in findings.hidden]
     ranking = [_entry(findings, name) for name in (*findings.selected, *unselected)]

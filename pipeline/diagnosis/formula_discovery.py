@@ -263,9 +263,7 @@ def discover(selection: Selection, unknown: list[dict[str, Any]], case: Case) ->
         names = [*case.configured, form.name]
         register(form)
         try:
-            reselected = select(
-                context.observations, names, noise, case.sensor_config, accelerometer=case.accelerometer
-            )
+            reselected = select(context.observations, names, noise, case.data_sheet, accelerometer=case.accelerometer)
         finally:
             forget(form.name)
         criterion = _criterion(reselected, terms)

@@ -34,19 +34,20 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion, Recording, SensorCalibration, Values
+    from pipeline.settings import Settings, Table
 
 LEAST_SHARE = 0.02  # of the mean square: a smaller part adds less than 1 % to the rms error
 SURE = 5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
 
 
 def method_errors(
-    calibration: SensorCalibration, selection: Selection, recordings: Sequence[Recording], settings: Mapping[str, Any]
+    calibration: SensorCalibration, selection: Selection, recordings: Sequence[Recording], settings: Settings
 ) -> list[dict[str, Any]]:
     """Return the errors by the method's approximations, the largest share first; none if it is the free fit.
 
-    ``selection``: the free fit. ``recordings``: all of the unit, filtered. ``settings``: sections ``table``, ``method``
-    and, for a given calibration, ``sensor``. Entries: ``name, meaning, size, unit, share, rms`` on the recordings of
-    the fit (rms in the unit of the sensor), ``held_out_share`` and ``held_out_magnitude_share`` (or None).
+    ``selection``: the free fit. ``recordings``: all of the unit, filtered. Entries: ``name, meaning, size, unit, share,
+    rms`` on the recordings of the fit (rms in the unit of the sensor), ``held_out_share`` and
+    ``held_out_magnitude_share`` (or None).
     """
     stages = [*declarations(calibration).values()]
     if not stages or stages[-1].reference:
@@ -59,7 +60,7 @@ def method_errors(
     of_free = free.covariance, np.kron(calibration.matrix, np.eye(3))
     difference = _Difference.of(calibration, free.bias, free.K, of_free, settings)
     of_turns, of_held_out = (
-        _errors(difference, free, [r for r in recordings if r.role == role], settings["table"])
+        _errors(difference, free, [r for r in recordings if r.role == role], settings.table)
         for role in (calibration.sensor, "validation")
     )
     shares = {
@@ -67,7 +68,7 @@ def method_errors(
         "held_out_magnitude_share": _shares({name: _rms(error) for name, (_, error) in of_held_out.items()}),
     }
     rms = {name: _rms(error) for name, (error, _) in of_turns.items()}
-    printed = bool((settings.get("method") or {}).get("as_printed"))
+    printed = settings.method.as_printed
     return _named(difference, rms, recordings, selection.names, shares, printed=printed)
 
 
@@ -75,7 +76,7 @@ def given_differences(
     calibration: SensorCalibration,
     free_fit: Callable[[], SensorCalibration],
     recordings: Sequence[Recording],
-    settings: Mapping[str, Any],
+    settings: Settings,
 ) -> list[dict[str, Any]]:
     """Return the differences of a given calibration from a free fit of rests and moves by hand, as ``method_errors``.
 
@@ -112,7 +113,7 @@ class _Difference:
         bias: Values,
         K: Values,
         of_free: tuple[Values | None, Any],
-        settings: Mapping[str, Any],
+        settings: Settings,
     ) -> _Difference:
         """Return the difference from a free fit.
 
@@ -155,7 +156,7 @@ class _Difference:
         return {"two_sided": complete, "bias": of_bias, **of_matrix}
 
 
-def _covariance(calibration: SensorCalibration, settings: Mapping[str, Any]) -> Values:
+def _covariance(calibration: SensorCalibration, settings: Settings) -> Values:
     """Return the covariance of bias and matrix: (12, 12).
 
     If a given calibration states none, its bias varies by at least the wander of the sensor file.
@@ -163,14 +164,13 @@ def _covariance(calibration: SensorCalibration, settings: Mapping[str, Any]) -> 
     covariance = calibration.parameters.covariance[BASE, BASE]
     if covariance.any() or [stage.name for stage in calibration.stages] != ["given"]:
         return covariance
-    wander = float(settings["sensor"][calibration.sensor]["bias_wander"])
     covariance = np.zeros_like(covariance)
-    covariance[BIAS, BIAS] = wander**2 * np.eye(3)
+    covariance[BIAS, BIAS] = settings.sensor.of(calibration.sensor).bias_wander ** 2 * np.eye(3)
     return covariance
 
 
 def _errors(
-    difference: _Difference, free: Fit, recordings: Sequence[Recording], table: Mapping[str, Any]
+    difference: _Difference, free: Fit, recordings: Sequence[Recording], table: Table
 ) -> dict[str, tuple[Values, Values]]:
     """Return the errors by cause in the recordings with a known motion: (n, 3), and of the magnitude: (n,)."""
     sensor = difference.method.sensor

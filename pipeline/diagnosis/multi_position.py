@@ -38,8 +38,10 @@ from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.model import NEW, NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
 from pipeline.estimation.multi_position.selection import Selection, posterior
+from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import is_given
 from pipeline.model.effects import catalogue, effect_from
+from pipeline.records import UnitRecordings
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.multi_position.model import Model, State
     from pipeline.records import Mask, Noise, Recording, SensorCalibration
+    from pipeline.settings import Settings
 
 NEEDED = MORE
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
@@ -65,7 +68,7 @@ def findings(case: Case) -> Findings:
     Raises ``NotObservableError`` if there are no rests, or if they do not determine bias and matrix.
     """
     model, calibration, noise = _model_of_all_rests(case), case.calibration, _without_creep(case)
-    given = calibration, case.configured, case.noise, case.sensor_config
+    given = calibration, case.configured, case.noise, case.data_sheet
     selection = Selection(model, *given)
     expected = NoiseHypothesis(WHITE, (0.0,) * model.kinds)
     if noise is not None:
@@ -87,7 +90,7 @@ def findings(case: Case) -> Findings:
 
     def advice(verdict: Verdict) -> str:
         if verdict == Verdict.NOT_ENOUGH_DATA:
-            return f"{MORE}{WITH_FACES if case.settings['procedure'].get('faces') else ''}"
+            return f"{MORE}{WITH_FACES if case.settings.procedure.faces else ''}"
         if left_over is not None and (left_over > FIRM or verdict == Verdict.UNEXPLAINED):
             return _of_scatter(_suspects(selection, hidden), left_over)
         warmth = catalogue()["bias_temperature"]
@@ -140,21 +143,22 @@ def _model_of_all_rests(case: Case) -> Model:
     The accelerometer is calibrated again by all rests, which shows rests that contradict the others, unless it has
     effects or all rests do not determine it. One that is given stays as it is, because the gyroscope refers to it.
     """
-    settings = {**case.settings, "procedure": {**case.settings["procedure"], "holdout_every": 0}}
+    settings = case.settings.replaced(procedure=case.settings.procedure.replaced(holdout_every=0))
 
     def with_all_rests(fitted: SensorCalibration, noise: Noise | None) -> SensorCalibration:
-        known = {"noise": {"accelerometer": noise}} if noise is not None else {}
         if fitted.effects:
             return fitted
+        noise = noise or noise_of("accelerometer", case.recordings, settings.sensor.accelerometer)
+        recordings = UnitRecordings([*case.recordings], {"accelerometer": noise})
         try:
-            return nonlinear_least_squares.fit(case.recordings, None, {**settings, **known})
+            return nonlinear_least_squares.fit(recordings, None, settings)
         except PipelineError:
             return fitted
 
     calibration, other = case.calibration, None
     if case.sensor == "accelerometer":
         calibration = with_all_rests(calibration, case.noise)
-    elif case.accelerometer and is_given("accelerometer", settings):
+    elif case.accelerometer and is_given("accelerometer", settings.method):
         other = case.accelerometer
     elif case.accelerometer:
         other = with_all_rests(case.accelerometer, None)
@@ -165,7 +169,7 @@ def require_model(
     recordings: Sequence[Recording],
     calibration: SensorCalibration,
     noise: Noise | None,
-    settings: Mapping[str, Any],
+    settings: Settings,
     accelerometer: SensorCalibration | None = None,
 ) -> Model:
     """Return the model of rests and moves; see ``pipeline.estimation.multi_position.result.model_of``.
@@ -186,11 +190,11 @@ def _without_creep(case: Case) -> Noise | None:
 
     In rests by hand a slow change of the attitude moves gravity between the axes and looks like a wander of the bias.
     """
-    noise, sensor_config = case.noise, case.sensor_config
+    noise, data_sheet = case.noise, case.data_sheet
     if noise is None or noise.source == "static":
         return noise
-    wander = np.full(3, float(sensor_config.get("bias_wander") or 0.0))
-    time = float(sensor_config.get("wander_time_s") or noise.correlation_time)
+    wander = np.full(3, data_sheet.bias_wander)
+    time = data_sheet.wander_time_s
     return replace(noise, wander=wander, correlation_time=time)
 
 

@@ -47,8 +47,8 @@ def findings(case: Case) -> Findings:
 
     Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
     """
-    observations = observe(case.sensor, case.recordings, case.settings["table"])
-    known = case.noise, case.sensor_config, case.calibration
+    observations = observe(case.sensor, case.recordings, case.settings.table)
+    known = case.noise, case.data_sheet, case.calibration
     selection = select(observations, case.configured, *known, accelerometer=case.accelerometer)
     unknown = dependences(selection)
 
@@ -181,7 +181,7 @@ def _held_out_errors(selection: Selection, fits: Sequence[Fit], case: Case) -> t
     """Return the held-out error of each fit, and the noise floor of the last; no errors without held-out motion."""
     noise = case.noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
     held = [r for r in case.recordings if r.role == "validation"] if selection.names else []
-    found = [samples_of_motion(case.sensor, r, noise, case.settings["table"], smoothed=True) for r in held]
+    found = [samples_of_motion(case.sensor, r, noise, case.settings.table, smoothed=True) for r in held]
     samples = [s for s in found if s is not None and s.known.any()]
     if not samples:
         return [], 0.0

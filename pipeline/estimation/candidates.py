@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations
     from pipeline.model.effects.base import Effect
     from pipeline.records import Motion, Recording, SensorCalibration, Values
+    from pipeline.settings import DataSheet, Settings, Table
 
 AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
@@ -40,17 +41,16 @@ def parameter_names(sensor: str, effects: Sequence[Effect]) -> list[str]:
     return [f"{e.name}.{p.name}" for e in effects for p in e.parameters(sensor)]
 
 
-def configured_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
+def configured_effects(sensor: str, settings: Settings, recordings: Sequence[Recording]) -> list[str]:
     """Return the effects in the model: effects of the bench, and listed effects."""
-    wanted = settings["effects"][sensor]
+    wanted = settings.effects.of(sensor)
     listed = [] if wanted == AUTO else list(wanted)
-    return [*(name for name in bench_effects(sensor, settings, recordings) if name not in listed), *listed]
+    return [*(name for name in bench_effects(sensor, settings.table, recordings) if name not in listed), *listed]
 
 
-def bench_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
+def bench_effects(sensor: str, table: Table, recordings: Sequence[Recording]) -> list[str]:
     """Return the effects of the bench: errors that the table's config states, and estimated zeros of the angle."""
-    table = settings["table"]
-    stated = stated_priors(table) if table.get("motion") != "none" else {}
+    stated = stated_priors(table) if table.motion != "none" else {}
     one_clock = all(recording.clock_shared for recording in recordings)
     names = [name for name in stated if one_clock or not effect(name).needs_clock]
     found = any(note.code == "N-FOUND" for recording in recordings for note in recording.notes)
@@ -158,13 +158,13 @@ def is_held(name: str, parameter: Mapping[str, Any]) -> bool:
     return is_tilt and u < 10.0 * HELD_DEG and abs(parameter["value"]) < 0.01 * HELD_DEG
 
 
-def limits_of(sensor: str, sensor_config: Mapping[str, Any]) -> dict[str, Values]:
+def limits_of(sensor: str, data_sheet: DataSheet) -> dict[str, Values]:
     """Return the limits of plausibility of every effect's parameters, absolute values; infinite if none is stated.
 
-    ``sensor_config``: ``effects`` of the sensor file: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
+    ``data_sheet``: ``effects`` of the sensor file: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
     one or, without the axis, for some of them.
     """
-    stated = sensor_config.get("effects") or {}
+    stated = data_sheet.effects
     limits = {n: parameter_limits(this, sensor, stated) for n, this in catalogue().items() if sensor in this.sensors}
     return {name: values for name, values in limits.items() if len(values)}
 

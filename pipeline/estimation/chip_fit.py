@@ -16,7 +16,7 @@ import scipy
 from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Blocks, Prior
-from pipeline.estimation.noise import prior_of
+from pipeline.estimation.noise import noise_of, wander_prior
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects.base import STANDARD_GRAVITY
 from pipeline.model.kinematics import skew, turn_by_vector
@@ -24,6 +24,8 @@ from pipeline.records import MEDIAN_SIZE, SENSORS, Mask, Recording, SensorCalibr
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from pipeline.settings import Sensor
 
 Signals: TypeAlias = "dict[str, Values]"
 
@@ -44,16 +46,17 @@ ROUNDS, SMALL = 20, 1e-10  # of Gauss-Newton steps; rad
 
 @dataclass(frozen=True)
 class Chip:
-    """One chip of a board: its recordings, its calibrations, and the section ``sensor`` of its settings."""
+    """One chip of a board: its recordings, its calibrations, and its sensor model."""
 
     unit: str
     recordings: Sequence[Recording]
     calibrations: Mapping[str, SensorCalibration | None]
-    sensor_config: Mapping[str, Any]
+    sensor_model: Sensor
 
     def prior(self, sensor: str) -> Prior:
         """Return the prior of the wander of its bias."""
-        return prior_of(sensor, self.recordings, {"sensor": self.sensor_config})
+        data_sheet = self.sensor_model.of(sensor)
+        return wander_prior(noise_of(sensor, self.recordings, data_sheet), data_sheet)
 
 
 @dataclass(frozen=True)

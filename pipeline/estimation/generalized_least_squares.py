@@ -69,7 +69,9 @@ from pipeline.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
+
+    from pipeline.settings import Settings
 
 
 ROUNDS = 25  # of Gauss-Newton
@@ -313,7 +315,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     recordings: Sequence[Recording],
     effects: Sequence[str],
     noise: Noise | None,
-    settings: Mapping[str, Any],
+    settings: Settings,
     start: SensorCalibration | None = None,
     accelerometer: SensorCalibration | None = None,
 ) -> SensorCalibration:
@@ -325,7 +327,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     ``NotObservableError`` if the recordings do not determine a parameter; ``ConfigurationError`` if an effect is
     unknown or not of this sensor.
     """
-    observations = weighted(observe(sensor, recordings, settings["table"]), noise)
+    observations = weighted(observe(sensor, recordings, settings.table), noise)
     combinations = starts_of(effects, observations, start, accelerometer)
     base = ordinary_base(observations, noise)
     require_available(observations, effects)
@@ -342,7 +344,7 @@ def calibration_of(
     fit: Fit,
     observations: Observations,
     before: SensorCalibration | None,
-    settings: Mapping[str, Any] | None = None,
+    settings: Settings | None = None,
     noise: Noise | None = None,
 ) -> SensorCalibration:
     """Convert a fit to a calibration: ``matrix = K^-1``, with ``d matrix = -matrix dK matrix``.
@@ -391,9 +393,9 @@ def calibration_of(
     names = [term.effect.name for term in fit.terms]
     design = fit.design(observations)
     first = design.linear_map(fit.setting)
-    prior = wander_prior(noise, (settings.get("sensor") or {}).get(sensor) or {})
+    prior = wander_prior(noise, settings.sensor.of(sensor))
     whole = first.then(change)
-    reference = Reference(sensor, [part.motion for part in observations.parts], fit.K, settings["table"])
+    reference = Reference(sensor, [part.motion for part in observations.parts], fit.K, settings.table)
     errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))), reference)
     values = np.concatenate([base_values(fit.bias, fit.K), *(term.values for term in fit.terms)])
     of_channels = np.concatenate(first.derivative, axis=1)

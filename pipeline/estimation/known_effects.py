@@ -11,7 +11,7 @@ the sum.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,14 +35,15 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import StageResult
+    from pipeline.settings import Method
 
 SOURCE = "known effects"  # of the uncertainty budget
 
 
-def known_effects(sensor: str, settings: Mapping[str, Any]) -> tuple[FittedEffect, ...]:
+def known_effects(sensor: str, method: Method) -> tuple[FittedEffect, ...]:
     """Return the effects that the method of a sensor knows before the fit (``method.known``)."""
-    known = (settings.get("method") or {}).get("known") or {}
-    return tuple(FittedEffect(**entry) for entry in known.get(sensor) or ())
+    entries = [] if method.known is None else method.known.get(sensor, [])
+    return tuple(FittedEffect(**entry) for entry in entries)
 
 
 def subtracted(
@@ -130,12 +131,12 @@ def _moved(effect: FittedEffect, by: Values) -> FittedEffect:
 
 
 def without_known_effects(
-    recordings: UnitRecordings, calibrations: Mapping[str, SensorCalibration | None], settings: Mapping[str, Any]
+    recordings: UnitRecordings, calibrations: Mapping[str, SensorCalibration | None], method: Method
 ) -> tuple[UnitRecordings, dict[str, SensorCalibration | None]]:
     """Return the recordings of a unit less the known effects of both sensors, and calibrations of these readings."""
     filtered, found = recordings.filtered, dict(calibrations)
     for sensor, calibration in calibrations.items():
-        known = known_effects(sensor, settings)
+        known = known_effects(sensor, method)
         if calibration is not None and known:
             filtered = subtracted(filtered, calibration, known)
             found[sensor] = without_known(calibration, known)

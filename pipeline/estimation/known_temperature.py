@@ -14,7 +14,7 @@ The bias is fitted, and that at T_r differs from that at 25 degC by a constant: 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,19 +23,18 @@ from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.stages import FitStage
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE
-from pipeline.records import FittedEffect, Recording, SensorCalibration, StageResult
+from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.settings import DataSheet
+    from pipeline.records import UnitRecordings
+    from pipeline.settings import DataSheet, Settings
 
 NAME = "known_temperature"
 
 
-def known(sensor: str, sheet: DataSheet) -> list[FittedEffect]:
+def known(sensor: str, data_sheet: DataSheet) -> list[FittedEffect]:
     """Return the effects with known parameters; raise ``ConfigurationError`` if the settings state no coefficient."""
-    stated, values = sheet.known_temperature, {}
+    stated, values = data_sheet.known_temperature, {}
     if stated.bias is not None:
         values["bias_temperature"] = np.array(stated.bias)
     if stated.scale_factor is not None:
@@ -62,11 +61,11 @@ FIT_STAGES = {NAME: FitStage(changes=("readings",), known=known)}
 
 
 def fit(
-    sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+    sensor: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
 ) -> SensorCalibration:
     """Return the known effects as a calibration without bias and matrix (``pipeline.estimation.stages``)."""
     del recordings, previous  # it is the first stage
-    effects = known_effects(sensor, settings)
+    effects = known_effects(sensor, settings.method)
     parameters = {
         f"{e.name}.{name}": {"value": p["value"], "unit": p["unit"], "standard_uncertainty": None}
         for e in effects

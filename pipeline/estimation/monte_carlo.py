@@ -18,15 +18,15 @@ trials, else two, because the ends of a Monte Carlo interval scatter by 2.7 u / 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipeline.estimation.engine import Posterior, draw_normal
-from pipeline.records import AFTER_BASE, BIAS, MATRIX, MONTE_CARLO, MonteCarlo
+from pipeline.records import AFTER_BASE, BIAS, MATRIX, MonteCarlo
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -91,11 +91,6 @@ def compare(
     tolerance = numerical_tolerance(np.minimum(found.standard_uncertainty, U), digits)
     low, high = np.abs(y - U - found.symmetric[:, 0]), np.abs(y + U - found.symmetric[:, 1])
     return Comparison(tolerance, low, high, (low <= tolerance) & (high <= tolerance))
-
-
-def trials_of(settings: Mapping[str, Any]) -> int:
-    """Return the number of trials by ``uncertainty.monte_carlo``; 0: none."""
-    return int((settings.get("uncertainty") or {}).get(MONTE_CARLO) or 0)
 
 
 def through(posterior: Posterior, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:

@@ -47,14 +47,13 @@ with ``nu`` degrees of freedom of S, maximised over the white noise at every q a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.estimation.gauss_markov import (
-    DEFAULT_TIME_S,
     FARTHEST,
     SHARPEST_WIDTH,
     STATED_WIDTH,
@@ -67,7 +66,7 @@ from pipeline.estimation.gauss_markov import (
     orthonormal,
     variance_of_average,
 )
-from pipeline.records import Noise, Recording, WanderLikelihood, median
+from pipeline.records import SENSORS, Noise, Recording, UnitRecordings, WanderLikelihood, median
 from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
 from pipeline.signal.quiet_motion import coarse_steps, component_along_gravity, creep_of_readings
 from pipeline.signal.rests import rest_readings, stretches_of, usable
@@ -75,7 +74,8 @@ from pipeline.signal.rests import rest_readings, stretches_of, usable
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Integers, Mask, SensorCalibration, UnitRecordings, Values
+    from pipeline.records import Integers, Mask, SensorCalibration, Values
+    from pipeline.settings import DataSheet, Sensor
 
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times of the grid, over that of the sensor file
 TIMES_BY_HAND = np.exp2(np.arange(-11.0, 4.0))  # the same by hand: from 0.05 s at 100 s; a tremor has 8 to 12 Hz
@@ -90,31 +90,28 @@ RATIOS = np.concatenate([[0.0], np.geomspace(2e-3, 5.0, 40)])  # sqrt(q) of the 
 WEAKEST_DIRECTION = 1e-3  # singular value of unit columns, below which two nuisance columns count as one
 
 
-def estimate_noise(sensor: str, recordings: Sequence[Recording], sensor_file: Mapping[str, Any]) -> Noise:
+def estimate_noise(sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise:
     """Return white noise and bias wander of a sensor.
 
-    ``sensor_file``: ``noise_density`` (g/sqrt(Hz) or deg/s/sqrt(Hz)), ``bias_wander`` (g or deg/s), ``wander_time_s``.
-    Raises ``ConfigurationError`` if neither the recordings nor the sensor file determine the noise.
+    Raises ``ConfigurationError`` if no recording holds readings of the sensor.
     """
     fitted = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
-    return _not_below_rounding(_of_recordings(sensor, fitted, sensor_file), sensor, fitted, sensor_file)
+    return _not_below_rounding(_of_recordings(sensor, fitted, data_sheet), sensor, fitted, data_sheet)
 
 
-def _not_below_rounding(
-    noise: Noise, sensor: str, recordings: Sequence[Recording], sensor_file: Mapping[str, Any]
-) -> Noise:
+def _not_below_rounding(noise: Noise, sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise with at least the rounding error of coarse readings as white noise."""
     steps = coarse_steps([values for r in recordings if (values := r.reading(sensor)) is not None])
     constant = noise.white <= SMALLEST_WHITE
     if not np.any(constant | (steps > 0.0)):
         return noise
-    stated = float(sensor_file.get("noise_density") or 0.0) * np.sqrt(0.5 / recordings[0].interval)
+    stated = data_sheet.noise_density * np.sqrt(0.5 / recordings[0].interval)
     white = np.maximum(np.where(constant, stated, noise.white), steps / np.sqrt(12.0))
-    found = _with_stated_wander(white, sensor_file, "data_sheet" if constant.all() and stated else noise.source)
+    found = _with_stated_wander(white, data_sheet, "data_sheet" if constant.all() and stated else noise.source)
     return replace(found, step=steps if np.any(steps > 0.0) else None)
 
 
-def _of_recordings(sensor: str, fitted: list[Recording], sensor_file: Mapping[str, Any]) -> Noise:
+def _of_recordings(sensor: str, fitted: list[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise as it shows in the recordings, else that of the sensor file."""
     static = [r for r in fitted if r.role == "static"]
     static_rests, rests = (
@@ -127,23 +124,19 @@ def _of_recordings(sensor: str, fitted: list[Recording], sensor_file: Mapping[st
         for whole in (True, False)
     )
     if sum(len(rest.time) for rest in static_rests) >= FEWEST_SAMPLES:
-        noise = _noise_of_rests(static_rests, static, sensor_file, "static", other_rests=rests)
+        noise = _noise_of_rests(static_rests, static, data_sheet, "static", other_rests=rests)
         return replace(noise, length=sum(float(rest.time[-1] - rest.time[0]) for rest in static_rests))
     if sum(len(rest.time) for rest in rests) >= FEWEST_SAMPLES:
         if sensor == "accelerometer" and _by_hand(fitted):
-            return _noise_along_gravity(rests, fitted, sensor_file)
-        return _noise_of_rests(rests, fitted, sensor_file, "rests")
+            return _noise_along_gravity(rests, fitted, data_sheet)
+        return _noise_of_rests(rests, fitted, data_sheet, "rests")
     white = _white_of_turns(fitted, sensor)
     if white is not None:
-        return _with_stated_wander(white, sensor_file, "residual")
-    density = sensor_file.get("noise_density")
-    if not density or not fitted:
-        raise ConfigurationError(
-            "the recordings hold no rest and too few even stretches to determine the noise; "
-            "give the sensor's noise_density, or record static (a rest of some minutes)"
-        )
-    white = np.full(3, float(density) * np.sqrt(0.5 / fitted[0].interval))
-    return _with_stated_wander(white, sensor_file, "data_sheet")
+        return _with_stated_wander(white, data_sheet, "residual")
+    if not fitted:
+        raise ConfigurationError(f"no recording holds readings of the {sensor}: record static (a rest of some minutes)")
+    white = np.full(3, data_sheet.noise_density * np.sqrt(0.5 / fitted[0].interval))
+    return _with_stated_wander(white, data_sheet, "data_sheet")
 
 
 def _by_hand(recordings: list[Recording]) -> bool:
@@ -151,12 +144,12 @@ def _by_hand(recordings: list[Recording]) -> bool:
     return any(r.role == "rests" for r in recordings) and not logged
 
 
-def _noise_along_gravity(rests: list[Rest], recordings: list[Recording], sensor_file: Mapping[str, Any]) -> Noise:
+def _noise_along_gravity(rests: list[Rest], recordings: list[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise of an accelerometer in a unit that may creep: see the module, 2."""
     components = [component_along_gravity(rest.time, rest.reading) for rest in rests]
     along = [replace(rest, reading=values[:, None]) for rest, (values, _) in zip(rests, components, strict=True)]
     creeping = [k for k, (_, creeps) in enumerate(components) if creeps]
-    noise = _noise_of_rests(along, recordings, sensor_file, "rests", creeping=creeping)
+    noise = _noise_of_rests(along, recordings, data_sheet, "rests", creeping=creeping)
     creeps = [creep_of_readings(rest.time, rest.reading) for rest in rests]
     counts, covariance = np.array([len(rest.time) for rest in rests]), filter_autocovariance(recordings[0])
     fitted = counts - [creep.freedom for creep in creeps]
@@ -168,7 +161,7 @@ def _noise_along_gravity(rests: list[Rest], recordings: list[Recording], sensor_
 def _noise_of_rests(
     rests: list[Rest],
     recordings: list[Recording],
-    sensor_file: Mapping[str, Any],
+    data_sheet: DataSheet,
     source: str,
     *,
     other_rests: Sequence[Rest] = (),
@@ -185,11 +178,11 @@ def _noise_of_rests(
     informative = blocks.cut & ~np.isin(blocks.rest, creeping)
     if informative.sum() - len(np.unique(blocks.rest[informative])) < 3 or not passes_wander:
         expected = np.sum(blocks.count * (covariance[0] - variance_of_mean(covariance, blocks.count)))
-        return _with_stated_wander(np.sqrt(blocks.scatter / max(float(expected), 1e-300)), sensor_file, source)
+        return _with_stated_wander(np.sqrt(blocks.scatter / max(float(expected), 1e-300)), data_sheet, source)
     design, lengths = _nuisance(blocks, recordings, source, creeping), [float(r.time[-1] - r.time[0]) for r in rests]
     if source == "static" or not _by_hand(recordings):
-        return _most_likely(blocks, design, covariance, sensor_file, source)
-    noise = _most_likely(blocks, design, covariance, sensor_file, source, longest=max(lengths))
+        return _most_likely(blocks, design, covariance, data_sheet, source)
+    noise = _most_likely(blocks, design, covariance, data_sheet, source, longest=max(lengths))
     return replace(noise, length=sum(lengths)) if noise.wander_source == "rests" else noise
 
 
@@ -213,7 +206,7 @@ def _most_likely(
     blocks: _RestBlocks,
     design: Values,
     covariance: Values,
-    sensor_file: Mapping[str, Any],
+    data_sheet: DataSheet,
     source: str,
     *,
     longest: float = float("inf"),
@@ -222,17 +215,17 @@ def _most_likely(
 
     ``longest``: largest possible correlation time by hand, s.
     """
-    times = (TIMES if np.isinf(longest) else TIMES_BY_HAND) * _stated_time(sensor_file)
+    times = (TIMES if np.isinf(longest) else TIMES_BY_HAND) * data_sheet.wander_time_s
     log_likelihood, white = _likelihood(blocks, design, covariance, times)
     gain = 2.0 * (log_likelihood - log_likelihood[:, :1])
     pooled = gain.sum(axis=2).max(axis=1)
     possible = max(np.count_nonzero(times <= longest), 1)
     row, time_source = int(np.argmax(pooled[:possible])), source
-    stated_row = int(np.argmin(np.abs(times - _stated_time(sensor_file))))
+    stated_row = int(np.argmin(np.abs(times - data_sheet.wander_time_s)))
     if np.isinf(longest) and pooled[row] < max(pooled[stated_row] + AGREEMENT_LOSS, DETECTION_GAIN):
         row, time_source = stated_row, "data_sheet"
     if pooled[row] < DETECTION_GAIN:  # the sensor file's wander if the likelihood allows it, else 0
-        noise = _with_stated_wander(white[stated_row, 0], sensor_file, source)
+        noise = _with_stated_wander(white[stated_row, 0], data_sheet, source)
         nearest = np.argmin(np.abs(RATIOS[:, None] - noise.wander / noise.white), axis=0)
         if -float(np.take_along_axis(gain[stated_row], nearest[None], axis=0).sum()) >= AGREEMENT_LOSS:
             noise = replace(noise, wander=np.zeros(3), wander_source=source)
@@ -260,14 +253,9 @@ def _peak(gain: Values) -> float:
     return float(np.exp(x[1] + (0.5 * (a - c) / bend * (x[1] - x[0]) if bend < 0 else 0.0)))
 
 
-def _stated_time(sensor_file: Mapping[str, Any]) -> float:
-    """Return the correlation time of the bias wander by the sensor file, s."""
-    return float(sensor_file.get("wander_time_s") or DEFAULT_TIME_S)
-
-
-def _with_stated_wander(white: Values, sensor_file: Mapping[str, Any], source: str) -> Noise:
-    wander = np.full(3, float(sensor_file.get("bias_wander") or 0.0))
-    return Noise(np.maximum(white, SMALLEST_WHITE), wander, _stated_time(sensor_file), source)
+def _with_stated_wander(white: Values, data_sheet: DataSheet, source: str) -> Noise:
+    wander = np.full(3, data_sheet.bias_wander)
+    return Noise(np.maximum(white, SMALLEST_WHITE), wander, data_sheet.wander_time_s, source)
 
 
 def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
@@ -380,32 +368,36 @@ def _likelihood(
     return log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape)
 
 
-def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Noise | None:
-    """Return the noise from an earlier stage (``settings["noise"]``), else estimate it; None if that is impossible."""
-    if "noise" in settings:
-        noise: Noise | None = settings["noise"][sensor]
-        return noise
+def noise_of(sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise | None:
+    """Return ``estimate_noise``; None where that is impossible."""
     try:
-        return estimate_noise(sensor, recordings, settings.get("sensor", {}).get(sensor) or {})
+        return estimate_noise(sensor, recordings, data_sheet)
     except (ConfigurationError, InputError):
         return None
 
 
+def with_noises(
+    recordings: Sequence[Recording], sensor_model: Sensor, sensors: Sequence[str] = SENSORS
+) -> UnitRecordings:
+    """Return the recordings of a unit with the noise of its sensors."""
+    return UnitRecordings([*recordings], {s: noise_of(s, recordings, sensor_model.of(s)) for s in sensors})
+
+
 def required_noises(
     recordings: UnitRecordings,
-    sensor_configs: Mapping[str, Any],
+    sensor_model: Sensor,
     calibrations: Mapping[str, SensorCalibration | None],
 ) -> dict[str, Noise]:
     """Return the noise of each calibrated sensor; ``ConfigurationError`` if nothing determines it."""
     return {
-        sensor: recordings.noises[sensor] or estimate_noise(sensor, recordings.filtered, sensor_configs[sensor])
+        sensor: recordings.noises[sensor] or estimate_noise(sensor, recordings.filtered, sensor_model.of(sensor))
         for sensor, calibration in calibrations.items()
         if calibration is not None
     }
 
 
-def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Prior:
-    """Return the prior of the bias wander from the sensor file and a static recording; ``settings``: ``sensor``.
+def wander_prior(noise: Noise | None, data_sheet: DataSheet) -> Prior:
+    """Return the prior of the bias wander from the sensor file and the noise of a static recording.
 
     It is the prior of the sensor file times the likelihood of the static recording at each wander and correlation time.
     A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative uncertainty
@@ -416,14 +408,7 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
     does not determine a slow wander, and is white noise in the means of the blocks of a fit: then the prior is that of
     the sensor file.
     """
-    sensor_file = settings.get("sensor", {}).get(sensor) or {}
-    static = any(r.role == "static" and r.reading(sensor) is not None and r.samples > 1 for r in recordings)
-    return wander_prior(noise_of(sensor, recordings, settings) if static and sensor_file else None, sensor_file)
-
-
-def wander_prior(noise: Noise | None, sensor_file: Mapping[str, Any]) -> Prior:
-    """Return the prior by the sensor file, and by the noise of a static recording (``prior_of``)."""
-    stated = Prior(float(sensor_file.get("bias_wander") or 0.0), _stated_time(sensor_file))
+    stated = Prior(data_sheet.bias_wander, data_sheet.wander_time_s)
     if noise is None or noise.source != "static" or noise.likelihood is None or fast(noise):
         return stated
     width = float(np.sqrt(noise.correlation_time / noise.length))

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from pipeline.records import Mask, Motion, Noise, Recording, Values
+    from pipeline.settings import Table
 
 
 ROLES = ("accelerometer", "gyroscope", "static")
@@ -199,11 +200,10 @@ def _lost_at_stops(part: Part, observations: Observations) -> Values:
     return np.asarray(np.bincount(group, part.weight * squares, 2 * stops)[group], np.float64)
 
 
-def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
+def observe(sensor: str, recordings: Sequence[Recording], table: Table) -> Observations:
     """Return the data of one sensor for a fit: every recording with its readings and a table's motion.
 
-    ``recordings``: held-out ones are not used. ``table``: ``gravity_g``, ``latitude_deg``, ``azimuth_deg``, and the
-    settings of ``bench_priors``.
+    ``recordings``: held-out ones are not used.
     """
     used = [r for r in recordings if r.role in ROLES and r.samples >= 6]
     logged = [(r, table_motion(r, table)) for r in used if r.reading(sensor) is not None]
@@ -220,8 +220,8 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
         earth=earth_of(table) is not None,
         bench=stated_priors(table),
         mounting_in_doubt=any(note.code == "N-SEATS" for recording in recordings for note in recording.notes),
-        angle_deg=float(table.get("angle_accuracy_deg") or 0.0) if table.get("motion") == "logged" else 0.0,
-        levelling_deg=float(table.get("levelling_deg") or 0.0),
+        angle_deg=table.angle_accuracy_deg if table.motion == "logged" else 0.0,
+        levelling_deg=table.levelling_deg or 0.0,
     )
 
 

@@ -25,7 +25,7 @@ The covariance includes bias wander (``pipeline.estimation.engine``) and the tab
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,18 +35,19 @@ from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
-from pipeline.estimation.noise import noise_of, prior_of
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import Part, noise_of_fit, parts_of, settled, used_motions
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import truth
-from pipeline.records import AXES, BASE_COUNT, MATRIX, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
 from pipeline.signal.filters import filtered
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from pipeline.records import UnitRecordings
+    from pipeline.settings import Settings
 
 
 NAME = "reference_least_squares"
@@ -61,10 +62,10 @@ ADVICE = {
 
 
 def fit(
-    sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+    sensor: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
 ) -> SensorCalibration:
     """Fit bias and matrix of a sensor against the table's motion (``pipeline.estimation.stages``); role: the sensor."""
-    parts = [_select(sensor, part) for part in parts_of(recordings, sensor, settings["table"], NAME)]
+    parts = [_select(sensor, part) for part in parts_of(recordings.filtered, sensor, settings.table, NAME)]
     y = np.concatenate([part.reading(sensor) for part in parts])
     u = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
     X = np.column_stack([np.ones(len(u)), u])
@@ -72,7 +73,7 @@ def fit(
     factors = ScaledColumns.of(X)
     beta = factors.solve(y)
     residuals = y - X @ beta
-    prior = prior_of(sensor, recordings, settings)
+    prior = wander_prior(recordings.noises[sensor], settings.sensor.of(sensor))
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
     J = np.zeros((3, BASE_COUNT, 4))
@@ -81,7 +82,7 @@ def fit(
         J[channel, MATRIX, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
     weights = factors.weights()
     fit = LinearMap((weights, weights, weights), (J[0], J[1], J[2]))
-    reference = Reference(sensor, used_motions(parts), K, settings["table"])
+    reference = Reference(sensor, used_motions(parts), K, settings.table)
     noise = noise_of_fit(parts, reference, residuals, X, prior)
     contributions = [noise_contribution(noise, fit, prior)]
     result = StageResult(
@@ -109,9 +110,9 @@ def fit(
     def results(errors: Values) -> Values:
         return with_matrix(of_channels(beta.T.ravel() + errors))
 
-    bench = bench_effects(sensor, settings, recordings)
-    if bench and not stated_priors(settings["table"]):  # else the stage ``effects`` fits them
-        return fit_joint(sensor, recordings, bench, noise_of(sensor, recordings, settings), settings, found)
+    bench = bench_effects(sensor, settings.table, recordings.filtered)
+    if bench and not stated_priors(settings.table):  # else the stage ``effects`` fits them
+        return fit_joint(sensor, recordings.filtered, bench, recordings.noises[sensor], settings, found)
     return budgeted(found, reference, fit, noise, contributions, settings, results)
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Index, Integers, Mask, Recording, SensorCalibration, Values
+    from pipeline.settings import Procedure, Settings, Table
 
 ROLE, HELD_OUT = "rests", "validation"
 
@@ -38,14 +39,12 @@ class RestSplit:
     left_out: tuple[Rest, ...]  # refused, each with its reason
 
 
-def holdout_interval(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> int:
+def holdout_interval(recordings: Sequence[Recording], procedure: Procedure) -> int:
     """Return k if every k-th rest is held out; 0 if none is held out.
 
-    With a recording for validation, or fewer rests than ``holdout_from``, none is held out. ``settings``: section
-    ``procedure``: ``holdout_every`` and ``holdout_from``.
+    With a recording for validation, or fewer rests than ``holdout_from``, none is held out.
     """
-    procedure = settings["procedure"]
-    every, fewest = (int(procedure.get(key) or 0) for key in ("holdout_every", "holdout_from"))
+    every, fewest = procedure.holdout_every, procedure.holdout_from
     if not every or any(recording.role == HELD_OUT for recording in recordings):
         return 0
     return every if not fewest or count_of_rests(recordings) >= fewest else 0
@@ -72,18 +71,18 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
     )
 
 
-def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[Rest]]:
+def held_out_rests(recordings: Sequence[Recording], procedure: Procedure) -> dict[str, list[Rest]]:
     """Return the held-out rests of recordings of role ``rests``, by the name of the recording; empty if there are none.
 
     The move before a held-out rest is held out, too.
     """
-    every = holdout_interval(recordings, settings)
+    every = holdout_interval(recordings, procedure)
     return {r.name: list(split_rests(r, every).held_out) for r in recordings if every and r.role == ROLE}
 
 
-def advice_on_held_out(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> str:
+def advice_on_held_out(recordings: Sequence[Recording], procedure: Procedure) -> str:
     """Return advice, as a clause, on how to use the held-out rests in the fit; empty if none are held out."""
-    held = sum(map(len, held_out_rests(recordings, settings).values()))
+    held = sum(map(len, held_out_rests(recordings, procedure).values()))
     if not held:
         return ""
     return (
@@ -92,13 +91,13 @@ def advice_on_held_out(recordings: Sequence[Recording], settings: Mapping[str, A
     )
 
 
-def rests_by_use(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+def rests_by_use(recordings: Sequence[Recording], procedure: Procedure) -> dict[str, list[dict[str, Any]]]:
     """Describe the rests of the recordings of role ``rests`` by their use in a fit: see ``describe_rests``.
 
     The keys are ``rests_used``, ``rests_held_out`` and ``rests_left_out``. Rests that the fit itself excludes later are
     listed as used.
     """
-    every = holdout_interval(recordings, settings)
+    every = holdout_interval(recordings, procedure)
     splits = [(r, split_rests(r, every)) for r in recordings if r.role == ROLE]
     return {
         f"rests_{use}": describe_rests([(r, rest) for r, split in splits for rest in getattr(split, use)])
@@ -202,16 +201,16 @@ def is_multi_position(sensor: str, recordings: Sequence[Recording]) -> bool:
 def rests_of(
     sensor: str,
     recordings: Sequence[Recording],
-    settings: Mapping[str, Any],
+    procedure: Procedure,
     accelerometer: SensorCalibration | None = None,
     role: str = ROLE,
 ) -> Rests | None:
     """Return the rests of the recordings of a role, or None where there are none.
 
-    ``settings``: section ``procedure``: ``holdout_every``. ``accelerometer``: rests that its method left out are left
-    out here. ``role``: ``rests``, or ``validation``, whose rests are all held out.
+    ``accelerometer``: rests that its method left out are left out here. ``role``: ``rests``, or ``validation``, whose
+    rests are all held out.
     """
-    every = holdout_interval(recordings, settings) if role == ROLE else 0
+    every = holdout_interval(recordings, procedure) if role == ROLE else 0
     refused = {
         (rest["recording"], float(rest["time_s"]))
         for stage in (accelerometer.stages if accelerometer else ())
@@ -265,13 +264,12 @@ class Orientations:
         return self.rests.white / (gain or 1.0)
 
 
-def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Orientations:
+def orientations_of(recordings: Sequence[Recording], settings: Settings) -> Orientations:
     """Return the rows of all recordings of role ``rests`` and ``accelerometer``.
 
-    ``settings``: sections ``table`` and ``procedure``. Raises ``CannotCalibrateError`` if no such recording holds
-    readings of the accelerometer.
+    Raises ``CannotCalibrateError`` if no such recording holds readings of the accelerometer.
     """
-    every = holdout_interval(recordings, settings)
+    every = holdout_interval(recordings, settings.procedure)
     used: dict[int, Sequence[Rest]] = {}
     held_out: list[tuple[Recording, Rest]] = []
     left_out: list[tuple[Recording, Rest]] = []
@@ -279,7 +277,7 @@ def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]
     for i, recording in enumerate(recordings):
         if recording.role not in {ROLE, "accelerometer"} or recording.accelerometer is None:
             continue
-        on_table = _rests_on_table(recording, settings["table"])
+        on_table = _rests_on_table(recording, settings.table)
         if on_table is None:
             split = split_rests(recording, every if recording.role == ROLE else 0)
             used[i] = split.used
@@ -296,7 +294,7 @@ def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]
     return Orientations(recordings, rests, tuple(held_out), tuple(left_out), by_hand)
 
 
-def _rests_on_table(recording: Recording, table: Mapping[str, Any]) -> list[Rest] | None:
+def _rests_on_table(recording: Recording, table: Table) -> list[Rest] | None:
     """Return the dwells of a recording on a table, single samples of a continuous one, or None without a table."""
     motion = table_motion(recording, table) if recording.role == "accelerometer" else None
     if motion is None:

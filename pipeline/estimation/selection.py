@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -32,9 +32,10 @@ from pipeline.estimation.ranking import Ranking, Score
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.records import Noise, SensorCalibration, Values
+    from pipeline.settings import DataSheet
 
 
 MOST = 5  # effects that one selection adds
@@ -55,7 +56,7 @@ def select(
     observations: Observations,
     configured: Sequence[str],
     noise: Noise | None,
-    sensor_config: Mapping[str, Any],
+    data_sheet: DataSheet,
     known: SensorCalibration | None = None,
     *,
     accelerometer: SensorCalibration | None = None,
@@ -63,7 +64,7 @@ def select(
 ) -> Selection:
     """Select effects.
 
-    ``configured``: effects of the model. ``sensor_config``: the sensor's section of the configuration. ``known``: a
+    ``configured``: effects of the model. ``data_sheet``: the sensor's section of the configuration. ``known``: a
     calibration whose effects are starts for the configured ones. ``accelerometer``, for the gyroscope: its fit with the
     mountings. ``search``: False computes the base and the products of the candidates only, without scores.
     """
@@ -78,9 +79,9 @@ def select(
             prior = prior_of(this, observations, accelerometer, configured)
             candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
         ranking = Ranking(observations, base, base, candidates, grid)
-        limits = limits_of(observations.sensor, sensor_config)
+        limits = limits_of(observations.sensor, data_sheet)
         selection = Selection(
-            observations, noise, sensor_config, start, grid, limits, candidates, base, base, ranking, ranking
+            observations, noise, data_sheet, start, grid, limits, candidates, base, base, ranking, ranking
         )
         if search:
             selection.run()
@@ -97,7 +98,7 @@ class Selection:
 
     observations: Observations
     noise: Noise | None
-    sensor_config: Mapping[str, Any]
+    data_sheet: DataSheet
     start: Start
     settings: list[Setting]
     limits: dict[str, Values]
@@ -354,7 +355,7 @@ class Selection:
         """Return whether the residual's wander is far above that of a static recording or of the sensor file."""
         _, setting = self.ranking.of_model([])
         white = float(np.sqrt(np.mean(self.start.scale**2)))
-        expected = float(self.sensor_config.get("bias_wander") or 0.0)
+        expected = self.data_sheet.bias_wander
         if self.noise is not None and self.noise.source == "static":
             expected = float(np.sqrt(np.mean(self.noise.wander**2)))
         return expected > 0 and self.ranking.settings[setting].ratio * white > INFLATED * expected

@@ -6,9 +6,9 @@ The stages of the staged method are functions of one module for each sensor, who
 module declares its stages in ``FIT_STAGES``, by name (``FitStage``). A new stage needs only such a module and its name
 in a method's list.
 
-    recordings : all of a unit; a stage uses those of its roles
+    recordings : all of a unit, with the noise of each sensor; a stage uses those of its roles
     previous   : the result of the stage before, whose stages the new result continues; None for the first
-    settings   : sections of the configuration; ``noise`` by sensor if an earlier stage of the run estimated it
+    settings   : sections of the configuration
 
 A stage raises ``CannotCalibrateError`` if there is no recording for it, ``NotObservableError`` if the recordings do not
 determine its parameters. ``check_stages`` refuses a method whose stages cannot follow each other before any job.
@@ -39,14 +39,14 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
-from pipeline.records import BASE, NORMAL, SENSORS, Contribution, Recording, SensorCalibration, StageResult, Values
+from pipeline.records import BASE, NORMAL, SENSORS, Contribution, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
-    from pipeline.records import FittedEffect
-    from pipeline.settings import DataSheet
+    from pipeline.records import FittedEffect, UnitRecordings
+    from pipeline.settings import DataSheet, Method, Settings
 
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
@@ -146,9 +146,9 @@ def _listed(names: Sequence[str]) -> str:
 def fit_stage(
     sensor: str,
     stage: str,
-    recordings: Sequence[Recording],
+    recordings: UnitRecordings,
     previous: SensorCalibration | None,
-    settings: Mapping[str, Any],
+    settings: Settings,
 ) -> SensorCalibration:
     """Run a stage on the result of the stage before.
 
@@ -157,14 +157,15 @@ def fit_stage(
     if stage == NOT_WANTED:
         raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")
     if stage == GIVEN:
-        return given_calibration(sensor, settings)
+        return given_calibration(sensor, settings.method)
     check_stages(sensor, [*declarations(previous), stage] if previous else [stage])
     module, of_both = import_module(stage_module(sensor, stage)), len(declared(sensor, stage).sensors) > 1
     fit = partial(module.fit, *((stage,) if len(module.FIT_STAGES) > 1 else (sensor,) if of_both else ()))
     for other in SENSORS:
-        if other != sensor and (of_other := known_effects(other, settings)):
-            recordings = subtracted(recordings, SensorCalibration(other), of_other, ("rests",))
-    known = () if declared(sensor, stage).known else known_effects(sensor, settings)
+        if other != sensor and (of_other := known_effects(other, settings.method)):
+            filtered = subtracted(recordings.filtered, SensorCalibration(other), of_other, ("rests",))
+            recordings = replace(recordings, filtered=filtered)
+    known = () if declared(sensor, stage).known else known_effects(sensor, settings.method)
     if known and previous is not None:
         return _fit_to_corrected(fit, recordings, previous, known, settings)
     calibration: SensorCalibration = fit(recordings, previous, settings)
@@ -173,10 +174,10 @@ def fit_stage(
 
 def _fit_to_corrected(
     fit: Callable[..., SensorCalibration],
-    recordings: Sequence[Recording],
+    recordings: UnitRecordings,
     previous: SensorCalibration,
     known: Sequence[FittedEffect],
-    settings: Mapping[str, Any],
+    settings: Settings,
 ) -> SensorCalibration:
     """Return the fit to the readings less the known effects, which depend on bias and matrix, with these effects."""
     sensor, stages = previous.sensor, declarations(previous)
@@ -185,8 +186,8 @@ def _fit_to_corrected(
     before = replace(before, stages=tuple(s for s in previous.stages if s not in held))
     at, passes = before, 0
     while True:
-        corrected = subtracted(recordings, at, known, (sensor, "rests"))
-        found = fit(corrected, before if before.stages else None, settings)
+        filtered = subtracted(recordings.filtered, at, known, (sensor, "rests"))
+        found = fit(replace(recordings, filtered=filtered), before if before.stages else None, settings)
         if found is before:  # nothing to fit
             return previous
         passes += 1
@@ -196,12 +197,12 @@ def _fit_to_corrected(
         at = found
 
 
-def is_given(sensor: str, settings: Mapping[str, Any]) -> bool:
+def is_given(sensor: str, method: Method) -> bool:
     """Return whether the calibration of a sensor is given, and not fitted."""
-    return sensor in ((settings.get("method") or {}).get("given") or {})
+    return method.given is not None and sensor in method.given
 
 
-def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibration:
+def given_calibration(sensor: str, method: Method) -> SensorCalibration:
     """Return the given calibration of a sensor from the configuration (``method.given``).
 
     Effects of mounting, place, table and timing belong to the bench of that calibration: they are not used, and the
@@ -209,7 +210,7 @@ def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibra
     """
     from pipeline.estimation.uncertainty_budget import base_parameters, combined  # noqa: PLC0415  (0.1 s of Snakemake)
 
-    given = settings["method"]["given"]
+    given = _given(method)
     part, source = given[sensor], given["source"]
     if part is None:
         raise CannotCalibrateError(f"the given calibration {source} holds nothing of the {sensor}")
@@ -223,18 +224,24 @@ def given_calibration(sensor: str, settings: Mapping[str, Any]) -> SensorCalibra
     effects = tuple(e for e in found.effects if e.name not in bench)
     calibration = SensorCalibration(sensor, found.bias, found.matrix, effects=effects, stages=(stage,))
     if not part["uncertain"]:
-        return combined(calibration, [], unknown_uncertainty(sensor, settings))
+        return combined(calibration, [], unknown_uncertainty(sensor, method))
     freedom = np.full(len(kept), np.inf) if found.freedom is None else kept.degrees_of_freedom
     line = Contribution(GIVEN_SOURCE, "B", NORMAL, kept.covariance, freedom, remark=f"as {source} states it")
     return combined(calibration, [line], {})
 
 
-def unknown_uncertainty(sensor: str, settings: Mapping[str, Any]) -> dict[str, str]:
+def unknown_uncertainty(sensor: str, method: Method) -> dict[str, str]:
     """Return the entry of a budget for a given calibration whose file states no uncertainty; empty if it does."""
-    given = settings["method"]["given"]
+    given = _given(method)
     if given[sensor] is None or given[sensor]["uncertain"]:
         return {}
     return {GIVEN_SOURCE: f"{given['source']} states no uncertainty: none is known, and zeros stand for it"}
+
+
+def _given(method: Method) -> dict[str, Any]:
+    """Return the document of a given calibration."""
+    assert method.given is not None  # noqa: S101  (``is_given``)
+    return method.given
 
 
 def staged_result(  # noqa: PLR0917  (the results of a stage)

@@ -20,7 +20,7 @@ elements of the matrix, in the sensor's unit for the bias.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -53,8 +53,10 @@ from pipeline.signal.filters import temperature_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.records import UnitRecordings
+    from pipeline.settings import DataSheet, Settings, Table
+
 FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
-ACCURACY = "temperature_accuracy_degc"
 BURSTS = "interval of bursts"
 GRAVITY_ON_EARTH = 0.0044  # relative: 9.7639 to 9.8337 m/s^2 (Hirt et al. 2013, GRL 40, 4279) against 9.80665 m/s^2
 IN_LOCAL_GRAVITY = (
@@ -63,36 +65,32 @@ IN_LOCAL_GRAVITY = (
 )
 
 
-def with_stated(
-    calibration: SensorCalibration, recordings: Sequence[Recording], settings: Mapping[str, Any]
-) -> SensorCalibration:
+def with_stated(calibration: SensorCalibration, recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
     """Add temperature, repeatability and a counted time to a calibration's budget, as far as they are known.
 
-    ``recordings``: of the fit; their temperature and notes are used. ``settings``: sections ``sensor``, ``table``;
-    ``noise``, if it is known.
+    ``recordings``: of the fit; their temperature and notes are used.
     """
+    filtered, noise = recordings.filtered, recordings.noises[calibration.sensor]
     before, budget = calibration.covariance, calibration.budget
     if before is None or budget is None:
         return calibration
-    sensor_config = settings["sensor"].get(calibration.sensor) or {}
-    lines, missing = _repeatability(calibration, sensor_config)
-    accuracy = settings["sensor"].get(ACCURACY)
+    data_sheet = settings.sensor.of(calibration.sensor)
+    lines, missing = _repeatability(calibration, data_sheet)
+    accuracy, limits = settings.sensor.temperature_accuracy_degc, data_sheet.effects
     if accuracy is not None:
-        warm = _temperature(calibration, float(accuracy), recordings, sensor_config.get("effects") or {})
+        warm = _temperature(calibration, accuracy, filtered, limits)
         if isinstance(warm, str):
             missing["temperature"] = warm
         else:
             lines += warm
-    limits = sensor_config.get("effects") or {}
-    noise: Noise | None = (settings.get("noise") or {}).get(calibration.sensor)
     missing |= _rounding(noise, calibration.sensor)
-    lines += _counted_time(calibration, recordings, limits.get("clock_rate"))
-    lines += _rate_off_angle(calibration, recordings, settings.get("table") or {})
-    lines += _of_bursts(calibration, recordings)
+    lines += _counted_time(calibration, filtered, limits.get("clock_rate"))
+    lines += _rate_off_angle(calibration, filtered, settings.table)
+    lines += _of_bursts(calibration, filtered)
     known = {line.source.partition(" (")[0] for line in lines} | set(missing)
     up_to: dict[str, dict[str, float]] = {}
     entries = [entry for entry in budget.not_included if entry.source not in known]
-    not_included = [_bounded(entry, settings.get("table") or {}, limits.get("clock_rate")) for entry in entries]
+    not_included = [_bounded(entry, settings.table, limits.get("clock_rate")) for entry in entries]
     if noise is not None and noise.step is not None:
         up_to = {QUANTISATION: {"bias": 0.5 * float(noise.step.max())}}
     not_included += [NotIncluded(source, reason, up_to.get(source, {})) for source, reason in missing.items()]
@@ -141,16 +139,15 @@ def _of_bursts(calibration: SensorCalibration, recordings: Sequence[Recording]) 
 
 
 def _rate_off_angle(
-    calibration: SensorCalibration, recordings: Sequence[Recording], table: Mapping[str, Any]
+    calibration: SensorCalibration, recordings: Sequence[Recording], table: Table
 ) -> list[Contribution]:
     """Return the line of a table whose rate is not the change of its angle, beyond the rate's stated accuracy."""
-    stated = table.get("rate_accuracy")
-    if calibration.sensor != "gyroscope" or stated is None:
+    if calibration.sensor != "gyroscope":
         return []
     turns = [r for r in recordings if r.role == "gyroscope" and r.table_angle is not None]
     found = filter(None, map(rate_against_angle, turns))
     off = max((abs(ratio - 1.0) for ratio, spread, _ in found if abs(ratio - 1.0) > SIGNIFICANT * spread), default=0.0)
-    if off <= EXPANDED * float(stated):
+    if off <= EXPANDED * table.rate_accuracy:
         return []
     remark = f"the table's rate and the change of its angle differ by up to {1e6 * off:.3g} ppm"
     return [clock_contribution(calibration, 1e6 * off / np.sqrt(3.0), RECTANGULAR, remark)]
@@ -160,9 +157,9 @@ def _clock_unstated(entry: NotIncluded) -> bool:
     return entry.source == TIME_BASE and "clock_accuracy_ppm is not stated" in entry.reason
 
 
-def _bounded(entry: NotIncluded, table: Mapping[str, Any], limit_ppm: float | None) -> NotIncluded:
+def _bounded(entry: NotIncluded, table: Table, limit_ppm: float | None) -> NotIncluded:
     """Return a source that is not included, with ``up_to`` where the size of its error has a known limit."""
-    if entry.source == GRAVITY and float(table.get("gravity_g") or 1.0) == 1.0:
+    if entry.source == GRAVITY and table.gravity_g == 1.0:
         return NotIncluded(GRAVITY, IN_LOCAL_GRAVITY, {"matrix": GRAVITY_ON_EARTH})
     if _clock_unstated(entry) and limit_ppm:
         reason = f"{entry.reason}; the sensor file states {limit_ppm:g} ppm for times by the sensor's own clock"
@@ -183,17 +180,15 @@ def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]
     return [("bias", SENSOR_UNITS[calibration.sensor], np.eye(size)[:, BIAS]), ("scale_factor", "1", of_scale)]
 
 
-def _repeatability(
-    calibration: SensorCalibration, sensor_config: Mapping[str, Any]
-) -> tuple[list[Contribution], dict[str, str]]:
+def _repeatability(calibration: SensorCalibration, data_sheet: DataSheet) -> tuple[list[Contribution], dict[str, str]]:
     """Return the contributions of the repeatability, and the reason if it is not stated."""
     lines, lacking = [], []
     for name, unit, effect in _effects_on(calibration):
-        u = sensor_config.get(f"repeatability_{name}")
+        u: float | None = getattr(data_sheet, f"repeatability_{name}")
         if u is None:
             lacking.append(f"sensor.{calibration.sensor}.repeatability_{name}")
         elif u:
-            lines.append(type_b(f"repeatability ({name.replace('_', ' ')})", NORMAL, float(u), unit, effect))
+            lines.append(type_b(f"repeatability ({name.replace('_', ' ')})", NORMAL, u, unit, effect))
     reason = f"{NOT_STATED}, compare, and state it as {' and '.join(lacking)}"
     return lines, {"repeatability": reason} if lacking else {}
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,9 +33,10 @@ from pipeline.records import NORMAL, SENSORS, Contribution, Index, Motion, Value
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.estimation.gauss_markov import Blocks, Prior
+    from pipeline.settings import Table
 
 ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
@@ -60,7 +61,7 @@ class Reference:
     sensor: str
     motions: Sequence[Motion]  # their samples, one after the other, are the columns of ``LinearMap.weights``
     K: Values  # (3, 3)
-    table: Mapping[str, Any]
+    table: Table
 
     def summed(self, fit: LinearMap | BlockSums, change: Callable[[Motion], Values | None], inputs: int) -> Values:
         """Return the change of the parameters by inputs that change the truth: (p, inputs) array.
@@ -147,7 +148,7 @@ def _stated_errors(
     for source, key, unit, sensors, replaced_by, inputs, change in ACCURACIES:
         if reference.sensor not in sensors:
             continue
-        u = reference.table.get(key)
+        u: float | None = getattr(reference.table, key)
         fitted = [n for n in replaced_by if n in estimated or all(f"{n}@{setup}" in estimated for setup in setups)]
         reason = f"estimated by {fitted[0]}" if fitted else _without(source, key, reference)
         if reason:
@@ -155,7 +156,7 @@ def _stated_errors(
         elif u:
             if change is None:
                 by_input = _angle(reference, fit)
-            elif change is _rate and reference.table.get("motion") == "commanded":
+            elif change is _rate and reference.table.motion == "commanded":
                 by_input = _rate_of_each(reference, fit)
             else:
                 by_input = reference.summed(fit, partial(change, reference), inputs)
@@ -192,21 +193,21 @@ def noise_on_table(
 def _largest(reference: Reference) -> float:
     """Return the approximate largest error of the truth by the stated accuracies, g or deg/s."""
     table, size = reference.table, 0.0
-    tilt = np.radians(max(float(table.get(key) or 0.0) for key in TILTS))
+    tilt = np.radians(max(float(getattr(table, key) or 0.0) for key in TILTS))
     for motion in reference.motions:
         u = truth(reference.sensor, motion)
         size = max(size, tilt * float(np.abs(u).max()))
         if reference.sensor == "gyroscope" and motion.angle is not None and motion.rate is not None:
             slope = float(np.abs(motion.rate * between_stops(motion.angle, motion.rate)[2]).max())
-            size = max(size, slope * float(table.get("angle_accuracy_deg") or 0.0))
-            size = max(size, float(np.abs(motion.rate).max()) * float(table.get("rate_accuracy") or 0.0))
+            size = max(size, slope * table.angle_accuracy_deg)
+            size = max(size, float(np.abs(motion.rate).max()) * table.rate_accuracy)
     return size
 
 
 def _without(source: str, key: str, reference: Reference) -> str:
     """Return why a source is not included; empty if it is, or if its accuracy is stated as 0."""
     table, clocks = reference.table, {motion.timed_by for motion in reference.motions}
-    placed = table.get("latitude_deg") is not None and table.get("azimuth_deg") is not None
+    placed = table.latitude_deg is not None and table.azimuth_deg is not None
     if source == "Earth's rotation" and not placed:
         return "not in the model: table.latitude_deg and table.azimuth_deg are not set; up to 0.0042 deg/s"
     if source == TIME_BASE:
@@ -214,8 +215,8 @@ def _without(source: str, key: str, reference: Reference) -> str:
             return "no time enters the direction of gravity at an angle of the table"
         if "sensor" not in clocks:
             return CLOCK_OF_TABLE if "table" in clocks else "the table states the rate itself: no clock changes it"
-        return "" if table.get(key) is not None else f"table.{key} is not stated; {TIMED_BY_SENSOR}"
-    return f"table.{key} is not stated" if table.get(key) is None else ""
+        return "" if getattr(table, key) is not None else f"table.{key} is not stated; {TIMED_BY_SENSOR}"
+    return f"table.{key} is not stated" if getattr(table, key) is None else ""
 
 
 def _angle(reference: Reference, fit: LinearMap | BlockSums) -> Values:
@@ -331,7 +332,7 @@ def _levelling(reference: Reference, motion: Motion) -> Values | None:
 
 def _gravity(reference: Reference, motion: Motion) -> Values:
     """Return the change of the truth by gravity, per g."""
-    return motion.specific_force[:, :, None] / float(reference.table.get("gravity_g") or 1.0)
+    return motion.specific_force[:, :, None] / reference.table.gravity_g
 
 
 def _azimuth(reference: Reference, motion: Motion) -> Values | None:

@@ -16,10 +16,11 @@ from pipeline.model.kinematics import table_motion
 from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.records import Index, Mask, Motion, Recording, Values
+    from pipeline.settings import Table
 
 
 BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
@@ -60,7 +61,7 @@ def used_motions(parts: Sequence[Part]) -> list[Motion]:
     return [part.used_motion for part in parts if part.keep.any()]
 
 
-def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, Any], method: str) -> list[Part]:
+def parts_of(recordings: Sequence[Recording], sensor: str, table: Table, method: str) -> list[Part]:
     """Return the recordings made for a sensor with its readings and the table's motion, without invalid samples.
 
     ``method``: name of the method, for the message. Raises ``CannotCalibrateError`` if there is none.
@@ -137,9 +138,7 @@ def noise_of_fit(
     return noise_on_table(reference, residuals, design, blocks_of_samples(parts), prior)
 
 
-def noise_of_turns(
-    parts: Sequence[Part], prior: Prior, table: Mapping[str, Any], *, two_sided: bool = False
-) -> ResidualNoise:
+def noise_of_turns(parts: Sequence[Part], prior: Prior, table: Table, *, two_sided: bool = False) -> ResidualNoise:
     """Return the noise of an accelerometer on a table, from the residuals of ``y = b + K u``, or ``+ C |u|`` too."""
     motions = used_motions(parts)
     u = np.concatenate([motion.specific_force for motion in motions])

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.candidates import TILT, tilt_like_zeros
-from pipeline.estimation.monte_carlo import through, trials_of, with_trials
+from pipeline.estimation.monte_carlo import through, with_trials
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.records import (
     AFTER_BASE,
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import Term
     from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
+    from pipeline.settings import Settings, Table
 
 BY_CHANCE = 0.1  # share of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
@@ -99,15 +100,13 @@ def scatter_contribution(
     return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
 
 
-def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
+def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, unit: str) -> Contribution | str:
     """Return the contribution of rounding to whole counts, or why it has no separate line.
 
     With white noise of half a count or more, the rounding errors of the samples are independent, of variance 1/12
     count^2, and part of the noise of the residuals. With less, all samples of a block have the same error.
     """
-    if not counts_per_unit:
-        return "the sensor's counts_per_unit is not configured"
-    step = 1.0 / float(counts_per_unit)
+    step = 1.0 / counts_per_unit
     if np.all(noise.white >= DITHERED * step):
         return f"contained in the {NOISE}, which reach {float(noise.white.min()) / step:.1f} counts or more"
     label = noise.blocks.label(int(noise.blocks.weight.sum()))
@@ -116,14 +115,14 @@ def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float |
     return type_b(QUANTISATION, RECTANGULAR, step / np.sqrt(12.0), unit, np.concatenate(effects, axis=1))
 
 
-def gravity_line(calibration: SensorCalibration, table: Mapping[str, Any]) -> tuple[list[Contribution], dict[str, str]]:
+def gravity_line(calibration: SensorCalibration, table: Table) -> tuple[list[Contribution], dict[str, str]]:
     """Return the contribution of local gravity, which scales the matrix, ``dM = M dG / G``, or why there is none."""
-    u = table.get("gravity_accuracy_g")
+    u = table.gravity_accuracy_g
     if not u:
         return [], {GRAVITY: "table.gravity_accuracy_g is not stated"} if u is None else {}
     effect = np.zeros((len(calibration.parameters), 1))
-    effect[MATRIX, 0] = calibration.matrix.ravel() / float(table.get("gravity_g") or 1.0)
-    return [type_b(GRAVITY, NORMAL, float(u), "g", effect)], {}
+    effect[MATRIX, 0] = calibration.matrix.ravel() / table.gravity_g
+    return [type_b(GRAVITY, NORMAL, u, "g", effect)], {}
 
 
 def clock_contribution(
@@ -185,19 +184,18 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     fit: LinearMap,
     noise: ResidualNoise,
     contributions: Sequence[Contribution],
-    settings: Mapping[str, Any],
+    settings: Settings,
     results: Callable[[Values], Values],
     estimated: Sequence[str] = (),
 ) -> SensorCalibration:
     """Return a calibration on a table with its budget and, if configured, a Monte Carlo run.
 
-    ``contributions``: first that of the noise; the others act on the parameters directly. ``settings``: sections
-    ``sensor``, for the size of a count, and ``uncertainty``. ``results``: function of (t, q) errors of the fit's linear
-    map, channel after channel, to (t, p) parameters. ``estimated``: effects of the fit; an error that one of them
-    estimates is no input.
+    ``contributions``: first that of the noise; the others act on the parameters directly. ``results``: function of
+    (t, q) errors of the fit's linear map, channel after channel, to (t, p) parameters. ``estimated``: effects of the
+    fit; an error that one of them estimates is no input.
     """
     sensor = calibration.sensor
-    counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
+    counts = settings.sensor.of(sensor).counts_per_unit
     found, absent = table_errors(reference, fit, estimated)
     if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
         absent["levelling"] = ACROSS
@@ -212,7 +210,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     else:
         lines.append(rounded)
     complete = combined(calibration, [*lines, *found], {**absent, **missing})
-    trials = trials_of(settings)
+    trials = settings.uncertainty.monte_carlo
     if not trials:
         return complete
     first = fit.first()

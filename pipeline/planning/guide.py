@@ -45,7 +45,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -62,9 +62,9 @@ from pipeline.simulation.trajectory import rotation_by
 from pipeline.unit import Task, run_checked, run_steps
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from pipeline.settings import Settings
+    from pipeline.settings import DataSheet, Procedure, Settings
     from pipeline.unit import UnitState
 
 
@@ -181,12 +181,12 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> Progress:
     if fitted is not None:
         values = fitted.parameters.values[PLACE]
         scatter = float(fitted.stages[-1].details["scatter_between_rests"])
-    sensor_config, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
-    rests, white = orientations.rests, _white_of_rest(orientations, sensor_config, dwell)
+    data_sheet, gravity = settings.sensor.accelerometer, settings.table.gravity_g
+    rests, white = orientations.rests, _white_of_rest(orientations, data_sheet, dwell)
     error = float(np.hypot(white, scatter))
-    u = {True: 0.5 * float(sensor_config["scale_factor"]), False: limit_of_misalignment(sensor_config)}
+    u = {True: 0.5 * data_sheet.scale_factor, False: limit_of_misalignment(data_sheet)}
     of_matrix = [u[bool(i == j)] for i, j in zip(ROWS, COLUMNS, strict=True)]
-    F = np.diag(1.0 / np.square([0.5 * float(sensor_config["bias"]) / gravity] * 3 + of_matrix))  # P
+    F = np.diag(1.0 / np.square([0.5 * data_sheet.bias / gravity] * 3 + of_matrix))  # P
     if len(rests.time):
         J = derivative_of(rests.reading, values)
         F = F + (J / (np.mean(orientations.white**2) * rests.share + scatter**2)[:, None]).T @ J
@@ -203,7 +203,7 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> Progress:
     of_both.sort(key=lambda entry: (recordings.index(entry[0][0]), entry[0][1].start))
     pairs = [pair for pair, _ in of_both]
     last = sum(pair[0] is pairs[-1][0] for pair in pairs) if pairs else 0
-    every = holdout_interval(recordings, settings)
+    every = holdout_interval(recordings, settings.procedure)
     return Progress(
         rests=tuple(pairs),
         held_out=tuple(held for _, held in of_both),
@@ -220,15 +220,15 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> Progress:
     )
 
 
-def default_goal(sensor_config: Mapping[str, Any], gravity: float, dwell: float) -> float:
+def default_goal(data_sheet: DataSheet, gravity: float, dwell: float) -> float:
     """Return the largest U of ``orientations_24`` by the noise of the sensor file, g, to two digits."""
     angle = np.radians(np.arange(0.0, 360.0, 45.0))
     turn = gravity * np.column_stack([np.zeros(8), np.cos(angle), np.sin(angle)])
     up = np.concatenate([np.roll(turn, axis, axis=1) for axis in range(3)])
     time = dwell * np.arange(len(up))
-    R = np.exp(-np.abs(time[:, None] - time) / float(sensor_config["wander_time_s"]))
-    white = float(sensor_config["noise_density"]) ** 2 / (2.0 * dwell)
-    C = white * np.eye(len(up)) + (float(sensor_config["bias_wander"]) / gravity) ** 2 * (up @ up.T) * R
+    R = np.exp(-np.abs(time[:, None] - time) / data_sheet.wander_time_s)
+    white = data_sheet.noise_density**2 / (2.0 * dwell)
+    C = white * np.eye(len(up)) + (data_sheet.bias_wander / gravity) ** 2 * (up @ up.T) * R
     J = derivative_of(up, IDEAL)
     variance = np.diag(np.linalg.inv(J.T @ np.linalg.solve(C, J)))
     return float(f"{coverage_factor(len(up) - J.shape[1]) * np.sqrt(np.max(variance)):.2g}")
@@ -254,13 +254,13 @@ def _undetermined(fitted: SensorCalibration) -> str:
     return f"{count} orientations determine nine parameters without a check" if count <= FEWEST else ""
 
 
-def _white_of_rest(orientations: Orientations, sensor_config: Mapping[str, Any], dwell: float) -> float:
+def _white_of_rest(orientations: Orientations, data_sheet: DataSheet, dwell: float) -> float:
     """Return the standard deviation by white noise of the mean of a future rest on an axis, g."""
     white = float(np.sqrt(np.mean(orientations.white**2)))
     if white > 0.0:
         (recording, _), *_ = orientations.used
         return white / float(np.sqrt(max((dwell - WINDOW_S) / recording.interval, 1.0)))
-    return float(sensor_config["noise_density"]) / float(np.sqrt(2.0 * dwell))
+    return data_sheet.noise_density / float(np.sqrt(2.0 * dwell))
 
 
 def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Values:
@@ -364,17 +364,16 @@ def most_informative_turn(gyroscope: SensorCalibration, direction: float) -> Tur
     return max(turns, key=gain)
 
 
-def next_face_or_turn(
-    recordings: Sequence[Recording], procedure: Mapping[str, Any], dwell: float
-) -> tuple[bool, list[str]]:
+def next_face_or_turn(recordings: Sequence[Recording], procedure: Procedure, dwell: float) -> tuple[bool, list[str]]:
     """Return whether all faces and turns are recorded, and lines that state what is recorded and what comes next.
 
-    ``dwell``: s, of a future rest.
+    ``procedure``: with turns. ``dwell``: s, of a future rest.
     """
-    stated = procedure["turns"]
-    if any(entry.get("windows") for entry in procedure["recordings"].values()):
-        stated = {**stated, "holdout_every": 0}  # the windows state what is held out
-    faces, angle = dict.fromkeys(FACES, 0), float(stated["angle_deg"])
+    stated = procedure.turns
+    assert stated is not None  # noqa: S101
+    if any(entry.windows for entry in procedure.recordings.values()):
+        stated = stated.replaced(holdout_every=0)  # the windows state what is held out
+    faces, angle = dict.fromkeys(FACES, 0), stated.angle_deg
     turns: dict[str, list[bool]] = {axis: [] for axis in AXES}  # whether each is held out
     pairs = [(r, [rest for rest in find_rests(r) if rest.accepted]) for r in recordings if r.role == ROLE]
     at_rest = [r.gyroscope[rest.start : rest.stop] for r, rests in pairs for rest in rests if r.gyroscope is not None]
@@ -388,7 +387,7 @@ def next_face_or_turn(
             rate = np.asarray(recording.gyroscope) - np.concatenate(at_rest).mean(axis=0)  # a part that is one turn
             axis, count = multiples(np.trapezoid(rate, recording.time, axis=0), angle)
             turns[AXES[axis]] += [False] * bool(count)
-    judged = bool(int(stated["holdout_every"])) and not any(r.role == "validation" for r in recordings)
+    judged = bool(stated.holdout_every) and not any(r.role == "validation" for r in recordings)
     counts = (f"{axis} {len(held)}" + f" ({sum(held)} held out)" * judged for axis, held in turns.items())
     lines = [
         "faces: " + ", ".join(f"{name} {count}" for name, count in faces.items()) + " rests",

@@ -18,7 +18,7 @@ from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.samples import OTHER, samples_of_motion
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from pipeline.settings import Table
 
 JSON = dict[str, Any]
 ALIKE = 1.2  # held-out errors of diagnosis and validation that agree within this factor are shown as one series
@@ -105,16 +105,16 @@ def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
 
 
 def held_out_figures(
-    sensor: str, calibration: JSON, held_out: JSON, recordings: list[Recording], table: Mapping[str, Any]
+    sensor: str, calibration: JSON, held_out: JSON, recordings: list[Recording], table: Table
 ) -> list[Figure]:
     """Draw the error of the magnitude in each held-out recording with a reference, as in the validation.
 
-    ``held_out``: the sensor's part of the validation; ``table``: this section of the unit's configuration.
+    ``held_out``: the sensor's part of the validation.
     """
     fits = {s: SensorCalibration.from_json(s, calibration[s]) for s in SENSORS if calibration.get(s)}
-    floor, by_hand, figures = held_out.get("noise_floor"), table.get("motion") == "none", []
+    floor, by_hand, figures = held_out.get("noise_floor"), table.motion == "none", []
     for recording in (r for r in recordings if r.role == "validation"):
-        logged = sensor == "accelerometer" or (recording.table_rate is not None and table.get("latitude_deg") is None)
+        logged = sensor == "accelerometer" or (recording.table_rate is not None and table.latitude_deg is None)
         needed = fits[sensor].effects or not logged  # otherwise the attitude, which costs time, changes no magnitude
         reference = recording if needed else replace(recording, table_attitude=None)
         samples = samples_of_motion(sensor, reference, SILENT, table, other=fits.get(OTHER[sensor]))

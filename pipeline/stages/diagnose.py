@@ -51,7 +51,7 @@ def diagnose_unit(
     A diagnosis of one sensor that fails does not stop the other.
     """
     noises = required_noises(recordings, settings.sensor, calibrated(fits))
-    recordings, known = without_known_effects(recordings, calibrated(fits), settings)
+    recordings, known = without_known_effects(recordings, calibrated(fits), settings.method)
     made = Diagnosis(unit)
     for sensor, calibration in known.items():
         if calibration is None:
@@ -62,7 +62,7 @@ def diagnose_unit(
             found = _diagnosed(calibration, known, recordings, noises[sensor], settings, validated, gravity)
         except Exception as error:  # noqa: BLE001  (the calibration does not depend on its diagnosis)
             made.omissions.append(omission(error, unit, f"diagnose/{sensor}"))
-            found = without_diagnosis(sensor, settings, made.omissions[-1])
+            found = without_diagnosis(sensor, settings.effects, made.omissions[-1])
         if found.suggested_effect:
             file = f"{unit}_{sensor}_unknown.yaml"
             made.effect_files[file] = effect_file(found.suggested_effect, unit)
@@ -74,7 +74,7 @@ def diagnose_unit(
 def diagnose_without(job: Job, unit: str, settings: Settings, record: dict[str, Any]) -> Files:
     """Return the document of a unit without a diagnosis of either sensor."""
     known = calibrated(StoredUnit(job, unit).fits)
-    parts = {s: None if c is None else without_diagnosis(s, settings, record) for s, c in known.items()}
+    parts = {s: None if c is None else without_diagnosis(s, settings.effects, record) for s, c in known.items()}
     return {f"{unit}.json": Diagnosis(unit, parts).document}
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.estimation.noise import noise_of
-from pipeline.records import SENSORS, Recording, UnitRecordings
+from pipeline.estimation.noise import with_noises
 from pipeline.signal.filters import apply_filter
 
 if TYPE_CHECKING:
+    from pipeline.records import Recording, UnitRecordings
     from pipeline.settings import Settings
 
 
@@ -17,4 +17,4 @@ def filter_recordings(checked: list[Recording], settings: Settings) -> UnitRecor
     filtered = checked
     if settings.filter.name != "none":
         filtered = [apply_filter(recording, settings.filter) for recording in checked]
-    return UnitRecordings(filtered, {sensor: noise_of(sensor, filtered, settings) for sensor in SENSORS})
+    return with_noises(filtered, settings.sensor)

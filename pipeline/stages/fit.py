@@ -33,10 +33,9 @@ def fit(
     previous = fits.get(sensor)
     if isinstance(previous, NotCalibrated):
         return previous
-    with_noise = {**settings, "noise": recordings.noises}
     try:
-        found = fit_stage(sensor, stage, recordings.filtered, previous, with_noise)
+        found = fit_stage(sensor, stage, recordings, previous, settings)
         # only after the last stage, or it would be counted twice; a given calibration states its own uncertainty
-        return with_stated(found, recordings.filtered, with_noise) if last and stage != GIVEN else found
+        return with_stated(found, recordings, settings) if last and stage != GIVEN else found
     except CannotCalibrateError as reason:
         return NotCalibrated(reason.message)

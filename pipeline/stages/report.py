@@ -65,5 +65,5 @@ def _page_of_failed(job: Job, document: dict[str, Any], settings: Settings) -> s
     recordings = recordings_of(job.inputs, unit) if f"{unit}.noise.json" in job.inputs["filter"] else []
     if recordings:
         document["inputs"] = inputs(recordings)
-        document["rests"] = rests_by_use(recordings, settings)
+        document["rests"] = rests_by_use(recordings, settings.procedure)
     return render(document, None, None, recordings, settings)

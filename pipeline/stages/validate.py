@@ -24,7 +24,7 @@ def validate_unit(unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit]
         unit,
         held_out_errors(recordings, fits, settings),
         attitude(found["accelerometer"], found["gyroscope"], filtered),
-        gravity_direction(**found, recordings=filtered, noise=noise, settings=settings),
+        gravity_direction(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
     )
 
 

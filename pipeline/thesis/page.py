@@ -23,6 +23,7 @@ from pipeline.report.group_charts import Point, curves, stems
 from pipeline.report.held_out_section import held_out_over_time
 from pipeline.report.numbers import MINUS, NOTHING, number
 from pipeline.report.pages import template
+from pipeline.simulation.description import shipped_settings
 from pipeline.thesis.findings import KINDS, Errors, agreements, conclusions, evidence, scatters, verdict_of
 from pipeline.thesis.seeds import CAUSES, device_of
 from pipeline.thesis.tables import (
@@ -150,7 +151,7 @@ def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figur
 def _before_and_after(results: Results, name: str, sensor: str) -> Figure | None:
     """Draw the error e before and after calibration over the held-out motion."""
     held_out = results.recordings(f"{name}-printed", "validation")
-    samples = samples_of_motion(sensor, held_out[0], SILENT, {"gravity_g": 1.0}) if held_out else None
+    samples = samples_of_motion(sensor, held_out[0], SILENT, shipped_settings().table) if held_out else None
     if samples is None:
         return None
     corrected = apply_correction(results.correction(f"{name}-printed", sensor), samples.reading)

@@ -195,7 +195,7 @@ class Drawn:
         turns, settings = self.turns(), self._settings()
         found = gyroscope.estimates_of(turns, settings)
         bias = found.theta[0]
-        A = cholesky_lu.forward_of(turns, bias, settings).A
+        A = cholesky_lu.forward_of(turns, bias, settings.table).A
         matrices = {
             "staged": gyroscope.follow(found.response, list(gyroscope.STAGES)).contract()[1],
             "cholesky-printed": cholesky_lu.calibration_matrix(A, as_printed=True),

@@ -20,6 +20,7 @@ from scipy.integrate import cumulative_trapezoid
 from pipeline.pack import Pack, read_published
 from pipeline.records import Noise, Recording, Values
 from pipeline.signal.rests import find_rests
+from pipeline.simulation.description import shipped_settings
 from pipeline.stages.unit_files import recordings_of
 from pipeline.validation.samples import samples_of_motion
 
@@ -165,7 +166,7 @@ class Results:
         held_out = self.recordings(f"{name}-printed", "validation")
         if not held_out:
             return np.nan
-        samples = samples_of_motion(sensor, held_out[0], SILENT, {"gravity_g": 1.0})
+        samples = samples_of_motion(sensor, held_out[0], SILENT, shipped_settings().table)
         assert samples is not None  # noqa: S101  (the table logs its rate)
         if sensor == "accelerometer":
             O, M, S, b = (values(parameters, pattern) for pattern in ("O_{}", "M_{}", "S_{}", "b_{}_g"))

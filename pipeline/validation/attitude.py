@@ -34,7 +34,9 @@ from pipeline.model.effects import effect
 from pipeline.records import MATRIX, Integers, Noise, Recording, SensorCalibration, Values, continuous, level_in_body
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
+
+    from pipeline.settings import Procedure
 
 
 DRIFT_TIME_S = 60.0  # s over which a drift is stated
@@ -196,7 +198,7 @@ def gravity_direction(
     gyroscope: SensorCalibration | None,
     recordings: Sequence[Recording],
     noise: Noise | None,
-    settings: Mapping[str, Any],
+    procedure: Procedure,
 ) -> dict[str, Any]:
     """Return the part ``gravity_direction`` of ``validations/<unit>.json``, with the noise of the gyroscope.
 
@@ -211,12 +213,12 @@ def gravity_direction(
     if accelerometer is None or gyroscope is None:
         return {"reason": "both sensors have to be calibrated"}
     role = HELD_OUT if any(r.role == HELD_OUT for r in recordings) else ROLE
-    observed = observed_rests(recordings, accelerometer, settings, role)
+    observed = observed_rests(recordings, accelerometer, procedure, role)
     if observed is None:
         return {"reason": "no rest is held out"}
     rests, gravity = observed
     judged = replace(rests, held_out=~rests.held_out)
-    stated, whole = settings["procedure"].get("turns"), role if role == HELD_OUT else ""
+    stated, whole = procedure.turns, role if role == HELD_OUT else ""
     turns = turns_of(recordings, judged, accelerometer, stated, whole)[0] if stated else None
     model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1, turns=turns)
     if model.moves is None:

@@ -35,7 +35,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -48,9 +48,10 @@ from pipeline.validation.error_breakdown import last_step
 from pipeline.validation.samples import Samples, mean_squares, reference_vector
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.records import Noise, SensorCalibration, Values
+    from pipeline.settings import Settings, Table
 
 
 LACK_OF_FIT = "lack of fit"  # the part of a line of the budget that noise does not explain: 0 in a correct model
@@ -129,23 +130,22 @@ def expected_rms_error(
     calibration: SensorCalibration,
     held_out: Sequence[LinearizedSamples],
     noise: Noise,
-    settings: Mapping[str, Any],
+    settings: Settings,
     fitted_s: float = 0.0,
 ) -> tuple[float, float]:
     """Return the interval in which the rms error lies with 99 % probability, g or deg/s.
 
-    Without a covariance, the parameters of the calibration count as exact. ``settings``: sections ``table``
-    (``rate_accuracy``) and ``sensor`` (``bias_wander, wander_time_s, counts_per_unit``); ``fitted_s``: length of the
-    recordings of the fit, s.
+    Without a covariance, the parameters of the calibration count as exact. ``fitted_s``: length of the recordings of
+    the fit, s.
     """
-    sensor_file = (settings.get("sensor") or {}).get(calibration.sensor) or {}
-    step = 1.0 / float(sensor_file["counts_per_unit"]) if sensor_file.get("counts_per_unit") else 0.0
+    data_sheet = settings.sensor.of(calibration.sensor)
+    step = 1.0 / data_sheet.counts_per_unit
     wanders = [s.details["bias_wander"] for s in calibration.stages if "bias_wander" in s.details]
     residual_wander = np.array(wanders[-1]) if wanders else None  # of the residuals of the fit: (3,)
-    time = float(sensor_file.get("wander_time_s") or DEFAULT_TIME_S)
-    drift = _drift(residual_wander, noise, float(sensor_file.get("bias_wander") or 0.0), time)
+    time = data_sheet.wander_time_s
+    drift = _drift(residual_wander, noise, data_sheet.bias_wander, time)
     coarse = np.where(noise.white < DITHERED * step, step**2 / 12.0, 0.0)  # rounding that is not in the white noise
-    covariance, freedom = _of_parameters(calibration, settings.get("table") or {})
+    covariance, freedom = _of_parameters(calibration, settings.table)
     form = _form(calibration.matrix, held_out, covariance, noise, coarse=coarse, drift=drift, drift_time=time)
     if form.cumulants(np.ones((4, 1)))[0, 0] <= 0.0:
         return 0.0, 0.0
@@ -169,7 +169,7 @@ def _drift(residual_wander: Values | None, noise: Noise, size: float, time: floa
     return np.asarray(np.maximum(size**2 - slow, 0.0) + np.maximum(fitted - noise.wander**2, 0.0))
 
 
-def _of_parameters(calibration: SensorCalibration, table: Mapping[str, Any]) -> tuple[Values, Values]:
+def _of_parameters(calibration: SensorCalibration, table: Table) -> tuple[Values, Values]:
     """Return covariance and degrees of freedom of the parameters and of the scale of the table's rate.
 
     The covariance is without lack of fit. Errors that calibration and reference share are left out. Their size is
@@ -188,7 +188,7 @@ def _of_parameters(calibration: SensorCalibration, table: Mapping[str, Any]) -> 
         with np.errstate(invalid="ignore"):  # of a parameter without variance
             nu[:size] = np.where(share > 0.0, np.maximum(parameters.degrees_of_freedom * share**2, 1.0), np.inf)
     if calibration.sensor == "gyroscope" and not any(line.source == "table rate" for line in calibration.lines):
-        out[size, size] = float(table.get("rate_accuracy") or 0.0) ** 2
+        out[size, size] = table.rate_accuracy**2
     return out, nu
 
 

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
+from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import NAMES
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
@@ -52,7 +52,9 @@ from pipeline.records import (
     SensorValidation,
     StepErrors,
     TemperatureBin,
+    UnitRecordings,
 )
+from pipeline.settings import Uncertainty
 from pipeline.signal.rests import Rest
 from pipeline.validation.error_breakdown import (
     direction_known,
@@ -65,9 +67,10 @@ from pipeline.validation.expected_error import LinearizedSamples, expected_rms_e
 from pipeline.validation.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.settings import SensorLimits, Settings
 
 FALSE_REFUSALS = 1e-3  # probability that a calibration as good as the raw readings is refused
 STRETCHES = 20  # a stretch of a recording of minutes is longer than the correlation time of most wander
@@ -81,14 +84,11 @@ def validate(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
     noise: Noise,
-    settings: Mapping[str, Any],
+    settings: Settings,
     *,
     other: SensorCalibration | None = None,
 ) -> SensorValidation:
-    """Return the errors of a sensor on held-out motion; see ``HeldOutCase`` for the arguments.
-
-    Raises ``ConfigurationError`` if a limit's name is unknown.
-    """
+    """Return the errors of a sensor on held-out motion; see ``HeldOutCase`` for the arguments."""
     case, sensor = HeldOutCase(calibration, recordings, noise, settings, other), calibration.sensor
     samples, reason = case.held_out_samples(), None
     if not samples:
@@ -130,8 +130,7 @@ def validate(
                 f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
             )
         part = replace(part, notes=tuple(notes))
-    limits = (settings.get("limits") or {}).get(sensor) or {}
-    return replace(part, limits=_check_limits(calibration, part.steps[-1], limits))
+    return replace(part, limits=_check_limits(calibration, part.steps[-1], settings.limits.of(sensor)))
 
 
 EARTH_LEFT_OUT = (
@@ -260,10 +259,11 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
         values: dict[str, Any] = {"role": sensor, sensor: np.nan_to_num(reading)}
         calibrated.append(recording.with_readings(flags=np.where(known, flags, flags | STUCK), **values))
     at_rest = [r for r in case.recordings if r.role == "static"]
-    table = {**settings["table"], **dict.fromkeys(bench_priors().values())}
-    plain = {"table": table, "sensor": settings.get("sensor") or {}, "noise": {sensor: case.noise}}
+    table = settings.table.replaced(**dict.fromkeys(bench_priors().values()))
+    plain = settings.replaced(table=table, uncertainty=Uncertainty(monte_carlo=0))
+    held_out_and_static = UnitRecordings([*calibrated, *at_rest], {sensor: case.noise})
     try:
-        fit = reference_least_squares.fit(sensor, [*calibrated, *at_rest], None, plain)
+        fit = reference_least_squares.fit(sensor, held_out_and_static, None, plain)
     except (CannotCalibrateError, NotObservableError):
         return None
     slopes /= sum(part.number for part in parts)
@@ -295,12 +295,12 @@ def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> 
 def _why_not_held_out(case: HeldOutCase) -> str:
     """Return why no samples are held out."""
     reason = f"no held-out recording holds readings of the {case.calibration.sensor} and a reference for them"
-    stated = case.settings.get("procedure", {})
-    if case.by_hand and stated.get("turns"):
+    procedure = case.settings.procedure
+    if case.by_hand and procedure.turns is not None:
         return reason + " (with two turns about each axis between rests of 4 s or longer, the second is held out)"
-    count, fewest = count_of_rests(case.recordings), stated.get("holdout_from", 0)
+    count, fewest = count_of_rests(case.recordings), procedure.holdout_from
     if count < fewest and all(r.role != "validation" for r in case.recordings):
-        every = stated["holdout_every"]
+        every = procedure.holdout_every
         return reason + f" ({count} rests all go to the fit; of {fewest} and more, one of {every} is held out)"
     return reason
 
@@ -331,7 +331,7 @@ def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: floa
     limit = stdtrit(len(means) - 1, 1.0 - FALSE_REFUSALS) * float(means.std(ddof=1))
     if means.mean() * np.sqrt(len(means)) <= limit:
         return None
-    unit, on_table = unit_of(case.calibration.sensor), case.settings["table"].get("motion") != "none"
+    unit, on_table = unit_of(case.calibration.sensor), case.settings.table.motion != "none"
     return (
         f"the calibration makes held-out motion worse: {sizes[0]:.3g} {unit} rms before it, {sizes[1]:.3g} {unit} "
         f"after, where noise and stated uncertainties explain at most {allowed:.3g} {unit}. Check that fit and "
@@ -339,9 +339,7 @@ def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: floa
     )
 
 
-def _check_limits(
-    calibration: SensorCalibration, last: StepErrors, limits: Mapping[str, float | None]
-) -> tuple[LimitCheck, ...]:
+def _check_limits(calibration: SensorCalibration, last: StepErrors, limits: SensorLimits) -> tuple[LimitCheck, ...]:
     """Return each limit with its figure.
 
     A limit that is null is not checked; a figure that is not known does not pass.
@@ -355,11 +353,9 @@ def _check_limits(
         "scale_factor": float(np.max(np.abs(np.diag(calibration.matrix) - 1.0))),
     }
     checks = []
-    for name, limit in limits.items():
-        if name not in figures:
-            raise ConfigurationError(f"limits.{calibration.sensor}.{name} is unknown; known: {', '.join(figures)}")
+    for name, value in figures.items():
+        limit: float | None = getattr(limits, name)
         if limit is not None:
-            value = figures[name]
             passes = value is not None and bool(value <= limit)
-            checks.append(LimitCheck(name, float(limit), value, passes))
+            checks.append(LimitCheck(name, limit, value, passes))
     return tuple(checks)

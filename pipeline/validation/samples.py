@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Index, Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.settings import Settings, Table
     from pipeline.signal.rests import Rest
 
 OTHER = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
@@ -99,15 +100,15 @@ class Samples:
 class HeldOutCase:
     """A calibration, and the data from which its held-out error is computed.
 
-    ``recordings``: all of the unit, filtered as for the fit; ``settings``: sections ``table``, ``procedure``,
-    ``limits`` and, for the expected error, ``sensor``; ``other``: calibration of the unit's other sensor, for effects
-    that depend on its signal where no attitude is logged. Without it, the readings of the other sensor are used.
+    ``recordings``: all of the unit, filtered as for the fit; ``other``: calibration of the unit's other sensor, for
+    effects that depend on its signal where no attitude is logged. Without it, the readings of the other sensor are
+    used.
     """
 
     calibration: SensorCalibration
     recordings: Sequence[Recording]
     noise: Noise
-    settings: Mapping[str, Any]
+    settings: Settings
     other: SensorCalibration | None = None
 
     @property
@@ -123,7 +124,9 @@ class HeldOutCase:
         found = self._in_motion("validation", smoothed=smoothed)
         if found or not self.by_hand:
             return found
-        return self.at_rests(held_out_rests(self.recordings, self.settings)) or self._at_rests_of("validation")
+        return self.at_rests(held_out_rests(self.recordings, self.settings.procedure)) or self._at_rests_of(
+            "validation"
+        )
 
     def fit_samples(self) -> list[Samples]:
         """Return the samples that the fit used."""
@@ -139,7 +142,7 @@ class HeldOutCase:
         return self.at_rests({r.name: split_rests(r, 0).used for r in self.recordings if r.role == role})
 
     def _in_motion(self, role: str, *, smoothed: bool = False) -> list[Samples]:
-        sensor, table, chosen = self.calibration.sensor, self.settings["table"], self.recordings
+        sensor, table, chosen = self.calibration.sensor, self.settings.table, self.recordings
         if self.by_hand:  # without a log of the motion the specific force between the rests is unknown
             logs = ("table_attitude", "table_rate", "table_angle")
             chosen = [r for r in chosen if any(getattr(r, log) is not None for log in logs)]
@@ -174,7 +177,7 @@ class HeldOutCase:
             for v in (recording.time, recording.temperature)
         )
         assert time is not None  # noqa: S101
-        gravity = float(self.settings["table"].get("gravity_g") or 1.0)
+        gravity = self.settings.table.gravity_g
         return Samples(
             sensor,
             time,
@@ -194,7 +197,7 @@ def samples_of_motion(
     sensor: str,
     recording: Recording,
     noise: Noise,
-    table: Mapping[str, Any],
+    table: Table,
     *,
     other: SensorCalibration | None = None,
     smoothed: bool = False,
@@ -213,7 +216,7 @@ def samples_of_motion(
     if motion is not None:
         motion = filtered_motion(motion, recording) if smoothed else shifted(motion, -delay)
     white = np.broadcast_to((float(recording.filter.get("noise_gain", 1.0)) * noise.white) ** 2, (n, 3))
-    magnitude = np.full(n, float(table.get("gravity_g") or 1.0))
+    magnitude = np.full(n, table.gravity_g)
     if sensor == "gyroscope":
         by_angle = _rate_by_angle(recording)
         rate = _rate(recording, motion, earth, delay, by_angle)

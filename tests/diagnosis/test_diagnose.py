@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import yaml
 from bench_session import (
     CONTINUOUS,
     ONE_WAY,
@@ -24,6 +22,7 @@ from bench_session import (
     record,
     values_of,
 )
+from unit_settings import settings_of, with_noise
 
 from pipeline.diagnosis.observability import not_observable
 from pipeline.diagnosis.words import in_words
@@ -36,10 +35,14 @@ from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.kinematics import table_motion
 from pipeline.records import Noise, Recording, SensorCalibration
 from pipeline.signal.filters import apply_filter
+from pipeline.simulation.description import shipped_settings
 from tests.published import diagnose
 
-SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
-TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
+
+SHEET = shipped_settings(sensor="mpu6050").sensor
+TABLE = settings_of().table
 FIRST = [
     ("accelerometer", "bias_temperature"),
     ("accelerometer", "scale_factor_asymmetry"),
@@ -78,13 +81,13 @@ ENTRY = {
 }
 
 
-def settings(sensor: str, configured: Any = ()) -> dict[str, Any]:
+def settings(sensor: str, configured: Any = ()) -> Settings:
     names = configured if isinstance(configured, str) else list(configured)
-    return {"sensor": SHEET, "table": TABLE, "effects": {sensor: names}}
+    return settings_of(sensor=SHEET, effects={sensor: names})
 
 
 def diagnosed(sensor: str, recordings: list[Recording], configured: Any = ()) -> dict[str, Any]:
-    noise = estimate_noise(sensor, recordings, SHEET[sensor])
+    noise = estimate_noise(sensor, recordings, SHEET.of(sensor))
     return diagnose(SensorCalibration(sensor), recordings, noise, settings(sensor, configured))
 
 
@@ -159,10 +162,10 @@ def test_a_static_recording_may_face_another_way_and_no_more(offset: float, verd
         for r in record(Session(3, static=True, white=0.1, wander=0.1))
     ]
     method = {"method": {"gyroscope": "reference_least_squares"}}
-    sheet = SHEET["gyroscope"] | {"bias_wander": 3e-4, "counts_per_unit": 1e5}
+    sheet = SHEET.gyroscope.replaced(bias_wander=3e-4, counts_per_unit=1e5)
     noise = estimate_noise("gyroscope", recordings, sheet)
-    of_unit = settings("gyroscope") | method | {"sensor": SHEET | {"gyroscope": sheet}}
-    fitted = reference_least_squares.fit("gyroscope", recordings, None, of_unit)
+    of_unit = settings_of(settings("gyroscope"), sensor=SHEET.replaced(gyroscope=sheet), **method)
+    fitted = reference_least_squares.fit("gyroscope", with_noise(recordings, of_unit), None, of_unit)
     found = diagnose(fitted, recordings, noise, of_unit)
     assert found["verdict"] == verdict, found["reason"]
 
@@ -210,7 +213,7 @@ def test_a_delay_is_found_by_the_ramps_of_a_rounded_log_and_not_without_them() -
     noise = Noise(np.full(3, WHITE["gyroscope"]), np.full(3, WANDER["gyroscope"]), 100.0, "rests")
 
     def selected(recordings: list[Recording], *, search: bool = True) -> Selection:
-        return select(observe("gyroscope", recordings, TABLE), [], noise, SHEET["gyroscope"], search=search)
+        return select(observe("gyroscope", recordings, TABLE), [], noise, SHEET.gyroscope, search=search)
 
     found = selected(rounded)
     assert found.names == ["time_offset"]
@@ -249,7 +252,7 @@ def test_an_effect_outside_the_data_sheet_is_called_implausible() -> None:
 
 def test_earth_rotation_is_no_candidate_where_the_place_is_configured() -> None:
     recordings = hidden("gyroscope")
-    configured = settings("gyroscope") | {"table": TABLE | {"latitude_deg": 13.7, "azimuth_deg": 0.0}}
+    configured = settings_of(settings("gyroscope"), table={"latitude_deg": 13.7, "azimuth_deg": 0.0})
     part = diagnose(SensorCalibration("gyroscope"), recordings, None, configured)
     named = {e["effect"] for e in part["ranking"]} | {e["effect"] for e in part["not_observable"]}
     assert "earth_rotation" not in named
@@ -285,7 +288,7 @@ def test_a_table_far_off_its_log_is_unexplained_and_not_mended_with_whatever_fit
 
 def test_a_filter_of_the_thesis_leaves_nothing_to_explain_but_its_own_smoothing() -> None:
     verdicts = {"accelerometer": "left_by_method", "gyroscope": "nothing_missing"}  # of a rate, little is smoothed away
-    settings_of_filter = {"name": "rc_low_pass", "cutoff_hz": 1.0, "time_constant_s": None, "zero_phase": False}
+    settings_of_filter = settings_of(filter="rc_low_pass", **{"filter.cutoff_hz": 1.0}).filter
     for sensor in SIZE:
         filtered = [apply_filter(r, settings_of_filter) for r in record(Session(1, static=True))]
         part = diagnosed(sensor, filtered)
@@ -305,9 +308,11 @@ def test_recordings_without_a_table_cannot_be_diagnosed_and_say_so() -> None:
 
 def test_automatic_effects_are_fitted_and_the_diagnosis_tells_what_was_added() -> None:
     recordings = hidden("gyroscope", "g_sensitivity")
-    calibration = fit_effects("gyroscope", recordings, None, settings("gyroscope", "auto"))
+    calibration = fit_effects(
+        "gyroscope", with_noise(recordings, settings("gyroscope", "auto")), None, settings("gyroscope", "auto")
+    )
     assert [e.name for e in calibration.effects] == ["g_sensitivity"]
-    noise = estimate_noise("gyroscope", recordings, SHEET["gyroscope"])
+    noise = estimate_noise("gyroscope", recordings, SHEET.gyroscope)
     part = diagnose(calibration, recordings, noise, settings("gyroscope", "auto"))
     assert part["selected"] == ["g_sensitivity"]
 

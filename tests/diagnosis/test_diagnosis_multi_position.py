@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hand_session import WARM, Unit, hand_held
 from hand_simulator import Hand, draw
+from unit_settings import settings_of, with_noise
 
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.accelerometer import nonlinear_least_squares
@@ -148,11 +149,11 @@ def test_six_positions_are_not_enough_and_the_advice_says_what_is() -> None:
     assert part["ranking"] == []
     assert "6 rests are too few" in reasons(part)["quadratic_nonlinearity"]
     assert "record 40 rests" in part["next_experiment"]
-    noise = estimate_noise("accelerometer", unit.recordings, unit.settings["sensor"]["accelerometer"])
+    noise = estimate_noise("accelerometer", unit.recordings, unit.settings.sensor.accelerometer)
     judged = validate(unit.calibrated("accelerometer"), unit.recordings, noise, unit.settings)
     assert judged["reason"].endswith("through its 6 rests exactly, so that their error does not test it: record more")
     assert all(step["rms_error"] is None for step in judged["steps"])
-    unit.settings["procedure"]["faces"] = {"accuracy_deg": 1.0}
+    unit = replace(unit, settings=settings_of(unit.settings, procedure={"faces": {"accuracy_deg": 1.0}}))
     assert "in addition to those on the six faces" in unit.diagnosed("accelerometer")["next_experiment"]
 
 
@@ -191,8 +192,8 @@ def test_a_part_is_json_and_is_told_in_words() -> None:
 def test_a_drift_that_a_short_recording_hides_is_given_the_time_that_shows_it() -> None:
     """Drifts of half the limit: 4 of 16 are found in 8 minutes, 10 of 16 in 11, and 15 of 16 in 14."""
     drawn = draw(Hand(rests=20), 1)
-    noise = estimate_noise("accelerometer", [drawn.recording], drawn.settings["sensor"]["accelerometer"])
-    calibration = nonlinear_least_squares.fit([drawn.recording], None, drawn.settings)
+    noise = estimate_noise("accelerometer", [drawn.recording], drawn.settings.sensor.accelerometer)
+    calibration = nonlinear_least_squares.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
     found = diagnose(calibration, [drawn.recording], noise, drawn.settings)["not_observable"]
     (reason,) = [entry["reason"] for entry in found if entry["effect"] == "bias_drift"]
     (minutes,) = re.findall(r"within (\d+) min", reason)
@@ -202,8 +203,8 @@ def test_a_drift_that_a_short_recording_hides_is_given_the_time_that_shows_it() 
 @pytest.mark.parametrize(("sensor", "change"), [("gyroscope", 0.1), ("accelerometer", 0.01)])
 def test_a_static_recording_of_another_switching_on_is_in_doubt(sensor: str, change: float) -> None:
     unit = hand_held("mpu6050", 3)
-    settings = {**unit.settings, "method": {"gyroscope": "rests_and_moves", "accelerometer": "nonlinear_least_squares"}}
-    unit = replace(unit, settings=settings)
+    by_hand = {"gyroscope": "rests_and_moves", "accelerometer": "nonlinear_least_squares"}
+    unit = replace(unit, settings=settings_of(unit.settings, method=by_hand))
     moves, static = unit.recordings
     shifted = replace(static, **{sensor: static.reading(sensor) + change})
     other = replace(unit, recordings=[moves, shifted])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from unit_settings import settings_of
 
 from pipeline.diagnosis.effective_noise import effective_noise
 from pipeline.records import Noise, Recording, SensorCalibration, SensorDiagnosis
@@ -14,7 +15,7 @@ from pipeline.verdicts import Verdict
 from tests.published import candidate
 
 DT, N = 0.01, 60_000
-TABLE: dict[str, Any] = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+TABLE = settings_of().table
 WHITE = Noise(np.full(3, 0.05), np.zeros(3), 100.0, "static")
 NOTHING = SensorDiagnosis(Verdict.NOTHING_MISSING, [])
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Course, Session, record, values_of
+from unit_settings import settings_of
 
 from pipeline.diagnosis import turntable
 from pipeline.diagnosis.formula_discovery import (
@@ -35,10 +35,11 @@ from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.filters import smooth_temperature
+from pipeline.simulation.description import shipped_settings
 from tests.published import diagnose
 
-SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
-TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+SHEET = shipped_settings(sensor="mpu6050").sensor
+TABLE = settings_of().table
 SHORT = replace(STOP_AND_GO, validation_s=0.0)
 SLOW = replace(
     CONTINUOUS,
@@ -79,16 +80,14 @@ def warm(recording: Recording) -> np.ndarray:
 def diagnosed(
     sensor: str, recordings: list[Recording], configured: tuple[str, ...] = (), depth: str = "standard"
 ) -> dict[str, Any]:
-    noise = estimate_noise(sensor, recordings, SHEET[sensor])
-    settings = {
-        "sensor": SHEET, "table": TABLE, "effects": {sensor: list(configured)}, "diagnosis": {"depth": depth}
-    }  # fmt: skip
+    noise = estimate_noise(sensor, recordings, SHEET.of(sensor))
+    settings = settings_of(sensor=SHEET, effects={sensor: list(configured)}, diagnosis={"depth": depth})
     return diagnose(SensorCalibration(sensor), recordings, noise, settings)
 
 
 def selection_of(sensor: str, recordings: list[Recording]) -> Selection:
-    noise = estimate_noise(sensor, recordings, SHEET[sensor])
-    return select(observe(sensor, recordings, TABLE), [], noise, SHEET[sensor])
+    noise = estimate_noise(sensor, recordings, SHEET.of(sensor))
+    return select(observe(sensor, recordings, TABLE), [], noise, SHEET.of(sensor))
 
 
 def require_mended(sensor: str, recordings: list[Recording], part: dict[str, Any]) -> None:
@@ -121,7 +120,7 @@ def test_only_effects_that_the_recordings_determine_together_are_selected() -> N
         extra = [0.0, 0.0, 0.0, size / end**3]
         recordings = with_extra("gyroscope", lambda r, c=extra: np.polynomial.Polynomial(c)(r.time)[:, None], seed)
         selection = selection_of("gyroscope", recordings)
-        settings = {"sensor": SHEET, "table": TABLE}
+        settings = settings_of(sensor=SHEET)
         fit_joint("gyroscope", recordings, selection.names, selection.noise, settings)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hand_simulator import Hand, draw
 from scipy.spatial.transform import Rotation
+from unit_settings import settings_of, with_noise
 
 from pipeline.diagnosis.findings import Case
 from pipeline.diagnosis.method_errors import given_differences
@@ -22,7 +23,7 @@ GIVEN = Evidence("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE
 FREE = SensorCalibration(
     "gyroscope", np.array([1.0, -2.0, 0.5]), np.diag([1.01, 0.99, 1.02]), covariance=np.eye(12) * 1e-8
 )
-SHEET = {"sensor": {"gyroscope": {"bias_wander": 0.01}}}
+SETTINGS = settings_of(sensor={"gyroscope": {"bias_wander": 0.01}})
 SHIFT = np.array([0.0, 0.3, 0.0])
 RATE = np.tile([[30.0, 0.0, 0.0]], (50, 1))
 MOVES = [Recording("recording", "rests", None, np.arange(50) * 10**7, None, RATE)]
@@ -36,33 +37,34 @@ def given(**changes: np.ndarray) -> SensorCalibration:
 
 
 def test_a_shift_of_the_bias_is_named_with_its_size() -> None:
-    (found,) = given_differences(given(bias=FREE.bias + SHIFT), lambda: FREE, MOVES, SHEET)
+    (found,) = given_differences(given(bias=FREE.bias + SHIFT), lambda: FREE, MOVES, SETTINGS)
     assert (found["name"], found["unit"], found["share"]) == ("bias", "deg/s", 1.0)
     assert found["size"] == pytest.approx(0.3 * 0.99)
 
 
 def test_a_scale_factor_is_named_and_a_rotation_of_the_mounting_is_not() -> None:
-    (found,) = given_differences(given(matrix=FREE.matrix @ np.diag([1.02, 1.0, 1.0])), lambda: FREE, MOVES, SHEET)
+    (found,) = given_differences(given(matrix=FREE.matrix @ np.diag([1.02, 1.0, 1.0])), lambda: FREE, MOVES, SETTINGS)
     assert found["name"] == "scale_factor"
     assert found["size"] == pytest.approx(0.02)
     assert found["rms"] == pytest.approx(30.0 * 0.02 / np.sqrt(3.0))
     angle = np.radians(2.0)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    named = [e["name"] for e in given_differences(given(matrix=turn @ FREE.matrix), lambda: FREE, MOVES, SHEET)]
+    named = [e["name"] for e in given_differences(given(matrix=turn @ FREE.matrix), lambda: FREE, MOVES, SETTINGS)]
     assert "rotation" not in named
     assert "non_orthogonality" not in named
 
 
 def test_what_the_uncertainties_of_both_explain_is_not_named() -> None:
     near = given(bias=FREE.bias + 0.04)  # four times the wander of the sensor file, as the file states no uncertainty
-    assert given_differences(near, lambda: FREE, MOVES, SHEET) == []
+    assert given_differences(near, lambda: FREE, MOVES, SETTINGS) == []
     wide = replace(given(bias=FREE.bias + SHIFT), covariance=np.eye(12) * 0.1**2)
-    assert given_differences(wide, lambda: FREE, MOVES, SHEET) == []
+    assert given_differences(wide, lambda: FREE, MOVES, SETTINGS) == []
 
 
 def test_a_method_that_fits_is_not_compared() -> None:
     assert (
-        given_differences(replace(FREE, stages=(StageResult("rests_and_moves", {}),)), lambda: FREE, MOVES, SHEET) == []
+        given_differences(replace(FREE, stages=(StageResult("rests_and_moves", {}),)), lambda: FREE, MOVES, SETTINGS)
+        == []
     )
 
 
@@ -80,23 +82,23 @@ def test_the_given_calibration_is_blamed_where_a_fit_of_the_recordings_leaves_no
 def test_a_gyroscope_by_hand_refers_to_the_given_accelerometer() -> None:
     """Seven rests do not determine the accelerometer; a given one does, here in a frame 3 deg off that of the rests."""
     hand = draw(Hand(rests=7, rest_s=2.0, rate_hz=50.0), 2)
-    settings = {**hand.settings, "procedure": {"holdout_every": 0}}
+    settings = settings_of(hand.settings, procedure={"holdout_every": 0})
     with pytest.raises(CannotCalibrateError, match="the 7 orientations are nearly degenerate"):
-        fit_stage("gyroscope", "rests_and_moves", [hand.recording], None, settings)
+        fit_stage("gyroscope", "rests_and_moves", with_noise([hand.recording], settings), None, settings)
     frame = Rotation.from_rotvec([2.0, -2.0, 1.0], degrees=True).as_matrix()
     known = SensorCalibration(
         "accelerometer", hand.bias["accelerometer"], frame @ hand.matrix["accelerometer"], covariance=np.eye(12) * 1e-12
     )
     part = known.to_json() | {"stages": [], "uncertain": True, "of_the_bench": []}
     file = {"source": "known.json", "sha256": "0" * 64, "notes": [], "accelerometer": part}
-    settings["method"] = {"as_printed": False, "given": file}
-    found = fit_stage("gyroscope", "rests_and_moves", [hand.recording], None, settings)
+    settings = settings_of(settings, method={"given": file})
+    found = fit_stage("gyroscope", "rests_and_moves", with_noise([hand.recording], settings), None, settings)
     expanded = np.array(found.to_json()["expanded_uncertainty"]["matrix"])
     assert np.all(np.abs(found.matrix - frame @ hand.matrix["gyroscope"]) < 2.0 * expanded)
     assert np.abs(found.matrix - hand.matrix["gyroscope"]).max() > 5.0 * expanded.max()
-    file["accelerometer"] = None
+    settings = settings_of(settings, method={"given": file | {"accelerometer": None}})
     with pytest.raises(CannotCalibrateError, match=r"known\.json holds nothing of the accelerometer"):
-        fit_stage("gyroscope", "rests_and_moves", [hand.recording], None, settings)
+        fit_stage("gyroscope", "rests_and_moves", with_noise([hand.recording], settings), None, settings)
 
 
 def test_the_diagnosis_of_a_gyroscope_by_hand_keeps_the_given_accelerometer() -> None:
@@ -104,7 +106,7 @@ def test_the_diagnosis_of_a_gyroscope_by_hand_keeps_the_given_accelerometer() ->
     frame = Rotation.from_rotvec([2.0, -2.0, 1.0], degrees=True).as_matrix()
     known = SensorCalibration("accelerometer", hand.bias["accelerometer"], frame @ hand.matrix["accelerometer"])
     gyroscope = SensorCalibration("gyroscope", hand.bias["gyroscope"], frame @ hand.matrix["gyroscope"])
-    settings = {**hand.settings, "method": {"given": {"accelerometer": known.to_json()}}}
+    settings = settings_of(hand.settings, method={"given": {"accelerometer": known.to_json()}})
     model = _model_of_all_rests(Case(gyroscope, [hand.recording], None, settings, known, []))
     spans = np.split(np.arange(len(hand.still)), np.flatnonzero(np.diff(hand.still.astype(int))) + 1)
     assert hand.recording.accelerometer is not None

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from bench_session import STOP_AND_GO, Session, record
+from unit_settings import settings_of
 
 from pipeline.diagnosis.influence import influence
 from pipeline.diagnosis.residual_dependence import goodness_of_fit
@@ -16,16 +15,17 @@ from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
+from pipeline.simulation.description import shipped_settings
 
-SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
-TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+SHEET = shipped_settings(sensor="mpu6050").sensor
+TABLE = settings_of().table
 SHORT = replace(STOP_AND_GO, validation_s=0.0)
 
 
 def selected(sensor: str, effects: dict[str, list[float]]) -> Selection:
     recordings = record(Session(3, SHORT, effects={sensor: {n: np.array(v) for n, v in effects.items()}}))
-    noise = estimate_noise(sensor, recordings, SHEET[sensor])
-    return select(observe(sensor, recordings, TABLE), [], noise, SHEET[sensor])
+    noise = estimate_noise(sensor, recordings, SHEET.of(sensor))
+    return select(observe(sensor, recordings, TABLE), [], noise, SHEET.of(sensor))
 
 
 def test_an_asymmetry_on_one_axis_is_driven_by_the_turns_about_it_and_gone_without_them() -> None:
@@ -66,8 +66,8 @@ def test_the_share_of_worse_simulations_is_even_for_a_complete_model_and_none_fo
     shares = []
     for seed in range(5):
         recordings = record(Session(40 + seed, SHORT))
-        noise = estimate_noise("gyroscope", recordings, SHEET["gyroscope"])
-        complete = select(observe("gyroscope", recordings, TABLE), [], noise, SHEET["gyroscope"])
+        noise = estimate_noise("gyroscope", recordings, SHEET.gyroscope)
+        complete = select(observe("gyroscope", recordings, TABLE), [], noise, SHEET.gyroscope)
         shares.append(goodness_of_fit(complete)["share_worse"])
     assert min(shares) > 0.005  # five even shares: p = 0.025
     assert 0.1 < float(np.mean(shares)) < 0.9  # mean of five even shares, +- 3.1 standard errors
@@ -75,5 +75,5 @@ def test_the_share_of_worse_simulations_is_even_for_a_complete_model_and_none_fo
     for r in recordings:
         angle = np.zeros(r.samples) if r.table_angle is None else r.table_angle
         bent.append(replace(r, gyroscope=r.reading("gyroscope") + 0.02 * np.cos(np.radians(5.0 * angle))[:, None]))
-    missing = select(observe("gyroscope", bent, TABLE), [], noise, SHEET["gyroscope"])
+    missing = select(observe("gyroscope", bent, TABLE), [], noise, SHEET.gyroscope)
     assert goodness_of_fit(missing) == {"share_worse": 0.0, "simulations": 199}

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import yaml
 from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, Course, K, Session, record, values_of
+from unit_settings import settings_of, with_noise
 
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import fit_stage
 from pipeline.signal.filters import apply_filter
+from pipeline.simulation.description import shipped_settings
 from pipeline.validation.heldout import validate
 from tests.published import diagnose
 
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-SHEET = yaml.safe_load((CONFIGS / "sensor/mpu6050.yaml").read_text(encoding="utf-8"))
-TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+SHEET = shipped_settings(sensor="mpu6050").sensor
+TABLE = settings_of().table
 RC = {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": 0.24, "zero_phase": False}
 MAGNITUDE = "held_out_magnitude_share"
 
@@ -38,14 +39,12 @@ def diagnosed(
     method: str, sensor: str, recordings: list[Recording], *, as_printed: bool = False
 ) -> tuple[SensorCalibration, dict[str, Any]]:
     """The calibration by a method, and the diagnosis of it."""
-    config = yaml.safe_load((CONFIGS / f"method/{method}.yaml").read_text(encoding="utf-8"))
-    settings = {"sensor": SHEET, "table": TABLE, "effects": {sensor: []}, "procedure": {"holdout_every": 0}}
-    settings["method"] = config | {"as_printed": as_printed}
+    settings = settings_of(sensor=SHEET, method=method, **{"method.as_printed": as_printed})
     calibration = None
-    for stage in config["stages"][sensor]:
-        calibration = fit_stage(sensor, stage, recordings, calibration, settings)
+    for stage in settings.method.stages.of(sensor):
+        calibration = fit_stage(sensor, stage, with_noise(recordings, settings), calibration, settings)
     assert calibration is not None
-    noise = estimate_noise(sensor, recordings, SHEET[sensor])
+    noise = estimate_noise(sensor, recordings, SHEET.of(sensor))
     validation = validate(calibration, recordings, noise, settings)
     return calibration, diagnose(calibration, recordings, noise, settings, validation=validation)
 
@@ -126,8 +125,8 @@ def test_a_bias_that_a_method_gets_wrong_is_told_with_its_size() -> None:
     recordings = recordings_of()
     calibration, _ = diagnosed("staged", "gyroscope", recordings)
     wrong = replace(calibration, bias=BIAS["gyroscope"] + np.array([0.0, 0.3, 0.0]))
-    settings = {"sensor": SHEET, "table": TABLE, "effects": {"gyroscope": []}}
-    part = diagnose(wrong, recordings, estimate_noise("gyroscope", recordings, SHEET["gyroscope"]), settings)
+    settings = settings_of(sensor=SHEET)
+    part = diagnose(wrong, recordings, estimate_noise("gyroscope", recordings, SHEET.gyroscope), settings)
     assert [error["name"] for error in part["method_errors"]] == ["bias"]
     assert part["method_errors"][0]["size"] == pytest.approx(0.3, rel=0.05)
     assert part["method_errors"][0]["unit"] == "deg/s"

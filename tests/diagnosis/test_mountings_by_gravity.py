@@ -11,6 +11,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "study"))
 from bench_units import drawn, judged
+from unit_settings import with_noise
 
 from pipeline.diagnosis.diagnose import _doubts_of_gravity
 from pipeline.diagnosis.findings import Case
@@ -46,7 +47,7 @@ def test_a_tilt_that_shifts_no_mounting_is_no_doubt_about_the_gyroscope(tilt_deg
     recordings = [replace(r, table_attitude=None) for r in recordings]
     settings = unit_row([f"sensor={description.sensor}", f"table={description.table}"]).config
     recordings = check_recordings(recordings, settings)
-    by_gravity = mountings_by_gravity(recordings, settings)
+    by_gravity = mountings_by_gravity(with_noise(recordings, settings), settings)
     case = Case(SensorCalibration("gyroscope"), recordings, None, settings, by_gravity, ["mounting"])
     found = _doubts_of_gravity(SensorDiagnosis(Verdict.MISSING_EFFECT, [], selected=["table_tilt"]), case)
     assert bool(found) is doubted

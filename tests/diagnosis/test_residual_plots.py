@@ -5,22 +5,22 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from bench_session import STOP_AND_GO, Session, record, values_of
+from unit_settings import settings_of
 
 from pipeline.diagnosis.residual_plots import Bins
 from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording, SensorCalibration
+from pipeline.simulation.description import shipped_settings
 from tests.published import diagnose
 
-SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
-TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+SHEET = shipped_settings(sensor="mpu6050").sensor
+TABLE = settings_of().table
 HIDDEN = [
     ("gyroscope", "g_sensitivity"),
     ("accelerometer", "quadratic_nonlinearity"),
@@ -31,8 +31,8 @@ GEAR = {0: 0.004, 2: 0.003}  # amplitude of five cycles a turn on x and z, g
 
 
 def diagnosed(sensor: str, recordings: list[Recording]) -> dict[str, Any]:
-    noise = estimate_noise(sensor, recordings, SHEET[sensor])
-    settings = {"sensor": SHEET, "table": TABLE, "effects": {sensor: []}}
+    noise = estimate_noise(sensor, recordings, SHEET.of(sensor))
+    settings = settings_of(sensor=SHEET)
     return diagnose(SensorCalibration(sensor), recordings, noise, settings)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hand_simulator import Hand, draw
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
@@ -27,9 +28,13 @@ HIDDEN: list[tuple[str, str, dict[str, Any]]] = [
 @pytest.mark.parametrize(("sensor", "name", "effects"), HIDDEN)
 def test_twenty_rests_name_what_is_hidden_and_nothing_else(sensor: str, name: str, effects: dict[str, Any]) -> None:
     drawn = draw(Hand(effects=effects, **REAL), 5)
-    recordings, sheet = [drawn.recording], drawn.settings["sensor"][sensor]
-    felt = nonlinear_least_squares.fit(recordings, None, drawn.settings)
-    found = felt if sensor == "accelerometer" else rests_and_moves.fit(recordings, None, drawn.settings)
+    recordings, sheet = [drawn.recording], drawn.settings.sensor.of(sensor)
+    felt = nonlinear_least_squares.fit(with_noise(recordings, drawn.settings), None, drawn.settings)
+    found = (
+        felt
+        if sensor == "accelerometer"
+        else rests_and_moves.fit(with_noise(recordings, drawn.settings), None, drawn.settings)
+    )
     part = diagnose(found, recordings, estimate_noise(sensor, recordings, sheet), drawn.settings, felt)
     assert part["selected"] == ([name] if name else [])
     assert part["verdict"] == ("missing_effect" if name else "nothing_missing")
@@ -40,7 +45,7 @@ def test_twenty_rests_name_what_is_hidden_and_nothing_else(sensor: str, name: st
         best = part["ranking"][0]
         assert best["held_out_error_after"] < 0.7 * best["held_out_error_before"]
         assert (best["effect"], best["plausible"], part["override"]) == (name, True, f"effects.{sensor}=[{name}]")
-        configured = drawn.settings | {"effects": {"accelerometer": [], sensor: [name]}}
+        configured = settings_of(drawn.settings, effects={sensor: [name]})
         mended = diagnose(found, recordings, estimate_noise(sensor, recordings, sheet), configured, felt)
         assert mended["selected"] == []
         assert mended["residual_over_noise"] < 1.5 < part["residual_over_noise"]
@@ -52,8 +57,8 @@ def test_twenty_rests_name_what_is_hidden_and_nothing_else(sensor: str, name: st
 def test_advice_names_what_too_few_rests_cannot_tell_where_they_scatter() -> None:
     drawn = draw(Hand(effects={"quadratic": [0.003, -0.004, 0.003]}, **REAL), 11)
     recordings = [drawn.recording]
-    found = nonlinear_least_squares.fit(recordings, None, drawn.settings)
-    noise = estimate_noise("accelerometer", recordings, drawn.settings["sensor"]["accelerometer"])
+    found = nonlinear_least_squares.fit(with_noise(recordings, drawn.settings), None, drawn.settings)
+    noise = estimate_noise("accelerometer", recordings, drawn.settings.sensor.accelerometer)
     part = diagnose(found, recordings, noise, drawn.settings)
     assert part["selected"] == []
     assert part["residual_over_noise"] > 2.0

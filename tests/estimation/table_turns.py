@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import lfilter
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.stages import fit_stage
 from pipeline.records import Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
+    from pipeline.settings import Settings
 
 INTERVAL = 0.12
 SHEETS = {
@@ -20,12 +23,8 @@ SHEETS = {
 }
 
 
-def settings(*, as_printed: bool = False, **table: float) -> dict[str, Any]:
-    return {
-        "table": {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None} | table,
-        "method": {"as_printed": as_printed},
-        "sensor": SHEETS,
-    }
+def settings(*, as_printed: bool = False, **table: float) -> Settings:
+    return settings_of(table=table, method={"as_printed": as_printed}, sensor=SHEETS)
 
 
 def specific_force(axis: str, angle_deg: np.ndarray, gravity: float = 1.0) -> np.ndarray:
@@ -119,9 +118,9 @@ class Bench:
         return out
 
 
-def run_stages(sensor: str, names: list[str], recordings: list[Recording], config: dict[str, Any]) -> SensorCalibration:
+def run_stages(sensor: str, names: list[str], recordings: list[Recording], config: Settings) -> SensorCalibration:
     """Run the stages of a method, one after the other."""
     calibration = None
     for name in names:
-        calibration = fit_stage(sensor, name, recordings, calibration, config)
+        calibration = fit_stage(sensor, name, with_noise(recordings, config), calibration, config)
     return calibration

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from board_simulator import Chip, by_hand, draw_chip, felt, hand_board, table_board
 from scipy.spatial.transform import Rotation
+from unit_settings import settings_of
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.chips import chip_document
@@ -33,7 +34,7 @@ def ideal(axes: np.ndarray, place: np.ndarray, path, name: str = "recording", un
     noise = {"accelerometer": 5e-4, "gyroscope": 0.01}
     readings = {s: v @ axes.T + noise[s] * rng.standard_normal(v.shape) for s, v in felt(path, place).items()}
     recording = Recording(name, "rests", None, np.round(path.time * 1e9).astype(np.int64), **readings)
-    return Chip(unit, [recording], {s: SensorCalibration(s) for s in noise}, {"accelerometer": {}, "gyroscope": {}})
+    return Chip(unit, [recording], {s: SensorCalibration(s) for s in noise}, settings_of().sensor)
 
 
 def within(found: dict, kind: str, truth: np.ndarray, times: float = 1.5) -> bool:

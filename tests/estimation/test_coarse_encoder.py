@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
+from unit_settings import settings_of
 
 from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.selection import select
@@ -9,10 +10,8 @@ from pipeline.records import Noise, Recording
 
 WHITE = 0.03  # deg/s
 NOISE = Noise(np.full(3, WHITE), np.full(3, 1e-3), 100.0, "static")
-SHEET = {
-    "full_scale": 500.0, "bias": 20.0, "scale_factor": 0.03, "cross_axis": 0.02,
-    "effects": {"scale_factor_asymmetry": 1e-3, "g_sensitivity": 0.1, "table_encoder_error": 0.02, "time_offset": 0.01},
-}  # fmt: skip
+LIMITS = {"scale_factor_asymmetry": 1e-3, "g_sensitivity": 0.1, "table_encoder_error": 0.02, "time_offset": 0.01}
+SHEET = {"full_scale": 500.0, "bias": 20.0, "scale_factor": 0.03, "cross_axis": 0.02, "effects": LIMITS}
 
 
 def turns(axis: str, first: int, rng: np.random.Generator) -> Recording:
@@ -43,7 +42,7 @@ def recordings() -> list[Recording]:
 
 
 def test_rows_of_a_turn_weigh_less_by_the_noise_of_the_rate() -> None:
-    observations = observe("gyroscope", recordings(), {"gravity_g": 1.0})
+    observations = observe("gyroscope", recordings(), settings_of().table)
     for plain, part in zip(observations.parts, weighted(observations, NOISE).parts, strict=True):
         assert part.rounding is not None
         resting = part.rounding == 0.0
@@ -57,8 +56,8 @@ def test_rows_of_a_turn_weigh_less_by_the_noise_of_the_rate() -> None:
 
 
 def test_rounding_and_ripple_are_no_effect_of_the_sensor() -> None:
-    observations = observe("gyroscope", recordings(), {"gravity_g": 1.0})
-    selection = select(observations, (), NOISE, SHEET)
+    observations = observe("gyroscope", recordings(), settings_of().table)
+    selection = select(observations, (), NOISE, settings_of(sensor={"gyroscope": SHEET}).sensor.gyroscope)
     assert selection.names == []
     expected = WHITE * np.sqrt(selection.observations.less_stop_errors.expected_square)
     assert 0.95 * expected < selection.fit.residual_rms < 1.15 * expected

@@ -28,7 +28,7 @@ SETTINGS = [Setting(0.1, 60.0), Setting(1.0, 20.0)]
 
 
 def observed(angle_deg: float) -> Observations:
-    table = unit_row(["sensor=mpu6050", f"table.angle_accuracy_deg={angle_deg}"]).config["table"]
+    table = unit_row(["sensor=mpu6050", f"table.angle_accuracy_deg={angle_deg}"]).config.table
     turns = [r for r in recordings_of({}) if r.role == "accelerometer"]
     return weighted(observe("accelerometer", turns, table), Noise(SCALE, 0.1 * SCALE, 60.0, "rests"))
 

@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import yaml
 from bench_session import CONTINUOUS, STOP_AND_GO, WHITE, Session, record
+from unit_settings import settings_of
 
 from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
 from pipeline.signal.filters import apply_filter
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from pipeline.records import Recording
 
-CONFIGS = Path(__file__).parents[2] / "configs"
-SHEET = yaml.safe_load((CONFIGS / "sensor/mpu6050.yaml").read_text(encoding="utf-8"))
-TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+SHEET = shipped_settings(sensor="mpu6050").sensor
+TABLE = settings_of().table
 
 
 def filtered(recordings: list[Recording], name: str = "rc_low_pass") -> list[Recording]:
-    settings = yaml.safe_load((CONFIGS / f"filter/{name}.yaml").read_text(encoding="utf-8"))
-    return [apply_filter(r, settings) for r in recordings]
+    return [apply_filter(r, shipped_settings(filter=name).filter) for r in recordings]
 
 
 def without_rates(recordings: list[Recording]) -> list[Recording]:
@@ -72,7 +70,7 @@ def test_no_effect_of_timing_is_invented_in_twenty_filtered_units_without_one() 
         course = (STOP_AND_GO, CONTINUOUS)[seed % 2]
         session = Session(700 + seed, replace(course, validation_s=0.0), static=seed % 4 < 2)
         recordings = filtered(without_rates(record(session)))
-        noise = estimate_noise("gyroscope", recordings, SHEET["gyroscope"])
-        found = select(observe("gyroscope", recordings, TABLE), [], noise, SHEET["gyroscope"])
+        noise = estimate_noise("gyroscope", recordings, SHEET.gyroscope)
+        found = select(observe("gyroscope", recordings, TABLE), [], noise, SHEET.gyroscope)
         assert found.names == [], seed
         assert dependences(found) == [], seed

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from bench_session import BIAS, CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, K, Session, record, values_of
 from scipy.special import stdtrit
+from unit_settings import settings_of, with_noise
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import Term, ordinary_base
@@ -22,10 +23,11 @@ from pipeline.estimation.selection import select
 from pipeline.model.effects import effect
 from pipeline.records import SensorCalibration
 from pipeline.signal.filters import apply_filter
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 
-TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
-SETTINGS: dict[str, Any] = {"table": TABLE}
+SETTINGS = settings_of()
+TABLE = SETTINGS.table
+SHEETS = shipped_settings(sensor="mpu6050").sensor
 # A leaning turn axis adds to a rate what the matrix does: that is a test of its own.
 CASES = [(s, name) for s in SIZE for name in SIZE[s] if (s, name) != ("gyroscope", "table_axis_nonorthogonality")]
 
@@ -73,7 +75,7 @@ def test_the_uncertainty_of_a_matrix_far_from_one_is_that_of_drawn_inverses() ->
         if r.role == "gyroscope" and r.gyroscope is not None
     ]
     recordings[2] = recordings[2].select(slice(recordings[2].samples // 2))
-    settings = SETTINGS | {"uncertainty": {"monte_carlo": 4000}}
+    settings = settings_of(SETTINGS, uncertainty={"monte_carlo": 4000})
     budget = fit_joint("gyroscope", recordings, [], None, settings).to_json()["uncertainty_budget"]
     stated, drawn = (np.array(b["standard_uncertainty"])[3:] for b in (budget, budget["monte_carlo"]))
     assert np.abs(np.log(stated / drawn)).max() < 0.08  # a standard deviation of 4000 is known to 1 %
@@ -82,13 +84,12 @@ def test_the_uncertainty_of_a_matrix_far_from_one_is_that_of_drawn_inverses() ->
 
 def test_the_stage_passes_on_what_was_there_where_no_effect_is_asked_for() -> None:
     before = SensorCalibration("accelerometer", bias=np.ones(3))
-    assert fit_effects("accelerometer", [], before, {"effects": {"accelerometer": []}}) is before
+    assert fit_effects("accelerometer", with_noise([], SETTINGS), before, SETTINGS) is before
 
 
 def test_a_known_filter_acts_on_the_reference_too() -> None:
-    settings = {"name": "low_pass", "cutoff_hz": 1.5, "order": 2, "zero_phase": False, "time_constant_s": None}
-    settings |= {"low_hz": None, "high_hz": None}
-    filtered = [apply_filter(r, settings) for r in record(Session(4, CONTINUOUS))]
+    low_pass = settings_of(filter="low_pass", **{"filter.cutoff_hz": 1.5, "filter.order": 2}).filter
+    filtered = [apply_filter(r, low_pass) for r in record(Session(4, CONTINUOUS))]
     delay = filtered[0].filter["delay_s"]
     assert delay > 0.1
     calibration = fit_joint("accelerometer", filtered, ["time_offset"], None, SETTINGS)
@@ -123,7 +124,7 @@ def test_what_the_recordings_do_not_determine_is_refused_by_name(
 def test_an_effect_that_contains_a_configured_one_is_not_added_to_it() -> None:
     """The two are never fitted together; a parabola of the bias leaves much to find beside a configured line."""
     hidden = {"accelerometer": {"bias_temperature_quadratic": np.full(6, 1e-5)}}
-    recordings, sheet = record(Session(3, effects=hidden, ramp=20.0)), read_config("sensor", "mpu6050")["accelerometer"]
+    recordings, sheet = record(Session(3, effects=hidden, ramp=20.0)), SHEETS.accelerometer
     noise = estimate_noise("accelerometer", recordings, sheet)
     found = select(observe("accelerometer", recordings, TABLE), ["bias_temperature"], noise, sheet)
     score = found.alone["bias_temperature_quadratic"]
@@ -134,7 +135,7 @@ def test_an_effect_that_contains_a_configured_one_is_not_added_to_it() -> None:
 
 def test_a_fit_may_take_a_selected_effect_to_where_the_motion_does_not_excite_it() -> None:
     """As the time constant of a warm-up, in a unit whose thermometer lagged."""
-    recordings, sheet = record(Session(1)), read_config("sensor", "mpu6050")["gyroscope"]
+    recordings, sheet = record(Session(1)), SHEETS.gyroscope
     noise = estimate_noise("gyroscope", recordings, sheet)
     observations = observe("gyroscope", recordings, TABLE)
     start, warm_up = ordinary_base(observations, noise), effect("warm_up")
@@ -198,8 +199,7 @@ def test_a_lag_leaves_nothing_of_a_ramp_that_the_log_does_not_follow() -> None:
     """A 5 deg step has three ramps in a second; what a lag of 24 ms keeps of one that is lost would be 12 mdeg/s."""
     tau = np.array([0.024])
     quiet = Session(5, effects={"gyroscope": {"low_pass_lag": tau}}, white=0.0, wander=0.0)
-    table = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
-    observations = observe("gyroscope", record(quiet), table)
+    observations = observe("gyroscope", record(quiet), TABLE)
     felt = [effect("low_pass_lag").moved(part.motion, tau).angular_rate for part in observations.parts]
     rest = observations.reading - (BIAS["gyroscope"] + np.concatenate(felt) @ K["gyroscope"].T)
     assert np.abs(rest).max() < 3e-4
@@ -209,8 +209,7 @@ def test_a_lever_arm_leaves_nothing_at_the_corners_of_a_ramp() -> None:
     """At a sample at which a ramp ends the acceleration is that before or that after, and 0.05 m make it 4 mg."""
     arm = np.array([0.05, 0.03, -0.04])
     quiet = Session(5, effects={"accelerometer": {"lever_arm": arm}}, white=0.0, wander=0.0)
-    table = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
-    observations = observe("accelerometer", record(quiet), table)
+    observations = observe("accelerometer", record(quiet), TABLE)
     matrix, row = K["accelerometer"], 0
     for part in observations.parts:
         added = effect("lever_arm").reading("accelerometer", part.motion, matrix, arm)

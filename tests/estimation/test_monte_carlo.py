@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer import nonlinear_least_squares
@@ -17,8 +18,11 @@ from pipeline.estimation.monte_carlo import quadratic_results, through, with_tri
 from pipeline.records import LIMIT, Budget, SensorCalibration
 from pipeline.report.pages import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription
 from tests.hand_session import hand_held
+
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
 
 PARAMETERS = 12
 
@@ -84,19 +88,19 @@ def test_second_order_steps_are_those_of_exact_refits() -> None:
     assert np.abs(steps(e) - exact).max() < 0.15 * np.abs(linear - exact).max()
 
 
-def asked(settings: dict[str, Any]) -> dict[str, Any]:
-    return {**settings, "uncertainty": {"monte_carlo": 3000}}
+def asked(settings: Settings) -> Settings:
+    return settings_of(settings, uncertainty={"monte_carlo": 3000})
 
 
 def test_methods_by_hand_and_on_a_table_run_it_beside_their_budget() -> None:
     unit = hand_held("mpu6050", 3)
     course = {"step_deg": 30.0, "dwell_s": 1.2, "rates_dps": [60.0], "static_s": 0.0, "validation_s": 0.0}
     turns, _ = simulate_unit(UnitDescription("U", course=course), 3, 0)
-    settings = {**unit.settings, "table": read_config("table", "acutronic")}
+    settings = settings_of(unit.settings, table="acutronic")
     found = [
-        nonlinear_least_squares.fit(unit.recordings, None, asked(unit.settings)),
-        rests_and_moves.fit(unit.recordings, None, asked(unit.settings)),
-        reference_least_squares.fit("accelerometer", turns, None, asked(settings)),
+        nonlinear_least_squares.fit(with_noise(unit.recordings, unit.settings), None, asked(unit.settings)),
+        rests_and_moves.fit(with_noise(unit.recordings, unit.settings), None, asked(unit.settings)),
+        reference_least_squares.fit("accelerometer", with_noise(turns, settings), None, asked(settings)),
     ]
     for calibration in found:
         budget = calibration.to_json()["uncertainty_budget"]
@@ -114,7 +118,8 @@ def test_methods_by_hand_and_on_a_table_run_it_beside_their_budget() -> None:
 
 def test_in_six_positions_the_squares_of_the_misalignments_are_in_both() -> None:
     unit = hand_held("mpu6050", 3, procedure="six_positions", holdout_every=0)
-    budget = nonlinear_least_squares.fit(unit.recordings, None, asked(unit.settings)).to_json()["uncertainty_budget"]
+    recordings = with_noise(unit.recordings, unit.settings)
+    budget = nonlinear_least_squares.fit(recordings, None, asked(unit.settings)).to_json()["uncertainty_budget"]
     run, u = budget["monte_carlo"], np.array(budget["standard_uncertainty"])
     known = u > 0.0
     shift = np.array(run["mean"]) - run["estimate"]  # half the variance of a misalignment, which is not corrected
@@ -125,7 +130,8 @@ def test_in_six_positions_the_squares_of_the_misalignments_are_in_both() -> None
 
 def test_without_the_switch_there_is_no_run() -> None:
     unit = hand_held("mpu6050", 3)
+    recordings = with_noise(unit.recordings, unit.settings)
     assert (
         "monte_carlo"
-        not in nonlinear_least_squares.fit(unit.recordings, None, unit.settings).to_json()["uncertainty_budget"]
+        not in nonlinear_least_squares.fit(recordings, None, unit.settings).to_json()["uncertainty_budget"]
     )

@@ -5,27 +5,34 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from unit_settings import settings_of
 
-from pipeline.config.stage_settings import configuration
 from pipeline.estimation.effects import fit
 from pipeline.estimation.reference_least_squares import fit as fit_to_reference
 from pipeline.model.effects import effect, effect_of
 from pipeline.model.kinematics import reference_motion
 from pipeline.one_unit import unit_row
 from pipeline.preprocessing.mounting import check_mounting
-from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration
+from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, UnitRecordings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "preprocessing"))
 from benches import BIAS, K, Setup, recordings_of
 from benches import settings_of as bench_settings
 
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
+
 TURNS = [(role, axis) for role in ("accelerometer", "gyroscope") for axis in "xyz"]
 SEAT_DEG = 2.0
+
+
+WHITE = {"accelerometer": 8e-4, "gyroscope": 0.01}  # of benches.py
+NOISES = {s: Noise(np.full(3, w), np.zeros(3), 100.0, "rests") for s, w in WHITE.items()}
 
 
 def seated_anew(seed: int, seat_deg: float) -> tuple[list[Recording], np.ndarray]:
@@ -35,14 +42,12 @@ def seated_anew(seed: int, seat_deg: float) -> tuple[list[Recording], np.ndarray
     return made, seats
 
 
-def settings() -> dict[str, Any]:
+def settings(**table: Any) -> Settings:
     """Return settings of a table on which the unit is mounted anew for each turn."""
-    table = {"angle_accuracy_deg": 0.0, "rate_accuracy": 0.0, "seat_deg": SEAT_DEG}
+    table = {"angle_accuracy_deg": 0.0, "rate_accuracy": 0.0, "seat_deg": SEAT_DEG} | table
     quiet = [f"sensor.{s}.bias_wander=0" for s in K]  # the turns are made with white noise alone
     row = unit_row(["sensor=mpu6050", *(f"table.{key}={value}" for key, value in table.items()), *quiet])
-    whole = configuration(row.config)
-    white = {"accelerometer": 8e-4, "gyroscope": 0.01}  # of benches.py
-    return {**whole, "noise": {s: Noise(np.full(3, w), np.zeros(3), 100.0, "rests") for s, w in white.items()}}
+    return row.config
 
 
 def errors_over_u(found: SensorCalibration, seats: np.ndarray) -> np.ndarray:
@@ -59,7 +64,7 @@ def test_gravity_determines_the_mountings_of_both_sensors_to_their_uncertainty()
     for seed in range(4):
         recordings, seats = seated_anew(seed, 1.0)
         for sensor, z in found.items():
-            calibrated = fit(sensor, recordings, None, settings())
+            calibrated = fit(sensor, UnitRecordings(recordings, NOISES), None, settings())
             z.append(errors_over_u(calibrated, seats))
             (mounting,) = calibrated.effects
             assert mounting.name == "mounting"
@@ -77,7 +82,7 @@ def test_recordings_of_one_setup_share_a_mounting_and_the_gyroscope_is_better_kn
     clamped = [replace(r, setup=f"on_{axis}") for r, (_, axis) in zip(made, TURNS, strict=True)]
     u = {}
     for name, recordings in (("apart", made), ("shared", clamped)):
-        found = fit("gyroscope", recordings, None, settings())
+        found = fit("gyroscope", UnitRecordings(recordings, NOISES), None, settings())
         assert np.abs(errors_over_u(found, seats)).max() < 4.0
         assert found.covariance is not None
         u[name] = np.sqrt(np.diag(found.covariance)[3:12].reshape(3, 3)[~np.eye(3, dtype=bool)])
@@ -89,8 +94,8 @@ def test_recordings_of_one_setup_share_a_mounting_and_the_gyroscope_is_better_kn
 
 def test_a_mounting_is_as_uncertain_for_the_gyroscope_as_gravity_leaves_it() -> None:
     recordings, _ = seated_anew(0, 3.0)
-    by_gravity = fit("accelerometer", recordings, None, settings())
-    found = fit("gyroscope", recordings, None, settings())
+    by_gravity = fit("accelerometer", UnitRecordings(recordings, NOISES), None, settings())
+    found = fit("gyroscope", UnitRecordings(recordings, NOISES), None, settings())
     assert by_gravity.covariance is not None
     of_turns = np.sqrt(np.diag(by_gravity.covariance)[12:]).reshape(6, 3)[3:]
     across = ~np.eye(3, dtype=bool)  # a rotation about the turn axis does not change the rate
@@ -105,11 +110,10 @@ def test_a_mounting_is_as_uncertain_for_the_gyroscope_as_gravity_leaves_it() -> 
 @pytest.mark.parametrize(("azimuth_of", "held"), [("turn_axis", True), ("level_x", False)])
 def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(azimuth_of: str, *, held: bool) -> None:
     recordings, seats = seated_anew(0, 1.0)
-    whole = settings()
-    whole["table"]["azimuth_of"] = azimuth_of
-    plain = fit("accelerometer", recordings, None, whole)
-    whole["effects"]["accelerometer"] = ["table_tilt"]
-    tilted = fit("accelerometer", recordings, None, whole)
+    whole = settings(azimuth_of=azimuth_of)
+    plain = fit("accelerometer", UnitRecordings(recordings, NOISES), None, whole)
+    whole = settings_of(whole, effects={"accelerometer": ["table_tilt"]})
+    tilted = fit("accelerometer", UnitRecordings(recordings, NOISES), None, whole)
     assert plain.covariance is not None
     assert tilted.covariance is not None
     u, wider = (np.sqrt(np.diag(found.covariance)) for found in (plain, tilted))
@@ -124,8 +128,8 @@ def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(
         why = {line["source"]: line["reason"] for line in tilted.to_json()["uncertainty_budget"]["not_included"]}
         assert why["levelling"].startswith("table_tilt estimates the component across the shaft alone")
         assert abs(d[1]) < 4.0 * wider[-1]  # the part across the shaft is estimated; the truth is 0
-        whole["table"]["levelling_deg"] = 0.1
-        stated = fit("accelerometer", recordings, None, whole)
+        whole = settings_of(whole, table={"levelling_deg": 0.1})
+        stated = fit("accelerometer", UnitRecordings(recordings, NOISES), None, whole)
         assert stated.covariance is not None
         assert np.sqrt(stated.covariance[-2, -2]) == pytest.approx(0.1, rel=0.01)
     else:
@@ -135,16 +139,20 @@ def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(
 
 def test_without_mountings_the_same_turns_leave_a_wrong_matrix() -> None:
     recordings, seats = seated_anew(0, 1.0)
-    plain = settings()
-    plain["table"]["seat_deg"] = None
-    assert np.abs(errors_over_u(fit_to_reference("gyroscope", recordings, None, plain), seats)).max() > 20.0
+    plain = settings(seat_deg="null")
+    assert (
+        np.abs(
+            errors_over_u(fit_to_reference("gyroscope", UnitRecordings(recordings, NOISES), None, plain), seats)
+        ).max()
+        > 20.0
+    )
 
 
 def test_without_an_accelerometer_the_mountings_stay_as_uncertain_as_their_prior() -> None:
     recordings = [r for r in seated_anew(0, 1.0)[0] if r.role == "gyroscope"]
     blind = [replace(r, accelerometer=None) for r in recordings]
     whole = settings()
-    found = fit("gyroscope", blind, None, whole)
+    found = fit("gyroscope", UnitRecordings(blind, NOISES), None, whole)
     assert found.covariance is not None
     u = np.sqrt(np.diag(found.covariance)[3:12].reshape(3, 3)[~np.eye(3, dtype=bool)])
     assert np.all(u > 0.5 * np.radians(SEAT_DEG))
@@ -155,9 +163,8 @@ def test_a_zero_that_is_found_is_estimated_with_the_matrix() -> None:
     for seed in range(4):
         recordings = recordings_of({a: Setup(a, zero=37.0) for a in "xyz"}, seed)
         found = check_mounting(recordings, bench_settings(recordings))
-        whole = settings()
-        whole["table"]["seat_deg"] = None
-        calibrated = fit_to_reference("accelerometer", found, None, whole)
+        whole = settings(seat_deg="null")
+        calibrated = fit_to_reference("accelerometer", UnitRecordings(found, NOISES), None, whole)
         assert [e.name for e in calibrated.effects] == ["encoder_zero"]
         z.append(errors_over_u(calibrated, np.zeros((1, 3))))
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.signal import lfilter
 from scipy.stats import norm
+from unit_settings import settings_of, with_noise
 
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.gauss_markov import (
@@ -25,8 +26,9 @@ from pipeline.one_unit import unit_row
 from pipeline.records import Noise, Recording
 from pipeline.signal.filters import apply_filter, filter_autocovariance
 
-SHEET = {"noise_density": 4e-4, "bias_wander": 1e-4, "wander_time_s": 100.0}
-NO_WANDER = {"noise_density": 4e-4, "bias_wander": 0.0, "wander_time_s": 100.0}
+SHEET = settings_of().sensor.accelerometer.replaced(noise_density=4e-4, bias_wander=1e-4, wander_time_s=100.0)
+NO_WANDER = SHEET.replaced(bias_wander=0.0)
+GYROSCOPE = SHEET.replaced(noise_density=0.005, bias_wander=0.003)
 DT = 0.12
 WHITE = 8e-4
 OFF = {"cutoff_hz": None, "time_constant_s": None, "low_hz": None, "high_hz": None, "order": 2, "zero_phase": False}
@@ -84,7 +86,7 @@ def test_wander_is_recovered_from_a_static_recording(name: str, wander: float) -
 def test_hypotheses_of_a_static_recording_predict_the_scatter_of_an_average() -> None:
     rng, covered, length = np.random.default_rng(3), [], 100.0
     for seed in range(100):
-        wander = SHEET["bias_wander"] * np.exp(STATED_WIDTH * rng.standard_normal())
+        wander = SHEET.bias_wander * np.exp(STATED_WIDTH * rng.standard_normal())
         tau = 100.0 * rng.choice(TIME_FACTORS, p=TIME_PRIOR)
         noise = estimate_noise("accelerometer", [rest(7500, wander, seed, tau=tau)], SHEET)
         settings = wander_prior(noise, SHEET).grid(WHITE)
@@ -107,7 +109,9 @@ def test_values_held_between_samples_do_not_hide_a_slow_wander_from_the_stated_u
     assert estimate_noise("accelerometer", held, SHEET).correlation_time < 25.0
     config = unit_row(["sensor=mpu6050"]).config
     stated = [
-        np.array(fit("accelerometer", of_unit, None, config).to_json()["expanded_uncertainty"]["bias"])
+        np.array(
+            fit("accelerometer", with_noise(of_unit, config), None, config).to_json()["expanded_uncertainty"]["bias"]
+        )
         for of_unit in (sampled, held)
     ]
     assert np.all(stated[1] > 0.7 * stated[0])
@@ -215,10 +219,9 @@ def test_data_sheet_is_the_last_resort() -> None:
     assert noise.white == pytest.approx(np.full(3, 4e-4 / np.sqrt(2 * DT)), rel=1e-6)
 
 
-def test_without_rest_turns_and_data_sheet_the_user_is_told_what_to_give() -> None:
-    fast = replace(stop_and_go(0, 20), table_rate=np.full(240, 200.0))
-    with pytest.raises(ConfigurationError, match="noise_density"):
-        estimate_noise("accelerometer", [fast], {})
+def test_without_readings_of_the_sensor_there_is_no_noise() -> None:
+    with pytest.raises(ConfigurationError, match="gyroscope"):
+        estimate_noise("gyroscope", [stop_and_go(0, 20)], SHEET)
 
 
 def held_in_a_hand(tremor: float, seed: int = 5) -> Recording:
@@ -234,7 +237,7 @@ def held_in_a_hand(tremor: float, seed: int = 5) -> Recording:
 
 def test_the_tremor_of_a_hand_is_no_slow_wander() -> None:
     tremor, length = 0.44, 100.0
-    noise = estimate_noise("gyroscope", [held_in_a_hand(tremor)], {**SHEET, "bias_wander": 3e-3})
+    noise = estimate_noise("gyroscope", [held_in_a_hand(tremor)], SHEET.replaced(bias_wander=3e-3))
     true = tremor * np.sqrt(2.0 * 0.07 / length)  # of the mean of a long rest, after the white noise
     said = noise.wander * np.sqrt(variance_of_average(np.array(length), noise.correlation_time))
     assert np.all((said > true / 1.5) & (said < 1.5 * true))
@@ -303,8 +306,7 @@ def test_what_a_filter_still_holds_of_a_turn_is_no_noise() -> None:
     time_ns = np.arange(550) * 120_000_000
     recording = Recording("gyro_x", "gyroscope", "x", time_ns, gyroscope=readings, table_rate=turn)
     settings = {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": 0.24, "zero_phase": False}
-    sheet = {"noise_density": 0.005, "bias_wander": 0.003, "wander_time_s": 100.0}
-    noise = estimate_noise("gyroscope", [apply_filter(recording, settings)], sheet)
+    noise = estimate_noise("gyroscope", [apply_filter(recording, settings)], GYROSCOPE)
     assert noise.source == "rests"
     assert noise.white == pytest.approx(0.01, rel=0.1)
 
@@ -313,8 +315,7 @@ def test_a_clock_that_is_off_by_a_sample_leaves_the_noise_of_the_rests() -> None
     """By the log it rests, by the sensor's clock it still moves at 100 deg/s^2 at the edge of each rest."""
     off = {"clock_rate": np.array([160.0])}
     recordings = bench_session.record(bench_session.Session(9, effects={"gyroscope": off}))
-    sheet = {"noise_density": 0.005, "bias_wander": 0.003, "wander_time_s": 100.0}
-    assert estimate_noise("gyroscope", recordings, sheet).white == pytest.approx(
+    assert estimate_noise("gyroscope", recordings, GYROSCOPE).white == pytest.approx(
         np.full(3, bench_session.WHITE["gyroscope"]), rel=0.05
     )
 
@@ -331,18 +332,16 @@ def in_steps(step: float, white: float, seed: int = 1) -> list[Recording]:
 
 @pytest.mark.parametrize("white", [0.0, 0.05, 0.3])
 def test_readings_in_steps_have_at_least_the_noise_of_rounding(white: float) -> None:
-    sheet = {"noise_density": 0.005, "bias_wander": 0.003, "wander_time_s": 100.0}
-    coarse = estimate_noise("gyroscope", in_steps(1.0, white), sheet)
+    coarse = estimate_noise("gyroscope", in_steps(1.0, white), GYROSCOPE)
     assert np.all(coarse.white >= (1.0 - 1e-9) / np.sqrt(12.0))
     if white < 0.2:  # the readings at rest do not change: no wander shows
         assert coarse.white == pytest.approx(max(1.0 / np.sqrt(12.0), 0.005 * np.sqrt(0.5 / 0.02)))
         assert (coarse.wander.tolist(), coarse.wander_source, coarse.likelihood) == ([0.003] * 3, "data_sheet", None)
-    fine = estimate_noise("gyroscope", in_steps(0.01, 0.05), sheet)
+    fine = estimate_noise("gyroscope", in_steps(0.01, 0.05), GYROSCOPE)
     assert fine.white == pytest.approx(0.05, rel=0.1)
 
 
 def test_rests_without_any_noise_leave_the_noise_to_the_sensor_file() -> None:
-    sheet = {"noise_density": 0.005, "bias_wander": 0.003, "wander_time_s": 100.0}
-    found = estimate_noise("gyroscope", in_steps(1e-6, 0.0), sheet)
+    found = estimate_noise("gyroscope", in_steps(1e-6, 0.0), GYROSCOPE)
     assert found.white == pytest.approx(0.005 * np.sqrt(0.5 / 0.02))
     assert found.source == "data_sheet"

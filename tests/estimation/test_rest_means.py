@@ -1,15 +1,14 @@
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
+from unit_settings import settings_of
 
 from pipeline.estimation.rest_means import held_out_rests, holdout_interval, rest_means, split_rests
 from pipeline.records import Recording
 from pipeline.signal.rests import Rest
 
-SETTINGS: dict[str, Any] = {"procedure": {"holdout_every": 3}}
+PROCEDURE = settings_of(procedure={"holdout_every": 3}).procedure
 
 
 def _steps(rests: int, role: str = "rests", name: str = "recording") -> Recording:
@@ -45,31 +44,31 @@ def test_the_middle_one_of_each_three_rests_is_held_out() -> None:
     assert means[:, 0] == pytest.approx([1, 4, 7], abs=1e-3)
     means, _ = rest_means(recording, split.used)
     assert means[:, 0] == pytest.approx([0, 2, 3, 5, 6], abs=1e-3)
-    assert [(r.start, r.stop) for r in held_out_rests([recording], SETTINGS)["recording"]] == [
+    assert [(r.start, r.stop) for r in held_out_rests([recording], PROCEDURE)["recording"]] == [
         (r.start, r.stop) for r in split.held_out
     ]
 
 
 def test_nothing_is_held_out_where_a_recording_is_for_validation() -> None:
     recordings = [_steps(4), _steps(3, "validation", "validation")]
-    assert holdout_interval(recordings, SETTINGS) == 0
-    assert held_out_rests(recordings, SETTINGS) == {}
+    assert holdout_interval(recordings, PROCEDURE) == 0
+    assert held_out_rests(recordings, PROCEDURE) == {}
     assert split_rests(recordings[0], 0).held_out == ()
 
 
 def test_nothing_is_held_out_where_the_procedure_says_so() -> None:
-    assert held_out_rests([_steps(4)], {"procedure": {"holdout_every": 0}}) == {}
+    assert held_out_rests([_steps(4)], settings_of().procedure) == {}
 
 
 def test_of_few_rests_none_is_held_out() -> None:
-    settings = {"procedure": {"holdout_every": 3, "holdout_from": 8}}
-    assert held_out_rests([_steps(7)], settings) == {}
-    assert len(held_out_rests([_steps(8)], settings)["recording"]) == 3
-    assert held_out_rests([_steps(5), _steps(3)], settings)["recording"]
+    procedure = PROCEDURE.replaced(holdout_from=8)
+    assert held_out_rests([_steps(7)], procedure) == {}
+    assert len(held_out_rests([_steps(8)], procedure)["recording"]) == 3
+    assert held_out_rests([_steps(5), _steps(3)], procedure)["recording"]
 
 
 def test_rests_of_other_roles_are_not_held_out() -> None:
-    assert held_out_rests([_steps(4, "static", "static")], SETTINGS) == {}
+    assert held_out_rests([_steps(4, "static", "static")], PROCEDURE) == {}
 
 
 def test_a_table_log_takes_the_place_of_the_search() -> None:

@@ -10,6 +10,7 @@ import pytest
 from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, K, Session, record
 from scipy.spatial.transform import Rotation
 from stage_files import load_recordings, save_recordings
+from unit_settings import settings_of
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.generalized_least_squares import fit_joint
@@ -20,7 +21,7 @@ from pipeline.model.kinematics import reference_motion
 if TYPE_CHECKING:
     from pipeline.records import Recording
 
-SETTINGS: dict[str, Any] = {"table": {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}}
+SETTINGS = settings_of()
 TILT = {"precise": np.array([0.02, -0.03]), "home": np.array([0.35, -0.2])}
 LEAN = np.array([0.1, -0.08, 0.05, 0.12, -0.06, 0.09])
 THETA = np.array([2.0, -1.5, 1.0])  # as by eye

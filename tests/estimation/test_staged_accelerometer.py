@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from table_turns import Bench, run_stages, settings, specific_force, stepped_angle
+from unit_settings import with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.stages import apply_correction, fit_stage
@@ -283,7 +284,7 @@ def test_a_recording_about_another_axis_than_it_says_is_refused() -> None:
 def test_a_stage_of_another_method_cannot_come_before() -> None:
     before = SensorCalibration("accelerometer", stages=(StageResult("reference_least_squares", {}),))
     with pytest.raises(ConfigurationError, match="cannot follow reference_least_squares: it does not honour bias"):
-        fit_stage("accelerometer", "scale_factor", [], before, settings())
+        fit_stage("accelerometer", "scale_factor", with_noise([], settings()), before, settings())
 
 
 def test_the_result_survives_its_file() -> None:

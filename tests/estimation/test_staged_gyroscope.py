@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from table_turns import INTERVAL, Bench, ramped_rate, run_stages, settings
+from unit_settings import with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.stages import apply_correction, fit_stage
@@ -177,7 +178,7 @@ def test_an_axis_that_was_not_turned_about_is_named() -> None:
 def test_a_stage_of_another_method_cannot_come_before() -> None:
     before = SensorCalibration("gyroscope", stages=(StageResult("bias", {}), StageResult("cholesky_lu", {})))
     with pytest.raises(ConfigurationError, match="cannot follow cholesky_lu: it does not honour matrix"):
-        fit_stage("gyroscope", "scale_factor", [], before, settings())
+        fit_stage("gyroscope", "scale_factor", with_noise([], settings()), before, settings())
 
 
 def test_ramps_are_no_part_of_a_steady_turn() -> None:
@@ -192,6 +193,6 @@ def test_a_stage_works_on_the_output_of_the_stage_before() -> None:
     before = run_stages("gyroscope", STAGES[:1], recordings, settings())
     shifted = [{"subtract": (np.array(BIAS) + 0.5).tolist()}]
     given = replace(before, bias=before.bias + 0.5, stages=(replace(before.stages[0], correction={"steps": shifted}),))
-    found = fit_stage("gyroscope", STAGES[1], recordings, given, settings())
+    found = fit_stage("gyroscope", STAGES[1], with_noise(recordings, settings()), given, settings())
     assert found.bias == pytest.approx(np.array(BIAS) + 0.5, abs=1e-9)
     assert found.stages[-1].correction["steps"][:1] == shifted

@@ -9,39 +9,49 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from stage_files import documents, write_pack
-from table_turns import SHEETS, Bench, settings
+from table_turns import Bench, settings
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.io.arrow import to_parquet
 from pipeline.model.calibration_file import beyond_uncertainty
-from pipeline.records import FittedEffect, Noise, Note
+from pipeline.records import FittedEffect, Noise, Note, UnitRecordings
 from pipeline.settings import Settings
 from pipeline.stages import batch
 from pipeline.stages.filter import filter_recordings
 from pipeline.stages.unit_files import FILES
+from pipeline.unit import STEPS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.records import Recording, SensorCalibration
+    from pipeline.settings import Settings
 
 K = np.diag([1.02, 0.99, 1.01])
 WARM = (20.0, 26.0)  # degC, from the first sample to the last of each recording
 
 
 @pytest.fixture(scope="module")
-def fitted() -> tuple[SensorCalibration, list[Recording]]:
+def fitted() -> tuple[SensorCalibration, UnitRecordings]:
     turns = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.01).turns_at([60.0, -60.0])
     warm = [replace(r, temperature=np.linspace(*WARM, r.samples)) for r in turns]
-    return reference_least_squares.fit("gyroscope", warm, None, settings()), warm
+    return reference_least_squares.fit("gyroscope", with_noise(warm, settings()), None, settings()), known(warm)
 
 
-def sheet(**stated: Any) -> dict[str, Any]:
+def known(recordings: list[Recording], noise: Noise | None = None) -> UnitRecordings:
+    return UnitRecordings(recordings, {"gyroscope": noise})
+
+
+def sheet(**stated: Any) -> Settings:
     accuracy = stated.pop("accuracy", None)
     limits = {"bias_temperature": 0.05, "scale_factor_temperature": 1e-3}
-    return {"sensor": {"temperature_accuracy_degc": accuracy, "gyroscope": {"effects": limits, **stated}}}
+    return settings_of(
+        table={"rate_accuracy": 1e-3},  # above the error of the trapezoidal rule, which gives the angle of the turns
+        sensor={"temperature_accuracy_degc": accuracy, "gyroscope": {"effects": limits, **stated}},
+    )
 
 
 def line(found: SensorCalibration, source: str) -> dict[str, Any]:
@@ -58,12 +68,13 @@ def test_what_is_not_stated_is_named_with_the_key_that_states_it(fitted: Any) ->
 
 
 def test_the_rounding_of_a_coarse_log_is_stated_as_not_included(fitted: Any) -> None:
+    calibration, warm = fitted[0], fitted[1].filtered
     noise = Noise(np.full(3, 0.3), np.zeros(3), 100.0, "static", step=np.array([0.5, 0.0, 1.0]))
-    part = with_stated(*fitted, {**sheet(), "noise": {"gyroscope": noise}}).to_json()
+    part = with_stated(calibration, known(warm, noise), sheet()).to_json()
     (entry,) = [e for e in part["uncertainty_budget"]["not_included"] if e["source"] == "quantisation"]
     assert (entry["up_to"], "steps of 1 deg/s" in entry["reason"]) == ({"bias": 0.5}, True)
     assert "quantisation, up to 0.5 deg/s of bias" in dict(beyond_uncertainty(part))
-    fine = with_stated(*fitted, {**sheet(), "noise": {"gyroscope": replace(noise, step=None)}}).to_json()
+    fine = with_stated(calibration, known(warm, replace(noise, step=None)), sheet()).to_json()
     assert not any("quantisation" in source for source, _ in beyond_uncertainty(fine))
 
 
@@ -111,8 +122,8 @@ def test_with_a_fitted_effect_only_the_thermometer_counts_by_what_was_found(fitt
 
 
 def test_without_a_thermometer_in_the_recordings_that_is_said(fitted: Any) -> None:
-    cold = [replace(r, temperature=None) for r in fitted[1]]
-    found = with_stated(fitted[0], cold, sheet(accuracy=0.5))
+    cold = [replace(r, temperature=None) for r in fitted[1].filtered]
+    found = with_stated(fitted[0], known(cold), sheet(accuracy=0.5))
     left = {entry["source"]: entry["reason"] for entry in found.to_json()["uncertainty_budget"]["not_included"]}
     assert left["temperature"] == "the recordings hold no temperature"
 
@@ -126,8 +137,10 @@ def by_angle(sensor: str, *, counted: bool, **table: float) -> tuple[SensorCalib
     turns = bench.turns_at([60.0, -60.0]) if sensor == "gyroscope" else bench.stop_and_go(45.0, 2.4)
     note = Note("N-SYNTHTIME", 1, 0, 0, "")
     turns = [replace(r, table_rate=None, notes=(note,) if counted else ()) for r in turns]
-    config = settings(**table) | {"sensor": {sensor: {**SHEETS[sensor], "effects": {"clock_rate": LIMIT_PPM}}}}
-    found = with_stated(reference_least_squares.fit(sensor, turns, None, config), turns, config)
+    config = settings_of(settings(**table), **{f"sensor.{sensor}.effects.clock_rate": LIMIT_PPM})
+    found = with_stated(
+        reference_least_squares.fit(sensor, with_noise(turns, config), None, config), with_noise(turns, config), config
+    )
     return found, {entry["source"]: entry for entry in found.to_json()["uncertainty_budget"]["not_included"]}
 
 
@@ -152,22 +165,30 @@ def test_rows_counted_at_a_stated_rate_have_the_error_of_the_sensors_clock() -> 
 def test_the_interval_of_samples_in_bursts_is_as_uncertain_as_their_number_leaves_it() -> None:
     bench = Bench("gyroscope", [0.03, -0.02, 0.05], K, white=0.001)
     plain = [replace(r, table_rate=None) for r in bench.turns_at([60.0, -60.0])]
-    config = settings() | {"sensor": {"gyroscope": SHEETS["gyroscope"]}}
-    fit = reference_least_squares.fit("gyroscope", plain, None, config)
+    config = settings()
+    fit = reference_least_squares.fit("gyroscope", with_noise(plain, config), None, config)
     clocks = ({"interval_ns": 1e7, "uncertainty_ns": u} for u in (4e3, 6e3, 2e3))
     turns = [replace(r, source={**r.source, "bursts": clock}) for r, clock in zip(plain, clocks, strict=False)]
-    found = with_stated(fit, turns, config)
+    found = with_stated(fit, with_noise(turns, config), config)
     own = line(found, "interval of bursts")
     assert own["standard_uncertainty"] == pytest.approx(300.0)  # ppm: half of 6 us in 10 ms
-    added = found.covariance - with_stated(fit, plain, config).covariance
+    added = found.covariance - with_stated(fit, with_noise(plain, config), config).covariance
     m = fit.matrix.ravel()
     assert added[3:12, 3:12] == pytest.approx(3e-4**2 * np.outer(m, m), rel=1e-6, abs=1e-12)
     assert any(entry["source"] == "time base" for entry in found.to_json()["uncertainty_budget"]["not_included"])
-    stated = settings(clock_accuracy_ppm=20.0) | {"sensor": config["sensor"]}
-    both = with_stated(reference_least_squares.fit("gyroscope", turns, None, stated), turns, stated)
+    stated = settings(clock_accuracy_ppm=20.0)
+    both = with_stated(
+        reference_least_squares.fit("gyroscope", with_noise(turns, stated), None, stated),
+        with_noise(turns, stated),
+        stated,
+    )
     assert line(both, "interval of bursts")["standard_uncertainty"] == pytest.approx(300.0)
     rated = [replace(r, source=t.source) for r, t in zip(bench.turns_at([60.0, -60.0]), turns, strict=False)]
-    by_rate = with_stated(reference_least_squares.fit("gyroscope", rated, None, config), rated, config)
+    by_rate = with_stated(
+        reference_least_squares.fit("gyroscope", with_noise(rated, config), None, config),
+        with_noise(rated, config),
+        config,
+    )
     assert "interval of bursts" not in {
         entry["source"] for entry in by_rate.to_json()["uncertainty_budget"]["contributions"]
     }
@@ -176,14 +197,14 @@ def test_the_interval_of_samples_in_bursts_is_as_uncertain_as_their_number_leave
 def test_a_rate_that_is_not_the_change_of_its_angle_is_in_the_uncertainty() -> None:
     turns, off = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.001).turns_at([60.0, -60.0]), 1.5e-4
     turns = [replace(r, table_rate=(1.0 + off) * r.table_rate) for r in turns]
-    config = settings(rate_accuracy=5e-6) | {"sensor": {"gyroscope": SHEETS["gyroscope"]}}
-    fit = reference_least_squares.fit("gyroscope", turns, None, config)
-    truth, found = np.linalg.inv(K), with_stated(fit, turns, config).to_json()
+    config = settings(rate_accuracy=5e-6)
+    fit = reference_least_squares.fit("gyroscope", with_noise(turns, config), None, config)
+    truth, found = np.linalg.inv(K), with_stated(fit, with_noise(turns, config), config).to_json()
     error = np.abs(np.diag(np.array(found["matrix"]) - truth))
     assert error == pytest.approx(off * np.diag(truth), rel=0.2)  # the rate was wrong; angle and time were right
     assert np.all(error > np.diag(fit.to_json()["expanded_uncertainty"]["matrix"]))
     assert np.all(error < np.diag(found["expanded_uncertainty"]["matrix"]))
-    precise = with_stated(fit, turns, config | {"table": config["table"] | {"rate_accuracy": 1e-4}})
+    precise = with_stated(fit, with_noise(turns, config), settings_of(config, **{"table.rate_accuracy": 1e-4}))
     assert np.array_equal(precise.covariance, fit.covariance)  # the stated accuracy explains the difference
 
 
@@ -217,11 +238,11 @@ def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:
     bench = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.01)
     turns = [r.select(np.abs(r.table_rate) > 1.0) for r in bench.turns_at([60.0, -60.0])]  # without a rest in them
     still = replace(bench.turns_at([0.0])[0], name="static", role="static")
-    part = settings() | {"sensor": sheet(repeatability_bias=0.02)["sensor"] | {"accelerometer": {}}, "effects": {}}
+    part = sheet(repeatability_bias=0.02).only(STEPS["fit"].settings)
     (tmp_path / "part.json").write_text(json.dumps({"units": {"U": part}}))
     stages = [tmp_path / "bias", tmp_path / "cholesky_lu"]
     ingested = write_pack(tmp_path / "ingest.zip", {"U.parquet": to_parquet([*turns, still])})
-    recordings = filter_recordings([*turns, still], Settings.of_sections(settings() | {"filter": {"name": "none"}}))
+    recordings = filter_recordings([*turns, still], settings())
     filtered = write_pack(tmp_path / "filter.zip", FILES["filter"]("U", recordings))
     for stage, previous, last in zip(stages, ["", str(stages[0])], ["no", "yes"], strict=True):
         chosen = ["--sensor", "gyroscope", "--stage", stage.name, "--previous", previous, "--last", last]

@@ -11,9 +11,9 @@ import pytest
 from pipeline.model.effects import bench_priors
 from pipeline.one_unit import unit_of_recordings
 from pipeline.records import SensorCalibration
-from pipeline.settings import OF_BENCH
+from pipeline.settings import OF_BENCH, Table
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
 from pipeline.study.run import diagnose_case
@@ -103,4 +103,4 @@ def test_rests_leave_the_offset_as_uncertain_as_its_prior() -> None:
 
 def test_priors_of_the_catalogue_are_settings_of_a_table() -> None:
     assert sorted(bench_priors().values()) == sorted(OF_BENCH)
-    assert set(OF_BENCH) <= set(read_config("table", "acutronic"))
+    assert set(OF_BENCH) <= set(Table.model_fields)

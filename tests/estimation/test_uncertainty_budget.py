@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from table_turns import Bench, run_stages, settings, specific_force
+from unit_settings import settings_of
 
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.records import coverage_factor
@@ -193,9 +194,7 @@ def test_what_nobody_has_stated_is_named_and_left_out() -> None:
     found = run_stages("accelerometer", ["reference_least_squares"], recordings_of("accelerometer", 8e-4), settings())
     missing = {entry["source"]: entry["reason"] for entry in found.to_json()["uncertainty_budget"]["not_included"]}
     assert missing["levelling"] == "table.levelling_deg is not stated"
-    assert {"table angle", "local gravity", "wobble of the table's axes", "repeatability", "temperature"} <= set(
-        missing
-    )
+    assert {"local gravity", "wobble of the table's axes", "repeatability", "temperature"} <= set(missing)
     assert [line.source for line in found.lines] == ["noise of the readings"]
 
 
@@ -203,9 +202,7 @@ def test_what_nobody_has_stated_is_named_and_left_out() -> None:
 def test_rounding_is_a_part_of_the_noise_only_where_the_noise_reaches_half_a_count(
     *, counts_per_unit: float, own_line: bool
 ) -> None:
-    config = settings()
-    sheet = {**config["sensor"]["accelerometer"], "counts_per_unit": counts_per_unit}
-    config = config | {"sensor": {**config["sensor"], "accelerometer": sheet}}
+    config = settings_of(settings(), **{"sensor.accelerometer.counts_per_unit": counts_per_unit})
     recordings = [
         replace(r, accelerometer=np.round(r.accelerometer * counts_per_unit) / counts_per_unit)
         for r in recordings_of("accelerometer", 8e-4)

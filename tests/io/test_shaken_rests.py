@@ -7,16 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Session, record, values_of
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.stages import fit_stage
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.records import Note, Recording
 
-SETTINGS = {
-    "table": {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None},
-    "procedure": {"holdout_every": 0},
-    "sensor": {"accelerometer": {"bias_wander": 1e-4, "wander_time_s": 100.0, "cross_axis": 0.02}},
-}
+SETTINGS = settings_of(sensor={"accelerometer": {"bias_wander": 1e-4, "cross_axis": 0.02}})
 METHODS = {"reference": "reference_least_squares", "magnitude": "nonlinear_least_squares"}
 
 
@@ -58,7 +55,9 @@ def test_half_a_dwell_that_was_disturbed_costs_the_calibration_nothing(
     assert "1 of " in kept[0].notes[0].detail
     assert kept[0].flags is not None
     for method in METHODS.values():
-        good, mended, wrong = (fit_stage("accelerometer", method, r, None, SETTINGS) for r in (clean, kept, spoilt))
+        good, mended, wrong = (
+            fit_stage("accelerometer", method, with_noise(r, SETTINGS), None, SETTINGS) for r in (clean, kept, spoilt)
+        )
         assert good.covariance is not None
         u = np.sqrt(np.diag(good.covariance))[:12]
         known = u > 0.0

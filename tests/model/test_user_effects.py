@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from bench_session import CONTINUOUS, STOP_AND_GO, K, Session, record
+from unit_settings import settings_of
 
 from pipeline import load_calibration
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
@@ -37,7 +38,7 @@ from pipeline.records import FittedEffect, Motion, Recording, SensorCalibration
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-SETTINGS: dict[str, Any] = {"table": {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}}
+SETTINGS = settings_of()
 GEAR = """\
 name: gear_mesh
 owner: table

@@ -18,9 +18,8 @@ from pipeline.model.effects import catalogue, effect
 from pipeline.planning.detection_limits import noise_sums
 from pipeline.planning.plan import FAULTLESS, ROOM, plan_of, stated_noise
 from pipeline.records import SENSORS
-from pipeline.settings import DataSheet
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription, shipped_settings
 
 UNITS = 20
 FACTOR = 1.5
@@ -44,7 +43,7 @@ def planned() -> dict[str, dict[str, Any]]:
 
 def _found(planned: dict[str, dict[str, Any]], names: dict[str, str], factor: float) -> dict[str, int]:
     """Return in how many units the effect of each sensor passes the gate, at a factor of its smallest size."""
-    sheets, table = read_config("sensor", PROCEDURE.sensor), read_config("table", PROCEDURE.table)
+    shipped = shipped_settings(sensor=PROCEDURE.sensor, table=PROCEDURE.table)
     found = dict.fromkeys(SENSORS, 0)
     for number in range(UNITS):
         signs = np.random.default_rng([number, 7])
@@ -56,8 +55,8 @@ def _found(planned: dict[str, dict[str, Any]], names: dict[str, str], factor: fl
         }
         recordings, _ = simulate_unit(replace(PROCEDURE, effects=hidden), 2, number)
         for sensor, name in names.items():
-            noise = stated_noise(DataSheet.model_validate(sheets[sensor]), PROCEDURE.interval_s, long_rest=True)
-            observations = observe(sensor, recordings, table)
+            noise = stated_noise(shipped.sensor.of(sensor), PROCEDURE.interval_s, long_rest=True)
+            observations = observe(sensor, recordings, shipped.table)
             start = ordinary_base(observations, noise)
             term = Term(effect(name), np.zeros(len(hidden[f"{sensor}.{name}"])))
             ranking = Ranking(observations, start, start, {name: term}, selection_grid(noise))
@@ -78,14 +77,16 @@ def test_half_of_the_units_are_found_within_a_factor_of_the_planned_size(
 
 
 def test_an_effect_of_twice_the_planned_size_is_named(planned: dict[str, dict[str, Any]]) -> None:
-    sheets, table = read_config("sensor", PROCEDURE.sensor), read_config("table", PROCEDURE.table)
+    shipped = shipped_settings(sensor=PROCEDURE.sensor, table=PROCEDURE.table)
     hidden = {"accelerometer": "lever_arm", "gyroscope": "scale_factor_asymmetry"}
     for number in range(4):
         sizes = {f"{s}.{name}": [2.0 * v for v in planned[s][name]["sizes"].values()] for s, name in hidden.items()}
         recordings, _ = simulate_unit(replace(PROCEDURE, effects=sizes), 4, number)
         for sensor, name in hidden.items():
-            noise = stated_noise(DataSheet.model_validate(sheets[sensor]), PROCEDURE.interval_s, long_rest=True)
-            assert select(observe(sensor, recordings, table), [], noise, sheets[sensor]).names == [name]
+            noise = stated_noise(shipped.sensor.of(sensor), PROCEDURE.interval_s, long_rest=True)
+            assert select(observe(sensor, recordings, shipped.table), [], noise, shipped.sensor.of(sensor)).names == [
+                name
+            ]
 
 
 def test_an_effect_is_taken_for_its_simpler_look_alike_where_the_plan_says_so(
@@ -95,12 +96,12 @@ def test_an_effect_is_taken_for_its_simpler_look_alike_where_the_plan_says_so(
     assert entry["taken_for"] == "bias_temperature"
     values = [1.5 * v for v in entry["sizes"].values()]
     unit = replace(PROCEDURE, effects={"accelerometer.bias_temperature_quadratic": values})
-    sheets, table = read_config("sensor", unit.sensor), read_config("table", unit.table)
+    shipped = shipped_settings(sensor=unit.sensor, table=unit.table)
     for number in range(4):
         recordings, _ = simulate_unit(unit, 3, number)
-        noise = stated_noise(DataSheet.model_validate(sheets["accelerometer"]), unit.interval_s, long_rest=True)
-        observations = observe("accelerometer", recordings, table)
-        assert select(observations, [], noise, sheets["accelerometer"]).names == ["bias_temperature"]
+        noise = stated_noise(shipped.sensor.accelerometer, unit.interval_s, long_rest=True)
+        observations = observe("accelerometer", recordings, shipped.table)
+        assert select(observations, [], noise, shipped.sensor.accelerometer).names == ["bias_temperature"]
 
 
 def test_the_expected_sum_of_squares_is_the_trace_of_two_covariances() -> None:

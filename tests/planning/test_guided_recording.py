@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from unit_settings import with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.planning.guide import (
@@ -31,6 +32,8 @@ from pipeline.simulation.description import shipped_settings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.settings import Settings
+
 SHIPPED = shipped_settings(sensor="mpu6050", table="hand", procedure="multi_position")
 SETTINGS = SHIPPED.replaced(procedure=SHIPPED.procedure.replaced(holdout_every=0))
 WHITE, RATE, DWELL = 8e-4, 20.0, 4.0
@@ -50,7 +53,7 @@ def recorded(attitudes: Sequence[Any], rng: np.random.Generator, white: float = 
     return Recording("recording", "rests", None, time, accelerometer=reading)
 
 
-def progress_of(recordings: list[Recording], settings: dict[str, Any], dwell: float) -> Progress:
+def progress_of(recordings: list[Recording], settings: Settings, dwell: float) -> Progress:
     return progress_of_unit(fitted_by_hand(recordings, settings), settings, dwell)
 
 
@@ -99,12 +102,12 @@ def test_the_default_goal_is_what_24_rests_45_deg_apart_give(sensor: str) -> Non
     found = []
     for seed in range(6):
         rng = np.random.default_rng([4, seed])
-        quiet = recorded(turns, rng, white=sheet["noise_density"] * np.sqrt(RATE / 2))
+        quiet = recorded(turns, rng, white=sheet.noise_density * np.sqrt(RATE / 2))
         assert quiet.accelerometer is not None
-        keep, wander = np.exp(-1 / RATE / sheet["wander_time_s"]), [rng.standard_normal(3)]
+        keep, wander = np.exp(-1 / RATE / sheet.wander_time_s), [rng.standard_normal(3)]
         for step in np.sqrt(1 - keep**2) * rng.standard_normal((quiet.samples - 1, 3)):
             wander.append(keep * wander[-1] + step)
-        log = replace(quiet, accelerometer=quiet.accelerometer + sheet["bias_wander"] * np.array(wander))
+        log = replace(quiet, accelerometer=quiet.accelerometer + sheet.bias_wander * np.array(wander))
         found.append(progress_of([log], SETTINGS.replaced(sensor=model), DWELL).expanded)
     assert default_goal(sheet, 1.0, DWELL) == pytest.approx(np.median(found), rel=0.25)
 
@@ -127,7 +130,10 @@ def test_the_number_of_rests_and_the_uncertainty_come_true() -> None:
 def test_the_plan_starts_from_the_covariance_of_the_fit_while_a_misalignment_is_known_by_its_limit() -> None:
     for seed in range(3):
         log = [recorded(attitudes()[:10], np.random.default_rng(seed))]
-        progress, found = progress_of(log, SETTINGS, DWELL), nonlinear_least_squares.fit(log, None, SETTINGS)
+        progress, found = (
+            progress_of(log, SETTINGS, DWELL),
+            nonlinear_least_squares.fit(with_noise(log, SETTINGS), None, SETTINGS),
+        )
         assert progress.reason == "10 orientations leave misalignment_zy open"
         assert found.covariance is not None
         published = np.sqrt(np.diag(found.covariance))[nonlinear_least_squares.PLACE]

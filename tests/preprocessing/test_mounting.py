@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import unit_settings
 from benches import BIAS, INTERVAL_S, RATE, Setup, recordings_of, settings_of
 from benches import K as TRUE_K
 from scipy.spatial.transform import Rotation
@@ -62,13 +63,13 @@ def _pair(recording: Recording, sensor: str) -> tuple[np.ndarray, np.ndarray]:
 def test_a_stated_bench_calibrates_within_the_expanded_uncertainty() -> None:
     setups = {"x": Setup("x", "-y", -1, 37.0), "y": Setup("y", "+x", 1, -151.0), "z": Setup("z", "-y", -1, 12.5)}
     sensors = {"accelerometer": SHEET, "gyroscope": SHEET | {"noise_density": 5e-3, "bias_wander": 3e-3}}
+    settings = unit_settings.settings_of(sensor=sensors)
     outside = 0
     for seed in range(10):
         recordings = recordings_of(setups, seed)
         checked = check_mounting(recordings, settings_of(recordings, setups))
         for sensor in ("accelerometer", "gyroscope"):
-            table = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
-            found = fit(sensor, checked, None, {"table": table, "method": {"as_printed": False}, "sensor": sensors})
+            found = fit(sensor, unit_settings.with_noise(checked, settings), None, settings)
             error = found.matrix - np.linalg.inv(TRUE_K[sensor])
             expanded = np.array(found.to_json()["expanded_uncertainty"]["matrix"])
             outside += int(np.sum(np.abs(error) > expanded))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hand_simulator import Drawn, Hand, draw
+from unit_settings import with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
@@ -50,8 +51,8 @@ def test_a_creeping_unit_has_the_floor_and_the_errors_of_one_that_stands_still()
     figures: dict[float, list[float]] = {}
     for creep in (0.0, 0.15):
         drawn = draw(Hand(creep_dps=creep, white=QUIET), 6)
-        found = nonlinear_least_squares.fit([drawn.recording], None, drawn.settings)
-        noise = estimate_noise("accelerometer", [drawn.recording], drawn.settings["sensor"]["accelerometer"])
+        found = nonlinear_least_squares.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+        noise = estimate_noise("accelerometer", [drawn.recording], drawn.settings.sensor.accelerometer)
         part = validate(found, [drawn.recording], noise, drawn.settings)
         low, high = part["expected_rms_error"]
         assert low < part["steps"][-1]["rms_error"] < high
@@ -65,11 +66,11 @@ def test_a_creeping_unit_has_the_floor_and_the_errors_of_one_that_stands_still()
 
 def test_the_rate_of_a_creeping_unit_is_no_error_of_its_gyroscope() -> None:
     drawn = draw(Hand(creep_dps=0.1), 7)
-    found = rests_and_moves.fit([drawn.recording], None, drawn.settings)
+    found = rests_and_moves.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
     assert found.covariance is not None
     error = np.concatenate([found.bias - drawn.bias["gyroscope"], (found.matrix - drawn.matrix["gyroscope"]).ravel()])
     assert np.mean(error**2 / np.diag(found.covariance)) < 2.2  # 12 parameters: 1.2 chance in 1000 beyond
-    noise = estimate_noise("gyroscope", [drawn.recording], drawn.settings["sensor"]["gyroscope"])
+    noise = estimate_noise("gyroscope", [drawn.recording], drawn.settings.sensor.gyroscope)
     part = validate(found, [drawn.recording], noise, drawn.settings)
     low, high = part["expected_rms_error"]
     assert low < part["steps"][-1]["rms_error"] < high

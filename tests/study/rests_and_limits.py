@@ -12,6 +12,7 @@ import sys
 from typing import Any
 
 import numpy as np
+from unit_settings import settings_of, with_noise
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
@@ -48,7 +49,7 @@ def recorded(up: np.ndarray, K: np.ndarray, bias: np.ndarray, rng: np.random.Gen
 def coverage(kind: str, limit: float, units: int, seed: int) -> dict[str, Any]:
     """Return the share of parameters within U, and how many units were refused or have a misalignment by its limit."""
     sensor = {"bias_wander": WANDER_G, "wander_time_s": TAU_S, "cross_axis": limit}
-    settings = {"table": {"gravity_g": 1.0}, "procedure": {"holdout_every": 0}, "sensor": {"accelerometer": sensor}}
+    settings = settings_of(sensor={"accelerometer": sensor})
     inside, by_limit = [], 0
     for unit in range(units):
         rng = np.random.default_rng([seed, unit])
@@ -56,7 +57,7 @@ def coverage(kind: str, limit: float, units: int, seed: int) -> dict[str, Any]:
         K = np.diag(1 + 0.03 * rng.uniform(-1, 1, 3)) + limit * rng.uniform(-1, 1, (3, 3)) * (1 - np.eye(3))
         bias, M = 0.05 * rng.uniform(-1, 1, 3), np.linalg.inv(K)
         try:
-            found = fit([recorded(up, K, bias, rng)], None, settings)
+            found = fit(with_noise([recorded(up, K, bias, rng)], settings), None, settings)
         except NotObservableError:
             continue
         L = np.linalg.cholesky((M.T @ M)[::-1, ::-1])[::-1, ::-1].T  # L^T L = M^T M

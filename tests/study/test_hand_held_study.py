@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from hand_simulator import Drawn, Hand, draw, draw_together, one_sensor
 from scipy import stats
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
@@ -31,7 +32,7 @@ from pipeline.estimation.multi_position.result import model_of
 from pipeline.estimation.multi_position.selection import Selection
 from pipeline.estimation.noise import estimate_noise
 from pipeline.io.read import read_recordings
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 from tests.published import validate
 
 if TYPE_CHECKING:
@@ -64,14 +65,14 @@ def judged(drawn: Drawn) -> dict[str, Any]:
     for sensor, method in FITS.items():
         if drawn.recording.reading(sensor) is None:
             continue
-        calibration = method.fit([drawn.recording], None, drawn.settings)
+        calibration = method.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
         assert calibration.covariance is not None
         assert calibration.freedom is not None
         u = np.sqrt(np.diag(calibration.covariance))[:12]
         error = np.append(calibration.bias - drawn.bias[sensor], calibration.matrix - drawn.matrix[sensor])
         t = np.abs(np.divide(error, u, out=np.zeros(12), where=u > 0.0))
         z = stats.norm.isf(stats.t.sf(t, np.minimum(calibration.freedom[:12], 1e6)))
-        noise = estimate_noise(sensor, [drawn.recording], drawn.settings["sensor"][sensor])
+        noise = estimate_noise(sensor, [drawn.recording], drawn.settings.sensor.of(sensor))
         part = validate(calibration, [drawn.recording], noise, drawn.settings)
         low, high = part["expected_rms_error"]
         found[sensor] = {"chi": z**2, "inside": low <= part["steps"][-1]["rms_error"] <= high}
@@ -88,15 +89,15 @@ def in_one_log(hand: Hand, seed: int, folder: Path) -> list[Drawn]:
             values += list(drawn.recording.reading(sensor).T)
     folder.mkdir()
     np.savetxt(folder / "recording.csv", np.column_stack(values), "%.9g", ",", header=",".join(header), comments="")
-    plain, out = read_config("ingest", "canonical_csv"), []
+    plain, out = shipped_settings().ingest, []
     for k, drawn in enumerate(units):
-        columns: dict[str, Any] = dict.fromkeys(plain["csv"]["columns"])
+        columns: dict[str, Any] = dict.fromkeys(plain.csv["columns"])
         columns["time"] = {"column": "time", "unit": "s"}
         for channel, unit, short in (("accel", "g", "a"), ("gyro", "deg/s", "g")):
             columns |= {f"{channel}_{axis}": {"column": f"{short}{axis}_{k}", "unit": unit} for axis in "xyz"}
-        ingest = plain | {"csv": plain["csv"] | {"columns": columns}}
-        procedure = read_config("procedure", "multi_position")
-        (recording,) = read_recordings(procedure, ingest, drawn.settings["sensor"], folder)
+        ingest = plain.replaced(csv=plain.csv | {"columns": columns})
+        procedure = shipped_settings(procedure="multi_position").procedure
+        (recording,) = read_recordings(procedure, ingest, drawn.settings.sensor, folder)
         out.append(replace(drawn, recording=recording))
     return out
 
@@ -143,12 +144,12 @@ def named(which: str, seed: int, rest_s: float | None = None) -> bool:
     sensor, effect, size, length = HIDDEN[which]
     signs = np.random.default_rng([7, seed]).choice([-1.0, 1.0], (3, 3) if which == "g_sensitivity" else 3)
     drawn = draw(Hand(rests=20, rest_s=rest_s or length, effects={which: size * signs}), 30_000 + seed)
-    settings = drawn.settings | {"procedure": {"holdout_every": 0}}
-    noise = estimate_noise(sensor, [drawn.recording], settings["sensor"][sensor])
-    calibration = FITS[sensor].fit([drawn.recording], None, settings)
+    settings = settings_of(drawn.settings, procedure={"holdout_every": 0})
+    noise = estimate_noise(sensor, [drawn.recording], settings.sensor.of(sensor))
+    calibration = FITS[sensor].fit(with_noise([drawn.recording], settings), None, settings)
     model = model_of([drawn.recording], calibration, noise, settings)
     assert model is not None
-    return effect in Selection(model, calibration, [], noise, settings["sensor"][sensor]).names
+    return effect in Selection(model, calibration, [], noise, settings.sensor.of(sensor)).names
 
 
 @pytest.mark.study
@@ -173,6 +174,6 @@ def test_units_of_one_log_are_calibrated_by_their_own_columns(tmp_path: Path) ->
 
 def test_the_cosine_is_zero_under_the_weights_of_the_fit() -> None:
     drawn = draw(Hand(settle_deg=0.3, creep_dps=0.1), 1)
-    found = rests_and_moves.fit([drawn.recording], None, drawn.settings)
+    found = rests_and_moves.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
     assert found.convergence is not None
     assert found.convergence["cosine"] < 1e-5  # steps end at 3e-3 of an uncertainty; other weights give 1.5e-3

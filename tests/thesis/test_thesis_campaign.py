@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from unit_settings import settings_of, with_noise
 
 from pipeline.config import load_campaign
 from pipeline.estimation.accelerometer.staged import STAGES as OF_ACCELEROMETER
@@ -41,7 +42,7 @@ def filtered(name: str) -> tuple[Recording, ...]:
     """Return a set of recordings behind the campaign's filter."""
     description = read_description(CAMPAIGN / "simulation.yaml")
     number = [u.unit for u in description.units].index(name)
-    settings = loaded().units["mpu6050-1-stop-1s-printed"].config["filter"]
+    settings = loaded().units["mpu6050-1-stop-1s-printed"].config.filter
     recordings = simulate_unit(description.units[number], description.seed, number)[0]
     return tuple(apply_filter(r, settings) for r in recordings)
 
@@ -50,14 +51,14 @@ def fitted(name: str, sensor: str, stages: tuple[str, ...], method: str) -> Sens
     settings = loaded().units[f"{name}-{method}"].config
     calibration = None
     for stage in stages:
-        calibration = fit_stage(sensor, stage, filtered(name), calibration, settings)
+        calibration = fit_stage(sensor, stage, with_noise(filtered(name), settings), calibration, settings)
     assert isinstance(calibration, SensorCalibration)
     return calibration
 
 
 def mean_error(device: str, calibration: SensorCalibration | None) -> float:
     """Return the mean |e| of the gyroscope's held-out motion."""
-    held_out = samples_of_motion("gyroscope", filtered(f"{device}-held-out-gyroscope")[0], SILENT, {})
+    held_out = samples_of_motion("gyroscope", filtered(f"{device}-held-out-gyroscope")[0], SILENT, settings_of().table)
     assert held_out is not None
     rate = held_out.reading if calibration is None else linear_truth(calibration, held_out.reading)
     return float(np.mean(np.abs(np.linalg.norm(rate, axis=1) - held_out.magnitude)))

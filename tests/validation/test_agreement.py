@@ -8,25 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from unit_settings import settings_of, with_noise
 
 from pipeline.diagnosis.verdict import DISAGREES
 from pipeline.estimation import effects, reference_least_squares
 from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording, SensorCalibration
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription
 from pipeline.validation.heldout import validate
 from tests.published import diagnose
 
-SETTINGS: dict[str, Any] = {
-    "sensor": read_config("sensor", "mpu6050"),
-    "table": read_config("table", "acutronic"),
-    "procedure": {"holdout_every": 3},
-    "limits": {},
-    "effects": {"accelerometer": [], "gyroscope": []},
-    "method": {"gyroscope": "reference_least_squares", "accelerometer": "reference_least_squares"},
-    "diagnosis": {"depth": "standard"},
-}
+SETTINGS = settings_of(sensor="mpu6050", table="acutronic", procedure={"holdout_every": 3})
 TURN = np.array([[0.0, -5e-4, 0.0], [5e-4, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
@@ -43,11 +36,10 @@ def held_out(sensor: str, change: np.ndarray, configured: tuple[str, ...] = (), 
         replace(r, **{sensor: r.reading(sensor) @ (np.eye(3) + change).T}) if r.role == "validation" else r
         for r in unit(hidden)
     ]
-    settings = SETTINGS | {"effects": {sensor: list(configured)}}
-    noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
-    settings |= {"noise": {sensor: noise}}
-    found = reference_least_squares.fit(sensor, recordings, None, settings)
-    found = effects.fit(sensor, recordings, found, settings) if configured else found
+    settings = settings_of(SETTINGS, effects={sensor: list(configured)})
+    noise = estimate_noise(sensor, recordings, settings.sensor.of(sensor))
+    found = reference_least_squares.fit(sensor, with_noise(recordings, settings), None, settings)
+    found = effects.fit(sensor, with_noise(recordings, settings), found, settings) if configured else found
     return validate(found, recordings, noise, settings), (found, recordings, noise, settings)
 
 
@@ -83,8 +75,8 @@ def test_held_out_motion_that_does_not_move_says_nothing_of_the_matrix() -> None
     still = next(r for r in recordings if r.role == "static")
     attitude = np.tile([1.0, 0.0, 0.0, 0.0], (still.samples, 1))
     held = replace(still, name="validation", role="validation", table_attitude=attitude, table_rate=attitude[:, 1])
-    noise = estimate_noise("gyroscope", recordings, SETTINGS["sensor"]["gyroscope"])
-    found = reference_least_squares.fit("gyroscope", recordings, None, SETTINGS)
+    noise = estimate_noise("gyroscope", recordings, SETTINGS.sensor.gyroscope)
+    found = reference_least_squares.fit("gyroscope", with_noise(recordings, SETTINGS), None, SETTINGS)
     assert validate(found, [*recordings, held], noise, SETTINGS).agreement is None
 
 

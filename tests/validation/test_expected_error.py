@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from unit_settings import settings_of
 
 from pipeline.records import Noise, SensorCalibration
 from pipeline.validation.expected_error import LinearizedSamples, expected_rms_error
@@ -73,7 +74,7 @@ def interval(
     found = SensorCalibration("gyroscope", covariance=covariance, degrees_of_freedom=smallest, freedom=each)
     spread = [np.broadcast_to(v**2, (SAMPLES, 3)) for v in (noise.white, noise.wander)]
     held_out = LinearizedSamples(INTERVAL * np.arange(SAMPLES), *spread, truth, J, SAMPLES, correlated)
-    return expected_rms_error(found, [held_out], noise, {})
+    return expected_rms_error(found, [held_out], noise, settings_of())
 
 
 def test_the_interval_holds_99_percent_of_units_whose_noise_a_filter_has_correlated() -> None:

@@ -13,6 +13,7 @@ from pipeline.config.compose import Composer
 from pipeline.io.arrow import to_parquet
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.stages import batch
+from pipeline.unit import STEPS
 from tests.published import TESTED, validation_document
 
 HARM = "the calibration makes held-out motion worse"
@@ -21,7 +22,7 @@ HARM = "the calibration makes held-out motion worse"
 def run_stage(folder: Path, harmed: list[str], absent: list[str], *, as_printed: bool = False) -> dict[str, Any]:
     """Run the stage on one unit and return its files by name."""
     settings = [f"method.as_printed={str(as_printed).lower()}"]
-    part = Composer(folder).unit("U1", settings).json_value
+    part = Composer(folder).unit("U1", settings).only(STEPS["calibration"].settings)
     (folder / "part.json").write_text(json.dumps({"units": {"U1": part}}))
     parts = {s: None if s in absent else replace(TESTED, worse_than_raw=HARM if s in harmed else None) for s in SENSORS}
     files: dict[str, Any] = {

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from unit_settings import with_noise
 from whole_run import run_campaign
 
 from pipeline.config.campaign import load_campaign
@@ -159,12 +160,12 @@ def test_ten_rests_are_not_enough_to_tell_an_effect(shipped: Bench) -> None:
 def test_ten_rests_without_a_recording_for_validation_calibrate_both_sensors() -> None:
     campaign = load_campaign({"campaign": str(SHIPPED)})
     config = campaign.units["mpu6050"].config
-    recordings = read_recordings(config["procedure"], config["ingest"], config["sensor"], campaign.folder("mpu6050"))
+    recordings = read_recordings(config.procedure, config.ingest, config.sensor, campaign.folder("mpu6050"))
     alone = [r for r in recordings if r.role != "validation"]
-    found = rests_and_moves.fit(alone, None, config)
+    found = rests_and_moves.fit(with_noise(alone, config), None, config)
     assert found.stages[-1].details["rests"] == 10
     assert np.abs(np.diag(found.matrix) / AUTHORS["gyroscope"] - 1)[1:].max() < 9e-4
-    part = validate(found, alone, estimate_noise("gyroscope", alone, config["sensor"]["gyroscope"]), config)
+    part = validate(found, alone, estimate_noise("gyroscope", alone, config.sensor.gyroscope), config)
     assert not part["held_out"]
     assert "10 rests all go to the fit; of 15 and more, one of 3 is held out" in part["reason"]
 

@@ -26,7 +26,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE, Prior
 from pipeline.estimation.least_squares import ScaledColumns
-from pipeline.estimation.monte_carlo import quadratic_results, through, trials_of, with_trials
+from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, AccelerometerModel, limit_of_misalignment
 from pipeline.estimation.multi_position.fit import Fit
 from pipeline.estimation.multi_position.fit import fit as fit_model
@@ -40,7 +40,7 @@ from pipeline.estimation.multi_position.result import (
     require_faces,
     with_stage,
 )
-from pipeline.estimation.noise import prior_of
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.stages import FitStage
 from pipeline.estimation.turns import Part, noise_of_turns
@@ -60,7 +60,6 @@ from pipeline.records import (
     Mask,
     Noise,
     NoMonteCarlo,
-    Recording,
     SensorCalibration,
     Values,
     base_units,
@@ -69,7 +68,10 @@ from pipeline.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
+
+    from pipeline.records import UnitRecordings
+    from pipeline.settings import Settings
 
 
 NAME = "nonlinear_least_squares"
@@ -143,17 +145,15 @@ class _Solved:
         return float(np.sqrt(high))
 
 
-def fit(
-    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
-) -> SensorCalibration:
+def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
     """Fit bias, scale factors and misalignment of the accelerometer (``pipeline.estimation.stages``).
 
     The recordings are rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``). Where
     the procedure states faces, the full matrix is fitted (``pipeline.estimation.multi_position.result``).
     """
-    if not settings["procedure"].get("faces"):
+    if not settings.procedure.faces:
         return _fit_triangular(recordings, previous, settings)
-    require_faces(recordings, settings)
+    require_faces(recordings.filtered, settings.procedure)
     return fit_faces(_fit_triangular(recordings, previous, settings), recordings, settings)
 
 
@@ -165,11 +165,11 @@ def triangle(values: Values) -> Values:
 
 
 def _fit_triangular(
-    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+    recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
 ) -> SensorCalibration:
-    table, prior = settings["table"], prior_of("accelerometer", recordings, settings)
-    gravity_g = float(table.get("gravity_g", 1.0))
-    rows, limit = orientations_of(recordings, settings), limit_of_misalignment(settings["sensor"]["accelerometer"])
+    data_sheet, gravity_g = settings.sensor.accelerometer, settings.table.gravity_g
+    prior = wander_prior(recordings.noises["accelerometer"], data_sheet)
+    rows, limit = orientations_of(recordings.filtered, settings), limit_of_misalignment(data_sheet)
     solved = _fit_determined(rows, gravity_g, prior, limit)
     while refused := _outlier(rows, solved):
         rows = _without(rows, refused)
@@ -312,7 +312,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     before: SensorCalibration,
     correction: dict[str, Any],
     prior: Prior,
-    settings: Mapping[str, Any],
+    settings: Settings,
 ) -> SensorCalibration:
     """Return the calibration under white noise and bias wander, estimated from the residuals of ``y = b + K u``.
 
@@ -321,7 +321,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     """
     count, parts = rows.rests.count, []
     for i in dict.fromkeys(rows.rests.recording.tolist()):
-        recording, motion = rows.recordings[i], table_motion(rows.recordings[i], settings["table"])
+        recording, motion = rows.recordings[i], table_motion(rows.recordings[i], settings.table)
         assert motion is not None  # noqa: S101
         keep = np.zeros(recording.samples, bool)
         for start, stop in rows.rests.span[rows.rests.recording == i]:
@@ -329,7 +329,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         parts.append(Part(recording, motion, keep & sound_samples(recording, "accelerometer")))
     truth = (rows.rests.reading - solved.fit.state.bias) @ solved.fit.state.matrix.T
     along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ solved.fit.state.matrix
-    noise, row = noise_of_turns(parts, prior, settings["table"]), np.repeat(np.arange(len(count)), count)
+    noise, row = noise_of_turns(parts, prior, settings.table), np.repeat(np.arange(len(count)), count)
 
     def map_of(weights: Values, derivative: Values) -> LinearMap:
         x, y, z = ((weights / count)[:, row] * along[row, c] for c in range(3))
@@ -341,9 +341,9 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     details = _details(rows, solved, float(scatter.degrees_of_freedom.min()))
     parameters = _parameters(solved, np.sum([line.covariance for line in lines], axis=0))
     calibration = with_stage(before, NAME, details, solved.model, solved.fit, correction, parameters)
-    gravity, missing = gravity_line(calibration, settings["table"])
+    gravity, missing = gravity_line(calibration, settings.table)
     lines += gravity
-    complete, trials = combined(calibration, lines, missing | OF_LENGTH), trials_of(settings)
+    complete, trials = combined(calibration, lines, missing | OF_LENGTH), settings.uncertainty.monte_carlo
     if not trials:
         return complete
     if len(count) > MOST_ROWS:

@@ -40,7 +40,7 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     turns_of,
 )
 from pipeline.estimation.engine import LinearMap, ResidualNoise
-from pipeline.estimation.noise import prior_of
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage, apply_correction, staged_result, two_sided
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import noise_of_turns, parts_of, used_motions
@@ -69,6 +69,8 @@ if TYPE_CHECKING:
 
     Quantities = dict[str, tuple[float, str]]  # value and unit of each parameter
     Outcome = tuple[list[dict[str, Any]], Quantities]  # steps of the correction by a stage, and its parameters
+    from pipeline.records import UnitRecordings
+    from pipeline.settings import Settings
 
 REPLICATES = 60  # synthetic turns: their covariance is known to a tenth
 SEED = 20190508  # any number
@@ -259,12 +261,12 @@ class Estimator:
     as_printed: bool
 
     @classmethod
-    def of(cls, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Estimator:
+    def of(cls, recordings: Sequence[Recording], settings: Settings) -> Estimator:
         """Return the turns of recordings; ``settings``: sections ``table`` and ``method``."""
-        as_printed = bool(settings["method"].get("as_printed", False))
-        parts = parts_of(recordings, "accelerometer", settings["table"], "the staged method")
+        as_printed = settings.method.as_printed
+        parts = parts_of(recordings, "accelerometer", settings.table, "the staged method")
         turns = turns_of(parts, as_printed=as_printed)
-        return cls(turns, float(settings["table"].get("gravity_g", 1.0)), as_printed)
+        return cls(turns, settings.table.gravity_g, as_printed)
 
     @cached_property
     def sinusoids(self) -> list[list[Sinusoid]]:
@@ -280,13 +282,13 @@ class Estimator:
 
 
 def fit(
-    name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+    name: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
 ) -> SensorCalibration:
     """Run one stage of the staged method (``pipeline.estimation.stages``); role ``accelerometer``, on a table."""
     before = [stage.name for stage in previous.stages] if previous else []
-    estimator = Estimator.of(recordings, settings)
+    estimator = Estimator.of(recordings.filtered, settings)
     turns, gravity_g, sinusoids = estimator.turns, estimator.gravity_g, estimator.sinusoids
-    prior = prior_of("accelerometer", recordings, settings)
+    prior = wander_prior(recordings.noises["accelerometer"], settings.sensor.accelerometer)
     theta = np.concatenate([s.coefficients for channel in range(3) for s in (turn[channel] for turn in sinusoids)])
 
     def chain(values: Values) -> Values:
@@ -294,7 +296,7 @@ def fit(
 
     found = estimator.after([name], Corrected.of(previous))
     # A separate sinusoid for each turn and channel would absorb the changes of the bias from turn to turn.
-    noise = noise_of_turns([part for turn in turns for part in turn.parts], prior, settings["table"], two_sided=True)
+    noise = noise_of_turns([part for turn in turns for part in turn.parts], prior, settings.table, two_sided=True)
     if estimator.as_printed:
         scatter = _resampled(turns, sinusoids, noise, gravity_g, [*before, name])
     else:
@@ -325,7 +327,7 @@ def fit(
     if estimator.as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
     motions = used_motions([part for turn in turns for part in turn.parts])
-    reference = Reference("accelerometer", motions, np.diag(found.k), settings["table"])
+    reference = Reference("accelerometer", motions, np.diag(found.k), settings.table)
 
     def results(errors: Values) -> Values:
         return np.array([chain(theta + e)[kept] for e in errors])

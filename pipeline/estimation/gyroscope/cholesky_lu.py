@@ -32,7 +32,7 @@ output of a filter still changes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
-from pipeline.estimation.noise import prior_of
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.reference_least_squares import of_channels
 from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
@@ -62,7 +62,10 @@ from pipeline.records import (
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
+
+    from pipeline.records import UnitRecordings
+    from pipeline.settings import Settings, Table
 
 
 NAME = "cholesky_lu"
@@ -96,31 +99,29 @@ class Forward(NamedTuple):
     A: Values  # (3, 3)
 
 
-def forward_of(recordings: Sequence[Recording], bias: Values, settings: Mapping[str, Any]) -> Forward:
-    """Return the forward matrix of recordings without its uncertainty; ``settings``: section ``table``."""
-    turns = turns_of(parts_of(recordings, "gyroscope", settings["table"], "the Cholesky and LU method"))
+def forward_of(recordings: Sequence[Recording], bias: Values, table: Table) -> Forward:
+    """Return the forward matrix of recordings without its uncertainty."""
+    turns = turns_of(parts_of(recordings, "gyroscope", table, "the Cholesky and LU method"))
     Y, U = turns.integral(turns.reading - bias), turns.integral(turns.rate)
     require_turns(U)
     columns = ScaledColumns.of(U)
     return Forward(turns, Y, U, columns, columns.solve(Y).T)
 
 
-def fit(
-    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
-) -> SensorCalibration:
+def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
     """Fit the matrix of the gyroscope to integrated turns (``pipeline.estimation.stages``).
 
     Role ``gyroscope``, on a table, after the stage ``bias``.
     """
     assert previous is not None  # noqa: S101  (it needs the bias: FIT_STAGES)
-    turns, Y, U, columns, A = forward_of(recordings, previous.bias, settings)
-    as_printed = bool(settings["method"].get("as_printed", False))
+    turns, Y, U, columns, A = forward_of(recordings.filtered, previous.bias, settings.table)
+    as_printed = settings.method.as_printed
     factors = factorise(A)
     residuals = turns.reading - previous.bias - turns.rate @ A.T
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
-    prior = prior_of("gyroscope", recordings, settings)
+    prior = wander_prior(recordings.noises["gyroscope"], settings.sensor.gyroscope)
     fit, of_bias = _linear_map(turns, A, previous, as_printed=as_printed)
-    reference = Reference("gyroscope", used_motions(turns.parts), A, settings["table"])
+    reference = Reference("gyroscope", used_motions(turns.parts), A, settings.table)
     noise = noise_of_fit(turns.parts, reference, residuals, design, prior)
     scatter = noise_contribution(noise, fit, prior)
     matrix = calibration_matrix(A, as_printed=as_printed)

@@ -17,18 +17,18 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
-from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, model_of
+from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, accelerometer_of, model_of
 from pipeline.estimation.multi_position.model import NEW, State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
-from pipeline.estimation.noise import noise_of, prior_of
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
 from pipeline.estimation.stages import FitStage
-from pipeline.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Recording, SensorCalibration
+from pipeline.records import BASE_COUNT, MATRIX, MATRIX_NAMES, SensorCalibration
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
+    from pipeline.records import UnitRecordings
+    from pipeline.settings import Settings
 
 NAME = "rests_and_moves"
 FIT_STAGES = {NAME: FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
@@ -37,28 +37,28 @@ UNKNOWN = 0.05  # standard uncertainty beyond which an element of the matrix is 
 ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
-def fit(
-    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
-) -> SensorCalibration:
+def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
     """Fit bias and matrix of the gyroscope (``pipeline.estimation.stages``).
 
     Role ``rests``, with the readings of the accelerometer, which is calibrated first. Raises ``CannotCalibrateError``
     also where there are too few moves: the unit then keeps the calibration of its accelerometer.
     """
-    if not is_multi_position("gyroscope", recordings):
+    filtered, procedure = recordings.filtered, settings.procedure
+    if not is_multi_position("gyroscope", filtered):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
-    if not any(r.role == ROLE and r.accelerometer is not None for r in recordings):
+    if not any(r.role == ROLE and r.accelerometer is not None for r in filtered):
         raise CannotCalibrateError(
             "rests and moves need the readings of both sensors: gravity before and after each move shows by how much "
             "the unit turned. A gyroscope alone needs a rate table"
         )
-    noise, advice = noise_of("gyroscope", recordings, settings), ADVICE + advice_on_held_out(recordings, settings)
-    model = model_of(recordings, None, noise, settings)
+    noise, advice = recordings.noises["gyroscope"], ADVICE + advice_on_held_out(filtered, procedure)
+    accelerometer = accelerometer_of(recordings, settings)
+    model = model_of(filtered, None, noise, procedure, accelerometer)
     if model is None or (model.moves is None and model.turns is None):
-        rests = rests_of("gyroscope", recordings, settings)
+        rests = rests_of("gyroscope", filtered, procedure)
         raise CannotCalibrateError(
             f"the gyroscope's matrix needs at least {FEWEST_MOVES} moves between rests, without gaps or clipped "
-            f"readings{clipped_moves(recordings, rests) if rests else ''}: {advice}"
+            f"readings{clipped_moves(filtered, rests) if rests else ''}: {advice}"
         )
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     base = model.equations(start).base
@@ -66,16 +66,16 @@ def fit(
         raise NotObservableError(
             f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {advice}"
         )
-    prior = prior_of("gyroscope", recordings, settings)
+    prior = wander_prior(noise, settings.sensor.gyroscope)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     fit_model = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
-    model, fitted, outlying = fit_robustly(model, fit_model, recordings)
-    moved, faces = np.zeros(BASE_COUNT), settings["procedure"].get("faces")
+    model, fitted, outlying = fit_robustly(model, fit_model, filtered)
+    moved, faces = np.zeros(BASE_COUNT), procedure.faces
     for _ in range(MOVED_TIMES if faces and model.moves else 0):
         moved = model.accelerometer_errors(fitted)
-        model = model_of(recordings, None, noise, settings, moved=moved)
+        model = model_of(filtered, None, noise, procedure, accelerometer, moved=moved)
         assert model is not None  # noqa: S101
-        model, fitted, outlying = fit_robustly(model, partial(fit_model, start=fitted.state), recordings)
+        model, fitted, outlying = fit_robustly(model, partial(fit_model, start=fitted.state), filtered)
     moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(fitted.covariance))[MATRIX]
     if np.any(u > UNKNOWN):
         weak = [name for name, one in zip(MATRIX_NAMES, u, strict=True) if one > UNKNOWN]

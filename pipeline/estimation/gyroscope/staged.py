@@ -29,7 +29,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certified
-from pipeline.estimation.noise import prior_of
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage, apply_correction, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import Part, noise_of_fit, parts_of, steady_turns, used_motions
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
     # step of the correction by a stage, and value and unit of each of its parameters
     Outcome = tuple[dict[str, Any], dict[str, tuple[float, str]]]
+    from pipeline.records import UnitRecordings
+    from pipeline.settings import Settings
 
 STEP = 1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 FORGOTTEN = 1e-5  # share of a change of rate in a filter's output, below which the filter has settled
@@ -147,25 +149,25 @@ class Estimates(NamedTuple):
     response: Response
 
 
-def estimates_of(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Estimates:
+def estimates_of(recordings: Sequence[Recording], settings: Settings) -> Estimates:
     """Return what the stages read of recordings; ``settings``: sections ``table`` and ``method``."""
-    as_printed = bool(settings["method"].get("as_printed", False))
-    samples = samples_of(parts_of(recordings, "gyroscope", settings["table"], "the staged method"), recordings)
+    as_printed = settings.method.as_printed
+    samples = samples_of(parts_of(recordings, "gyroscope", settings.table, "the staged method"), recordings)
     weights = weights_of(samples.rate, as_printed=as_printed)
     theta = weights @ samples.reading
     return Estimates(samples, weights, theta, Response(theta[0], theta[1:], samples.speed, as_printed))
 
 
 def fit(
-    name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+    name: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
 ) -> SensorCalibration:
     """Run one stage of the staged method (``pipeline.estimation.stages``).
 
     Role ``gyroscope``, on a table; also role ``static`` if these recordings hold no rest.
     """
     before = [stage.name for stage in previous.stages] if previous else []
-    samples, weights, theta, response = estimates_of(recordings, settings)
-    prior = prior_of("gyroscope", recordings, settings)
+    samples, weights, theta, response = estimates_of(recordings.filtered, settings)
+    prior = wander_prior(recordings.noises["gyroscope"], settings.sensor.gyroscope)
     design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])
     residuals = samples.reading - theta[0] - samples.rate @ theta[1:]
 
@@ -178,7 +180,7 @@ def fit(
     found = follow(response, [name], correction.get("steps", []))
     x, y, z = np.split(derivative(chain, here, np.full(here.size, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
-    reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings["table"])
+    reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings.table)
     noise = noise_of_fit(samples.parts, reference, residuals, design, prior)
     scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, samples.reading)

@@ -21,7 +21,7 @@ because L_ij is the angle between two axes, the sum of their two cross-axis sens
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.design import Term
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.settings import DataSheet, Settings
 
 ROUNDS = 12  # of effects that depend on the force
 SETTLED = 1e-12  # g
@@ -172,9 +173,9 @@ def white_of(rests: Rests, noise: Noise | None) -> Values:
     return rests.white
 
 
-def limit_of_misalignment(sensor_config: Mapping[str, Any]) -> float:
-    """Return u of a misalignment by the sensor file's limit, rad; ``sensor_config``: its section ``accelerometer``."""
-    return float(np.sqrt(2.0 / 3.0)) * float(sensor_config["cross_axis"])
+def limit_of_misalignment(data_sheet: DataSheet) -> float:
+    """Return u of a misalignment by the sensor file's limit, rad; ``data_sheet``: of the accelerometer."""
+    return float(np.sqrt(2.0 / 3.0)) * data_sheet.cross_axis
 
 
 def _directions(calibration: SensorCalibration) -> Values:
@@ -188,19 +189,19 @@ def _directions(calibration: SensorCalibration) -> Values:
 
 
 def model_of(
-    recordings: Sequence[Recording], calibration: SensorCalibration, noise: Noise | None, settings: Mapping[str, Any]
+    recordings: Sequence[Recording], calibration: SensorCalibration, noise: Noise | None, settings: Settings
 ) -> AccelerometerModel | None:
     """Return the model of the recordings' rests, or None if there are none.
 
-    ``calibration``: of the accelerometer's method; ``settings``: sections ``table`` and ``procedure``.
+    ``calibration``: of the accelerometer's method.
     """
-    rests = rests_of("accelerometer", recordings, settings, calibration)
+    rests = rests_of("accelerometer", recordings, settings.procedure, calibration)
     if rests is None:
         return None
-    gravity = float(settings["table"].get("gravity_g") or 1.0)
-    held = rests_of("accelerometer", recordings, settings, role=HELD_OUT) or rests.select(rests.held_out)
+    gravity = settings.table.gravity_g
+    held = rests_of("accelerometer", recordings, settings.procedure, role=HELD_OUT) or rests.select(rests.held_out)
     used = rests.select(~rests.held_out)
-    faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings)
+    faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings.procedure.faces)
     by_limit = {name: u for stage in calibration.stages for name, u in stage.details.get(KNOWN_BY_LIMIT, {}).items()}
     directions = _directions(calibration)
     return AccelerometerModel(used, directions, gravity, noise, held=held, faces=faces, known_by_limit=by_limit)

@@ -32,9 +32,11 @@ from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibra
 from pipeline.signal.segments import ACROSS, multiples
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.estimation.design import Term
+    from pipeline.settings import Faces as StatedFaces
+    from pipeline.settings import HandTurns
 
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
 DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5
@@ -61,13 +63,12 @@ class Faces:
         return np.array(rows).reshape(-1, len(self.face), 3)
 
 
-def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces | None:
+def faces_of(rests: Rests, force: Values, stated: StatedFaces | None) -> Faces | None:
     """Return the face of each rest, by its specific force (m, 3); None if the procedure states no faces.
 
     Raises ``NotObservableError`` if there is no rest on a face.
     """
-    stated = settings["procedure"].get("faces")
-    if not stated:
+    if stated is None:
         return None
     face, axis, along, tilt = face_of(force)
     missing = [name for i, name in enumerate(FACES) if not np.any(face == i)]
@@ -78,7 +79,7 @@ def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces 
             f"there is no rest with body {' or '.join(missing)} up, within {NEAR_DEG:g} deg: rest the unit for 4 s or "
             f"longer on each of its six faces. Nearest to up in the rests found: {found}"
         )
-    return Faces(face, float(np.radians(stated["accuracy_deg"])))
+    return Faces(face, float(np.radians(stated.accuracy_deg)))
 
 
 def face_of(force: Values) -> tuple[Index, Index, Values, Values]:
@@ -175,7 +176,7 @@ def turns_of(
     recordings: Sequence[Recording],
     rests: Rests,
     accelerometer: SensorCalibration,
-    turns: Mapping[str, Any],
+    turns: HandTurns,
     role: str = ROLE,
 ) -> tuple[Turns | None, list[tuple[Recording, float, Values]]]:
     """Return the moves that are turns by a multiple of the stated angle, and all moves.
@@ -200,7 +201,7 @@ def turns_of(
         if sound_span(recording, span):
             rate, time = np.asarray(recording.gyroscope)[span] - bias, recording.time[span]
             angle = np.asarray(np.trapezoid(rate, time, axis=0), np.float64)
-            axis, count = multiples(angle, float(turns["angle_deg"]))
+            axis, count = multiples(angle, turns.angle_deg)
             moves.append((recording, float(time[0]), angle))
             if count:
                 chosen.append((recording, span))
@@ -208,19 +209,19 @@ def turns_of(
     if not chosen:
         return None, moves
     axes, counts = np.array(multiple).T
-    stated, number = counts * float(turns["angle_deg"]), len(chosen)
+    stated, number = counts * turns.angle_deg, len(chosen)
     pairs = [(r, at) for (r, _), at in zip(chosen, padded([span for _, span in chosen]), strict=True)]
     force = [(np.asarray(r.accelerometer)[at] - accelerometer.bias) @ accelerometer.matrix.T for r, at in pairs]
     warmth = [np.full(len(at), np.nan) if r.temperature is None else r.temperature[at] for r, at in pairs]
     times = np.array([r.time[at] for r, at in pairs])
     rows = [np.outer(turn, np.eye(3)[axis]) for turn, axis in zip(np.eye(number), axes, strict=True)]
-    value, error = stated.tolist(), number * [float(turns["accuracy_deg"])]
+    value, error = stated.tolist(), number * [turns.accuracy_deg]
     for axis in np.unique(axes):
         signed = np.where(axes == axis, np.sign(stated), 0.0)
         share = np.degrees(signed / np.sum(signed * stated))
         rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != axis]
         value += [0.0, 0.0]
-        error += 2 * [float(turns["axis_accuracy_deg"])]
+        error += 2 * [turns.axis_accuracy_deg]
     return Turns(
         name=tuple(r.name for r, _ in chosen),
         axis=axes,
@@ -236,9 +237,7 @@ def turns_of(
     ), moves
 
 
-def require_turns(
-    found: Turns | None, moves: Sequence[tuple[Recording, float, Values]], turns: Mapping[str, Any]
-) -> None:
+def require_turns(found: Turns | None, moves: Sequence[tuple[Recording, float, Values]], turns: HandTurns) -> None:
     """Raise ``NotObservableError`` if an axis has no stated turn, or a recording of a turn has another turn."""
     expected = f"a multiple of {float(turns['angle_deg']):g} deg, within a tenth of it and a quarter of that angle"
     advice = (

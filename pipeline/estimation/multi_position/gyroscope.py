@@ -48,7 +48,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, UnitRecordings, Values
+    from pipeline.settings import Procedure, Settings
 
 FEWEST_MOVES = 6  # two equations each, for the nine of the matrix
 ROUNDS = 6  # of effects that depend on the rate
@@ -290,43 +291,46 @@ class GyroscopeModel:
         return motion, v, A
 
 
+def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
+    """Return the given calibration of the accelerometer (``method.given``), else calibrate it.
+
+    Raises ``CannotCalibrateError`` if that fails.
+    """
+    from pipeline.estimation.accelerometer import nonlinear_least_squares  # noqa: PLC0415  (needs this package)
+
+    try:
+        if is_given("accelerometer", settings.method):
+            return given_calibration("accelerometer", settings.method)
+        return nonlinear_least_squares.fit(recordings, None, settings)
+    except (NotObservableError, CannotCalibrateError) as lack:
+        raise CannotCalibrateError(
+            f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
+        ) from lack
+
+
 def model_of(
     recordings: Sequence[Recording],
     calibration: SensorCalibration | None,
     noise: Noise | None,
-    settings: Mapping[str, Any],
-    accelerometer: SensorCalibration | None = None,
+    procedure: Procedure,
+    accelerometer: SensorCalibration,
     *,
     moved: Values | None = None,
 ) -> GyroscopeModel | None:
     """Return the model of the recordings' rests and moves, or None if there is no rest.
 
-    ``calibration``: of the gyroscope; its outlying moves are not used. ``settings``: sections ``table`` and
-    ``procedure``. ``accelerometer``: by default the given calibration (``method.given``), else the accelerometer is
-    calibrated here; ``CannotCalibrateError`` if that fails. ``moved``: (12,), see ``moves.observed_rests``; by default
-    that of ``calibration``.
+    ``calibration``: of the gyroscope; its outlying moves are not used. ``moved``: (12,), see ``moves.observed_rests``;
+    by default that of ``calibration``.
     """
-    if accelerometer is None:
-        from pipeline.estimation.accelerometer import nonlinear_least_squares  # noqa: PLC0415  (needs this package)
-
-        try:
-            if is_given("accelerometer", settings):
-                accelerometer = given_calibration("accelerometer", settings)
-            else:
-                accelerometer = nonlinear_least_squares.fit(recordings, None, settings)
-        except (NotObservableError, CannotCalibrateError) as lack:
-            raise CannotCalibrateError(
-                f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
-            ) from lack
     details = [stage.details for stage in calibration.stages] if calibration else []
     if moved is None:
         moved = next((np.array(d[MOVED]) for d in details if MOVED in d), None)
-    observed = observed_rests(recordings, accelerometer, settings, moved=moved)
+    observed = observed_rests(recordings, accelerometer, procedure, moved=moved)
     if observed is None:
         return None
     rests, gravity = observed
-    moves, turns, stated = moves_of(recordings, rests), None, settings["procedure"].get("turns")
-    if stated:
+    moves, turns, stated = moves_of(recordings, rests), None, procedure.turns
+    if stated is not None:
         turns, every = turns_of(recordings, rests, accelerometer, stated)
         require_turns(turns, every, stated)
     if moves is not None and calibration is not None:

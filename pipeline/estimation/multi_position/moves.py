@@ -53,10 +53,10 @@ from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.signal.rests import Rest
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from typing import Any
+    from collections.abc import Sequence
 
     from pipeline.records import Index, Mask, Recording, SensorCalibration, Values
+    from pipeline.settings import Procedure
 
 LONGEST_S = 60.0  # see ``moves_of``
 GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
@@ -277,7 +277,7 @@ class Gravity:
 def observed_rests(
     recordings: Sequence[Recording],
     accelerometer: SensorCalibration,
-    settings: Mapping[str, Any],
+    procedure: Procedure,
     role: str = ROLE,
     moved: Values | None = None,
 ) -> tuple[Rests, Gravity] | None:
@@ -285,8 +285,8 @@ def observed_rests(
 
     ``moved`` is added to bias and matrix of the accelerometer, (12,): gravity is linear in their errors from there on.
     """
-    of_force = rests_of("accelerometer", recordings, settings, accelerometer, role)
-    of_rate = rests_of("gyroscope", recordings, settings, accelerometer, role)
+    of_force = rests_of("accelerometer", recordings, procedure, accelerometer, role)
+    of_rate = rests_of("gyroscope", recordings, procedure, accelerometer, role)
     if of_force is None or of_rate is None:
         return None
     keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (of_force, of_rate)]

@@ -20,13 +20,13 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import AUTO, limits_of
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import certified
-from pipeline.estimation.monte_carlo import quadratic_results, trials_of, with_trials
+from pipeline.estimation.monte_carlo import quadratic_results, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
 from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_observable
 from pipeline.estimation.multi_position.model import Model, State, prior_hypotheses, selection_hypotheses, stepped
 from pipeline.estimation.multi_position.selection import Selection, fit_configured, refusal
-from pipeline.estimation.noise import noise_of, prior_of
+from pipeline.estimation.noise import wander_prior, with_noises
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.stages import is_given, unknown_uncertainty
 from pipeline.estimation.table_errors import TIME_BASE
@@ -41,10 +41,13 @@ from pipeline.estimation.uncertainty_budget import (
     scatter_contribution,
 )
 from pipeline.model.effects import effect
-from pipeline.records import Contribution, Noise, Recording, SensorCalibration, StageResult, Values, base_values
+from pipeline.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from pipeline.records import Noise, UnitRecordings
+    from pipeline.settings import Procedure, Settings
 
 
 STEP = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
@@ -64,34 +67,39 @@ def model_of(
     recordings: Sequence[Recording],
     calibration: SensorCalibration,
     noise: Noise | None,
-    settings: Mapping[str, Any],
+    settings: Settings,
     other: SensorCalibration | None = None,
 ) -> Model | None:
     """Return the model of the sensor of a calibration, or None if its recordings have no rest.
 
-    ``calibration``: of the sensor's method. ``settings``: sections ``table`` and ``procedure``. ``other``: of the
-    accelerometer, where the sensor is the gyroscope; by default the accelerometer is calibrated here.
+    ``calibration``: of the sensor's method. ``other``: of the accelerometer, where the sensor is the gyroscope; by
+    default ``accelerometer_of``.
     """
     if calibration.sensor == "accelerometer":
         return accelerometer.model_of(recordings, calibration, noise, settings)
-    return gyroscope.model_of(recordings, calibration, noise, settings, other)
+    if other is None:
+        other = gyroscope.accelerometer_of(with_noises(recordings, settings.sensor, ("accelerometer",)), settings)
+    return gyroscope.model_of(recordings, calibration, noise, settings.procedure, other)
 
 
 def fit_effects_by_rests(
-    before: SensorCalibration, recordings: Sequence[Recording], noise: Noise | None, settings: Mapping[str, Any]
+    before: SensorCalibration, recordings: UnitRecordings, settings: Settings
 ) -> SensorCalibration:
-    """Fit the effects of ``settings["effects"]`` together with bias and matrix to rests and moves.
+    """Fit the effects of ``settings.effects`` together with bias and matrix to rests and moves.
 
     ``before``: of the sensor's method; returned unchanged where there is no effect to add. Raises
     ``NotObservableError`` if rests and moves do not determine an effect; ``ConfigurationError`` if an effect is unknown
     or not of this sensor.
     """
     sensor = before.sensor
-    wanted, sensor_config = settings["effects"][sensor], settings["sensor"][sensor]
-    model = model_of(recordings, before, noise, settings)
+    wanted, data_sheet = settings.effects.of(sensor), settings.sensor.of(sensor)
+    noise, other = recordings.noises[sensor], None
+    if sensor == "gyroscope":
+        other = gyroscope.accelerometer_of(recordings, settings)
+    model = model_of(recordings.filtered, before, noise, settings, other)
     if model is None:
         return before
-    names = Selection(model, before, [], noise, sensor_config).names if wanted == AUTO else list(wanted)
+    names = Selection(model, before, [], noise, data_sheet).names if wanted == AUTO else list(wanted)
     if not names:
         return before
     for name in names:
@@ -99,7 +107,7 @@ def fit_effects_by_rests(
         if reason:
             raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
     hypotheses = selection_hypotheses(noise, model.kinds)
-    limits = limits_of(sensor, sensor_config)
+    limits = limits_of(sensor, data_sheet)
     fitted = fit_configured(model, before, names, hypotheses)
     if plausible(model, fitted, limits):
         fitted = fit_configured(model, before, names, hypotheses, limits)
@@ -112,9 +120,7 @@ def fit_effects_by_rests(
     return calibration_of(model, fitted, before, settings)
 
 
-def calibration_of(
-    model: Model, fitted: Fit, before: SensorCalibration, settings: Mapping[str, Any]
-) -> SensorCalibration:
+def calibration_of(model: Model, fitted: Fit, before: SensorCalibration, settings: Settings) -> SensorCalibration:
     """Convert a fit to a calibration with the stage ``effects``."""
     details = {
         "samples": round(model.samples()),
@@ -158,7 +164,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     details: dict[str, Any],
     model: Model,
     fitted: Fit,
-    settings: Mapping[str, Any],
+    settings: Settings,
     correction: dict[str, Any] | None = None,
     *,
     parameters: dict[str, dict[str, Any]] | None = None,
@@ -167,11 +173,10 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
 ) -> SensorCalibration:
     """Convert a fit to a calibration after an additional stage, with its uncertainty budget by the residuals.
 
-    ``settings``: sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``), ``uncertainty``.
     ``parameters``: of the stage, where they are not bias and matrix. ``white``: (12,), variance by white noise, where
     the budget states it separately.
     """
-    sensor, table, place = model.sensor, settings["table"], _places(model, fitted)
+    sensor, table, place = model.sensor, settings.table, _places(model, fitted)
     covariance = place @ fitted.covariance @ place.T
     freedom = np.min(np.where(place != 0.0, fitted.degrees_of_freedom, np.inf), axis=1)
     effects, of_effects = effect_parameters(sensor, fitted.state.terms, covariance)
@@ -189,14 +194,14 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
         gravity, unstated = gravity_line(calibration, table)
         lines, missing = lines + gravity, missing | unstated
     else:
-        if table.get("clock_accuracy_ppm") is None:
+        if table.clock_accuracy_ppm is None:
             missing[TIME_BASE] = "table.clock_accuracy_ppm is not stated"
         else:
-            lines.append(clock_contribution(calibration, float(table["clock_accuracy_ppm"])))
-        if is_given("accelerometer", settings):
-            missing |= unknown_uncertainty("accelerometer", settings)
+            lines.append(clock_contribution(calibration, table.clock_accuracy_ppm))
+        if is_given("accelerometer", settings.method):
+            missing |= unknown_uncertainty("accelerometer", settings.method)
         missing["Earth's rotation"] = "not in the model: by hand the heading is unknown; up to 0.0042 deg/s of bias"
-    complete, trials = combined(calibration, [*lines, *limit], missing), trials_of(settings)
+    complete, trials = combined(calibration, [*lines, *limit], missing), settings.uncertainty.monte_carlo
     return _with_monte_carlo(complete, model, fitted, trials, lines[1:]) if trials else complete
 
 
@@ -260,31 +265,31 @@ def curvature(model: Model, fitted: Fit) -> Values:
     return np.asarray(0.5 * (H + H.transpose(0, 2, 1)))
 
 
-def require_faces(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> None:
+def require_faces(recordings: Sequence[Recording], procedure: Procedure) -> None:
     """Raise ``NotObservableError`` if there is a face without a rest, by the raw readings."""
-    rests = rests_of("accelerometer", recordings, settings)
+    rests = rests_of("accelerometer", recordings, procedure)
     if rests is not None:
         used = rests.select(~rests.held_out)
-        faces_of(used, used.reading, settings)
+        faces_of(used, used.reading, procedure.faces)
 
 
-def fit_faces(
-    before: SensorCalibration, recordings: Sequence[Recording], settings: Mapping[str, Any]
-) -> SensorCalibration:
+def fit_faces(before: SensorCalibration, recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
     """Fit bias and full matrix to the rests and their faces; ``before``: the calibration by the rests alone.
 
     Raises ``NotObservableError`` if there is no rest on a face.
     """
-    model = accelerometer.model_of(recordings, before, noise_of("accelerometer", recordings, settings), settings)
+    noise, stated = recordings.noises["accelerometer"], settings.procedure.faces
+    model = accelerometer.model_of(recordings.filtered, before, noise, settings)
     assert model is not None  # noqa: S101
     assert model.faces is not None  # noqa: S101
-    prior = prior_of("accelerometer", recordings, settings)
+    assert stated is not None  # noqa: S101
+    prior = wander_prior(noise, settings.sensor.accelerometer)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     fitted = fit(model, State(before.bias, before.matrix), noises, {})
     force, _ = model.specific_force(fitted.state, model.rests)
     across = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
     off = dict(zip(FACES, np.linalg.norm(across, axis=1).tolist(), strict=True))
-    accuracy = float(settings["procedure"]["faces"]["accuracy_deg"])
+    accuracy = stated.accuracy_deg
     details = {
         "departures": [
             f"face {name} is {angle:.1f} deg off the direction by the other faces, {angle / accuracy:.1f} times "

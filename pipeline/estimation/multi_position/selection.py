@@ -41,10 +41,10 @@ from pipeline.model.effects.base import Effect, Owner
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
-    from typing import Any
 
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Noise, SensorCalibration, Values
+    from pipeline.settings import DataSheet
 
 
 ROUNDS = 3 * MOST
@@ -82,7 +82,7 @@ def fit_configured(
 class Selection:
     """The selected effects, and the scores of every candidate: ``first`` and ``last`` before and after the search.
 
-    ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sensor_config``: the
+    ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``data_sheet``: the
     sensor's section of the configuration. ``names``: in order. ``steps``: score of each when it was accepted. ``fits``:
     of base and configured effects, then with each further selected one. ``own``: for each selected effect, the scores
     given all others.
@@ -94,11 +94,11 @@ class Selection:
         start: SensorCalibration,
         configured: Sequence[str],
         noise: Noise | None,
-        sensor_config: Mapping[str, Any],
+        data_sheet: DataSheet,
     ) -> None:
         self.model = model
         self.hypotheses = selection_hypotheses(noise, model.kinds)
-        self.limits = limits_of(model.sensor, sensor_config)
+        self.limits = limits_of(model.sensor, data_sheet)
         effects = catalogue().items()
         self.candidates = [e for n, e in effects if n not in configured and not refusal(e, model.sensor, model.rests)]
         self.bounds = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}

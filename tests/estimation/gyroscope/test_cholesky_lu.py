@@ -2,15 +2,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from unit_settings import settings_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
 from pipeline.estimation.stages import apply_correction, fit_stage
-from pipeline.records import Recording, SensorCalibration, coverage_factor
+from pipeline.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
+
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
 
 INTERVAL = 0.12
 S = np.array([1.01, 0.98, 1.03])
@@ -31,12 +35,8 @@ def _rotation(*degrees: float) -> np.ndarray:
 M = _rotation(1.5, -1.0, 2.0)
 FORWARD = S[:, None] * T @ M
 BIAS = np.array([1.2, -0.7, 0.4])
-SETTINGS: dict[str, Any] = {
-    "table": {"gravity_g": 1.0},
-    "method": {"as_printed": False},
-    "sensor": {"gyroscope": {"bias_wander": 3e-3, "wander_time_s": 100.0}},
-}
-AS_PRINTED = {**SETTINGS, "method": {"as_printed": True}}
+SETTINGS = settings_of(sensor={"gyroscope": {"bias_wander": 3e-3}})
+AS_PRINTED = settings_of(SETTINGS, method={"as_printed": True})
 
 
 def _turns(
@@ -77,8 +77,9 @@ def _campaign(
     return [_turns(axis, rates, rng, 2000 * k) for k, axis in enumerate("xyz")]
 
 
-def _fit(recordings: list[Recording], settings: dict[str, Any] = SETTINGS) -> SensorCalibration:
-    return fit(recordings, fit_stage("gyroscope", "bias", recordings, None, settings), settings)
+def _fit(recordings: list[Recording], settings: Settings = SETTINGS) -> SensorCalibration:
+    unit = with_noise(recordings, settings)
+    return fit(unit, fit_stage("gyroscope", "bias", unit, None, settings), settings)
 
 
 def _values(calibration: SensorCalibration) -> dict[str, float]:
@@ -187,7 +188,9 @@ def test_a_delay_of_the_readings_hardly_matters_to_integrated_turns() -> None:
         reading = np.asarray(recording.gyroscope)
         late = np.concatenate([reading[:2], reading[:-2]])  # 0.24 s: 5 deg at 20 deg/s
         delayed.append(dataclasses.replace(recording, gyroscope=late, filter={"name": "rc_low_pass", "delay_s": 0.24}))
-    assert _fit(delayed).matrix @ FORWARD == pytest.approx(np.eye(3), abs=1e-9)
+    unit = UnitRecordings(delayed, {"gyroscope": None})
+    found = fit(unit, fit_stage("gyroscope", "bias", unit, None, SETTINGS), SETTINGS)
+    assert found.matrix @ FORWARD == pytest.approx(np.eye(3), abs=1e-9)
 
 
 def test_turns_in_both_directions_without_a_rest_between_count_as_two() -> None:
@@ -248,10 +251,11 @@ def test_without_a_rest_the_bias_of_a_static_recording_counts_with_its_uncertain
     turning = [r.select(np.abs(np.asarray(r.table_rate)) > 1.0) for r in _campaign(rng, rates=(20.0,))]
     reading = BIAS + 0.05 * rng.normal(size=(2000, 3))
     static = Recording("static", "static", None, (9000 + np.arange(2000)) * 120_000_000, gyroscope=reading)
-    before = fit_stage("gyroscope", "bias", [*turning, static], None, SETTINGS)
+    before = fit_stage("gyroscope", "bias", with_noise([*turning, static], SETTINGS), None, SETTINGS)
     assert before.covariance is not None
-    known = fit([*turning, static], before, SETTINGS)
-    vague = fit([*turning, static], dataclasses.replace(before, covariance=1e4 * before.covariance), SETTINGS)
+    known = fit(with_noise([*turning, static], SETTINGS), before, SETTINGS)
+    unknown = dataclasses.replace(before, covariance=1e4 * before.covariance)
+    vague = fit(with_noise([*turning, static], SETTINGS), unknown, SETTINGS)
     assert known.covariance is not None
     assert vague.covariance is not None
     assert vague.covariance[3, 3] > 10.0 * known.covariance[3, 3]
@@ -279,9 +283,9 @@ def test_without_a_table_log_the_gyroscope_cannot_be_calibrated_and_the_recordin
     bare = [dataclasses.replace(r, table_angle=None, table_rate=None) for r in _campaign()]
     before = SensorCalibration("gyroscope", bias=BIAS)
     with pytest.raises(CannotCalibrateError, match=r"Cholesky and LU method needs the table's motion.*record turns"):
-        fit(bare, before, SETTINGS)
+        fit(with_noise(bare, SETTINGS), before, SETTINGS)
 
 
 def test_without_the_bias_stage_it_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="needs bias by an earlier stage"):
-        fit_stage("gyroscope", "cholesky_lu", _campaign(), None, SETTINGS)
+        fit_stage("gyroscope", "cholesky_lu", with_noise(_campaign(), SETTINGS), None, SETTINGS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hand_session import hand_held
+from unit_settings import settings_of
 
 from pipeline.estimation.multi_position.moves import moves_of
 from pipeline.estimation.rest_means import rests_of
@@ -28,7 +29,7 @@ def _recording(seed: int, rate: np.ndarray, angle: np.ndarray) -> Recording:
 
 def _angles(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Return the angle of each move, as it is used and by the raw readings."""
-    rests = rests_of("gyroscope", [recording], {"procedure": {"holdout_every": 0}})
+    rests = rests_of("gyroscope", [recording], settings_of().procedure)
     assert rests is not None
     moves = moves_of([recording], rests)
     assert moves is not None

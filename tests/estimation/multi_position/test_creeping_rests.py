@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from unit_settings import settings_of
 
 from pipeline.estimation.multi_position.moves import clocks_of, gravity_of
 from pipeline.estimation.rest_means import rests_of
@@ -27,7 +28,7 @@ def set_down(creep_deg: float, seed: int = 3) -> Recording:
 
 def test_gravity_after_a_move_is_that_next_to_it_where_the_unit_settles() -> None:
     recording = set_down(0.8)
-    felt = rests_of("accelerometer", [recording], {"procedure": {"holdout_every": 0}})
+    felt = rests_of("accelerometer", [recording], settings_of().procedure)
     assert felt is not None
     found = gravity_of([recording], felt, SensorCalibration("accelerometer", converged=True))
     begin = felt.span[1, 0] * 0.01 - 7.0  # s after the move
@@ -41,7 +42,7 @@ def test_gravity_after_a_move_is_that_next_to_it_where_the_unit_settles() -> Non
 
 def test_the_mean_is_kept_where_the_unit_rests() -> None:
     recording = set_down(0.0)
-    felt = rests_of("accelerometer", [recording], {"procedure": {"holdout_every": 0}})
+    felt = rests_of("accelerometer", [recording], settings_of().procedure)
     assert felt is not None
     found = gravity_of([recording], felt, SensorCalibration("accelerometer", converged=True))
     assert not found.creeping.any()
@@ -78,6 +79,6 @@ def test_where_the_readings_do_not_tell_only_stamps_that_a_file_rounds_are_regul
 
 
 def test_a_rest_lasts_from_its_first_sample_to_the_interval_after_its_last() -> None:
-    felt = rests_of("accelerometer", [set_down(0.0)], {"procedure": {"holdout_every": 0}})
+    felt = rests_of("accelerometer", [set_down(0.0)], settings_of().procedure)
     assert felt is not None
     assert felt.length == pytest.approx(0.01 * np.diff(felt.span)[:, 0])

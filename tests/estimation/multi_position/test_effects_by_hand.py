@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hand_session import WARM, Unit, hand_held
 from scipy.special import stdtrit
+from unit_settings import settings_of, with_noise
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.effects import fit as fit_effects
@@ -35,8 +36,8 @@ CASES = [
 
 def fitted(unit: Unit, wanted: Any, before: SensorCalibration | None = None) -> SensorCalibration:
     before = before or unit.calibrated("accelerometer")
-    settings = {**unit.settings, "effects": {"accelerometer": wanted}}
-    return fit_effects("accelerometer", unit.recordings, before, settings)
+    settings = settings_of(unit.settings, effects={"accelerometer": wanted})
+    return fit_effects("accelerometer", with_noise(unit.recordings, settings), before, settings)
 
 
 def deviations(unit: Unit, found: SensorCalibration) -> np.ndarray:
@@ -93,7 +94,7 @@ def test_of_three_cross_axis_terms_the_length_of_gravity_tells_only_the_sum() ->
     names = found.parameters.names
     three = [names.index(f"cross_axis_nonlinearity.K_{term}") for term in ("x_yz", "y_zx", "z_xy")]
     own = found.covariance[np.ix_(three, three)]
-    limit = unit.settings["sensor"]["accelerometer"]["effects"]["cross_axis_nonlinearity"]
+    limit = unit.settings.sensor.accelerometer.effects["cross_axis_nonlinearity"]
     assert 0.25 * limit < np.sqrt(np.diag(own)).min() < np.sqrt(np.diag(own)).max() < 0.5 * limit
     assert np.sqrt(own.sum()) < 0.2 * limit
     truth = unit.truth["accelerometer"]["effects"]["cross_axis_nonlinearity"]
@@ -105,7 +106,7 @@ def test_what_is_selected_brings_held_out_rests_to_the_noise_floor() -> None:
     unit = hand_held("mpu6050", 5, {"accelerometer.quadratic_nonlinearity": None})
     found = fitted(unit, "auto")
     assert [e.name for e in found.effects] == ["quadratic_nonlinearity"]
-    noise = estimate_noise("accelerometer", unit.recordings, unit.settings["sensor"]["accelerometer"])
+    noise = estimate_noise("accelerometer", unit.recordings, unit.settings.sensor.accelerometer)
     part = validate(found, unit.recordings, noise, unit.settings)
     error = {step["name"]: step["rms_error"] for step in part["steps"]}
     assert part["held_out"]
@@ -150,7 +151,7 @@ def test_derivatives_of_the_rests_are_those_of_their_residuals() -> None:
     before = unit.calibrated("accelerometer")
     model = model_of(unit.recordings, before, None, unit.settings)
     assert model is not None
-    limits = limits_of("accelerometer", unit.settings["sensor"]["accelerometer"])
+    limits = limits_of("accelerometer", unit.settings.sensor.accelerometer)
     state = fit_configured(model, before, names, selection_hypotheses(None, 1), limits).state
     equations, step = model.equations(state), 1e-6
     for j in range(6):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from ferraris_session import PROCEDURE, Session, held_out, in_parts, simulated
 from scipy import stats
+from unit_settings import settings_of, with_noise
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.gauss_markov import WHITE
@@ -21,7 +22,7 @@ from pipeline.signal.segments import multiples, turns_by_hand
 from pipeline.validation.attitude import gravity_direction
 from tests.published import diagnose
 
-FACE = np.radians(PROCEDURE["faces"]["accuracy_deg"])
+FACE = np.radians(PROCEDURE.faces.accuracy_deg)
 OFF_DIAGONAL = [4, 5, 6, 8, 9, 10]
 
 
@@ -50,8 +51,8 @@ def test_stages_after_the_faces_and_the_diagnosis_know_the_method_that_fitted_th
     faces = whole.fit("accelerometer")
     assert [stage.name for stage in faces.stages] == ["nonlinear_least_squares", "faces"]
     assert last_fit(faces).free
-    settings = whole.settings | {"effects": {"accelerometer": ["quadratic_nonlinearity"], "gyroscope": []}}
-    found = fit_stage("accelerometer", "effects", whole.recordings, faces, settings)
+    settings = settings_of(whole.settings, effects={"accelerometer": ["quadratic_nonlinearity"]})
+    found = fit_stage("accelerometer", "effects", with_noise(whole.recordings, settings), faces, settings)
     assert [effect.name for effect in found.effects] == ["quadratic_nonlinearity"]
     assert last_fit(found).free
 
@@ -64,21 +65,21 @@ def test_a_face_is_known_to_the_hand_and_the_length_of_gravity_to_the_noise(whol
 
 
 def test_turns_alone_give_scale_and_direction_to_the_stated_accuracy() -> None:
-    turns = PROCEDURE["turns"]
+    turns = PROCEDURE.turns
     session = in_parts(simulated(3))
     found = session.fit("gyroscope")
     _, u, _ = session.errors("gyroscope")
-    assert np.all(u[[3, 7, 11]] < 1.3 * turns["accuracy_deg"] / 360.0)
-    assert np.all(u[OFF_DIAGONAL] < 1.3 * np.radians(turns["axis_accuracy_deg"]))
+    assert np.all(u[[3, 7, 11]] < 1.3 * turns.accuracy_deg / 360.0)
+    assert np.all(u[OFF_DIAGONAL] < 1.3 * np.radians(turns.axis_accuracy_deg))
     told = found.stages[-1].details["turns"]
     assert [(t["recording"], t["axis"], abs(t["stated_deg"])) for t in told] == [
         (f"{axis}_rot", axis, 360.0) for axis in "xyz"
     ]
-    assert all(abs(t["angle_deg"] - t["stated_deg"]) < 4.0 * turns["accuracy_deg"] for t in told)
+    assert all(abs(t["angle_deg"] - t["stated_deg"]) < 4.0 * turns.accuracy_deg for t in told)
 
 
 def test_an_accurate_stop_gives_an_accurate_scale() -> None:
-    stated = {"turns": PROCEDURE["turns"] | {"accuracy_deg": 0.3}}
+    stated = {"turns": {"accuracy_deg": 0.3}}
     session = in_parts(simulated(4, procedure=stated, course={"turn_error_deg": 0.3}))
     error, u, freedom = session.errors("gyroscope")
     assert np.median(u[[3, 7, 11]]) < 1.25 * 0.3 / 360.0  # an axis askew in the chip adds what its other elements leave
@@ -86,13 +87,13 @@ def test_an_accurate_stop_gives_an_accurate_scale() -> None:
 
 
 def test_a_hand_that_departs_from_what_is_stated_is_doubted() -> None:
-    stated = {"turns": PROCEDURE["turns"] | {"accuracy_deg": 0.3}, "faces": {"accuracy_deg": 0.1}}
+    stated = {"turns": {"accuracy_deg": 0.3}, "faces": {"accuracy_deg": 0.1}}
     session = simulated(8, procedure=stated)
     found = {sensor: session.fit(sensor) for sensor in ("accelerometer", "gyroscope")}
     told = {sensor: fit.stages[-1].details["departures"] for sensor, fit in found.items()}
     assert any("times procedure.faces.accuracy_deg" in text for text in told["accelerometer"])
     assert any("times procedure.turns.accuracy_deg" in text for text in told["gyroscope"])
-    noise = estimate_noise("gyroscope", session.recordings, session.settings["sensor"]["gyroscope"])
+    noise = estimate_noise("gyroscope", session.recordings, session.settings.sensor.gyroscope)
     document = diagnose(found["gyroscope"], session.recordings, noise, session.settings)
     assert document["verdict"] == "reference_in_doubt"
     assert told["gyroscope"][0] in document["reason"]
@@ -111,8 +112,10 @@ def test_every_second_turn_is_held_out_and_judged(whole: Session) -> None:
     assert roles.count("validation") == 3
     assert all(r.start_s is None or r.detail.endswith("found") for part in whole.recordings for r in part.notes)
     fits = {sensor: whole.fit(sensor) for sensor in ("accelerometer", "gyroscope")}
-    noise = estimate_noise("gyroscope", whole.recordings, whole.settings["sensor"]["gyroscope"])
-    found = gravity_direction(fits["accelerometer"], fits["gyroscope"], whole.recordings, noise, whole.settings)
+    noise = estimate_noise("gyroscope", whole.recordings, whole.settings.sensor.gyroscope)
+    found = gravity_direction(
+        fits["accelerometer"], fits["gyroscope"], whole.recordings, noise, whole.settings.procedure
+    )
     assert found["moves"] == 3
     assert found["mean_deg"]["after"] < 3.0 * found["noise_floor_deg"] < 0.1 * found["mean_deg"]["before"]
     turns = found["turns"]
@@ -126,7 +129,7 @@ def test_rests_of_2_s_are_found_and_around_those_of_4_s_a_turn_is_held_out(
     interval: float, dwell: float, held: int
 ) -> None:
     session = simulated(3, interval_s=interval, course={"dwell_s": dwell})
-    recording, stated = session.recordings[0], session.settings["procedure"]["turns"]
+    recording, stated = session.recordings[0], session.settings.procedure.turns
     rests = find_rests(recording)
     assert [rest.accepted for rest in rests] == 15 * [True]  # six faces, and three for each axis
     turns = turns_by_hand(recording, rests, stated)
@@ -142,8 +145,8 @@ def test_rests_of_2_s_are_found_and_around_those_of_4_s_a_turn_is_held_out(
 def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) -> None:
     """The moves tell nothing of the common frame: else the gyroscope would claim to know it better than the faces."""
     gyroscope = whole.fit("gyroscope")
-    noise = noise_of("gyroscope", whole.recordings, whole.settings)
-    model = model_of(whole.recordings, gyroscope, noise, whole.settings)
+    noise = noise_of("gyroscope", whole.recordings, whole.settings.sensor.gyroscope)
+    model = model_of(whole.recordings, gyroscope, noise, whole.settings.procedure, whole.fit("accelerometer"))
     assert model is not None
     moves = model._of_moves(State(gyroscope.bias, gyroscope.matrix))
     for x in range(3):
@@ -157,8 +160,8 @@ def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) 
 
 def test_a_part_with_too_few_moves_is_fitted_by_its_rests_and_turns_alone(whole: Session) -> None:
     """Cross-validation leaves out every third rest with the move before it: few moves may be left."""
-    noise = noise_of("gyroscope", whole.recordings, whole.settings)
-    model = model_of(whole.recordings, None, noise, whole.settings)
+    noise = noise_of("gyroscope", whole.recordings, whole.settings.sensor.gyroscope)
+    model = model_of(whole.recordings, None, noise, whole.settings.procedure, whole.fit("accelerometer"))
     assert model is not None
     assert model.moves is not None
     used = np.arange(model.moves.count) < FEWEST_MOVES
@@ -198,7 +201,7 @@ def test_a_missing_turn_is_named_with_the_largest_about_its_axis() -> None:
 
 
 def test_an_implausible_angle_is_named_in_whole_and_in_parts() -> None:
-    stated = {"turns": PROCEDURE["turns"] | {"angle_deg": 500.0}}
+    stated = {"turns": {"angle_deg": 500.0}}
     session = simulated(7, procedure=stated)
     with pytest.raises(NotObservableError, match=r"no turn about x by a multiple of 500 deg.*is \((-)?3\d\d\.\d, "):
         session.fit("gyroscope")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hand_session import hand_held
 from scipy.special import stdtrit
+from unit_settings import settings_of, with_noise
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.design import Term
@@ -63,7 +64,7 @@ def test_bias_and_matrix_are_found_within_their_uncertainty() -> None:
 
 def test_derivatives_of_the_moves_are_those_of_their_residuals() -> None:
     unit = hand_held("mpu6050", 4)
-    model = model_of(unit.recordings, None, None, unit.settings)
+    model = model_of(unit.recordings, None, None, unit.settings.procedure, unit.calibrated("accelerometer"))
     assert model is not None
     terms = (
         Term(effect("scale_factor_asymmetry"), np.array([2e-4, -1e-4, 1e-4])),
@@ -91,8 +92,8 @@ def test_derivatives_of_the_moves_are_those_of_their_residuals() -> None:
 
 def test_an_effect_of_moves_is_fitted_with_the_matrix() -> None:
     unit = hand_held("mpu6050", 5, {"gyroscope.scale_factor_asymmetry": None}, interval_s=0.02)
-    settings = {**unit.settings, "effects": {"gyroscope": ["scale_factor_asymmetry"]}}
-    found = fit_effects("gyroscope", unit.recordings, unit.calibrated("gyroscope"), settings)
+    settings = settings_of(unit.settings, effects={"gyroscope": ["scale_factor_asymmetry"]})
+    found = fit_effects("gyroscope", with_noise(unit.recordings, settings), unit.calibrated("gyroscope"), settings)
     truth = np.array(list(unit.truth["gyroscope"]["effects"]["scale_factor_asymmetry"].values()))
     assert found.covariance is not None
     assert np.all(np.abs(found.effects[0].values - truth) < 4.0 * np.sqrt(np.diag(found.covariance))[12:])
@@ -103,19 +104,19 @@ def test_without_rests_by_hand_the_gyroscope_is_left_null_with_the_reason() -> N
     unit = hand_held("mpu6050", 6)
     turns: list[Recording] = [replace(r, role="gyroscope", axis="x") for r in unit.recordings]
     with pytest.raises(CannotCalibrateError, match="24 rests"):
-        rests_and_moves.fit(turns, None, unit.settings)
+        rests_and_moves.fit(with_noise(turns, unit.settings), None, unit.settings)
 
 
 def test_too_few_moves_are_refused() -> None:
     unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=0)
     with pytest.raises(CannotCalibrateError, match="at least 6 moves") as refused:
-        rests_and_moves.fit(unit.recordings, None, unit.settings)
+        rests_and_moves.fit(with_noise(unit.recordings, unit.settings), None, unit.settings)
     assert "holdout_every" not in str(refused.value)
     unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=3)
     with pytest.raises(
         CannotCalibrateError, match=r"2 are held out for validation \(procedure.holdout_every=0 uses them"
     ):
-        rests_and_moves.fit(unit.recordings, None, unit.settings)
+        rests_and_moves.fit(with_noise(unit.recordings, unit.settings), None, unit.settings)
     unit = hand_held("mpu6050", 6)
     few = [
         replace(r.select(slice(int(0.5 * r.samples), int(0.7 * r.samples))), role="rests")
@@ -125,7 +126,7 @@ def test_too_few_moves_are_refused() -> None:
     with pytest.raises(
         CannotCalibrateError, match=r"so 3 rests, .* are held out .* use them by procedure.holdout_every=0"
     ):
-        rests_and_moves.fit(few, None, unit.settings)
+        rests_and_moves.fit(with_noise(few, unit.settings), None, unit.settings)
 
 
 @pytest.mark.parametrize(("share", "left"), [(0.8, 14), (0.5, 0)])
@@ -138,7 +139,7 @@ def test_moves_that_are_clipped_below_the_stated_range_are_left_out_and_named(sh
     channels = {sensor: clipped.reading(sensor) for sensor in TRIADS}
     values = {c: channels[s][:, k] for s, triad in TRIADS.items() for k, c in enumerate(triad)}
     table = ChannelTable("log.csv", whole.time_ns, values, {}, np.arange(whole.samples), {})
-    flags, notes = examine(table, unit.settings["sensor"], Checks())
+    flags, notes = examine(table, unit.settings.sensor, Checks())
     assert all(n.code == "N-CLIP" and n.detail.startswith("gyro_") for n in notes)
     assert flags is not None
     np.testing.assert_array_equal(flags > 0, np.any(np.abs(whole.gyroscope) >= end, axis=1))
@@ -160,6 +161,6 @@ def test_rests_at_the_end_of_the_readings_of_a_coarse_log_are_not_clipped() -> N
         rate[start : start + 30] += 60.0 * rng.uniform(size=3) * np.sin(np.linspace(0.0, np.pi, 30))[:, None]
     values = dict(zip(TRIADS["gyroscope"], (0.2 * np.round(rate / 0.2)).T, strict=True))
     table = ChannelTable("log.csv", 10_000_000 * np.arange(1000), values, {}, np.arange(1000), {})
-    flags, notes = examine(table, hand_held("mpu6050", 5).settings["sensor"], Checks())
+    flags, notes = examine(table, hand_held("mpu6050", 5).settings.sensor, Checks())
     assert notes == []
     assert flags is None or not flags.any()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.effects import fit as fit_effects
@@ -15,7 +16,7 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.rest_means import split_rests
 from pipeline.io.read import read_recordings
 from pipeline.model.measurement import compensate
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 from pipeline.validation.attitude import gravity_direction
 
 if TYPE_CHECKING:
@@ -24,32 +25,30 @@ if TYPE_CHECKING:
 DATA = Path(__file__).parents[4] / "shared" / "data" / "xsens_mti_multi_position"
 BY_HAND_DEG = 6.1  # the most that turns of 360 deg by hand depart in a session of the same laboratory
 STATIC = slice(0, 5000)  # the first 50 s
-EFFECTS: dict[str, list[str]] = {"accelerometer": [], "gyroscope": ["g_sensitivity"]}
-SETTINGS: dict[str, Any] = {
-    "sensor": read_config("sensor", "generic"),
-    "table": read_config("table", "hand") | {"gravity_g": 9.81744 / 9.80665},
-    "procedure": read_config("procedure", "multi_position"),
-    "method": {"as_printed": False},
-    "effects": EFFECTS,
-}
+SETTINGS = settings_of(
+    sensor="generic",
+    table="hand",
+    procedure="multi_position",
+    ingest="xsens_mti_multi_position",
+    effects={"gyroscope": ["g_sensitivity"]},
+    **{"table.gravity_g": 9.81744 / 9.80665},
+)
 
 
 @pytest.fixture(scope="module")
 def recordings() -> list[Recording]:
     if not DATA.is_dir():
         pytest.skip("reference data not beside the repository")
-    ingest = read_config("ingest", "xsens_mti_multi_position")
-    checks = read_config("ingest", "canonical_csv")
-    return read_recordings(SETTINGS["procedure"], checks | ingest, SETTINGS["sensor"], DATA)
+    return read_recordings(SETTINGS.procedure, SETTINGS.ingest, SETTINGS.sensor, DATA)
 
 
 @pytest.fixture(scope="module")
 def fitted(recordings: list[Recording]) -> dict[str, SensorCalibration]:
-    plain = rests_and_moves.fit(recordings, None, SETTINGS)
+    plain = rests_and_moves.fit(with_noise(recordings, SETTINGS), None, SETTINGS)
     return {
-        "accelerometer": nonlinear_least_squares.fit(recordings, None, SETTINGS),
+        "accelerometer": nonlinear_least_squares.fit(with_noise(recordings, SETTINGS), None, SETTINGS),
         "gyroscope": plain,
-        "with g": fit_effects("gyroscope", recordings, plain, SETTINGS),
+        "with g": fit_effects("gyroscope", with_noise(recordings, SETTINGS), plain, SETTINGS),
     }
 
 
@@ -101,9 +100,9 @@ def test_the_bias_alone_differs_from_the_first_50_s_by_no_more_than_orientations
 def test_held_out_moves_end_where_gravity_is_felt(
     recordings: list[Recording], fitted: dict[str, SensorCalibration]
 ) -> None:
-    noise = estimate_noise("gyroscope", recordings, SETTINGS["sensor"]["gyroscope"])
+    noise = estimate_noise("gyroscope", recordings, SETTINGS.sensor.gyroscope)
     plain, with_g = (
-        gravity_direction(fitted["accelerometer"], fitted[name], recordings, noise, SETTINGS)
+        gravity_direction(fitted["accelerometer"], fitted[name], recordings, noise, SETTINGS.procedure)
         for name in ("gyroscope", "with g")
     )
     assert plain["moves"] == with_g["moves"] == 13
@@ -119,15 +118,15 @@ def test_whole_turns_of_a_ferraris_session_are_360_degrees_to_a_hands_accuracy(t
     if not session.is_file():
         pytest.skip("reference data not beside the repository")
     (tmp_path / "recording.csv").write_bytes(session.read_bytes())
-    plain = read_config("ingest", "canonical_csv")
-    columns: dict[str, Any] = dict.fromkeys(plain["csv"]["columns"])
+    plain = shipped_settings(ingest="canonical_csv").ingest
+    columns: dict[str, Any] = dict.fromkeys(plain.csv["columns"])
     for channel, short, unit in (("accel", "acc", "m/s^2"), ("gyro", "gyr", "deg/s")):
         columns |= {f"{channel}_{axis}": {"column": f"{short}_{axis}", "unit": unit} for axis in "xyz"}
-    ingest = plain | {"csv": plain["csv"] | {"columns": columns, "rate_hz": 102.4}}
-    sheets = {name: SETTINGS["sensor"][name] | {"full_scale": 2000.0} for name in ("accelerometer", "gyroscope")}
-    settings = SETTINGS | {"sensor": SETTINGS["sensor"] | sheets, "procedure": {"holdout_every": 0}}
-    recordings = read_recordings(SETTINGS["procedure"], ingest, settings["sensor"], tmp_path)
-    found = rests_and_moves.fit(recordings, None, settings)
+    ingest = plain.replaced(csv=plain.csv | {"columns": columns, "rate_hz": 102.4})
+    sheets = {name: {"full_scale": 2000.0} for name in ("accelerometer", "gyroscope")}
+    settings = settings_of(SETTINGS, sensor=sheets, procedure={"holdout_every": 0})
+    recordings = read_recordings(SETTINGS.procedure, ingest, settings.sensor, tmp_path)
+    found = rests_and_moves.fit(with_noise(recordings, settings), None, settings)
     assert recordings[0].gyroscope is not None
     calibrated = (recordings[0].gyroscope - found.bias) @ found.matrix.T / 102.4
     for axis, start, stop in ((0, 6728, 7141), (1, 8037, 8426), (2, 9161, 9559)):  # about x, y and z, between rests

@@ -12,18 +12,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.io.read import read_recordings
 from pipeline.signal.segments import cut
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "ferraris_wearable"
-PROCEDURE = read_config("procedure", "ferraris")
+PROCEDURE = shipped_settings(procedure="ferraris").procedure
 FITS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 PARTS = [f"{axis}_{part}" for part in ("p", "a") for axis in "xyz"], [f"{axis}_rot" for axis in "xyz"]
 # example_data/example_ferraris_session_list.json of imucal: first sample and the one after the last
@@ -71,11 +72,9 @@ def ferraris(force: dict[str, np.ndarray], rate: dict[str, np.ndarray], hz: floa
 
 def of_hand(sensor: str, matrix: np.ndarray) -> np.ndarray:
     """Return the standard uncertainty of bias and matrix by the hand's errors in that method: (12,) array."""
-    turns, face = PROCEDURE["turns"], np.radians(PROCEDURE["faces"]["accuracy_deg"])
-    across = np.radians(turns["axis_accuracy_deg"]) if sensor == "gyroscope" else face / np.sqrt(2.0)
-    along = (
-        turns["accuracy_deg"] / turns["angle_deg"] if sensor == "gyroscope" else face * np.abs(matrix - np.eye(3)).max()
-    )
+    turns, face = PROCEDURE.turns, np.radians(PROCEDURE.faces.accuracy_deg)
+    across = np.radians(turns.axis_accuracy_deg) if sensor == "gyroscope" else face / np.sqrt(2.0)
+    along = turns.accuracy_deg / turns.angle_deg if sensor == "gyroscope" else face * np.abs(matrix - np.eye(3)).max()
     bias = 0.0 if sensor == "gyroscope" else face * np.abs(matrix - np.eye(3)).max()
     u = np.full((3, 3), across)
     np.fill_diagonal(u, along)
@@ -85,22 +84,19 @@ def of_hand(sensor: str, matrix: np.ndarray) -> np.ndarray:
 def read(folder: Path, file: str, counts: tuple[float, float] | None, hz: float) -> tuple[list[Recording], Any]:
     """Return a session as one recording, and the settings of a run."""
     (folder / "recording.csv").write_bytes((DATA / file).read_bytes())
-    plain = read_config("ingest", "canonical_csv")
-    columns: dict[str, Any] = dict.fromkeys(plain["csv"]["columns"])
+    plain = shipped_settings(ingest="canonical_csv").ingest
+    columns: dict[str, Any] = dict.fromkeys(plain.csv["columns"])
     for channel, short, unit, k in (("accel", "acc", "m/s^2", 0), ("gyro", "gyr", "deg/s", 1)):
         scale = {"unit": "counts", "counts_per_unit": counts[k]} if counts else {"unit": unit}
         columns |= {f"{channel}_{axis}": {"column": f"{short}_{axis}", **scale} for axis in "xyz"}
-    ingest = plain | {"csv": plain["csv"] | {"columns": columns, "rate_hz": hz}}
-    sensor = read_config("sensor", "generic")
-    sheets = {name: sensor[name] | {"full_scale": 2000.0} for name in FITS}
-    settings = {
-        "sensor": sensor | sheets,
-        "table": read_config("table", "hand"),
-        "procedure": PROCEDURE,
-        "method": {"as_printed": False},
-        "effects": {"accelerometer": [], "gyroscope": []},
-    }
-    return read_recordings(PROCEDURE, ingest, settings["sensor"], folder), settings
+    ingest = plain.replaced(csv=plain.csv | {"columns": columns, "rate_hz": hz})
+    settings = settings_of(
+        sensor="generic",
+        table="hand",
+        procedure="ferraris",
+        **{f"sensor.{name}.full_scale": 2000.0 for name in FITS},
+    )
+    return read_recordings(PROCEDURE, ingest, settings.sensor, folder), settings
 
 
 def difference(found: SensorCalibration, other: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -124,12 +120,12 @@ def test_the_example_session_agrees_with_ferraris_1995(tmp_path: Path, sensor: s
     assert whole.accelerometer is not None
     assert whole.gyroscope is not None
     force, rate = ({n: v[a:b] for n, (a, b) in SECTIONS.items()} for v in (whole.accelerometer, whole.gyroscope))
-    found = FITS[sensor].fit(recordings, None, settings)
+    found = FITS[sensor].fit(with_noise(recordings, settings), None, settings)
     assert np.abs(difference(found, ferraris(force, rate, RATE_HZ, -360.0)[sensor])).max() < 2.0
     if sensor == "gyroscope":
         turns = found.stages[-1].details["turns"]
         assert [(t["axis"], t["stated_deg"]) for t in turns] == [("x", -360.0), ("y", -360.0), ("z", -360.0)]
-        assert max(abs(t["angle_deg"] - t["stated_deg"]) for t in turns) < 2.0 * PROCEDURE["turns"]["accuracy_deg"]
+        assert max(abs(t["angle_deg"] - t["stated_deg"]) for t in turns) < 2.0 * PROCEDURE.turns.accuracy_deg
     else:
         assert sum(found.stages[-1].details["rests_on_faces"].values()) == 13
 
@@ -145,7 +141,7 @@ def test_the_session_in_parts_agrees_with_the_published_calibration(tmp_path: Pa
         axis = name[0] if name in PARTS[1] else None
         windows.append({"role": "rests", "axis": axis, "start_s": own[0] / 204.8, "stop_s": (own[-1] + 1) / 204.8})
     parts = cut(recordings[0], windows)
-    found = FITS[sensor].fit(parts, None, settings)
+    found = FITS[sensor].fit(with_noise(parts, settings), None, settings)
     # K R of the published file is counts a m/s^2 or deg/s. Its turns are taken as -360 deg; the readings show +360.
     short, per_unit, sign = {"accelerometer": ("a", 9.81, 1.0), "gyroscope": ("g", 1.0, -1.0)}[sensor]
     scale = counts[0] if sensor == "accelerometer" else counts[1]
