@@ -28,7 +28,7 @@ import numpy as np
 from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
-from pipeline.model.kinematics import ABOUT, earth_rate
+from pipeline.model.kinematics import ABOUT, earth_of
 from pipeline.records import NORMAL, SENSORS, Contribution, Index, Motion, Values, noise_of_steps
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
@@ -337,9 +337,9 @@ def _gravity(reference: Reference, motion: Motion) -> Values:
 
 def _azimuth(reference: Reference, motion: Motion) -> Values | None:
     """Return the change of Earth's rotation by a turn of the table about the vertical, per deg."""
-    if motion.level is None:
+    earth = earth_of(reference.table)
+    if motion.level is None or earth is None:
         return None
-    earth = earth_rate(float(reference.table["latitude_deg"]), float(reference.table["azimuth_deg"]))
     change = np.radians(np.array([-earth[1], earth[0], 0.0]))
     return np.asarray(np.einsum("i,nij->nj", change, motion.level)[:, :, None])
 

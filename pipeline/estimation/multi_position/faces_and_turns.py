@@ -239,7 +239,7 @@ def turns_of(
 
 def require_turns(found: Turns | None, moves: Sequence[tuple[Recording, float, Values]], turns: HandTurns) -> None:
     """Raise ``NotObservableError`` if an axis has no stated turn, or a recording of a turn has another turn."""
-    expected = f"a multiple of {float(turns['angle_deg']):g} deg, within a tenth of it and a quarter of that angle"
+    expected = f"a multiple of {turns.angle_deg:g} deg, within a tenth of it and a quarter of that angle"
     advice = (
         "turn the unit from rest to rest about each body axis, and state the angle in procedure.turns.angle_deg; an "
         "angle that is wrong in all turns shows a wrong unit or range of the gyroscope"
