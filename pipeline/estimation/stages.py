@@ -1,4 +1,4 @@
-"""Run the stages of a fit, and apply the correction of readings by the stages.
+"""Run the stages of a fit.
 
 A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``, or, if it
 is the same for both sensors, ``pipeline/estimation/<stage>.py`` with ``fit(sensor, recordings, previous, settings)``.
@@ -17,14 +17,7 @@ The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effe
 for validation and diagnosis with the recordings. The uncertainty is that of the file. If the file states none, the
 covariance is zero, which the budget states; any held-out error beyond noise is then an error of the calibration.
 
-The correction by the stages so far is ``{"steps": [...]}``; each step acts on the output of the step before, on row
-vectors v:
-
-    {"subtract": b}                                          v - b
-    {"matrix": M}                                            v M^T, that is M v as a column
-    {"two_sided": {"positive": p, "negative": n, "switch_at": s}}   p_i v_i if v_i > s_i, else n_i v_i
-
-where b, p, n, s are (3,) and M is (3, 3).
+``pipeline.estimation.correction`` describes the correction of readings by the stages so far.
 """
 
 from __future__ import annotations
@@ -38,19 +31,20 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
+from pipeline.estimation.correction import published
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
 from pipeline.records import BASE, NORMAL, SENSORS, Contribution, SensorCalibration, StageResult, Values
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
+    from pipeline.estimation.correction import Step
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.records import FittedEffect, UnitRecordings
     from pipeline.settings import DataSheet, Method, Settings
 
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
-KINDS = "subtract, matrix, two_sided"
 
 MOST_PASSES = 4  # each reduces the error of the known effects by their share of the reading, at most a hundredth
 SETTLED = 1e-6  # change of bias, g or deg/s, and matrix in a pass: the known effects change by a hundredth of it
@@ -246,7 +240,7 @@ def _given(method: Method) -> dict[str, Any]:
 
 def staged_result(  # noqa: PLR0917  (the results of a stage)
     name: str,
-    steps: Sequence[Mapping[str, Any]],
+    steps: Sequence[Step],
     parameters: dict[str, dict[str, Any]],
     error: Values,
     samples: tuple[int, int],
@@ -261,38 +255,4 @@ def staged_result(  # noqa: PLR0917  (the results of a stage)
         "bias_wander": noise.wander.tolist(),
         "degrees_of_freedom": float(degrees_of_freedom.min()),
     }
-    return StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), {"steps": list(steps)}, details)
-
-
-def apply_correction(correction: Mapping[str, Any] | None, readings: Values) -> Values:
-    """Correct readings.
-
-    ``correction``: ``StageResult.correction``; None changes nothing. ``readings``: (n, 3), g or deg/s. Raises
-    ``ConfigurationError`` if a step is of an unknown kind.
-    """
-    out = np.array(readings, float)
-    for step in (correction or {}).get("steps", []):
-        out = apply_step(step, out)
-    return out
-
-
-def apply_step(step: Mapping[str, Any], readings: Values) -> Values:
-    """Apply one step to (n, 3) readings."""
-    out: Values
-    match dict(step):
-        case {"subtract": offset}:
-            out = readings - np.asarray(offset, float)
-        case {"matrix": matrix}:
-            out = readings @ np.asarray(matrix, float).T
-        case {"two_sided": sides}:
-            above = readings > np.asarray(sides["switch_at"], float)
-            out = readings * np.where(above, sides["positive"], sides["negative"])
-        case _:
-            raise ConfigurationError(f"a correction has a step {sorted(step)}; known kinds are {KINDS}")
-    return out
-
-
-def two_sided(positive: Values, negative: Values, switch_at: Values) -> dict[str, Any]:
-    """Return a step that multiplies each axis by one of two factors."""
-    sides = {"positive": positive, "negative": negative, "switch_at": switch_at}
-    return {"two_sided": {name: np.asarray(value, float).tolist() for name, value in sides.items()}}
+    return StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), published(steps), details)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.estimation.stages import apply_correction
+from pipeline.estimation import correction
 from pipeline.io.yaml_file import read_yaml
 from pipeline.records import SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Figure, Panel, Samples, chart
@@ -154,7 +154,8 @@ def _before_and_after(results: Results, name: str, sensor: str) -> Figure | None
     samples = samples_of_motion(sensor, held_out[0], SILENT, shipped_settings().table) if held_out else None
     if samples is None:
         return None
-    corrected = apply_correction(results.correction(f"{name}-printed", sensor), samples.reading)
+    steps = correction.steps_of(results.correction(f"{name}-printed", sensor))
+    corrected = correction.corrected(steps, samples.reading)
     before, after = (np.linalg.norm(v, axis=1) - samples.magnitude for v in (samples.reading, corrected))
     drawn = held_out_over_time(f"held-out-{name}", sensor, held_out[0], before, after)
     means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]

@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.accelerometer import staged as accelerometer
+from pipeline.estimation.correction import corrected
 from pipeline.estimation.gyroscope import cholesky_lu
 from pipeline.estimation.gyroscope import staged as gyroscope
-from pipeline.estimation.stages import apply_correction
 from pipeline.model.measurement import linear_truth
 from pipeline.records import SENSORS, Mask, NotCalibrated, Recording, Values
 from pipeline.signal.filters import apply_filter
@@ -167,7 +167,7 @@ class Drawn:
         row = {f"b_{a}": found[f"b_{a}"] for a in AXES}
         row |= {f"{q}_{a}": (found[f"{q}_P_{a}"] + found[f"{q}_N_{a}"]) / 2.0 for q in "OS" for a in AXES}
         row["M"] = (found["M_P_x"] + found["M_N_x"]) / 2.0  # the same on all axes
-        return row, self._accelerometer_error(partial(apply_correction, {"steps": chain.steps}))
+        return row, self._accelerometer_error(partial(corrected, chain.steps))
 
     def least_squares_accelerometer(self) -> Row:
         """Return the error after nonlinear least squares."""

@@ -4,41 +4,41 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.stages import apply_correction, two_sided
+from pipeline.estimation.correction import TwoSided, corrected, published, steps_of
 
 READINGS = np.array([[1.0, -2.0, 0.5], [-1.0, 2.0, 0.1]])
 
 
 def test_no_correction_leaves_readings_as_they_are() -> None:
-    assert np.array_equal(apply_correction(None, READINGS), READINGS)
-    assert np.array_equal(apply_correction({"steps": []}, READINGS), READINGS)
+    assert np.array_equal(corrected(steps_of(None), READINGS), READINGS)
+    assert np.array_equal(corrected(steps_of({"steps": []}), READINGS), READINGS)
 
 
 def test_steps_act_one_after_the_other() -> None:
     swap = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 2.0]]
     steps = [{"subtract": [1.0, 0.0, 0.0]}, {"matrix": swap}]
-    assert apply_correction({"steps": steps}, READINGS).tolist() == [[-2.0, 0.0, 1.0], [2.0, -2.0, 0.2]]
+    assert corrected(steps_of({"steps": steps}), READINGS).tolist() == [[-2.0, 0.0, 1.0], [2.0, -2.0, 0.2]]
     steps.reverse()
-    assert apply_correction({"steps": steps}, READINGS).tolist() == [[-3.0, 1.0, 1.0], [1.0, -1.0, 0.2]]
+    assert corrected(steps_of({"steps": steps}), READINGS).tolist() == [[-3.0, 1.0, 1.0], [1.0, -1.0, 0.2]]
 
 
 def test_a_matrix_step_acts_on_columns() -> None:
     M = np.arange(9.0).reshape(3, 3)
-    out = apply_correction({"steps": [{"matrix": M.tolist()}]}, READINGS)
+    out = corrected(steps_of({"steps": [{"matrix": M.tolist()}]}), READINGS)
     assert np.allclose(out[0], M @ READINGS[0])
 
 
 def test_a_two_sided_step_chooses_the_factor_by_its_own_threshold() -> None:
-    step = two_sided(np.array([2.0, 2.0, 2.0]), np.array([3.0, 3.0, 3.0]), np.array([0.0, 0.0, 0.3]))
-    assert np.allclose(apply_correction({"steps": [step]}, READINGS), [[2.0, -6.0, 1.0], [-3.0, 4.0, 0.3]])
+    step = TwoSided(np.array([2.0, 2.0, 2.0]), np.array([3.0, 3.0, 3.0]), np.array([0.0, 0.0, 0.3]))
+    assert np.allclose(corrected(steps_of(published([step])), READINGS), [[2.0, -6.0, 1.0], [-3.0, 4.0, 0.3]])
 
 
 def test_the_readings_that_are_given_are_not_changed() -> None:
     given = READINGS.copy()
-    apply_correction({"steps": [{"subtract": [1.0, 1.0, 1.0]}]}, given)
+    corrected(steps_of({"steps": [{"subtract": [1.0, 1.0, 1.0]}]}), given)
     assert np.array_equal(given, READINGS)
 
 
 def test_an_unknown_step_is_refused_by_name() -> None:
     with pytest.raises(ConfigurationError, match=r"\['rotate'\]; known kinds are subtract, matrix, two_sided"):
-        apply_correction({"steps": [{"rotate": 1}]}, READINGS)
+        corrected(steps_of({"steps": [{"rotate": 1}]}), READINGS)

@@ -8,7 +8,8 @@ from table_turns import Bench, run_stages, settings, specific_force, stepped_ang
 from unit_settings import with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.stages import apply_correction, fit_stage
+from pipeline.estimation.correction import corrected, steps_of
+from pipeline.estimation.stages import fit_stage
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter
 
@@ -66,9 +67,9 @@ def test_each_stage_keeps_those_before_it_and_corrects_readings_up_to_itself() -
     rms = [stage.residual_rms for stage in found.stages]
     assert rms[1] > 5 * rms[2] > 1000 * rms[3]
     truth = specific_force("x", recordings[0].table_angle)
-    corrected = apply_correction(found.stages[-1].correction, recordings[0].accelerometer)
-    assert np.allclose(corrected, truth, rtol=0, atol=1e-9)
-    after_bias = apply_correction(found.stages[2].correction, recordings[0].accelerometer)
+    output = corrected(steps_of(found.stages[-1].correction), recordings[0].accelerometer)
+    assert np.allclose(output, truth, rtol=0, atol=1e-9)
+    after_bias = corrected(steps_of(found.stages[2].correction), recordings[0].accelerometer)
     assert np.allclose(after_bias.mean(axis=0), recordings[0].accelerometer.mean(axis=0) - BIAS, atol=1e-9)
 
 
@@ -233,8 +234,8 @@ def test_held_out_error_of_mpu6050_falls_by_more_than_85_percent() -> None:
     found = calibrate(bench.stop_and_go(5.0, 1.2))
     attitudes = np.random.default_rng(5).standard_normal((10_250, 3))
     raw = bench.reading(attitudes / np.linalg.norm(attitudes, axis=1, keepdims=True))
-    corrected = apply_correction(found.stages[-1].correction, raw)
-    before, after = (np.mean(np.abs(np.linalg.norm(a, axis=1) - 1.0)) for a in (raw, corrected))
+    output = corrected(steps_of(found.stages[-1].correction), raw)
+    before, after = (np.mean(np.abs(np.linalg.norm(a, axis=1) - 1.0)) for a in (raw, output))
     assert before == pytest.approx(0.071, abs=0.003)
     assert 1.0 - after / before > 0.85
 

@@ -8,7 +8,8 @@ from table_turns import INTERVAL, Bench, ramped_rate, run_stages, settings
 from unit_settings import with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.stages import apply_correction, fit_stage
+from pipeline.estimation.correction import corrected, steps_of
+from pipeline.estimation.stages import fit_stage
 from pipeline.model.kinematics import earth_rate
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter
@@ -73,7 +74,7 @@ def test_the_correction_of_each_stage_is_that_of_row_vectors() -> None:
     recordings = Bench("gyroscope", BIAS, K).turns_at([60.0])
     found = calibrate(recordings)
     raw = recordings[1].gyroscope
-    after_bias, after_matrix = (apply_correction(stage.correction, raw) for stage in found.stages[:2])
+    after_bias, after_matrix = (corrected(steps_of(stage.correction), raw) for stage in found.stages[:2])
     assert np.allclose(after_bias, raw - BIAS, atol=1e-10)
     assert np.allclose(after_matrix, (raw - BIAS) @ M, atol=1e-9)
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.correction import Multiply, Subtract, published
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE, Prior
 from pipeline.estimation.least_squares import ScaledColumns
@@ -175,7 +176,7 @@ def _fit_triangular(
         rows = _without(rows, refused)
         solved = _fit_determined(rows, gravity_g, prior, limit)
     fitted, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
-    correction = {"steps": [{"subtract": fitted.state.bias.tolist()}, {"matrix": fitted.state.matrix.tolist()}]}
+    correction = published([Subtract(fitted.state.bias), Multiply(fitted.state.matrix)])
     if not rows.by_hand and solved.spare > 1:
         return _on_table(rows, solved, before, correction, prior, settings)
     covariance = PLACED @ fitted.covariance @ PLACED.T

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -39,9 +39,10 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     sinusoids_of,
     turns_of,
 )
+from pipeline.estimation.correction import Step, Subtract, TwoSided, corrected, steps_of
 from pipeline.estimation.engine import LinearMap, ResidualNoise
 from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.stages import FitStage, apply_correction, staged_result, two_sided
+from pipeline.estimation.stages import FitStage, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import noise_of_turns, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import (
@@ -68,7 +69,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     Quantities = dict[str, tuple[float, str]]  # value and unit of each parameter
-    Outcome = tuple[list[dict[str, Any]], Quantities]  # steps of the correction by a stage, and its parameters
+    Outcome = tuple[list[Step], Quantities]  # steps of the correction by a stage, and its parameters
     from pipeline.records import UnitRecordings
     from pipeline.settings import Settings
 
@@ -119,7 +120,7 @@ def orthogonality(extremes: Extremes) -> Outcome:
     switch_at = np.zeros(3) if extremes.as_printed else extremes.a_zero
     values = _per_axis("O_P", positive, "1") | _per_axis("O_N", negative, "1")
     values |= _angles({"P": extremes.excess_high, "N": extremes.excess_low})
-    return [two_sided(positive, negative, switch_at)], values
+    return [TwoSided(positive, negative, switch_at)], values
 
 
 def misalignment(extremes: Extremes) -> Outcome:
@@ -153,13 +154,13 @@ def misalignment(extremes: Extremes) -> Outcome:
     values = _per_axis("M_P", positive, "1") | _per_axis("M_N", negative, "1")
     values |= _angles({side: np.degrees(angle) for side, angle in sides.items()})
     switch_at = np.zeros(3) if extremes.as_printed else extremes.a_zero
-    return [two_sided(positive, negative, switch_at)], values
+    return [TwoSided(positive, negative, switch_at)], values
 
 
 def bias(extremes: Extremes) -> Outcome:
     """Return the bias (3.38-3.39): ``a_bi = a_mis - b``, b = a_zero, the mean reading of each axis where level."""
     b = extremes.a_zero
-    return [{"subtract": b.tolist()}], _per_axis("b", b, "g")
+    return [Subtract(b)], _per_axis("b", b, "g")
 
 
 def scale_factor(extremes: Extremes) -> Outcome:
@@ -173,10 +174,10 @@ def scale_factor(extremes: Extremes) -> Outcome:
     G, a_max, a_min, a_zero = extremes.gravity_g, extremes.a_max, extremes.a_min, extremes.a_zero
     if extremes.as_printed:
         positive, negative = G / a_max - a_zero, G / np.abs(a_min) - a_zero
-        steps = [{"subtract": a_zero.tolist()}, two_sided(positive, negative, np.zeros(3))]
+        steps: list[Step] = [Subtract(a_zero), TwoSided(positive, negative, np.zeros(3))]
     else:
         positive, negative = G / (a_max - a_zero), G / np.abs(a_min - a_zero)
-        steps = [two_sided(positive, negative, a_zero)]
+        steps = [TwoSided(positive, negative, a_zero)]
     return steps, _per_axis("S_P", positive, "1") | _per_axis("S_N", negative, "1")
 
 
@@ -193,7 +194,7 @@ FIT_STAGES = {
 class Corrected:
     """The output of a stage: the correction so far in both forms, and the parameters of the last stage."""
 
-    steps: list[dict[str, Any]] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)
     bias: Values = field(default_factory=lambda: np.zeros(3))
     positive: Values = field(default_factory=lambda: np.ones(3))
     negative: Values = field(default_factory=lambda: np.ones(3))
@@ -206,8 +207,7 @@ class Corrected:
             return cls()
         k = 1.0 / np.diag(previous.matrix)
         c = sum((e.values for e in previous.effects if e.name == ASYMMETRY), np.zeros(3))
-        correction = previous.stages[-1].correction or {}
-        return cls(list(correction.get("steps", [])), previous.bias, 1.0 / (k + c), 1.0 / (k - c))
+        return cls(steps_of(previous.stages[-1].correction), previous.bias, 1.0 / (k + c), 1.0 / (k - c))
 
     @property
     def k(self) -> Values:
@@ -219,12 +219,13 @@ class Corrected:
         """Half the difference of both sides: (3,) array."""
         return (1.0 / self.positive - 1.0 / self.negative) / 2.0
 
-    def after(self, step: Mapping[str, Any], *, averaged: bool) -> Corrected:
+    def after(self, step: Step, *, averaged: bool) -> Corrected:
         """Return the correction after a further step; ``averaged``: the factors of both sides are averaged."""
-        steps = [*self.steps, dict(step)]
-        if "subtract" in step:
-            return replace(self, steps=steps, bias=self.bias + np.array(step["subtract"]) * self.k)
-        positive, negative = (np.array(step["two_sided"][side]) for side in ("positive", "negative"))
+        steps = [*self.steps, step]
+        if isinstance(step, Subtract):
+            return replace(self, steps=steps, bias=self.bias + step.offset * self.k)
+        assert isinstance(step, TwoSided)  # noqa: S101  (``STAGES``)
+        positive, negative = step.positive, step.negative
         if averaged:
             positive = negative = (positive + negative) / 2.0
         return replace(self, steps=steps, positive=self.positive * positive, negative=self.negative * negative)
@@ -302,7 +303,7 @@ def fit(
     else:
         map_ = _linear_map(sinusoids, theta, chain)
         scatter = noise_contribution(noise, map_, prior)
-    after = apply_correction({"steps": found.steps}, np.concatenate([turn.reading for turn in turns]))
+    after = corrected(found.steps, np.concatenate([turn.reading for turn in turns]))
     after_c = BASE_COUNT + len(found.c)
     result = staged_result(
         name,

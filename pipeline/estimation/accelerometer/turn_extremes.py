@@ -37,13 +37,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.correction import Step, TwoSided
 from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
-from pipeline.estimation.stages import apply_step
 from pipeline.estimation.turns import Part, filtered_alike
 from pipeline.records import AXES, Mask, Values
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 
 ROUNDS = 12  # of the phase
@@ -94,18 +94,17 @@ class Extremes:
         """alpha_N, beta_N, gamma_N: the same of the lower extremes."""
         return wrap(self.angle_low[:, 0] - self.angle_low[:, 1] - 90.0)
 
-    def corrected(self, step: Mapping[str, Any]) -> Self:
+    def corrected(self, step: Step) -> Self:
         """Return the extremes of readings after a step of a correction."""
 
         def apply(values: Values) -> Values:
-            return apply_step(step, values.T).T
+            return step.apply(values.T).T
 
         height = self.height
         if self.as_printed:
             height = apply(height[:, None])[:, 0]
-        elif "two_sided" in step:
-            sides = step["two_sided"]
-            height = height * (np.array(sides["positive"]) + np.array(sides["negative"])) / 2.0
+        elif isinstance(step, TwoSided):
+            height = height * (step.positive + step.negative) / 2.0
         return replace(self, high=apply(self.high), low=apply(self.low), level=apply(self.level), height=height)
 
 

@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.correction import Multiply, Subtract, published
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
@@ -136,7 +137,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         name=NAME,
         parameters=stage_parameters(_values(factors), (scatter.covariance + of_bias)[AFTER_BASE, AFTER_BASE]),
         residual_rms=float(np.sqrt(np.mean(error**2))),
-        correction={"steps": [{"subtract": previous.bias.tolist()}, {"matrix": matrix.tolist()}]},
+        correction=published([Subtract(previous.bias), Multiply(matrix)]),
         details={
             "turns": len(U),
             "turns_left_out": turns.left_out,

@@ -22,15 +22,16 @@ these recordings the bias is from the static recording. As printed, row i is the
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.correction import Multiply, Step, Subtract, corrected, steps_of
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.stages import FitStage, apply_correction, staged_result
+from pipeline.estimation.stages import FitStage, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import Part, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
@@ -38,10 +39,10 @@ from pipeline.records import AFTER_BASE, AXES, BASE, Mask, Recording, SensorCali
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     # step of the correction by a stage, and value and unit of each of its parameters
-    Outcome = tuple[dict[str, Any], dict[str, tuple[float, str]]]
+    Outcome = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
     from pipeline.records import UnitRecordings
     from pipeline.settings import Settings
 
@@ -57,7 +58,7 @@ def bias(response: Response) -> Outcome:
     recording may be far away in time and temperature: it is used only where these hold no rest.
     """
     values = {f"b_{axis}": (float(b), "deg/s") for axis, b in zip(AXES, response.rest, strict=True)}
-    return {"subtract": response.rest.tolist()}, values
+    return Subtract(response.rest), values
 
 
 def orthogonality_and_misalignment(response: Response) -> Outcome:
@@ -75,7 +76,7 @@ def orthogonality_and_misalignment(response: Response) -> Outcome:
     S = rate @ response.slope
     M = np.linalg.solve(S.T, rate).T if response.as_printed else np.linalg.solve(S, rate)
     values = {f"M_{i + 1}{j + 1}": (float(M[i, j]), "1") for i in range(3) for j in range(3)}
-    return {"matrix": M.T.tolist()}, values
+    return Multiply(np.array(M.T, np.float64, order="C")), values
 
 
 def scale_factor(response: Response) -> Outcome:
@@ -90,7 +91,7 @@ def scale_factor(response: Response) -> Outcome:
     g_max = g_min + response.rate * np.diag(response.slope)
     scale = response.rate / g_max - g_min if response.as_printed else response.rate / (g_max - g_min)
     values = {f"S_{axis}": (float(s), "1") for axis, s in zip(AXES, scale, strict=True)}
-    return {"matrix": np.diag(scale).tolist()}, values
+    return Multiply(np.asarray(np.diag(scale), np.float64)), values
 
 
 STAGES = {f.__name__: f for f in (bias, orthogonality_and_misalignment, scale_factor)}
@@ -105,7 +106,7 @@ FIT_STAGES = {
 class Corrected:
     """The output of a stage: the correction so far, and the parameters of the last stage."""
 
-    steps: list[dict[str, Any]] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)
     values: dict[str, tuple[float, str]] = field(default_factory=dict)
 
     def contract(self) -> tuple[Values, Values]:
@@ -113,10 +114,10 @@ class Corrected:
         offset: Values = np.zeros(3)
         matrix: Values = np.eye(3)
         for step in self.steps:
-            if "subtract" in step:
-                offset = offset + np.asarray(step["subtract"])
-            else:
-                offset, matrix = np.asarray(step["matrix"]) @ offset, np.asarray(step["matrix"]) @ matrix
+            if isinstance(step, Subtract):
+                offset = offset + step.offset
+            elif isinstance(step, Multiply):
+                offset, matrix = step.matrix @ offset, step.matrix @ matrix
         return np.asarray(np.linalg.solve(matrix, offset), float), matrix
 
     def vector(self) -> Values:
@@ -125,17 +126,17 @@ class Corrected:
         return np.concatenate([offset, matrix.ravel(), [value for value, _ in self.values.values()]])
 
 
-def follow(response: Response, names: Sequence[str], start: Sequence[Mapping[str, Any]] = ()) -> Corrected:
+def follow(response: Response, names: Sequence[str], start: Sequence[Step] = ()) -> Corrected:
     """Run stages one after the other, each on the output of the one before.
 
     ``start``: the correction by the stages before the first of ``names``.
     """
-    found = Corrected([dict(step) for step in start])
+    found = Corrected([*start])
     for step in found.steps:
-        response = response.corrected(step)
+        response = response.after(step)
     for name in names:
         step, values = STAGES[name](response)
-        response = response.corrected(step)
+        response = response.after(step)
         found = Corrected([*found.steps, step], values)
     return found
 
@@ -176,14 +177,14 @@ def fit(
         return follow(replace(response, rest=b, slope=np.array(slope)), [*before, name]).vector()
 
     here = theta.T.ravel()
-    correction = (previous.stages[-1].correction or {}) if previous and previous.stages else {}
-    found = follow(response, [name], correction.get("steps", []))
+    so_far = previous.stages[-1].correction if previous and previous.stages else None
+    found = follow(response, [name], steps_of(so_far))
     x, y, z = np.split(derivative(chain, here, np.full(here.size, STEP)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
     reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings.table)
     noise = noise_of_fit(samples.parts, reference, residuals, design, prior)
     scatter = noise_contribution(noise, map_, prior)
-    after = apply_correction({"steps": found.steps}, samples.reading)
+    after = corrected(found.steps, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
     result = staged_result(
         name,
@@ -220,12 +221,12 @@ class Response:
     rate: Values  # (3,), deg/s; I: mean magnitude of the rate about each axis; 0 where none was recorded
     as_printed: bool = False  # whether the equations are those that are printed
 
-    def corrected(self, step: Mapping[str, Any]) -> Response:
+    def after(self, step: Step) -> Response:
         """Return the response of readings after a step of a correction."""
-        if "subtract" in step:
-            return replace(self, rest=self.rest - np.asarray(step["subtract"]))
-        matrix = np.asarray(step["matrix"])
-        return replace(self, rest=matrix @ self.rest, slope=self.slope @ matrix.T)
+        if isinstance(step, Subtract):
+            return replace(self, rest=self.rest - step.offset)
+        assert isinstance(step, Multiply)  # noqa: S101  (``STAGES``)
+        return replace(self, rest=step.matrix @ self.rest, slope=self.slope @ step.matrix.T)
 
     def require_turns(self) -> None:
         """Raise ``NotObservableError`` where there is no turn about one of the axes."""

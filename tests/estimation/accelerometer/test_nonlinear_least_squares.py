@@ -14,12 +14,12 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit, triangle
+from pipeline.estimation.correction import corrected, steps_of
 from pipeline.estimation.gauss_markov import Prior
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.model import State, prior_hypotheses
 from pipeline.estimation.rest_means import gathered, held_out_rests, rest_means
-from pipeline.estimation.stages import apply_correction
 from pipeline.model.calibration_file import not_determined
 from pipeline.planning.guide import derivative_of
 from pipeline.records import Recording, SensorCalibration, StageResult, coverage_factor
@@ -215,7 +215,7 @@ def test_the_correction_is_the_calibration() -> None:
     calibration = fit(with_noise([recording], _settings()), None, _settings())
     assert recording.accelerometer is not None
     expected = (recording.accelerometer - calibration.bias) @ calibration.matrix.T
-    assert apply_correction(calibration.stages[-1].correction, recording.accelerometer) == pytest.approx(expected)
+    assert corrected(steps_of(calibration.stages[-1].correction), recording.accelerometer) == pytest.approx(expected)
 
 
 def test_earlier_stages_are_kept_and_the_result_survives_its_file() -> None:

@@ -9,8 +9,9 @@ import pytest
 from unit_settings import settings_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
+from pipeline.estimation.correction import corrected, steps_of
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
-from pipeline.estimation.stages import apply_correction, fit_stage
+from pipeline.estimation.stages import fit_stage
 from pipeline.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
 
 if TYPE_CHECKING:
@@ -268,7 +269,7 @@ def test_the_correction_is_the_calibration_and_survives_its_file() -> None:
     assert [stage.name for stage in calibration.stages] == ["bias", "cholesky_lu"]
     reading = np.asarray(recordings[0].gyroscope)
     expected = (reading - calibration.bias) @ calibration.matrix.T
-    assert apply_correction(calibration.stages[-1].correction, reading) == pytest.approx(expected, abs=1e-12)
+    assert corrected(steps_of(calibration.stages[-1].correction), reading) == pytest.approx(expected, abs=1e-12)
     again = SensorCalibration.from_json("gyroscope", json.loads(json.dumps(calibration.to_json())))
     assert again.stages == calibration.stages
 
