@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.correction import Multiply, Subtract, published
+from pipeline.estimation.correction import Multiply, Step, Subtract
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE, Prior
 from pipeline.estimation.least_squares import ScaledColumns
@@ -69,7 +69,7 @@ from pipeline.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from pipeline.records import UnitRecordings
     from pipeline.settings import Settings
@@ -176,9 +176,9 @@ def _fit_triangular(
         rows = _without(rows, refused)
         solved = _fit_determined(rows, gravity_g, prior, limit)
     fitted, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
-    correction = published([Subtract(fitted.state.bias), Multiply(fitted.state.matrix)])
+    steps: list[Step] = [Subtract(fitted.state.bias), Multiply(fitted.state.matrix)]
     if not rows.by_hand and solved.spare > 1:
-        return _on_table(rows, solved, before, correction, prior, settings)
+        return _on_table(rows, solved, before, steps, prior, settings)
     covariance = PLACED @ fitted.covariance @ PLACED.T
     freedom = float(fitted.degrees_of_freedom.min())
     details, parameters = _details(rows, solved, freedom), _parameters(solved, covariance)
@@ -190,7 +190,7 @@ def _fit_triangular(
         solved.model,
         fitted,
         settings,
-        correction,
+        steps,
         parameters=parameters,
         white=PLACED @ np.sum(gain**2, axis=1),
         not_included=OF_LENGTH,
@@ -311,7 +311,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     rows: Orientations,
     solved: _Solved,
     before: SensorCalibration,
-    correction: dict[str, Any],
+    steps: Sequence[Step],
     prior: Prior,
     settings: Settings,
 ) -> SensorCalibration:
@@ -341,7 +341,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     lines = [scatter, *limits_contribution(solved.model, solved.fit)[0]]
     details = _details(rows, solved, float(scatter.degrees_of_freedom.min()))
     parameters = _parameters(solved, np.sum([line.covariance for line in lines], axis=0))
-    calibration = with_stage(before, NAME, details, solved.model, solved.fit, correction, parameters)
+    calibration = with_stage(before, NAME, details, solved.model, solved.fit, steps, parameters)
     gravity, missing = gravity_line(calibration, settings.table)
     lines += gravity
     complete, trials = combined(calibration, lines, missing | OF_LENGTH), settings.uncertainty.monte_carlo
@@ -350,12 +350,12 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     if len(count) > MOST_ROWS:
         reason = f"{len(count)} readings of a continuous turn are too many equations to draw; it is made for rests"
         return replace(complete, budget=complete.budget and replace(complete.budget, monte_carlo=NoMonteCarlo(reason)))
-    steps = quadratic_results(solved.columns / share[:, None], curvature(solved.model, solved.fit), np.diag(share**2))
+    moved = quadratic_results(solved.columns / share[:, None], curvature(solved.model, solved.fit), np.diag(share**2))
     estimate, every = calibration.parameters.values, np.eye(len(count))
 
     def results(drawn: Values) -> Values:
         errors = np.pad(drawn / white[solved.rows], ((0, 0), (0, len(white) - len(count))))
-        return np.asarray(estimate + steps(errors) @ PLACED.T)
+        return np.asarray(estimate + moved(errors) @ PLACED.T)
 
     return with_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines[1:])
 

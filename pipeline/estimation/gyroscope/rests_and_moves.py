@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation.correction import Multiply, Subtract, published
+from pipeline.estimation.correction import Multiply, Step, Subtract
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
@@ -102,6 +102,6 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     if model.turns is not None:
         details["turns"] = model.turns.described(fitted.state)
         details["departures"] = model.turns.departures(fitted.state)
-    correction = published([Subtract(fitted.state.bias), Multiply(fitted.state.matrix)])
+    steps: list[Step] = [Subtract(fitted.state.bias), Multiply(fitted.state.matrix)]
     before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
-    return after_stage(before, NAME, details, model, fitted, settings, correction)
+    return after_stage(before, NAME, details, model, fitted, settings, steps)

@@ -18,6 +18,7 @@ import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import AUTO, limits_of
+from pipeline.estimation.correction import published
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
@@ -46,6 +47,7 @@ from pipeline.records import Contribution, Recording, SensorCalibration, StageRe
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.estimation.correction import Step
     from pipeline.records import Noise, UnitRecordings
     from pipeline.settings import Procedure, Settings
 
@@ -141,7 +143,7 @@ def with_stage(  # noqa: PLR0917  (what a fit by hand is)
     details: dict[str, Any],
     model: Model,
     fitted: Fit,
-    correction: dict[str, Any] | None,
+    steps: Sequence[Step],
     parameters: dict[str, dict[str, Any]],
 ) -> SensorCalibration:
     """Return a calibration after an additional stage, without its uncertainty."""
@@ -152,7 +154,7 @@ def with_stage(  # noqa: PLR0917  (what a fit by hand is)
         before,
         bias=fitted.state.bias,
         matrix=fitted.state.matrix,
-        stages=(*before.stages, StageResult(name, parameters, rms, correction, details)),
+        stages=(*before.stages, StageResult(name, parameters, rms, published(steps) if steps else None, details)),
         converged=fitted.converged,
         convergence=certified(fitted.cosine, fitted.condition, rank, len(fitted.covariance)),
     )
@@ -165,7 +167,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     model: Model,
     fitted: Fit,
     settings: Settings,
-    correction: dict[str, Any] | None = None,
+    steps: Sequence[Step] = (),
     *,
     parameters: dict[str, dict[str, Any]] | None = None,
     white: Values | None = None,
@@ -182,7 +184,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     effects, of_effects = effect_parameters(sensor, fitted.state.terms, covariance)
     parameters = parameters or of_effects
     parameters = parameters or base_parameters(sensor, fitted.state.bias, fitted.state.matrix, covariance)
-    calibration = replace(with_stage(before, name, details, model, fitted, correction, parameters), effects=effects)
+    calibration = replace(with_stage(before, name, details, model, fitted, steps, parameters), effects=effects)
     limit, of_limit = limits_contribution(model, fitted)
     variance, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
     if white is not None:
