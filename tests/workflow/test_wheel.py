@@ -17,9 +17,13 @@ pytestmark = [
     pytest.mark.skipif(int(version("setuptools").split(".")[0]) < 77, reason="setuptools>=77 builds the wheel"),
 ]
 BUILT_FROM = ("pipeline", "imu_calibration", "configs", "workflow", "profiles", "data/demo")
+OF_THE_TOP = (
+    "pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "Snakefile", "CHANGELOG.md",
+    "requirements.lock",
+)  # fmt: skip
 PACKAGES, SHIPPED = BUILT_FROM[:2], BUILT_FROM[2:]
 PIPELINE = ("-m", "pipeline")
-BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+BUILD = "import sys; from setuptools import build_meta as b; to = sys.argv[1]; b.build_wheel(to); b.build_sdist(to)"
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +31,12 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The content of the wheel."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
-    for name in BUILT_FROM:
+    for name in (*BUILT_FROM, "docs"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "Snakefile"):
+    for name in OF_THE_TOP:
         shutil.copyfile(ROOT / name, source / name)
+    (source / "tests").mkdir()
+    shutil.copyfile(__file__, source / "tests" / "test_wheel.py")
     environment = os.environ | {"PYTHONWARNINGS": ""}
     command = [sys.executable, "-c", BUILD, str(folder)]
     built = subprocess.run(command, cwd=source, env=environment, capture_output=True, text=True, check=False)
@@ -38,7 +44,16 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (wheel,) = folder.glob("imu_calibration-*.whl")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(folder / "installed")
+    (sdist,) = folder.glob("imu_calibration-*.tar.gz")
+    shutil.unpack_archive(sdist, folder / "sdist")
     return folder / "installed"
+
+
+def test_the_source_distribution_holds_the_documents_and_no_test(installed: Path) -> None:
+    (source,) = (installed.parent / "sdist").iterdir()
+    found = {f.name for f in source.iterdir()}
+    assert {"docs", "CHANGELOG.md", "requirements.lock", "pipeline", "configs", "workflow", "Snakefile"} <= found
+    assert not {"tests", "benchmarks", "results"} & found
 
 
 def test_the_wheel_holds_the_package_the_rules_the_configurations_and_the_demo(installed: Path) -> None:
