@@ -188,13 +188,13 @@ class Table(Section):
     seat_deg: Annotated[float, Field(gt=0, le=10)] | None = None
 
 
-class Rest(Section):
+class ProgramRest(Section):
     """A rest in the program of a table."""
 
     rest_s: NonNegative
 
 
-class Turn(Section):
+class ProgramTurn(Section):
     """A turn in the program of a table, with trapezoidal rate."""
 
     turn_deg: float
@@ -206,7 +206,7 @@ class Repeated(Section):
     """Repeated steps in the program of a table."""
 
     repeat: Annotated[int, Field(ge=1)]
-    steps: list[Rest | Turn]
+    steps: list[ProgramRest | ProgramTurn]
 
 
 class Window(Section):
@@ -229,7 +229,7 @@ class RecordingFile(Section):
     sense: Sense | None = None
     zero_deg: Finite | None = None
     setup: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] | None = None
-    program: list[Rest | Turn | Repeated] | None = None
+    program: list[ProgramRest | ProgramTurn | Repeated] | None = None
     windows: list[Window] | None = None
     session: Annotated[int, Field(ge=1)] | None = None
 

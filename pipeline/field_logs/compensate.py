@@ -30,9 +30,10 @@ from pipeline.errors import ConfigurationError, InputError, MissingInputError, P
 from pipeline.field_logs.log_checks import LogChecks
 from pipeline.io.channel_table import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
 from pipeline.io.files import GIT_LFS, MESSAGE_FORMATS, not_regular
-from pipeline.io.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
+from pipeline.io.units import ACCELEROMETER, GYROSCOPE
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS, Recording
+from pipeline.settings import Ingest
 from pipeline.signal.rests import find_rests
 
 if TYPE_CHECKING:
@@ -53,7 +54,9 @@ PARTS, K95 = 10, 2.262  # of a rest; Student's t for 95 %, two-sided, with 9 deg
 
 
 USED = ("time", "temperature", *ACCELEROMETER, *GYROSCOPE)
-CANONICAL_CSV = {"csv": {"columns": {c: {"column": CANONICAL[c], "unit": next(iter(UNITS[c]))} for c in USED}}}
+CANONICAL_CSV = Ingest(
+    name="canonical_csv", csv={"columns": {c: {"column": CANONICAL[c], "unit": next(iter(UNITS[c]))} for c in USED}}
+)
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class LogProfile:
     reading axes point, by default +x, +y, +z.
     """
 
-    ingest: Mapping[str, Any] = field(default_factory=lambda: CANONICAL_CSV)
+    ingest: Ingest = CANONICAL_CSV
     axis_maps: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @classmethod
@@ -77,7 +80,7 @@ class LogProfile:
             maps = maps_of_log({"axis_map": log["axis_map"]})
             for axis_map in maps.values():
                 axis_matrix(axis_map)
-            return cls(CANONICAL_CSV if log["ingest"] is None else {**log["ingest"]}, maps)
+            return cls(CANONICAL_CSV if log["ingest"] is None else Ingest(name="", **log["ingest"]), maps)
         except (KeyError, TypeError, ConfigurationError) as error:
             expected = "log is invalid; expected ingest, an object or null, and axis_map, for example [+x, +y, +z]"
             raise InputError(f"{expected}; got {error}", file) from None

@@ -38,12 +38,13 @@ from pipeline.io.units import (
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Readings, Result
     from pipeline.io.text_log import Head
     from pipeline.records import Integers, Values
+    from pipeline.settings import Ingest
 
 BLOCK_ROWS = 20_000  # of a message log, like a block of a text log
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
@@ -173,7 +174,7 @@ class CsvLog:
         return signals
 
 
-def sensor_parts(ingest: Mapping[str, Any], *, messages: bool = False) -> list[int]:
+def sensor_parts(ingest: Ingest, *, messages: bool = False) -> list[int]:
     """Return the indices of the files with readings or the temperature in the profile's ``parts``.
 
     ``messages``: of message logs.

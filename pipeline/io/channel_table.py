@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.ingest_settings import ChannelSource
     from pipeline.records import Index, Integers, Values
+    from pipeline.settings import Sensor
 
 STRAIGHT = ("+x", "+y", "+z")
 
@@ -117,10 +118,9 @@ def axis_matrix(axis_map: Sequence[str]) -> Values:
     return matrix
 
 
-def axis_maps(sensor: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the axis map of each sensor from the section ``sensor``: the sensor's, else the unit's, else straight."""
-    common = sensor.get("axis_map") or STRAIGHT
-    return {s: tuple((sensor.get(s) or {}).get("axis_map") or common) for s in TRIADS}
+def axis_maps(sensor: Sensor | None) -> dict[str, tuple[str, ...]]:
+    """Return the axis map of each sensor: its own, else that of the sensor model; straight without a model."""
+    return {s: STRAIGHT if sensor is None else tuple(sensor.of(s).axis_map or sensor.axis_map) for s in TRIADS}
 
 
 def maps_of_log(log: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:

@@ -13,7 +13,7 @@ moves may have any length. Lost steps of the motors are not observable; they are
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,9 +22,10 @@ from pipeline.io.clock_alignment import fit_clocks
 from pipeline.io.encoder_log import seconds_of
 from pipeline.io.units import TRIADS
 from pipeline.records import Note
+from pipeline.settings import ProgramRest, ProgramTurn, Repeated
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from pipeline.records import Index, Values
 
@@ -35,12 +36,9 @@ ROUNDS = 12  # iterations at most; they end where no move changes by 1 us
 FARTHEST = 0.5  # of the rest before or after a move
 
 
-def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) -> ChannelTable:
-    """Add the angle and rate of a table with this program to a log; the gyroscope must show the moves.
-
-    ``program`` has rests ``{rest_s}``, turns ``{turn_deg, rate_dps, acceleration_dps2}`` and ``{repeat, steps}``.
-    """
-    pause = {"rest_s": BEFORE_S}
+def follow_program(table: ChannelTable, program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> ChannelTable:
+    """Add the angle and rate of a table with this program to a log; the gyroscope must show the moves."""
+    pause = ProgramRest(rest_s=BEFORE_S)
     commanded = Program([pause, *_flat(program), pause])
     times = np.arange(0.0, commanded.duration, STEP_S)
     angle, rate, *_ = commanded.at(times)
@@ -58,7 +56,8 @@ def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) ->
     )
     note = Note("N-PROGRAM", len(shifts), 0, 0, detail, float(table.time_ns[0]) / 1e9, float(table.time_ns[-1]) / 1e9)
     values = {**table.values, "table_angle": angle, "table_rate": rate}
-    return replace(table, values=values, notes=(*table.notes, note), source={**table.source, "program": list(program)})
+    source = {**table.source, "program": [step.json_value for step in program]}
+    return replace(table, values=values, notes=(*table.notes, note), source=source)
 
 
 class Program:
@@ -69,21 +68,23 @@ class Program:
     A turn by the angle D at the rate r with acceleration a ramps for r/a, holds r and ramps down; where |D| < r^2/a it
     does not reach r, and the ramps meet in the middle. The table rests before and after the program.
 
-    ``steps``: ``{rest_s}`` and ``{turn_deg, rate_dps, acceleration_dps2}``. ``knots``: (1 + 4 n, 4) array of time t_k
+    ``knots``: (1 + 4 n, 4) array of time t_k
     (s), angle A_k (deg), rate W_k (deg/s) and acceleration a_k (deg/s^2), four rows for each of n moves. ``stops``:
     (n + 1,) array of the angles before each move and after the last, deg. ``duration``: in s.
     """
 
-    def __init__(self, steps: Iterable[Mapping[str, Any]]) -> None:
+    def __init__(self, steps: Iterable[ProgramRest | ProgramTurn]) -> None:
         self.steps = list(steps)
         time, angle, rows = 0.0, 0.0, [(0.0, 0.0, 0.0, 0.0)]
         for step in self.steps:
-            turn = float(step.get("turn_deg", 0.0))
-            time += float(step.get("rest_s", 0.0))
+            if isinstance(step, ProgramRest):
+                time += step.rest_s
+                continue
+            turn = step.turn_deg
             if turn == 0.0:
                 continue
-            acceleration, sign = float(step["acceleration_dps2"]), float(np.sign(turn))
-            top = min(float(step["rate_dps"]), float(np.sqrt(abs(turn) * acceleration)))
+            acceleration, sign = step.acceleration_dps2, float(np.sign(turn))
+            top = min(step.rate_dps, float(np.sqrt(abs(turn) * acceleration)))
             ramp, hold = top / acceleration, abs(turn) / top - top / acceleration
             half = sign * 0.5 * top * ramp
             rows += [
@@ -104,11 +105,13 @@ class Program:
         return angle + (rate + 0.5 * acceleration * s) * s, rate + acceleration * s, acceleration, (k - 1) // 4
 
 
-def _flat(program: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+def _flat(program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> Iterator[ProgramRest | ProgramTurn]:
     """Yield the steps of a program, with repetitions expanded."""
     for step in program:
-        for _ in range(int(step.get("repeat", 1))):
-            yield from _flat(step["steps"]) if "repeat" in step else [step]
+        if isinstance(step, Repeated):
+            yield from step.repeat * step.steps
+        else:
+            yield step
 
 
 def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> tuple[Values, Values, float, float]:

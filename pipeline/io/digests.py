@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.pack import Pack
+    from pipeline.settings import Ingest, Procedure
 
 
-def digests_of_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], folder: Path) -> list[str]:
+def digests_of_files(procedure: Procedure, ingest: Ingest, folder: Path) -> list[str]:
     """Return the digests of the existing files of a unit's recordings; a file that cannot be read is left out."""
     digests = set()
     for path in {path for paths in recording_files(procedure, ingest, folder).values() for path in paths}:

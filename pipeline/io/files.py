@@ -15,12 +15,14 @@ import re
 import stat
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.errors import ConfigurationError, IngestError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+
+    from pipeline.settings import Ingest, Procedure, RecordingFile
 
 
 class MessageFormat(NamedTuple):
@@ -86,7 +88,7 @@ def is_mat_5(path: Path) -> bool:
         return stream.read(10) != b"MATLAB 7.3"
 
 
-def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], folder: Path) -> dict[str, list[Path]]:
+def recording_files(procedure: Procedure, ingest: Ingest, folder: Path) -> dict[str, list[Path]]:
     """Return the existing files of each recording of a procedure, in its order.
 
     A recording without any file is not in the result; a recording with missing parts has its existing parts.
@@ -101,14 +103,13 @@ def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], fol
     return found
 
 
-def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> dict[str, list[list[str]]]:
+def candidate_files(procedure: Procedure, ingest: Ingest) -> dict[str, list[list[str]]]:
     """Return the possible files of each recording: alternatives in order of preference, each with all its files."""
-    recordings: Mapping[str, Mapping[str, Any]] = procedure["recordings"]
     parts = parts_of(ingest)
-    owner = _owner_of_parts(recordings, parts)
+    owner = _owner_of_parts(procedure.recordings, parts)
     out = {}
-    for name, entry in recordings.items():
-        file = entry["file"]
+    for name, entry in procedure.recordings.items():
+        file = entry.file
         messages = [[file + suffix] for suffix in SUFFIXES[2:]]
         if Path(file).suffix:
             out[name] = [[file]]
@@ -121,18 +122,18 @@ def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> 
     return out
 
 
-def parts_of(ingest: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
+def parts_of(ingest: Ingest) -> Sequence[Mapping[str, str]]:
     """Return the files of one recording, if the profile joins several text or message logs."""
-    found: Sequence[Mapping[str, Any]] = (ingest.get("csv") or {}).get("parts") or ()
-    return found or (ingest.get("mcap") or {}).get("parts") or ()
+    found: Sequence[Mapping[str, str]] = ingest.csv.get("parts") or ingest.mcap.get("parts") or ()
+    return found
 
 
-def _owner_of_parts(recordings: Mapping[str, Mapping[str, Any]], parts: Sequence[Mapping[str, Any]]) -> str | None:
+def _owner_of_parts(recordings: Mapping[str, RecordingFile], parts: Sequence[Mapping[str, str]]) -> str | None:
     """Return the recording to which parts with fixed names belong; None if their names contain ``{file}``."""
     fixed = [part["file"] for part in parts if FILE not in part["file"]]
     if not fixed:
         return None
-    required = [name for name, entry in recordings.items() if not entry.get("optional", False)]
+    required = [name for name, entry in recordings.items() if not entry.optional]
     if len(required) != 1:
         raise ConfigurationError(
             f"parts of the ingest profile names {', '.join(fixed)} without {FILE}, which suits a procedure with one "

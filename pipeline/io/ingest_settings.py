@@ -22,6 +22,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.io.field_path import FieldPath
 from pipeline.io.files import candidate_files
 from pipeline.io.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, TRIADS, UNITS
+from pipeline.settings import Ingest, Procedure  # noqa: TC001
 
 WHITESPACE, AUTO, COMMENTED = "whitespace", "auto", "commented"
 REFUSE, DROP, GAP = "refuse", "drop", "gap"
@@ -231,14 +232,14 @@ def _once(where: str, groups: Iterable[Iterable[str]], what: str) -> set[str]:
     return seen
 
 
-def checks_of(ingest: Mapping[str, Any]) -> Checks:
+def checks_of(ingest: Ingest) -> Checks:
     """Return the limits of an ingest profile (``ingest.checks``)."""
-    return validated(Checks, ingest.get("checks") or {}, "ingest.checks")
+    return validated(Checks, ingest.checks, "ingest.checks")
 
 
-def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
+def csv_formats(ingest: Ingest) -> list[CsvFormat]:
     """Return the layout of each text file of a recording: one, or one for each part in the profile's ``parts``."""
-    csv: Mapping[str, Any] = ingest.get("csv") or {}
+    csv = ingest.csv
     refuse_unknown("ingest.csv", csv, [k for k in (*CsvFormat.model_fields, "parts") if k != "own_clock"])
     shared = {k: v for k, v in csv.items() if k not in ("parts", "columns")}
     header = bool(validated(CsvFormat, shared, "ingest.csv").header)
@@ -277,11 +278,11 @@ def _check_channels(formats: Sequence[CsvFormat]) -> None:
         raise ConfigurationError("ingest.csv.columns describes neither an accelerometer nor a gyroscope")
 
 
-def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None = None) -> None:
+def check_ingest(ingest: Ingest, procedure: Procedure | None = None) -> None:
     """Raise ``ConfigurationError`` for an invalid ingest profile, or if its parts do not match the procedure."""
     mcap_formats(ingest)
     checks_of(ingest)
-    if ingest.get("csv"):
+    if ingest.csv:
         csv_formats(ingest)
     if procedure is not None:
         candidate_files(procedure, ingest)
@@ -336,24 +337,25 @@ class McapFormat(Section):
     reorder_s: Duration = Field(default=1.0, description="a time in s, 0 or more")
 
 
-def mcap_formats(ingest: Mapping[str, Any]) -> list[McapFormat]:
+def mcap_formats(ingest: Ingest) -> list[McapFormat]:
     """Return how each message log of a recording is read: one, or one for each part in the profile's ``parts``."""
-    parts = (ingest.get("mcap") or {}).get("parts")
+    parts = ingest.mcap.get("parts")
     if not parts:
         return [mcap_format(ingest)]
-    if ingest["mcap"].get("topics") or (ingest.get("csv") or {}).get("parts"):
+    if ingest.mcap.get("topics") or ingest.csv.get("parts"):
         message = "ingest.mcap.parts: topics stand in each part, and ingest.csv.parts is null beside them"
         raise ConfigurationError(message)
     places = {f"ingest.mcap.parts[{index}]": part for index, part in enumerate(parts)}
     checked = [(where, validated(_LogPart, part, where)) for where, part in places.items()]
-    formats = [mcap_format({"mcap": {**ingest["mcap"], "topics": part.topics}}, where) for where, part in checked]
+    of_parts = [(where, ingest.replaced(mcap={**ingest.mcap, "topics": part.topics})) for where, part in checked]
+    formats = [mcap_format(of_part, where) for where, of_part in of_parts]
     _once("ingest.mcap.parts", ([c for topic in f.topics.values() for c in topic] for f in formats), "parts")
     return formats
 
 
-def mcap_format(ingest: Mapping[str, Any], place: str = "ingest.mcap") -> McapFormat:
+def mcap_format(ingest: Ingest, place: str = "ingest.mcap") -> McapFormat:
     """Return how a message log is read; ``place``: of its topics, in errors."""
-    section = {key: value for key, value in (ingest.get("mcap") or {}).items() if key != "parts"}
+    section = {key: value for key, value in ingest.mcap.items() if key != "parts"}
     topics = section.pop("topics", None) or {}
     settings = validated(McapFormat, section, "ingest.mcap")
     if not isinstance(topics, Mapping):

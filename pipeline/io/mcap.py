@@ -27,7 +27,7 @@ from pipeline.io.units import ACCELEROMETER, COUNTS, GYROSCOPE, TABLE_CHANNELS, 
 from pipeline.records import Note
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -36,11 +36,12 @@ if TYPE_CHECKING:
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.mcap_reader import MessageReader
     from pipeline.records import Integers
+    from pipeline.settings import Ingest
 
     Columns = dict[str, NDArray[Any]]
 
 
-def read_logs(paths: Sequence[Path], ingest: Mapping[str, Any]) -> ChannelTable:
+def read_logs(paths: Sequence[Path], ingest: Ingest) -> ChannelTable:
     """Read the log or, if the profile joins several, all logs of one recording; errors as of ``read_log``."""
     formats = mcap_formats(ingest)
     if len(paths) != len(formats):  # in place of the parts, a log that is a whole recording

@@ -12,7 +12,7 @@ resolution, and no run is flagged.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pipeline.io.channel_table import ChannelTable
     from pipeline.io.ingest_settings import Checks
     from pipeline.records import Index, Integers, Mask, Note
+    from pipeline.settings import Sensor
 
 GAP, CLIPPED, STUCK, REPAIRED = np.uint16(1), np.uint16(2), np.uint16(4), np.uint16(8)  # bits of ``Recording.flags``
 GAP_INTERVALS = 1.5  # half way to one missing sample
@@ -268,12 +269,10 @@ def _in_a_row(same: Mask, count: int) -> bool:
     return bool(np.any(places[further:] - places[: max(len(places) - further, 0)] == further))
 
 
-def examine(
-    table: ChannelTable, sensor: Mapping[str, Any], checks: Checks
-) -> tuple[NDArray[np.uint16] | None, list[Note]]:
+def examine(table: ChannelTable, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[np.uint16] | None, list[Note]]:
     """Return quality flags (None if none is set) and notes; raise ``IngestError`` for impossible values.
 
-    ``sensor``: section of the unit's configuration; its full scales may be absent.
+    ``sensor``: with the full scales; None if they are not known.
     """
     for channels in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in channels if c not in table.values]
@@ -289,9 +288,8 @@ def examine(
     notes = flag_gaps(table, flags, checks)
     stuck: dict[str, Index] = {}
     for name in TRIADS:
-        full_scale = (sensor.get(name) or {}).get("full_scale")
-        if full_scale is not None:
-            notes += flag_clipped(table, name, float(full_scale), flags)
+        if sensor is not None:
+            notes += flag_clipped(table, name, sensor.of(name).full_scale, flags)
         notes += flag_flat_tops(table, name, flags)
         stuck |= find_stuck(table, name, flags)
     notes += flag_stuck(table, stuck, flags)

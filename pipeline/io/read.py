@@ -13,7 +13,7 @@ import itertools
 import os
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from pipeline.io.ingest_settings import checks_of, csv_formats
 from pipeline.io.quality_flags import examine
 from pipeline.io.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording, files_of_readings, rate_of_attitude
+from pipeline.settings import Ingest
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from pipeline.io.channel_table import ChannelTable
     from pipeline.io.ingest_settings import Checks, CsvFormat
     from pipeline.records import Values
+    from pipeline.settings import Procedure, RecordingFile, Sensor
 
 
 MOST_NAMED = 5  # further files that an error lists
@@ -43,27 +45,27 @@ IN_MEMORY = "(DataFrame)"  # after the name of a recording that has no file
 
 
 def read_recordings(
-    procedure: Mapping[str, Any],
-    ingest: Mapping[str, Any],
-    sensor: Mapping[str, Any],
+    procedure: Procedure,
+    ingest: Ingest,
+    sensor: Sensor,
     folder: Path,
     in_memory: Mapping[str, bytes] = MappingProxyType({}),
 ) -> list[Recording]:
     """Read all existing recordings of a unit, in the order of the procedure.
 
-    ``procedure``, ``ingest`` and ``sensor`` are sections of the unit's configuration. ``in_memory``: canonical CSV
+    ``in_memory``: canonical CSV
     by the name of its recording, read in place of files. Raises ``MissingInputError`` if
     files that are not optional do not exist, ``InputError`` if files cannot be used; one error lists all such files.
     """
-    checks, layouts = checks_of(ingest), csv_formats(ingest) if ingest.get("csv") else None
+    checks, layouts = checks_of(ingest), csv_formats(ingest) if ingest.csv else None
     found, missing = set[str](), list[str]()
     recordings: list[Recording] = []
     refused: list[InputError] = []
     for name, candidates in candidate_files(procedure, ingest).items():
-        entry = procedure["recordings"][name]
+        entry = procedure.recordings[name]
         files, wanted, unread = _existing(candidates, folder) if name not in in_memory else ([name], [name], [])
         if not files:
-            missing += [] if entry.get("optional", False) else [f"{name} (tried {tried(candidates)})"]
+            missing += [] if entry.optional else [f"{name} (tried {tried(candidates)})"]
             continue
         found.add(name)
         if files != wanted:
@@ -73,7 +75,7 @@ def read_recordings(
             if name in in_memory:
                 table = read_canonical(name, in_memory[name], checks)
             else:
-                table = read_table([folder / f for f in files], ingest, layouts, entry.get("session"))
+                table = read_table([folder / f for f in files], ingest, layouts, entry.session)
             recording = to_recording(name, entry, table, sensor, checks)
         except IngestError as error:
             refused.append(error)
@@ -99,7 +101,7 @@ def read_recordings(
 
 def read_table(
     paths: Sequence[Path],
-    ingest: Mapping[str, Any],
+    ingest: Ingest,
     layouts: Sequence[CsvFormat] | None = None,
     session: int | None = None,
 ) -> ChannelTable:
@@ -136,11 +138,11 @@ def read_canonical(name: str, text: bytes, checks: Checks) -> ChannelTable:
         raise IngestError(error.fact, error.file, code=error.code, hint=hint) from None
 
 
-def canonical() -> dict[str, Any]:
+def canonical() -> Ingest:
     """Return the ingest profile of the canonical CSV."""
     from pipeline.io.yaml_file import read_yaml  # noqa: PLC0415  (a run reads profiles as settings)
 
-    return dict(read_yaml(CONFIGS / "ingest" / "canonical_csv.yaml"))
+    return Ingest(name="canonical_csv", **read_yaml(CONFIGS / "ingest" / "canonical_csv.yaml"))
 
 
 def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[str], list[str], list[str]]:
@@ -162,27 +164,26 @@ def tried(candidates: Sequence[Sequence[str]]) -> str:
     return ", ".join(texts)
 
 
-def of_one_sensor(procedure: Mapping[str, Any], files: Collection[str]) -> str:
+def of_one_sensor(procedure: Procedure, files: Collection[str]) -> str:
     """Return advice for a unit with one sensor, if all recordings of one sensor are missing; else empty."""
-    entries = procedure["recordings"].items()
-    there = {sensor: [n in files for n, e in entries if e["role"] == sensor] for sensor in TRIADS}
+    entries = procedure.recordings.items()
+    there = {sensor: [n in files for n, e in entries if e.role == sensor] for sensor in TRIADS}
     lacking = [sensor for sensor, found in there.items() if found and not any(found)]
     others = any(any(found) for found in there.values())
     return f"; of a unit without {lacking[0]}, set method.{lacking[0]}=null" if len(lacking) == 1 and others else ""
 
 
 def to_recording(
-    name: str, entry: Mapping[str, Any], table: ChannelTable, sensor: Mapping[str, Any], checks: Checks
+    name: str, entry: RecordingFile, table: ChannelTable, sensor: Sensor | None, checks: Checks
 ) -> Recording:
     """Convert a table of channels to a recording in body axes, with quality flags; removes the channels from ``table``.
 
-    ``entry``: the procedure's entry of the recording: ``role``, ``axis``, and ``program`` for a table without a log.
-    ``sensor``: section of the unit's configuration.
+    ``entry``: of the procedure, with the ``program`` of a table without a log. ``sensor``: None if it is not known.
     """
-    if entry.get("program") and not set(TABLE_CHANNELS) & table.values.keys():
+    if entry.program and not set(TABLE_CHANNELS) & table.values.keys():
         from pipeline.io.commanded_motion import follow_program  # noqa: PLC0415  (few tables need it)
 
-        table = follow_program(table, entry["program"])
+        table = follow_program(table, entry.program)
     table = unwrapped(table)
     flags, notes = examine(table, sensor, checks)
     maps, values = axis_maps(sensor), table.values
@@ -207,9 +208,9 @@ def to_recording(
         notes.append(Note("N-ABSENT", len(table.time_ns), 0, 0, detail))
     recording = Recording(
         name=name,
-        role=entry["role"],
-        axis=entry.get("axis"),
-        setup=entry.get("setup") or "",
+        role=entry.role,
+        axis=entry.axis,
+        setup=entry.setup or "",
         time_ns=table.time_ns,
         accelerometer=readings["accelerometer"],
         gyroscope=readings["gyroscope"],

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.model.checked import Check
+    from pipeline.settings import DataSheet
 
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
 # (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.
@@ -279,27 +280,27 @@ Entry = dict[str, Any]
 Row = tuple[str, float, float, str, float, float, str]  # name, value, uncertainty, unit, limit, floor, likely cause
 
 
-def implausible(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> list[Entry]:
+def implausible(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
     """Return the fitted parameters of a sensor that are beyond the sensor file's limits, the largest ratio first.
 
-    ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``sensor_config`` its part of the configuration. An
+    ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``data_sheet`` the figures of the sensor. An
     entry has ``parameter``, ``value``, ``unit``, ``limit`` of the sensor file, ``ratio`` of the two and
     ``likely_cause``.
     """
     entries = [
         _entry(row) | {"likely_cause": row[-1]}
-        for row in _limited(sensor, part, sensor_config)
+        for row in _limited(sensor, part, data_sheet)
         if abs(row[1]) - 2.0 * row[2] > max(MULTIPLE * row[4], row[5])
     ]
     return sorted(entries, key=lambda entry: -entry["ratio"])
 
 
-def beyond_limits(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> list[Entry]:
+def beyond_limits(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
     """Return the fitted parameters whose absolute value exceeds the sensor file's limit, the largest ratio first.
 
     Parameters as of ``implausible``; an entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
     """
-    entries = [_entry(row) for row in _limited(sensor, part, sensor_config) if abs(row[1]) > row[4]]
+    entries = [_entry(row) for row in _limited(sensor, part, data_sheet) if abs(row[1]) > row[4]]
     return sorted(entries, key=lambda entry: -entry["ratio"])
 
 
@@ -314,10 +315,10 @@ def _entry(row: Row) -> Entry:
     return {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit}
 
 
-def _limited(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> Iterator[Row]:
+def _limited(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[Row]:
     """Yield the rows of all parameters that the sensor file limits."""
-    yield from _of_bias_and_matrix(sensor, part, sensor_config)
-    yield from limited_effects(sensor, part, sensor_config["effects"])
+    yield from _of_bias_and_matrix(sensor, part, data_sheet)
+    yield from limited_effects(sensor, part, data_sheet.effects)
 
 
 def without_rotation(matrix: Values) -> Values:
@@ -327,19 +328,19 @@ def without_rotation(matrix: Values) -> Values:
     return np.asarray((axes * np.sqrt(squares)) @ axes.T)
 
 
-def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], sensor_config: Mapping[str, Any]) -> Iterator[Row]:
+def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[Row]:
     """Yield the rows of biases, scale factors and cross-axis sensitivities."""
     K, P = np.linalg.inv(np.array(part["matrix"], float)), without_rotation(np.array(part["matrix"], float))
     spread = part["expanded_uncertainty"]
     of_matrix = np.abs(K) @ np.array(spread["matrix"], float) @ np.abs(K)  # dK = -K dM K
-    floor, unit = LOW_COST_BIAS[sensor] * sensor_config["full_scale"], SENSOR_UNITS[sensor]
+    floor, unit = LOW_COST_BIAS[sensor] * data_sheet.full_scale, SENSOR_UNITS[sensor]
     for name, value, uncertainty in zip(BIAS_NAMES, part["bias"], spread["bias"], strict=True):
-        yield name, float(value), float(uncertainty), unit, sensor_config["bias"], floor, OF_BIAS
-    scale, limit = _scale_cause(sensor, np.diag(P)), sensor_config["scale_factor"]
+        yield name, float(value), float(uncertainty), unit, data_sheet.bias, floor, OF_BIAS
+    scale, limit = _scale_cause(sensor, np.diag(P)), data_sheet.scale_factor
     for i, a in enumerate(AXES):
         yield f"scale_factor_{a}", float(P[i, i] - 1.0), float(of_matrix[i, i]), "1", limit, LOW_COST_SCALE, scale
     for i, j in ((0, 1), (0, 2), (1, 2)):
-        name, limit = f"cross_axis_{AXES[i]}{AXES[j]}", sensor_config["cross_axis"]
+        name, limit = f"cross_axis_{AXES[i]}{AXES[j]}", data_sheet.cross_axis
         yield name, float(P[i, j]), float(of_matrix[i, j]), "1", limit, LOW_COST_CROSS, OF_CROSS_AXIS
 
 

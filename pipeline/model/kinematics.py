@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,7 +33,9 @@ from pipeline.signal.filters import temperature_of
 from pipeline.signal.rests import still_samples
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
+
+    from pipeline.settings import Table
 
 
 EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
@@ -65,16 +67,16 @@ def normal_gravity_g(latitude_deg: float) -> float:
     return float(9.7803253359 * (1.0 + 0.00193185265241 * s) / np.sqrt(1.0 - 0.00669437999014 * s) / 9.80665)
 
 
-def earth_of(table: Mapping[str, Any]) -> Values | None:
+def earth_of(table: Table) -> Values | None:
     """Return Earth's rotation in the level frame; None where the table's latitude or azimuth is not set."""
-    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
-    return None if latitude is None or azimuth is None else earth_rate(float(latitude), float(azimuth))
+    latitude, azimuth = table.latitude_deg, table.azimuth_deg
+    return None if latitude is None or azimuth is None else earth_rate(latitude, azimuth)
 
 
-def table_motion(recording: Recording, table: Mapping[str, Any]) -> Motion | None:
+def table_motion(recording: Recording, table: Table) -> Motion | None:
     """Return ``reference_motion`` with gravity, latitude and azimuth of a table's configuration."""
-    one_shaft = table.get("azimuth_of") == "turn_axis"
-    return reference_motion(recording, float(table.get("gravity_g") or 1.0), earth_of(table), one_shaft=one_shaft)
+    one_shaft = table.azimuth_of == "turn_axis"
+    return reference_motion(recording, table.gravity_g, earth_of(table), one_shaft=one_shaft)
 
 
 def reference_motion(

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Mask, Recording, Values
+    from pipeline.settings import DataSheet, Sensor, Settings
 
 
 BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
@@ -65,16 +66,16 @@ LEVEL_G = 0.5  # of the axes across a turn together, from which gravity turns in
 FEWEST = 32  # samples, of which an axis is copied or stays
 
 
-def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
+def check_static(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:
     """Return the recordings of a unit; of a static one only the part at rest, with the note ``N-MOVED``.
 
-    ``settings``: section ``sensor``. ``IngestError``: too little of a static recording is at rest.
+    ``IngestError``: too little of a static recording is at rest.
     """
     if all(r.role != "static" for r in recordings):
         return list(recordings)
-    sensor_configs, rests = settings.get("sensor") or {}, _rests_of(recordings)
+    sensor_model, rests = settings.sensor, _rests_of(recordings)
     return [
-        _doubted(_resting(r, rests, sensor_configs), recordings, rests, sensor_configs) if r.role == "static" else r
+        _doubted(_resting(r, rests, sensor_model), recordings, rests, sensor_model) if r.role == "static" else r
         for r in recordings
     ]
 
@@ -83,7 +84,7 @@ def _doubted(
     recording: Recording,
     recordings: Sequence[Recording],
     rests_of: Mapping[str, Values],
-    sensor_configs: Mapping[str, Any],
+    sensor_model: Sensor,
 ) -> Recording:
     """Return a static recording, with the note ``N-REFERENCE`` if it contradicts the rests of the others."""
     others = [r for r in recordings if r.role != "static" and r.samples > 1]
@@ -112,12 +113,11 @@ def _doubted(
                 f"the {sensor} has at most {1.0 / quieter:.2g} times the white noise of the rests of the other "
                 "recordings: if the recording is of another unit, the noise of this one is underestimated"
             )
-        sensor_config = sensor_configs.get(sensor)
-        if sensor == "gyroscope" and sensor_config:
+        if sensor == "gyroscope":
             means = rests[:, 2]
             away = float(np.max([means.min(axis=0) - static[2], static[2] - means.max(axis=0)]))
             noise = SIGNIFICANT * float(usual[0].max()) / np.sqrt(FEWEST_OF_REST)
-            most = noise + _bias_change([recording, *others], sensor_config)
+            most = noise + _bias_change([recording, *others], sensor_model.gyroscope)
             if away > most:
                 details.append(
                     f"the {sensor} reads {away:.3g} deg/s beyond all rests of the other recordings, where the sensor "
@@ -133,15 +133,15 @@ def _digit(reading: Values) -> Values:
     return np.asarray(np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
 
 
-def _bias_change(recordings: Sequence[Recording], sensor_config: Mapping[str, Any]) -> float:
+def _bias_change(recordings: Sequence[Recording], data_sheet: DataSheet) -> float:
     """Return the largest plausible change of the gyroscope's reading at rest between recordings, deg/s."""
-    effects = sensor_config.get("effects") or {}
-    attitude = 2.0 * float(effects.get("g_sensitivity") or 0.0) + float(effects.get("g_squared_sensitivity") or 0.0)
+    effects = data_sheet.effects
+    attitude = 2.0 * effects.get("g_sensitivity", 0.0) + effects.get("g_squared_sensitivity", 0.0)
     known = [r.temperature for r in recordings if r.temperature is not None]
     change = float(np.ptp(np.concatenate(known))) if len(known) == len(recordings) else UNKNOWN_DEGC
     duration = max(r.time[-1] for r in recordings) - min(r.time[0] for r in recordings)
     duration = max(float(duration), sum(float(r.time[-1] - r.time[0]) for r in recordings))
-    return attitude + 2.0 * EARTH_RATE_DPS + _slow(sensor_config, change, duration)
+    return attitude + 2.0 * EARTH_RATE_DPS + _slow(data_sheet, change, duration)
 
 
 def _blocks(recording: Recording, values: Values) -> Values:
@@ -151,7 +151,7 @@ def _blocks(recording: Recording, values: Values) -> Values:
     return values[: count * size].reshape(count, size, *values.shape[1:])
 
 
-def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_configs: Mapping[str, Any]) -> Recording:
+def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_model: Sensor) -> Recording:
     """Return the longest part of a static recording at rest, with a note if it is not all of it."""
     if recording.samples < 2 * FEWEST_OF_BLOCK:
         return recording
@@ -168,7 +168,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_config
         if reading is None:
             continue
         blocks = _blocks(recording, reading)
-        moves, what = _moving(recording, sensor, blocks, sensor_configs.get(sensor) or {}, rests_of[sensor])
+        moves, what = _moving(recording, sensor, blocks, sensor_model.of(sensor), rests_of[sensor])
         why = why or (what if moves.any() else "")
         moving |= moves
     if not moving.any():
@@ -194,7 +194,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_config
 
 
 def _moving(
-    recording: Recording, sensor: str, blocks: Values, sensor_config: Mapping[str, Any], rests: Values
+    recording: Recording, sensor: str, blocks: Values, data_sheet: DataSheet, rests: Values
 ) -> tuple[Mask, str]:
     """Return in which blocks a sensor moves, and the strongest evidence of it in words."""
     unit = SENSOR_UNITS[sensor]
@@ -203,7 +203,7 @@ def _moving(
     tiny = np.finfo(float).tiny
     spread = np.minimum(np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE, WIDEST)
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
-    white = float(sensor_config.get("noise_density") or 0.0) * np.sqrt(0.5 / recording.interval)
+    white = data_sheet.noise_density * np.sqrt(0.5 / recording.interval)
     if len(rests):
         usual = np.minimum(usual, OF_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
     elif white:
@@ -212,7 +212,7 @@ def _moving(
     loud = scatter / usual
     away = np.abs(means - median(means))
     change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
-    allowed = _slow(sensor_config, change, float(recording.time[-1] - recording.time[0])) + SIGNIFICANT * usual
+    allowed = _slow(data_sheet, change, float(recording.time[-1] - recording.time[0])) + SIGNIFICANT * usual
     moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)
     if np.any(loud > louder):
         return moving, f"the {sensor} scatters {loud.max():.3g} times as usual"
@@ -220,14 +220,14 @@ def _moving(
     return moving, what
 
 
-def _slow(sensor_config: Mapping[str, Any], change: float, duration: float) -> float:
+def _slow(data_sheet: DataSheet, change: float, duration: float) -> float:
     """Return the largest plausible change of a bias at rest, for a change of temperature (degC) and a duration (s)."""
-    effects = sensor_config.get("effects") or {}
+    effects = data_sheet.effects
     return (
-        SIGNIFICANT * float(sensor_config.get("bias_wander") or 0.0)
-        + float(effects.get("bias_drift") or 0.0) * duration
-        + float(effects.get("bias_temperature") or 0.0) * change
-        + float(effects.get("warm_up") or 0.0)
+        SIGNIFICANT * data_sheet.bias_wander
+        + effects.get("bias_drift", 0.0) * duration
+        + effects.get("bias_temperature", 0.0) * change
+        + effects.get("warm_up", 0.0)
     )
 
 

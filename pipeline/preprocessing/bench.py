@@ -48,7 +48,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -64,6 +64,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.gravity_rotation import Move
     from pipeline.records import Recording, Values
+    from pipeline.settings import RecordingFile, Table
 
 FEWEST = 10  # samples, five times the unknowns of an angle
 ACROSS = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
@@ -108,10 +109,13 @@ class Bench:
         return face - self.sense * self.zero_deg
 
 
-def stated_bench(entry: Mapping[str, Any], table: Mapping[str, Any], axis: str) -> Bench:
+def stated_bench(entry: RecordingFile | None, table: Table, axis: str) -> Bench:
     """Return the mounting that a recording's entry in the procedure states; the table states sense and zero else."""
-    stated = {k: table.get(k) if entry.get(k) is None else entry[k] for k in ("sense", "zero_deg")}
-    return Bench(axis, entry.get("up") or usual_up(axis), int(stated["sense"] or 1), float(stated["zero_deg"] or 0.0))
+    if entry is None:
+        return Bench(axis, usual_up(axis), table.sense, table.zero_deg)
+    sense = table.sense if entry.sense is None else entry.sense
+    zero_deg = table.zero_deg if entry.zero_deg is None else entry.zero_deg
+    return Bench(axis, entry.up or usual_up(axis), sense, zero_deg)
 
 
 def found_bench(fit: TurnFit, axis: str) -> Bench | None:

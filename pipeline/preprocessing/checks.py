@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,11 +32,12 @@ from pipeline.records import SENSOR_UNITS, SENSORS, Note
 from pipeline.signal.quiet_motion import coarse_steps
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from pipeline.records import Index, Recording
+    from pipeline.settings import Settings, Table
 
 FEWEST, APART = 20, 8  # rows, see above
 STEPS = "N-RESOLUTION"
@@ -47,15 +48,15 @@ OF_DECIMALS = 200  # samples that determine the decimals: a finer reading ends i
 MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
 
 
-def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
+def check_recordings(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:
     """Return the recordings of a unit, their turns by the convention, with notes on faults and corrections.
 
     Parameters
     ----------
     recordings : sequence of Recording
         In body axes, not filtered.
-    settings : mapping
-        The unit's configuration: sections ``procedure``, ``sensor``, ``table`` and ``ingest``.
+    settings : Settings
+        Sections ``procedure``, ``sensor``, ``table`` and ``ingest``.
 
     Raises
     ------
@@ -67,7 +68,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     recordings = _with_steps(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
     checked = refined(check_motion(check_mounting(turns, settings), delays, settings))
-    return _placed(checked, settings.get("table") or {})
+    return _placed(checked, settings.table)
 
 
 def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
@@ -93,14 +94,14 @@ def _is_whole(value: float) -> bool:
     return abs(value - round(value)) < SAME_STEP * abs(value)
 
 
-def _placed(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recording]:
+def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
     """Note the gravity at the latitude if ``gravity_g`` is left at 1, and the azimuths of the turn axes."""
-    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
+    latitude, azimuth = table.latitude_deg, table.azimuth_deg
     if latitude is None:
         return recordings
     gravity, notes = normal_gravity_g(float(latitude)), []
     measured = [k for k, r in enumerate(recordings) if r.accelerometer is not None]
-    if measured and table.get("gravity_g") == 1.0 and abs(gravity - 1.0) >= SAME_GRAVITY_G:
+    if measured and table.gravity_g == 1.0 and abs(gravity - 1.0) >= SAME_GRAVITY_G:
         detail = (
             f"table.gravity_g is 1, its default; at latitude {latitude:g} deg gravity is {gravity:.5f} g at sea level, "
             "and 0.000315 g less for each km of height. Scale and bias of the accelerometer are then in units of local "
@@ -108,7 +109,7 @@ def _placed(recordings: list[Recording], table: Mapping[str, Any]) -> list[Recor
         )
         notes.append((measured[0], Note("N-GRAVITY", 1, 0, 0, detail)))
     turns = [(k, r) for k, r in enumerate(recordings) if r.axis and not r.up and r.role != "validation"]
-    if turns and table.get("azimuth_of") == "turn_axis" and azimuth is not None:
+    if turns and table.azimuth_of == "turn_axis" and azimuth is not None:
         ends = [f"body {r.axis} to {(azimuth + 90.0 * (1 - r.sense)) % 360.0:g} deg in {r.name}" for _, r in turns]
         detail = (
             f"Earth's rotation is in the model: by table.azimuth_deg and the sense of the encoder the shaft points "

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Mask, Recording, Values
+    from pipeline.settings import Settings
 
 
 EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
@@ -47,17 +48,16 @@ class Limits:
     columns: Mapping[str, Any]  # ingest.csv.columns
 
     @classmethod
-    def of(cls, settings: Mapping[str, Any]) -> Limits:
-        """Return the limits by the sections ``sensor``, ``table`` and ``ingest``; those that are not stated are 0."""
-        sensor, table = settings.get("sensor") or {}, settings.get("table") or {}
-        effects = [(sensor.get(s) or {}).get("effects") or {} for s in SENSORS]
-        gyroscope = sensor.get("gyroscope") or {}
+    def of(cls, settings: Settings) -> Limits:
+        """Return the limits by sensor model, table and ingest profile; those that are not stated are 0."""
+        effects = [settings.sensor.of(s).effects for s in SENSORS]
+        gyroscope = settings.sensor.gyroscope
 
         def most(name: str) -> float:
-            return max(float(e.get(name) or 0.0) for e in effects)
+            return max(e.get(name, 0.0) for e in effects)
 
-        stated = EXPANDED * float(table.get("rate_accuracy") or 0.0)
-        angle = EXPANDED * float(table.get("angle_accuracy_deg") or 0.0)
+        stated = EXPANDED * settings.table.rate_accuracy
+        angle = EXPANDED * settings.table.angle_accuracy_deg
         encoder = most("table_encoder_error")
         return cls(
             late_s=most("time_offset") + most("low_pass_lag"),
@@ -66,9 +66,9 @@ class Limits:
             rate_stated=stated,
             angle_deg=encoder + 2.0 * most("table_backlash") + angle,
             angle_stated_deg=angle,
-            gain=float(gyroscope.get("scale_factor") or 0.0) + float(gyroscope.get("cross_axis") or 0.0),
+            gain=gyroscope.scale_factor + gyroscope.cross_axis,
             offset_dps=most("g_sensitivity") + most("g_squared_sensitivity"),
-            columns=((settings.get("ingest") or {}).get("csv") or {}).get("columns") or {},
+            columns=settings.ingest.csv.get("columns") or {},
         )
 
     def column(self, recording: Recording, channel: str) -> str:

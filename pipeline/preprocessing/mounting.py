@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
     from pipeline.preprocessing.bench import Bench, TurnFit
     from pipeline.records import Recording, Values
+    from pipeline.settings import Procedure, Sensor, Settings, Table
 
 TOLERANCE_DEG = 5.0  # default of procedure.mounting_tolerance_deg: beyond misalignments and seats of a careful bench
 TIME_OFFSET_S = 0.04  # largest plausible one where the sensor's config states none: as in configs/sensor/*.yaml
@@ -78,17 +79,16 @@ class _Departure:
     bench: Bench | None = None  # the mounting by gravity, which is applied; None: the turn is refused
 
 
-def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
+def check_mounting(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:
     """Return the recordings of a unit, in body axes, with the table's angle and rate by the convention.
 
-    ``settings``: sections ``procedure``, ``table`` and ``sensor``. ``IngestError``: the mounting of a turn differs from
+    ``IngestError``: the mounting of a turn differs from
     the stated one and gravity does not determine it, or accelerometer and gyroscope contradict each other.
     """
-    procedure, table, sensor = (settings.get(key) or {} for key in ("procedure", "table", "sensor"))
-    seated = table.get("seat_deg") is not None
-    tolerance = float(procedure.get("mounting_tolerance_deg") or TOLERANCE_DEG)
-    tolerance += 3.0 * float(table.get("seat_deg") or 0.0)
-    turns = _turns(recordings, procedure.get("recordings") or {}, table, sensor, tolerance)
+    table, sensor = settings.table, settings.sensor
+    seated = table.seat_deg is not None
+    tolerance = settings.procedure.mounting_tolerance_deg + 3.0 * (table.seat_deg or 0.0)
+    turns = _turns(recordings, settings.procedure, table, sensor, tolerance)
     maps, accelerometer = axis_maps(sensor), _accelerometer_axes(turns)
     check_frames([(t.recording, t.fit) for t in turns], accelerometer, maps)
     for recording in recordings:
@@ -135,21 +135,21 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
 
 def _turns(
     recordings: Sequence[Recording],
-    entries: Mapping[str, Any],
-    table: Mapping[str, Any],
-    sensor: Mapping[str, Any],
+    procedure: Procedure,
+    table: Table,
+    sensor: Sensor,
     tolerance: float,
 ) -> list[Turn]:
     # Largest plausible time offset, which adds to the zero of turns in one direction.
-    offset_s = float(((sensor.get("accelerometer") or {}).get("effects") or {}).get("time_offset") or TIME_OFFSET_S)
+    offset_s = sensor.accelerometer.effects.get("time_offset", TIME_OFFSET_S)
     # Three relative standard deviations of what a table without encoders loses, over half of the arc.
-    lost = 1.5 * float(table.get("rate_accuracy") or 0.0) if table.get("motion") == "commanded" else 0.0
+    lost = 1.5 * table.rate_accuracy if table.motion == "commanded" else 0.0
     turns = []
     for r in recordings:
         if r.axis is not None and not (r.table_angle is None and r.table_rate is None):
-            stated, fit = stated_bench(entries.get(r.name) or {}, table, r.axis), fit_turn(r)
+            stated, fit = stated_bench(procedure.recordings.get(r.name), table, r.axis), fit_turn(r)
             of_zero = tolerance + offset_s * abs(fit.mean_rate) + lost * fit.arc
-            turns.append(Turn(r, stated, fit, found_bench(fit, r.axis), r.name in entries, of_zero))
+            turns.append(Turn(r, stated, fit, found_bench(fit, r.axis), r.name in procedure.recordings, of_zero))
     return turns
 
 

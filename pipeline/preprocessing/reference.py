@@ -23,7 +23,7 @@ interval contradicts this.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 
     from pipeline.preprocessing.evidence import Channel
     from pipeline.records import Mask, Recording, Values
+    from pipeline.settings import Settings
 
 
 FEWEST = 32  # samples, two short stretches
@@ -87,9 +88,7 @@ class Delay:
         return min(max(value, self.low), self.high)
 
 
-def check_turns(
-    recordings: Sequence[Recording], settings: Mapping[str, Any]
-) -> tuple[list[Recording], dict[str, Delay]]:
+def check_turns(recordings: Sequence[Recording], settings: Settings) -> tuple[list[Recording], dict[str, Delay]]:
     """Return the recordings of a unit with notes on the reference of their turns, and the delay of the sensor in each.
 
     Signs and directions are not compared: this check precedes that of the mounting, which wrong units would mislead.
@@ -109,9 +108,7 @@ def _turns(recordings: Sequence[Recording]) -> list[Recording]:
     return [r for r in logged if r.axis is not None and not (r.table_rate is None and r.table_angle is None)]
 
 
-def check_motion(
-    recordings: Sequence[Recording], delays: Mapping[str, Delay], settings: Mapping[str, Any]
-) -> list[Recording]:
+def check_motion(recordings: Sequence[Recording], delays: Mapping[str, Delay], settings: Settings) -> list[Recording]:
     """Return the recordings of a unit with notes on the reference of held-out motion.
 
     ``recordings``: with their turns by the convention; ``delays``: of the sensor in them. ``IngestError``: channels of

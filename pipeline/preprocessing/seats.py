@@ -24,7 +24,7 @@ Turns that no common mounting explains get the note ``N-SEATS``.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,11 +34,12 @@ from pipeline.preprocessing.bench import ACROSS, angle_ahead, by_convention, uni
 from pipeline.records import AXES, Note, motion_at_rest
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.preprocessing.bench import Bench, Gravity
     from pipeline.preprocessing.mounting import Turn
     from pipeline.records import Values
+    from pipeline.settings import Sensor, Table
 
 # Smaller seats are left to the diagnosis: hidden table effects of the blind study (tilt 0.26 deg, leans 0.13 deg) reach
 # 0.2 deg.
@@ -169,18 +170,17 @@ def _offset_columns(turn: _Conventional) -> Values:
     return np.asarray(np.radians(mean_rate) * np.stack([np.zeros(3), across, -up])[..., None])
 
 
-def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> dict[str, Note]:
+def seat_notes(turns: Sequence[Turn], table: Table, sensor: Sensor) -> dict[str, Note]:
     """Return the note on each recording that the common mounting does not explain, by name.
 
     The turns of one setup are compared, or all together if no setup has turns about all three axes. With
     ``table.seat_deg`` each turn has a separate mounting, which the fit estimates.
     """
-    if table.get("seat_deg") is not None:
+    if table.seat_deg is not None:
         return {}
-    orthogonality, angle = (float(table.get(k) or 0.0) for k in ("orthogonality_deg", "angle_accuracy_deg"))
-    allowed = max(SMALLEST_DEG, TIMES_STATED * float(np.hypot(orthogonality, angle)))
-    effects = (sensor.get("accelerometer") or {}).get("effects") or {}
-    limits = [float(effects.get(name) or limit) for name, limit in LIMITS.items()]
+    allowed = max(SMALLEST_DEG, TIMES_STATED * float(np.hypot(table.orthogonality_deg, table.angle_accuracy_deg)))
+    effects = sensor.accelerometer.effects
+    limits = [effects.get(name, limit) for name, limit in LIMITS.items()]
     details: dict[str, str] = {}
     setups = [
         _conventional([(t, t.stated) for t in turns if t.recording.setup == setup])

@@ -46,10 +46,11 @@ from pipeline.profile_detection.unit_guesses import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.profile_detection.columns import Log
     from pipeline.records import Values
+    from pipeline.settings import Sensor
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
 FEWEST_LABELS, MOST_LABELS = 3, 4  # two texts may be states of the logger; labels that a remark names
@@ -89,9 +90,9 @@ class Proposal:
         keys = [k for k, v in self.csv.items() if v == UNKNOWN]
         return keys + [c for entries in self.columns for c, e in entries.items() if UNKNOWN in e.values()]
 
-    def ingest(self, name: str, sensor: Mapping[str, Any]) -> dict[str, Any]:
+    def ingest(self, name: str, sensor: Sensor | None) -> dict[str, Any]:
         """Return the proposal as the section ``ingest`` of a configuration, with the counts of the sensor's file."""
-        figures = {OF_SENSOR.format(s): sensor[s]["counts_per_unit"] for s in TRIADS if s in sensor}
+        figures = {OF_SENSOR.format(s): sensor.of(s).counts_per_unit for s in TRIADS} if sensor else {}
         columns = [
             {c: {k: figures.get(v, v) for k, v in entry.items()} for c, entry in entries.items()}
             for entries in self.columns
@@ -110,10 +111,10 @@ class Proposal:
         return {"name": name, "csv": {**self.csv, "parts": parts, "columns": {}}, "mcap": {}}
 
 
-def propose(logs: Sequence[Log], sensor: Mapping[str, Any] | None = None) -> list[Proposal]:
+def propose(logs: Sequence[Log], sensor: Sensor | None = None) -> list[Proposal]:
     """Return a proposal for each layout among the logs.
 
-    ``sensor``: the configuration of the sensor, if the user states one, for counts that the log does not determine.
+    ``sensor``: the sensor model, if the user states one, for counts that the log does not determine.
     """
     recordings: list[list[Columns]] = []  # each of one file, or of two files with equal times and one sensor each
     for columns in map(find_columns, logs):
@@ -124,7 +125,7 @@ def propose(logs: Sequence[Log], sensor: Mapping[str, Any] | None = None) -> lis
             other.append(columns)
     proposals: list[Proposal] = []
     for parts in recordings:
-        new = _proposal(parts, sensor or {})
+        new = _proposal(parts, sensor)
         twin = next((p for p in proposals if _alike(p, new)), None)
         if twin is None:
             proposals.append(new)
@@ -177,7 +178,7 @@ def _fill_in(proposal: Proposal, other: Proposal) -> None:
     proposal.remarks += [r for r in other.remarks if r not in proposal.remarks]
 
 
-def _proposal(parts: list[Columns], sensor: Mapping[str, Any]) -> Proposal:
+def _proposal(parts: list[Columns], sensor: Sensor | None) -> Proposal:
     logs = [columns.log for columns in parts]
     seen = [{key: _described(log.numbers.get(i)) for i, key in enumerate(log.keys)} for log in logs]
     first = logs[0]
@@ -196,7 +197,7 @@ def _proposal(parts: list[Columns], sensor: Mapping[str, Any]) -> Proposal:
         _add("gyroscope", parts, proposal, _gyroscope(parts, force, rate, time_s, sensor))
         find_encoder(parts, None, _in_dps(rate, proposal), time_s)
     for columns, entries in zip(parts, proposal.columns, strict=True):
-        _others(columns, entries, proposal, str(sensor.get("name", "")))
+        _others(columns, entries, proposal, sensor.name if sensor else "")
         proposal.remarks += columns.remarks
         proposal.remarks += columns.log.remarks + _labels(columns.log)
     if force is not None or rate is not None:
@@ -236,7 +237,7 @@ def _described(values: Values | None) -> str:
 
 
 def _gyroscope(
-    parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: Mapping[str, Any]
+    parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: Sensor | None
 ) -> Guess:
     """Return the unit of the rates from the table, from gravity, or, for counts, from the configuration."""
     moves, why_none = list[Move](), "no accelerometer in the log that determines the unit"

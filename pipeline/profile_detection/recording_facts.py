@@ -28,7 +28,7 @@ from pipeline.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.signal.rests import rests_from_table, runs
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from mcap.records import Channel, Schema
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.mcap_reader import MessageReader
     from pipeline.records import Note, Recording, Values
+    from pipeline.settings import Sensor
 
 MOST_SAMPLES = 500_000  # searched for rests and moves
 FEWEST_SAMPLES = 3  # of a rest, for a variance
@@ -54,7 +55,7 @@ MOST_TOPICS = 20  # with a line each
 Line = tuple[str, str]
 
 
-def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list[Line]:
+def facts(recording: Recording, sensor: Sensor | None = None) -> list[Line]:
     """Return the description of a recording as pairs of label and text; ``sensor`` has the full scales."""
     rests = _rests(recording)
     lines = [("time", _time(recording))]
@@ -66,7 +67,7 @@ def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list
         lines.append(("temperature", f"{low:.4g} to {high:.4g} degC" if high > low else f"{low:.4g} degC throughout"))
     lines += _table(recording)
     lines.append(("rests", _describe_rests(recording, rests)))
-    lines.append(("clipping", _clipping(recording, sensor or {})))
+    lines.append(("clipping", _clipping(recording, sensor)))
     lines += _units(recording, rests)
     lines += [("notes" if i == 0 else "", text) for i, text in enumerate(_notes(recording.notes))]
     return lines
@@ -172,9 +173,9 @@ def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> s
     return f"{len(rests)}, {_number(lengths.min(), 2)} to {_number(lengths.max(), 3)} s long"
 
 
-def _clipping(recording: Recording, sensor: Mapping[str, Any]) -> str:
+def _clipping(recording: Recording, sensor: Sensor | None) -> str:
     """Describe the readings at full scale or, if that is unknown, the readings that stay at their largest value."""
-    full_scale = {s: (sensor.get(s) or {}).get("full_scale") for s in SENSORS}
+    full_scale = {s: sensor.of(s).full_scale if sensor else None for s in SENSORS}
     flags = recording.flags
     texts = []
     for name in SENSORS:

@@ -20,11 +20,12 @@ from pipeline.io.units import COUNTS, DEGREES, FORCE_UNITS, UNITS
 from pipeline.profile_detection.columns import NO_SENSOR, OFFSETS, stated_unit, whole, words_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.io.gravity_rotation import Move
     from pipeline.profile_detection.columns import Columns
     from pipeline.records import Values
+    from pipeline.settings import Sensor
 
 UNKNOWN = "???"
 OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: a reference to the configuration of the sensor
@@ -225,24 +226,24 @@ def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Gu
     return Guess(entry, f"counts, {measured:.3g} a deg/s, {seen}{taken}")
 
 
-def other_range(guess: Guess, sensor: Mapping[str, Any]) -> list[str]:
+def other_range(guess: Guess, sensor: Sensor | None) -> list[str]:
     """Return a remark if the accelerometer's counts differ from those of the stated sensor."""
-    stated, seen = sensor.get("accelerometer", {}).get("counts_per_unit"), guess.entry.get("counts_per_unit")
-    if not stated or not seen or abs(seen / stated - 1) < CLOSE:
+    seen = guess.entry.get("counts_per_unit")
+    if sensor is None or not seen or abs(seen / sensor.accelerometer.counts_per_unit - 1) < CLOSE:
         return []
-    name = sensor["name"]
+    name, stated = sensor.name, sensor.accelerometer.counts_per_unit
     where = "sensor.accelerometer.range, and sensor.gyroscope.range"
     return [f"sensor={name} states {stated:g} counts a g: set {where}, as the logger does"]
 
 
-def counts_of_sensor(guess: Guess, name: str, sensor: Mapping[str, Any]) -> Guess:
+def counts_of_sensor(guess: Guess, name: str, sensor: Sensor | None) -> Guess:
     """Return a guess of counts that refers to the configuration of the sensor, if one is stated."""
     figure = OF_SENSOR.format(name)
-    if name not in sensor:
+    if sensor is None:
         text = f'{guess.evidence}; "{figure}" takes counts_per_unit from the configuration of the sensor and its range'
         return Guess(guess.entry, text)
     text = (
-        f"{guess.evidence}; counts_per_unit is that of sensor={sensor['name']}, {sensor[name]['counts_per_unit']:g}: "
+        f"{guess.evidence}; counts_per_unit is that of sensor={sensor.name}, {sensor.of(name).counts_per_unit:g}: "
         f"sensor.{name}.range must be the range that the logger sets"
     )
     return Guess({**guess.entry, "counts_per_unit": figure}, text)

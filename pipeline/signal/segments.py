@@ -30,17 +30,19 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.records import AXES, Mask, Note, Recording, Values, rate_of_attitude
+from pipeline.settings import Window
 from pipeline.signal.rests import RATE_AT_REST_DPS, SHORTEST_REST_S, WINDOW_S, find_rests, runs
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
+    from pipeline.settings import HandTurns
     from pipeline.signal.rests import Rest
 
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
@@ -85,14 +87,11 @@ class Move(NamedTuple):
         return self.axis, "turn" if self.angle >= HALF_A_TURN_DEG else "step"
 
 
-def cut(
-    recording: Recording, windows: Sequence[Mapping[str, Any]] | None = None, *, found: bool = False
-) -> list[Recording]:
+def cut(recording: Recording, windows: Sequence[Window] | None = None, *, found: bool = False) -> list[Recording]:
     """Return the segments of one long recording as separate recordings.
 
-    ``windows``: ``role``, ``axis``, ``start_s`` and ``stop_s`` (s since the first sample) of each segment, instead of
-    finding segments here. ``found``: whether the windows were computed from the recording, for the notes. Raises
-    ``InputError`` if no segment is found, or a window contains no samples.
+    ``windows``: the segments, instead of finding them here. ``found``: whether the windows were computed from the
+    recording, for the notes. Raises ``InputError`` if no segment is found, or a window contains no samples.
     """
     segments = _find_segments(recording) if windows is None else [_segment_of_window(recording, w) for w in windows]
     how = "found" if found or windows is None else "given by a window"
@@ -129,16 +128,16 @@ def _size_of_rate(part: Recording) -> Values | None:
     return turned
 
 
-def _segment_of_window(recording: Recording, window: Mapping[str, Any]) -> Segment:
+def _segment_of_window(recording: Recording, window: Window) -> Segment:
     since = recording.time - recording.time[0]
-    start, stop = np.searchsorted(since, [float(window["start_s"]), float(window["stop_s"])])
+    start, stop = np.searchsorted(since, [window.start_s, window.stop_s])
     if stop - start < 2:
         raise InputError(
-            f"the window from {window['start_s']:g} to {window['stop_s']:g} s holds {stop - start} samples; the "
+            f"the window from {window.start_s:g} to {window.stop_s:g} s holds {stop - start} samples; the "
             f"recording is {since[-1]:.2f} s long",
             recording.source.get("file"),
         )
-    role, axis = str(window["role"]), window.get("axis")
+    role, axis = window.role, window.axis
     return Segment(int(start), int(stop), role, axis, f"{role} about {axis}" if axis else role)
 
 
@@ -292,20 +291,20 @@ class TurnByHand(NamedTuple):
     held_out: bool
 
 
-def turns_by_hand(recording: Recording, rests: Sequence[Rest], turns: Mapping[str, Any]) -> list[TurnByHand]:
+def turns_by_hand(recording: Recording, rests: Sequence[Rest], turns: HandTurns) -> list[TurnByHand]:
     """Return the turns by a multiple of the stated angle between accepted rests.
 
-    Every k-th about an axis is held out, or the next one whose rests are long enough to be cut into two rests each.
-    ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none).
+    Every ``holdout_every``-th about an axis is held out, or the next one whose rests are long enough to be cut into
+    two rests each.
     """
-    rate, every = recording.gyroscope, int(turns["holdout_every"])
+    rate, every = recording.gyroscope, turns.holdout_every
     if rate is None:
         return []
     since, seen, found = recording.time - recording.time[0], [0, 0, 0], []
     for before, after in pairwise(r for r in rests if r.accepted):
         move = slice(before.stop - 1, after.start + 1)
         bias = 0.5 * sum(rate[r.start : r.stop].mean(axis=0) for r in (before, after))
-        axis, count = multiples(np.trapezoid(rate[move] - bias, since[move], axis=0), float(turns["angle_deg"]))
+        axis, count = multiples(np.trapezoid(rate[move] - bias, since[move], axis=0), turns.angle_deg)
         if not count:
             continue
         seen[axis] += 1
@@ -316,10 +315,10 @@ def turns_by_hand(recording: Recording, rests: Sequence[Rest], turns: Mapping[st
     return found
 
 
-def held_out_windows(recording: Recording, turns: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the windows that make every k-th turn about each axis a recording of the role ``validation``.
+def held_out_windows(recording: Recording, turns: HandTurns) -> list[Window]:
+    """Return the windows that make every ``holdout_every``-th turn about each axis a recording for validation.
 
-    ``turns``: ``angle_deg`` and ``holdout_every`` (k; 0: none). The windows, for ``cut``, are from the middle of the
+    The windows, for ``cut``, are from the middle of the
     rest before a turn to the middle of the rest after it; there are none where nothing is held out.
     """
     edges = [0.0]
@@ -327,6 +326,6 @@ def held_out_windows(recording: Recording, turns: Mapping[str, Any]) -> list[dic
         if turn.held_out:
             edges += [0.5 * (start + stop) for start, stop in (turn.before, turn.after)]
     edges.append(float(recording.time[-1] - recording.time[0]) + recording.interval)
-    roles = ["rests", "validation"] * len(edges)
+    roles: list[Literal["rests", "validation"]] = ["rests", "validation"] * len(edges)
     spans = zip(pairwise(edges), roles, strict=False)
-    return [{"role": role, "start_s": a, "stop_s": b} for (a, b), role in spans if b > a] if len(edges) > 2 else []
+    return [Window(role=role, start_s=a, stop_s=b) for (a, b), role in spans if b > a] if len(edges) > 2 else []

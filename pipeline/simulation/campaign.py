@@ -20,7 +20,7 @@ import pandas as pd
 from pipeline.errors import ConfigurationError
 from pipeline.io.arrow import write_canonical_csv
 from pipeline.records import AXES, SENSORS
-from pipeline.simulation.description import course_of, read_config
+from pipeline.simulation.description import course_of, shipped_settings
 from pipeline.simulation.procedures import ONE_RECORDING, plan
 from pipeline.simulation.sensor import decimals_of, drawn_effects, drawn_sensors
 from pipeline.simulation.session import (
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.records import Recording
+    from pipeline.settings import Sensor
     from pipeline.simulation.description import Description, UnitDescription
     from pipeline.simulation.sensor import Hidden, SimulatedSensor
     from pipeline.simulation.trajectory import Planned
@@ -72,11 +73,11 @@ def write_campaign(
         origin = names.index(unit.copy_of or unit.unit)
         original = replace(description.units[origin], table_log=unit.table_log)
         recordings, truth = simulate_unit(original, description.seed, origin)
-        sensor_config = read_config("sensor", unit.sensor)
+        sensor_model = shipped_settings(sensor=unit.sensor).sensor
         folder = directory / "raw" / unit.unit
         folder.mkdir(parents=True, exist_ok=True)
         for recording in recordings:
-            _write_recording(folder, recording, unit.format, sensor_config)
+            _write_recording(folder, recording, unit.format, sensor_model)
         path = directory / "truth" / f"{unit.unit}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({**truth, "unit": unit.unit}, indent=1) + "\n", encoding="utf-8")
@@ -116,7 +117,7 @@ def simulate_unit(
     """
     streams, course = Streams(seed, number), course_of(unit)
     benches, effects = _drawn(unit, streams)
-    by_hand = benches[""].table["angle_accuracy_deg"] if benches[""].table["motion"] == "none" else 0.0
+    by_hand = benches[""].table.angle_accuracy_deg if benches[""].table["motion"] == "none" else 0.0
     mover = streams["motion"] if unit.motion is None else Streams(seed, unit.motion)["motion"]
     planned = [*_selected(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
     total = sum(p.trajectory.duration + course.pause_s for p in planned)
@@ -144,21 +145,21 @@ def true_parameters(unit: UnitDescription, seed: int, number: int) -> dict[str, 
 
 def _drawn(unit: UnitDescription, streams: Streams) -> tuple[dict[str, Bench], dict[str, Hidden]]:
     """Return the bench of each recording (``""``: of all others), and the effects of each sensor."""
-    sensor_configs = read_config("sensor", unit.sensor)
-    effects = drawn_effects(unit.effects, sensor_configs, streams["effects"])
+    sensor_model = shipped_settings(sensor=unit.sensor).sensor
+    effects = drawn_effects(unit.effects, sensor_model, streams["effects"])
 
     def bench_of(other: Mapping[str, Any]) -> Bench:
         """Return the bench of the description, changed by ``other`` settings; with the same sensors."""
-        table = read_config("table", other.get("table", unit.table))
+        table = shipped_settings(table=other.get("table", unit.table)).table
         rng = streams["bench"]
         imperfections = {
-            "angle_accuracy_deg": table["angle_accuracy_deg"],
-            "rate_error": table["rate_accuracy"] * rng.standard_normal(3),
-            "direction_deg": table["orthogonality_deg"] * rng.standard_normal((3, 2)),
+            "angle_accuracy_deg": table.angle_accuracy_deg,
+            "rate_error": table.rate_accuracy * rng.standard_normal(3),
+            "direction_deg": table.orthogonality_deg * rng.standard_normal((3, 2)),
             **(other.get("imperfections", {}) if other else unit.imperfections),
         }
         given = {s: {**getattr(unit, s), **other.get(s, {})} for s in SENSORS}
-        return Bench(table, imperfections, drawn_sensors(sensor_configs, given, effects, streams["unit"]))
+        return Bench(table, imperfections, drawn_sensors(sensor_model, given, effects, streams["unit"]))
 
     held_out = dict.fromkeys(("validation", "static"), bench_of(unit.held_out)) if unit.held_out else {}
     return {"": bench_of({}), **held_out}, effects
@@ -175,15 +176,15 @@ def _selected(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
     return [p for p in planned if not unit.recordings or p.name in unit.recordings]
 
 
-def _write_recording(folder: Path, recording: Recording, kind: str, sensor_configs: dict[str, Any]) -> None:
+def _write_recording(folder: Path, recording: Recording, kind: str, sensor_model: Sensor) -> None:
     """Write one recording as ``<name>.csv`` or ``<name>.mcap``, in the axes of the unit's body."""
     if kind == "mcap":
         from pipeline.io.ros2_messages import write_mcap  # noqa: PLC0415  (needs the mcap library)
 
         write_mcap(folder / f"{recording.name}.mcap", recording)
         return
-    wanted = {f"accel_{a}_g": decimals_of(sensor_configs["accelerometer"]) for a in AXES}
-    wanted |= {f"gyro_{a}_dps": decimals_of(sensor_configs["gyroscope"]) for a in AXES}
+    wanted = {f"accel_{a}_g": decimals_of(sensor_model.accelerometer) for a in AXES}
+    wanted |= {f"gyro_{a}_dps": decimals_of(sensor_model.gyroscope) for a in AXES}
     wanted |= {"temperature_degc": TEMPERATURE_DECIMALS}
     wanted |= dict.fromkeys(("table_angle_deg", "table_rate_dps"), ANGLE_DECIMALS)
     wanted |= {f"table_q{c}": QUATERNION_DECIMALS for c in "wxyz"}
@@ -202,7 +203,7 @@ def _truth(sensor: SimulatedSensor, effects: Hidden, interval: float) -> dict[st
         **({"definitions": defined} if defined else {}),
         "noise": {
             "white": sensor.white(interval),
-            "wander": sensor.sensor_config["bias_wander"],
-            "correlation_time": sensor.sensor_config["wander_time_s"],
+            "wander": sensor.data_sheet.bias_wander,
+            "correlation_time": sensor.data_sheet.wander_time_s,
         },
     }

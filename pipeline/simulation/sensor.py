@@ -62,6 +62,7 @@ if TYPE_CHECKING:
 
     from pipeline.model.effects.base import Effect
     from pipeline.records import Values
+    from pipeline.settings import DataSheet, Sensor
     from pipeline.simulation.trajectory import Gimbals, Moves
 
     Alteration = Callable[["Scene", Values], "Scene"]
@@ -189,7 +190,7 @@ class SimulatedSensor:
     """One accelerometer or gyroscope with known errors."""
 
     sensor: str
-    sensor_config: Mapping[str, Any]  # its section of the configuration: full scale, counts, noise
+    data_sheet: DataSheet  # full scale, counts, noise
     bias: Values  # (3,), g or deg/s
     matrix: Values  # (3, 3), of a perfect calibration: body = matrix @ (reading - bias - effects)
     effects: Hidden = field(default_factory=dict)  # effects on the reading
@@ -204,19 +205,19 @@ class SimulatedSensor:
 
     def white(self, interval: float) -> float:
         """Return the standard deviation of one sample's white noise; interval in s."""
-        return float(self.sensor_config["noise_density"]) * float(np.sqrt(0.5 / interval))
+        return self.data_sheet.noise_density * float(np.sqrt(0.5 / interval))
 
     def quantised(self, reading: Values) -> Values:
         """Round the reading to whole counts and clip it at full scale: (n, 3) array, g or deg/s."""
-        counts = np.round(reading * self.sensor_config["counts_per_unit"])
-        top = self.sensor_config["full_scale"] * self.sensor_config["counts_per_unit"]
-        kept: Values = np.clip(counts, -top, top - 1.0) / self.sensor_config["counts_per_unit"]
+        counts = np.round(reading * self.data_sheet.counts_per_unit)
+        top = self.data_sheet.full_scale * self.data_sheet.counts_per_unit
+        kept: Values = np.clip(counts, -top, top - 1.0) / self.data_sheet.counts_per_unit
         return kept
 
 
-def decimals_of(sensor_config: Mapping[str, Any]) -> int:
+def decimals_of(data_sheet: DataSheet) -> int:
     """Return the number of decimals that prints a reading to a tenth of a count."""
-    return int(np.ceil(np.log10(sensor_config["counts_per_unit"]))) + 1
+    return int(np.ceil(np.log10(data_sheet.counts_per_unit))) + 1
 
 
 def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.Generator) -> list[Values]:
@@ -238,7 +239,7 @@ def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.
 
 
 def drawn_sensors(
-    sensor_configs: Mapping[str, Mapping[str, Any]],
+    sensor_model: Sensor,
     given: Mapping[str, Mapping[str, Any]],
     effects: Mapping[str, Hidden],
     rng: np.random.Generator,
@@ -254,24 +255,20 @@ def drawn_sensors(
         if unknown:
             known = ", ".join(sorted(KEYS | NOISE_KEYS))
             raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {known}")
-        sensor_config = {
-            **sensor_configs[sensor],
-            **{key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])},
-        }
+        noise = {key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])}
+        data_sheet = sensor_model.of(sensor).replaced(**noise)
         of_sensor = {name: hidden for name, hidden in effects[sensor].items() if name not in ALTERATIONS}
-        drawn = _limited(sensor_config["bias"], rng)
+        drawn = _limited(data_sheet.bias, rng)
         bias = np.array(given[sensor].get("bias", drawn), float)
         out[sensor] = SimulatedSensor(
-            sensor, sensor_config, bias, _matrix(sensor_config, given[sensor], mounting, rng), of_sensor
+            sensor, data_sheet, bias, _matrix(data_sheet, given[sensor], mounting, rng), of_sensor
         )
     return out
 
 
-def _matrix(
-    sensor_config: Mapping[str, Any], given: Mapping[str, Any], mounting: Values, rng: np.random.Generator
-) -> Values:
-    scale = 1.0 + _limited(sensor_config["scale_factor"], rng)
-    skew = np.degrees(_limited(sensor_config["cross_axis"], rng))
+def _matrix(data_sheet: DataSheet, given: Mapping[str, Any], mounting: Values, rng: np.random.Generator) -> Values:
+    scale = 1.0 + _limited(data_sheet.scale_factor, rng)
+    skew = np.degrees(_limited(data_sheet.cross_axis, rng))
     if "matrix" in given:
         return np.array(given["matrix"], float)
     if KEYS & set(given) - {"bias"}:
@@ -291,7 +288,7 @@ def _limited(limit: float, rng: np.random.Generator) -> Values:
 
 
 def drawn_effects(
-    specification: Mapping[str, Any], sensor_configs: Mapping[str, Mapping[str, Any]], rng: np.random.Generator
+    specification: Mapping[str, Any], sensor_model: Sensor, rng: np.random.Generator
 ) -> dict[str, Hidden]:
     """Return the effects that a description's ``effects`` hide in each sensor.
 
@@ -316,7 +313,7 @@ def drawn_effects(
             if name in ALTERATIONS and each != kind.sensors[0] and sensor == "":
                 out[each][name] = out[kind.sensors[0]][name]  # one table, one clock: the same for both sensors
             else:
-                out[each][name] = kind, _values(kind, each, size, sensor_configs[each]["effects"], rng)
+                out[each][name] = kind, _values(kind, each, size, sensor_model.of(each).effects, rng)
     return out
 
 

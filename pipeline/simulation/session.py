@@ -26,13 +26,13 @@ import scipy
 import yaml
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.kinematics import earth_rate
 from pipeline.records import AXES, SENSORS, Recording, continuous
 from pipeline.simulation import procedures
-from pipeline.simulation.description import FILE, PROGRAM, course_of, read_config
+from pipeline.simulation.description import FILE, PROGRAM, course_of, read_option
 from pipeline.simulation.procedures import ONE_RECORDING
 from pipeline.simulation.sensor import Scene, alter, bias_wander, decimals_of
 from pipeline.simulation.trajectory import Gimbals, Moves, Turn, random_errors, rotation_by
+from pipeline.settings import ProgramRest, Repeated
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.commanded_motion import Program
     from pipeline.records import Values
+    from pipeline.settings import ProgramTurn, Table
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.procedures import Course
     from pipeline.simulation.sensor import Hidden, SimulatedSensor
@@ -110,7 +111,7 @@ def random_environment(rng: np.random.Generator) -> Environment:
 class Bench:
     """Where a recording is made: the table, its errors, and the sensors as mounted on it."""
 
-    table: Mapping[str, Any]
+    table: Table
     imperfections: Mapping[str, Any]
     sensors: Mapping[str, SimulatedSensor]
 
@@ -134,7 +135,7 @@ def record(
     seconds = [t / NANOSECONDS for t in times]
     rng = {name: streams[name] for name in ("table", "temperature", "link", *SENSORS)}
     first = benches.get(planned[0].role, benches[""]).sensors
-    wander = {s: bias_wander(seconds, first[s].sensor_config["wander_time_s"], rng[s]) for s in SENSORS}
+    wander = {s: bias_wander(seconds, first[s].data_sheet.wander_time_s, rng[s]) for s in SENSORS}
     out = []
     for k, (plan, time) in enumerate(zip(planned, seconds, strict=True)):
         bench = benches.get(plan.role, benches[""])
@@ -146,8 +147,8 @@ def record(
             sensor, altered = bench.sensors[s], alter(scene, {name: values for name, (_, values) in effects[s].items()})
             motion = plain if altered is scene else altered.motion(time, temperature)
             white = sensor.white(unit.interval_s) * rng[s].standard_normal((len(time), 3))
-            reading = sensor.exact(motion) + white + sensor.sensor_config["bias_wander"] * wander[s][k]
-            readings[s] = np.round(sensor.quantised(reading), decimals_of(sensor.sensor_config))
+            reading = sensor.exact(motion) + white + sensor.data_sheet.bias_wander * wander[s][k]
+            readings[s] = np.round(sensor.quantised(reading), decimals_of(sensor.data_sheet))
         whole = Recording(
             plan.name,
             plan.role,
@@ -177,24 +178,25 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
     """Return the scene of a recording on its bench, without hidden effects."""
     table, settings = bench.table, dict(bench.imperfections)
     trajectory = plan.trajectory
-    if isinstance(trajectory, Turn) and table["motion"] != "none":
+    if isinstance(trajectory, Turn) and table.motion != "none":
         stops_and_goes = np.all(np.abs(np.diff(trajectory.program.stops)) < 180.0)
         if plan.role == "accelerometer" and stops_and_goes:
             settings["rate_error"] = (0.0, 0.0, 0.0)  # motors lose steps in fast turns only
         errors = random_errors(trajectory.program, rng, settings, trajectory.axis)
-        shaft = settings.get("sense", 1) if table.get("azimuth_of") == "turn_axis" else 0
+        shaft = settings.get("sense", 1) if table.azimuth_of == "turn_axis" else 0
         trajectory = Turn(trajectory.axis, trajectory.program, errors, shaft)
     up = rotation_by(np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0))[2]
-    placed = table["latitude_deg"] is not None and table["azimuth_deg"] is not None
-    earth = earth_rate(table["latitude_deg"], table["azimuth_deg"]) if placed else np.zeros(3)
+    earth = earth_of(table)
     mounting = rotation_by(np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float))
-    return Scene(trajectory, start, plan.axis, table["gravity_g"], up, earth, mounting=mounting)
+    return Scene(
+        trajectory, start, plan.axis, table.gravity_g, up, np.zeros(3) if earth is None else earth, mounting=mounting
+    )
 
 
 def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:
     """Return the table's log of the commanded motion."""
     trajectory = plan.trajectory
-    if bench.table["motion"] == "none":
+    if bench.table.motion == "none":
         return {}
     if isinstance(trajectory, Turn):
         angle, rate = trajectory.program.at(time)[:2]
@@ -292,18 +294,18 @@ def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values) -
     return {"table_angle": angle, "table_rate": rate, "table_attitude": attitude}
 
 
-def as_program(program: Program) -> list[dict[str, Any]]:
+def as_program(program: Program) -> list[ProgramRest | ProgramTurn | Repeated]:
     """Return a table's program as the steps of a procedure's ``program``; a repeated pair of steps has a count."""
-    steps = [{key: round(float(value), 9) for key, value in step.items()} for step in program.steps]
-    steps = [step for step in steps if step.get("rest_s") != 0.0]
-    out: list[dict[str, Any]] = []
+    rounded = [step.replaced(**{k: round(v, 9) for k, v in step.json_value.items()}) for step in program.steps]
+    steps = [step for step in rounded if not (isinstance(step, ProgramRest) and step.rest_s == 0.0)]
+    out: list[ProgramRest | ProgramTurn | Repeated] = []
     i = 0
     while i < len(steps):
         pair, count = steps[i : i + 2], 1
         while len(pair) == 2 and steps[i + 2 * count : i + 2 * count + 2] == pair:
             count += 1
         if count > 2:
-            out.append({"repeat": count, "steps": pair})
+            out.append(Repeated(repeat=count, steps=pair))
             i += 2 * count
         else:
             out.append(steps[i])
@@ -334,9 +336,9 @@ def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
 
 
 def _procedure_text(name: str, course: Course) -> str:
-    procedure = read_config("procedure", name)
+    procedure = read_option("procedure", name)
     entries = {recording: dict(entry) for recording, entry in procedure["recordings"].items()}
     for planned in procedures.plan(name, course, np.random.default_rng(0)):
         if isinstance(planned.trajectory, Turn) and planned.name in entries:
-            entries[planned.name]["program"] = as_program(planned.trajectory.program)
+            entries[planned.name]["program"] = [s.json_value for s in as_program(planned.trajectory.program)]
     return COMMENT + yaml.safe_dump({**procedure, "recordings": entries}, sort_keys=False, width=120)

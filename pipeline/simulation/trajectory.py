@@ -35,12 +35,13 @@ sections 3.3 and 5.2.3) has all of them: acrylic parts, stepper motors, friction
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import scipy
 
 from pipeline.model.kinematics import attitude_matrix, level_at_zero, turn_by_vector
+from pipeline.settings import ProgramRest, ProgramTurn
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -48,8 +49,8 @@ if TYPE_CHECKING:
     from pipeline.io.commanded_motion import Program
     from pipeline.records import Index, Values
 
-    Step = dict[str, float]
 
+Step: TypeAlias = ProgramRest | ProgramTurn
 SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])  # 42 deg of the middle gimbal: uniform attitudes (``random_gimbals``)
 PERIOD_S = 40.0  # longest period of the sinusoids before the speed is scaled; its value cancels
 SINUSOIDS = 4  # for each gimbal
@@ -88,12 +89,12 @@ def rotation_by(vector_deg: Values) -> Values:
 
 def rest(seconds: float) -> Step:
     """Return a rest as a step of a program."""
-    return {"rest_s": seconds}
+    return ProgramRest(rest_s=seconds)
 
 
 def turn(angle: float, rate: float, acceleration: float) -> Step:
     """Return a turn as a step of a program: angle in deg, signed; largest rate in deg/s; ramps in deg/s^2."""
-    return {"turn_deg": angle, "rate_dps": rate, "acceleration_dps2": acceleration}
+    return ProgramTurn(turn_deg=angle, rate_dps=rate, acceleration_dps2=acceleration)
 
 
 def turn_with_plateau(angle: float, rate: float, acceleration: float) -> Step:

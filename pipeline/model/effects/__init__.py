@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from pipeline.records import FittedEffect
+    from pipeline.settings import Table
 
 FOLDER = CONFIGS / "effect"
 BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
@@ -59,9 +60,9 @@ def bench_priors() -> dict[str, str]:
     return {name: kind.prior for name, kind in built_in().items() if kind.prior}
 
 
-def stated_priors(table: Mapping[str, Any]) -> dict[str, float]:
+def stated_priors(table: Table) -> dict[str, float]:
     """Return the standard deviation of each effect of the bench for which a table's config states one."""
-    return {name: float(table[key]) for name, key in bench_priors().items() if table.get(key)}
+    return {name: value for name, key in bench_priors().items() if (value := getattr(table, key))}
 
 
 @contextmanager
