@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.estimation.noise import with_noises
-from pipeline.settings import SECTIONS, DataSheet, Procedure, Section, Sensor, Settings, Table
+from pipeline.settings import SECTIONS, DataSheet, Ingest, Procedure, Section, Sensor, Settings, Table
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.records import Recording, UnitRecordings
 
@@ -73,6 +73,13 @@ def settings_of(base: Settings | None = None, /, **values: Any) -> Settings:
             content = _merged(getattr(found, section).json_value, other)
             found = found.replaced(**{section: SECTIONS[section].model_validate(content, strict=False)})
     return found
+
+
+def ingest_of(content: Mapping[str, Any]) -> Ingest:
+    """Return an ingest profile from the content of its file."""
+    return Ingest.model_validate(
+        {"name": "test", **{k: v for k, v in content.items() if v is not None and k != "defaults"}}
+    )
 
 
 def _merged(content: Any, values: Any) -> Any:

@@ -466,7 +466,7 @@ def _print_proposals(proposals: Sequence[Proposal], sensor_model: Sensor | None,
     for proposal in proposals:
         if proposal.complete:
             print("WITH THE PROFILE PROPOSED BELOW:\n")
-            ingest = Ingest.model_validate(proposal.ingest(name, sensor_model or {}))
+            ingest = Ingest.model_validate(proposal.ingest(name, sensor_model))
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for number, group in enumerate(groups):
                 outcome = _check_log(Reading.alone(group, ingest, sensor_model, "the proposed profile"))

@@ -74,11 +74,12 @@ class Reading:
         """Return the recording, without checks."""
         ingest, entry = self.settings.ingest, self.entry
         table = read_table(self.files, ingest, session=entry.session)
-        return to_recording(self.name, entry, table, self.sensor_model or {}, checks_of(ingest))
+        return to_recording(self.name, entry, table, self.sensor_model, checks_of(ingest))
 
     def checked(self) -> Recording:
-        """Return the recording after the checks of a single recording."""
-        return check_recordings([self.recording()], self.settings)[0]
+        """Return the recording after the checks of a single recording; without a sensor, by the limits of ``generic``."""
+        generic = {} if self.sensor_model else {"sensor": shipped_settings(sensor="generic").sensor}
+        return check_recordings([self.recording()], self.settings.replaced(**generic))[0]
 
 
 def grouped(files: Sequence[Path], ingest: Ingest) -> list[list[Path]]:

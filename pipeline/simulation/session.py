@@ -26,13 +26,14 @@ import scipy
 import yaml
 
 from pipeline.errors import ConfigurationError
+from pipeline.model.kinematics import earth_of
 from pipeline.records import AXES, SENSORS, Recording, continuous
+from pipeline.settings import ProgramRest, Repeated
 from pipeline.simulation import procedures
 from pipeline.simulation.description import FILE, PROGRAM, course_of, read_option
 from pipeline.simulation.procedures import ONE_RECORDING
 from pipeline.simulation.sensor import Scene, alter, bias_wander, decimals_of
 from pipeline.simulation.trajectory import Gimbals, Moves, Turn, random_errors, rotation_by
-from pipeline.settings import ProgramRest, Repeated
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -35,7 +35,7 @@ sections 3.3 and 5.2.3) has all of them: acrylic parts, stepper motors, friction
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy

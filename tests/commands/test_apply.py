@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from unit_settings import ingest_of
 
 from pipeline.commands.apply import main
 from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
@@ -409,7 +410,7 @@ def test_a_log_with_another_separator_is_named_so_and_read_by_the_campaigns_own_
 @pytest.mark.parametrize("block_bytes", [97, 1 << 20])
 def test_a_log_of_other_dress_keeps_it(calibration: Path, tmp_path: Path, block_bytes: int) -> None:
     dress = {"delimiter": ";", "decimal": ",", "comment": "#", "skip_lines": 1}
-    profile = LogProfile({"csv": counts_profile(**dress)})
+    profile = LogProfile(ingest_of({"csv": counts_profile(**dress)}))
     with_profile(calibration, counts_profile(**dress))
     counts = raw_counts()
     rows = [f"{10 * i},5;{';'.join(f'{v},0' for v in row)}" for i, row in enumerate(counts.tolist())]
@@ -436,7 +437,9 @@ def test_blanks_between_columns_without_names_and_a_rate_for_the_time(calibratio
     units = ["g"] * 3 + ["deg/s"] * 3
     places = {c: {"column": i, "unit": u} for i, (c, u) in enumerate(zip(channels, units, strict=True))}
     places["temperature"] = {"column": 6, "unit": "degC"}
-    profile = LogProfile({"csv": {"header": False, "delimiter": "whitespace", "rate_hz": 50.0, "columns": places}})
+    profile = LogProfile(
+        ingest_of({"csv": {"header": False, "delimiter": "whitespace", "rate_hz": 50.0, "columns": places}})
+    )
     values = np.round(np.random.default_rng(3).normal(0, 1, (40, 7)), 4)
     text = "\n".join("  ".join(f"{v}" for v in row) + " " for row in values.tolist())
     (tmp_path / "log.txt").write_text(text)

@@ -14,6 +14,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
+from unit_settings import ingest_of
 
 from pipeline.commands.apply import main
 from pipeline.errors import InputError
@@ -264,7 +265,7 @@ def test_a_topic_that_this_command_made_is_known_again(calibration: Path, tmp_pa
     for topic, reason in (("/imu/clean", "was made by this command with unit U1"), (None, "has the name of one")):
         compensate_log(load(calibration), log, out, topic=topic)
         chosen = topic or "/imu/data_calibrated"
-        profile = LogProfile({"mcap": {"imu_topic": chosen}})
+        profile = LogProfile(ingest_of({"mcap": {"imu_topic": chosen}}))
         source = out
         if topic is None:
             source = tmp_path / "bare.mcap"  # without the metadata: another program copied the messages
@@ -297,7 +298,7 @@ def test_a_truncated_log_is_compensated_where_the_profile_allows_it(calibration:
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
     with pytest.raises(InputError, match="truncated"):
         compensate_log(load(calibration), log, out)
-    profile = LogProfile({"mcap": {"allow_truncated": True}})
+    profile = LogProfile(ingest_of({"mcap": {"allow_truncated": True}}))
     done = compensate_log(load(calibration), log, out, profile)
     assert 0 < done.samples < COUNT
     assert len(messages(out)["/imu/data_calibrated"]) == done.samples
@@ -319,7 +320,7 @@ def test_readings_mapped_from_json_give_imu_messages(calibration: Path, tmp_path
     for i, a in enumerate("xyz"):
         fields[f"accel_{a}"] = {"field": f"a[{i}]", "unit": "counts", "counts_per_unit": 16384.0}
         fields[f"gyro_{a}"] = {"field": f"w[{i}]", "unit": "deg/s"}
-    done = compensate_log(load(calibration), log, out, LogProfile({"mcap": {"topics": {"/raw": fields}}}))
+    done = compensate_log(load(calibration), log, out, LogProfile(ingest_of({"mcap": {"topics": {"/raw": fields}}})))
     assert (done.samples, done.topic) == (300, "/raw_calibrated")
     assert messages(out)["/raw"] == messages(log)["/raw"]
     found = decoded(out, "/raw_calibrated")
@@ -327,7 +328,7 @@ def test_readings_mapped_from_json_give_imu_messages(calibration: Path, tmp_path
     np.testing.assert_allclose(numbers(found)[0] / G0, expected.accelerometer, atol=1e-12)
     np.testing.assert_allclose(np.degrees(numbers(found)[1]), expected.gyroscope, atol=1e-10)
     assert found[7].header.stamp.nanosec == 70_000_000
-    counted = LogProfile({"mcap": {"topics": {"/raw": fields}, "rate_hz": 250.0}})
+    counted = LogProfile(ingest_of({"mcap": {"topics": {"/raw": fields}, "rate_hz": 250.0}}))
     again = compensate_log(load(calibration), log, out, counted)
     assert again.samples == 300
     times = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in decoded(out, "/raw_calibrated")]
@@ -336,7 +337,7 @@ def test_readings_mapped_from_json_give_imu_messages(calibration: Path, tmp_path
 
 def test_the_sensors_axes_are_turned_to_the_bodys(calibration: Path, tmp_path: Path) -> None:
     log, out = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap"
-    compensate_log(load(calibration), log, out, LogProfile({}, dict.fromkeys(SENSORS, ("-y", "+x", "+z"))))
+    compensate_log(load(calibration), log, out, LogProfile(ingest_of({}), dict.fromkeys(SENSORS, ("-y", "+x", "+z"))))
     force, rate = in_house_units(decoded(out, "/imu/data"))
     turned = np.stack([force[:, 1], -force[:, 0], force[:, 2]], axis=1)  # body x is the reading's y, body y is -x
     expected = load(calibration).apply(turned, rate, np.zeros(COUNT), smoothing=0.0).accelerometer

@@ -7,18 +7,20 @@ from typing import Any
 
 import numpy as np
 import yaml
+from unit_settings import sheet_of
 
 from pipeline.records import Recording
+from pipeline.settings import Procedure, RecordingFile, Sensor
 
 REPOSITORY = Path(__file__).parents[2]
 REFERENCE = REPOSITORY.parent / "shared" / "data"
 
-SENSOR = {
-    "name": "test",
-    "axis_map": ["+x", "+y", "+z"],
-    "accelerometer": {"full_scale": 2.0},
-    "gyroscope": {"full_scale": 250.0},
-}
+SENSOR = Sensor(
+    name="test",
+    axis_map=["+x", "+y", "+z"],
+    accelerometer=sheet_of(full_scale=2.0),
+    gyroscope=sheet_of(full_scale=250.0),
+)
 
 
 def profile(name: str) -> dict[str, Any]:
@@ -30,12 +32,12 @@ def profile(name: str) -> dict[str, Any]:
     return loaded
 
 
-def procedure(*names: str, optional: tuple[str, ...] = ()) -> dict[str, Any]:
+def procedure(*names: str, optional: tuple[str, ...] = ()) -> Procedure:
     """Return a procedure of recordings about x whose files bear their names."""
     entries = {
-        n: {"file": n, "role": "accelerometer", "axis": "x", "optional": n in optional} for n in (*names, *optional)
+        n: RecordingFile(file=n, role="accelerometer", axis="x", optional=n in optional) for n in (*names, *optional)
     }
-    return {"name": "test", "recordings": entries}
+    return Procedure(name="test", table="test", folder="", recordings=entries, holdout_every=0)
 
 
 def make_recording(samples: int = 200, start_ns: int = 0, seed: int = 1, name: str = "accel_x") -> Recording:

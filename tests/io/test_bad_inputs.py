@@ -11,6 +11,7 @@ import pytest
 from bad_logs import FILE, RATE, TABLE_ANGLE, VALUES, Case, cases, table
 from sample_logs import SENSOR, procedure
 from stage_files import load_recordings, save_recordings
+from unit_settings import ingest_of, settings_of
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.io import text_log
@@ -50,9 +51,9 @@ def write(folder: Path, case: Case, number: str) -> None:
 
 def read(folder: Path, case: Case) -> Recording:
     names = [Path(f).stem for f in case.files if f != "table.csv"] or ["log"]
-    check_ingest(case.ingest())
-    settings = {"procedure": procedure(*names), "ingest": case.ingest(), "sensor": SENSOR}
-    return check_recordings(read_recordings(settings["procedure"], case.ingest(), SENSOR, folder), settings)[0]
+    check_ingest(ingest_of(case.ingest()))
+    settings = settings_of(procedure=procedure(*names), ingest=ingest_of(case.ingest()), sensor=SENSOR)
+    return check_recordings(read_recordings(settings.procedure, settings.ingest, SENSOR, folder), settings)[0]
 
 
 @pytest.mark.parametrize("number", [n for n, c in CASES.items() if c.fault])

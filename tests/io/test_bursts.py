@@ -9,6 +9,7 @@ import pytest
 from foreign_logs import Truth
 from sample_logs import SENSOR, procedure
 from scipy.io import savemat
+from unit_settings import ingest_of
 
 from pipeline.errors import IngestError, InputError
 from pipeline.io.bursts import find_bursts
@@ -103,7 +104,7 @@ def test_arrays_in_bursts_are_read_by_the_regular_clock_or_counted_at_the_stated
     timed = {"time": {"field": "t", "unit": "s"}, **fields}
     times = read_out(sampled, 80.0)
     savemat(log, {"t": times / 1e9, "acc": truth.force, "gyr": truth.rate})
-    (recording, *_) = read_recordings(procedure("log"), {"mcap": {"topics": {"/": timed}}}, SENSOR, tmp_path)
+    (recording, *_) = read_recordings(procedure("log"), ingest_of({"mcap": {"topics": {"/": timed}}}), SENSOR, tmp_path)
     (note,) = (n for n in recording.notes if n.code == "N-BURSTS")
     assert note.count == len(times) - len(np.unique(times))
     assert f"bursts of 8, 80 ms apart: {note.count} of 2400 rows have no time of their own" in note.detail
@@ -115,11 +116,11 @@ def test_arrays_in_bursts_are_read_by_the_regular_clock_or_counted_at_the_stated
     with pytest.raises(
         InputError, match=r"as if rows were missing; .* count the rows: ingest\.mcap\.rate_hz=100,"
     ) as e:
-        read_recordings(procedure("log"), {"mcap": {"topics": {"/": timed}}}, SENSOR, tmp_path)
+        read_recordings(procedure("log"), ingest_of({"mcap": {"topics": {"/": timed}}}), SENSOR, tmp_path)
     assert e.value.code == "bursts"
-    counted = mcap_format({"mcap": {"topics": {"/": timed}, "rate_hz": 100.0}})
+    counted = mcap_format(ingest_of({"mcap": {"topics": {"/": timed}, "rate_hz": 100.0}}))
     assert np.diff(read_log(log, counted).time_ns).tolist() == [10_000_000] * 2239
     two = {"t": np.repeat(sampled[:1200], 2) / 1e3, "acc": truth.force + 0.1 * (np.arange(2400) % 2)[:, None]}
     savemat(log, {**two, "gyr": truth.rate})
     with pytest.raises(IngestError, match="rows differ as those of two sensors"):
-        read_log(log, mcap_format({"mcap": {"topics": {"/": timed}}}))
+        read_log(log, mcap_format(ingest_of({"mcap": {"topics": {"/": timed}}})))

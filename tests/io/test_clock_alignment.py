@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from simulated_logs import as_table, beside_a_table, clock_errors
 from test_mcap_logs import header, imu, write_ros2
+from unit_settings import ingest_of, settings_of
 
 from pipeline.errors import IngestError, InputError
 from pipeline.io.encoder_log import align
@@ -17,6 +18,7 @@ from pipeline.io.read import read_recordings, to_recording
 from pipeline.io.ros2_messages import IMU, JOINT_STATE
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import rate_of_attitude
+from pipeline.settings import RecordingFile
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +69,8 @@ def test_the_rate_of_held_out_motion_is_that_of_its_attitude_by_the_tables_own_c
     sensor = aligned(beside_a_table(1, drift_ppm=8000.0)[0], "validation")
     q = np.column_stack([sensor.values[f"table_q{c}"] for c in "wxyz"])
     by_sensor = rate_of_attitude(sensor.time_ns / 1e9, q)
-    found = to_recording("validation", {"role": "validation"}, sensor, {}, Checks()).table_rate
+    entry = RecordingFile(file="validation", role="validation", axis=None, optional=False)
+    found = to_recording("validation", entry, sensor, None, Checks()).table_rate
     assert found is not None
     assert float(np.sum(found) / np.sum(by_sensor)) == pytest.approx(1.0 / 1.008, abs=1e-4)
 
@@ -161,13 +164,14 @@ def test_topics_of_another_clock_are_aligned_where_the_profile_says_so(tmp_path:
     recordings, truth = beside_a_table(3, interval_s=0.04)
     one, log = recordings["gyro_x"], recordings["gyro_x_table"]
     write_topics(tmp_path / "gyro_x.mcap", one, log)
-    entries = {"gyro_x": {"file": "gyro_x", "role": "gyroscope", "axis": "x", "optional": False}}
-    sensor = {"axis_map": ["+x", "+y", "+z"]}
+    entry = RecordingFile(file="gyro_x", role="gyroscope", axis="x", optional=False)
+    ideal = settings_of()
+    procedure, sensor = ideal.procedure.replaced(recordings={"gyro_x": entry}), ideal.sensor
     settings = {"clock_difference_s": None}
     with pytest.raises(InputError, match="table_clock=own"):
-        read_recordings({"recordings": entries}, {"mcap": settings}, sensor, tmp_path)
+        read_recordings(procedure, ingest_of({"mcap": settings}), sensor, tmp_path)
     own = {"mcap": {**settings, "table_clock": "own"}}
-    found = read_recordings({"recordings": entries}, own, sensor, tmp_path)[0]
+    found = read_recordings(procedure, ingest_of(own), sensor, tmp_path)[0]
     assert "joined" not in found.source  # no second file
     offset, uncertainty, *_ = clock_errors(found, one, truth)
     assert abs(offset) < 3.5 * uncertainty

@@ -14,7 +14,7 @@ from pipeline.io.commanded_motion import Program, follow_program
 from pipeline.records import Recording
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.session import Streams, as_program
-from pipeline.simulation.trajectory import Turn
+from pipeline.simulation.trajectory import Turn, rest, turn
 
 BIAS, SCALE = np.array([1.3, -0.4, 0.2]), 1.01
 COURSE = Course(step_deg=30.0, rates_dps=(30.0, 60.0), both_directions=True, validation_s=0.0, static_s=0.0)
@@ -49,8 +49,7 @@ def felt(name: str, begun: float, drift: float, pauses: Any, interval: float = 0
 
 
 def test_a_turn_is_a_trapezoid_of_the_rate_whose_ramps_meet_where_it_is_short() -> None:
-    steps = [{"rest_s": 2.0}, {"turn_deg": 90.0, "rate_dps": 30.0, "acceleration_dps2": 60.0}, {"rest_s": 1.0}]
-    program = Program([*steps, {"turn_deg": -15.0, "rate_dps": 60.0, "acceleration_dps2": 60.0}])
+    program = Program([rest(2.0), turn(90.0, 30.0, 60.0), rest(1.0), turn(-15.0, 60.0, 60.0)])
     # 90 deg at 30 deg/s with ramps of 0.5 s last 3.5 s; 15 deg are turned in two ramps of 0.5 s
     assert program.duration == pytest.approx(2.0 + 3.5 + 1.0 + 1.0)
     angle, rate, *_ = program.at(np.array([2.0, 2.5, 4.0, 5.25, 6.0, 7.0, 9.0]))

@@ -17,6 +17,7 @@ from bad_logs import FILE, HEADER, ROWS, VALUES, text
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sample_logs import SENSOR, procedure, profile
+from unit_settings import ingest_of
 
 from pipeline.errors import InputError
 from pipeline.io.read import read_recordings
@@ -44,7 +45,7 @@ def read(folder: Path, content: bytes, changes: dict[str, Any], share: float) ->
     ingest["checks"] = {"repaired_rows": share, "missing_time": share}
     (folder / FILE).write_bytes(content)
     try:
-        return read_recordings(procedure("log"), ingest, SENSOR, folder)[0]
+        return read_recordings(procedure("log"), ingest_of(ingest), SENSOR, folder)[0]
     except InputError:
         return None
 

@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, profile
+from unit_settings import ingest_of, sheet_of
 
 from pipeline.errors import IngestError
 from pipeline.io.arrow import write_canonical_csv
@@ -27,7 +28,7 @@ HEADER = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
 
 
 def read_back(folder: Path, ingest: dict[str, Any], name: str = "accel_x") -> Recording:
-    return read_recordings(procedure(name), ingest, SENSOR, folder)[0]
+    return read_recordings(procedure(name), ingest_of(ingest), SENSOR, folder)[0]
 
 
 def test_rows_that_are_counted_keep_the_rate_to_the_last(tmp_path: Path, canonical: dict[str, Any]) -> None:
@@ -118,7 +119,7 @@ def test_times_are_exact_to_the_nanosecond(
     canonical["csv"]["columns"]["time"]["unit"] = unit
     file = tmp_path / "log.csv"
     file.write_text(HEADER + "\n" + "".join(f"{c},0,0,1,0,0,0\n" for c in cells))
-    assert read_csv([file], csv_formats(canonical)).time_ns[:2].tolist() == nanoseconds[:2]
+    assert read_csv([file], csv_formats(ingest_of(canonical))).time_ns[:2].tolist() == nanoseconds[:2]
 
 
 def test_a_counter_of_clock_ticks_is_a_time_and_is_counted_on_where_it_overflows(
@@ -129,7 +130,7 @@ def test_a_counter_of_clock_ticks_is_a_time_and_is_counted_on_where_it_overflows
     ticks = [(2**24 - 512 + 256 * i) % 2**24 for i in range(5)]
     file = tmp_path / "log.csv"
     file.write_text(HEADER + "\n" + "".join(f"{t},0,0,1,0,0,0\n" for t in ticks))
-    read = read_csv([file], csv_formats(canonical))
+    read = read_csv([file], csv_formats(ingest_of(canonical)))
     assert np.diff(read.time_ns).tolist() == [10_000_000] * 4
     assert [n.code for n in read.notes] == ["N-WRAP"]
 
@@ -138,12 +139,12 @@ def test_times_since_1970_count_from_the_first_sample(tmp_path: Path, canonical:
     for name, start in (("a", 1_700_000_000), ("b", 1_700_000_100)):
         written = make_recording(start_ns=start * 10**9, seed=start, name=name)
         write_canonical_csv(tmp_path / f"{name}.csv", written)
-    first, second = read_recordings(procedure("a", "b"), canonical, SENSOR, tmp_path)
+    first, second = read_recordings(procedure("a", "b"), ingest_of(canonical), SENSOR, tmp_path)
     assert (first.time_ns[0], second.time_ns[0]) == (0, 100 * 10**9)
     assert [n.code for n in first.notes] == ["N-EPOCH"]
     assert first.clock_shared
     write_canonical_csv(tmp_path / "c.csv", make_recording(start_ns=2_000 * 10**9, seed=3, name="c"))
-    *_, last = mixed = read_recordings(procedure("a", "b", "c"), canonical, SENSOR, tmp_path)
+    *_, last = mixed = read_recordings(procedure("a", "b", "c"), ingest_of(canonical), SENSOR, tmp_path)
     assert [r.time_ns[0] for r in mixed] == [0, 100 * 10**9, 2_000 * 10**9]
     assert [len(r.notes) for r in mixed] == [1, 1, 0]
     assert not last.clock_shared  # 54 years lie between power-on and these files
@@ -196,8 +197,8 @@ def test_axis_map_turns_readings_into_body_axes(tmp_path: Path) -> None:
     ingest = profile("mpu6050_multi_position")
     ingest["csv"]["skip_lines"] = 0
     (tmp_path / "accel_x.csv").write_text("ax,ay,az,gx,gy,gz\n1,2,16384,131,262,393\n1,2,16384,131,262,393\n")
-    sensor = {**SENSOR, "axis_map": ["-y", "+x", "+z"]}
-    read = read_recordings(procedure("accel_x"), ingest, sensor, tmp_path)[0]
+    sensor = SENSOR.replaced(axis_map=["-y", "+x", "+z"])
+    read = read_recordings(procedure("accel_x"), ingest_of(ingest), sensor, tmp_path)[0]
     assert read.accelerometer is not None
     assert read.gyroscope is not None
     assert read.accelerometer[0].tolist() == [2 / 16384, -1 / 16384, 1.0]
@@ -207,8 +208,8 @@ def test_axis_map_turns_readings_into_body_axes(tmp_path: Path) -> None:
 def test_a_sensor_may_have_an_axis_map_of_its_own(tmp_path: Path, canonical: dict[str, Any]) -> None:
     made = make_recording()
     write_canonical_csv(tmp_path / "accel_x.csv", made)
-    sensor = {**SENSOR, "accelerometer": {**SENSOR["accelerometer"], "axis_map": ["+x", "+y", "-z"]}}
-    read = read_recordings(procedure("accel_x"), canonical, sensor, tmp_path)[0]
+    sensor = SENSOR.replaced(accelerometer=SENSOR.accelerometer.replaced(axis_map=["+x", "+y", "-z"]))
+    read = read_recordings(procedure("accel_x"), ingest_of(canonical), sensor, tmp_path)[0]
     np.testing.assert_allclose(read.accelerometer, made.accelerometer * [1.0, 1.0, -1.0], atol=1e-6)
     np.testing.assert_allclose(read.gyroscope, made.gyroscope, atol=1e-6)
     assert [n.detail for n in read.notes] == ["left-handed axis map: [+x, +y, -z] of the accelerometer"]
@@ -216,8 +217,8 @@ def test_a_sensor_may_have_an_axis_map_of_its_own(tmp_path: Path, canonical: dic
 
 def test_left_handed_axis_map_is_noted(tmp_path: Path, canonical: dict[str, Any]) -> None:
     write_canonical_csv(tmp_path / "accel_x.csv", make_recording())
-    sensor = {**SENSOR, "axis_map": ["+y", "+x", "+z"]}
-    read = read_recordings(procedure("accel_x"), canonical, sensor, tmp_path)[0]
+    sensor = SENSOR.replaced(axis_map=["+y", "+x", "+z"])
+    read = read_recordings(procedure("accel_x"), ingest_of(canonical), sensor, tmp_path)[0]
     assert [n.code for n in read.notes] == ["N-LEFTHANDED"]
 
 
@@ -265,9 +266,13 @@ def test_files_that_overlap_in_time_share_no_clock(tmp_path: Path, canonical: di
     for index, start in enumerate((0, 2, 4)):
         written = make_recording(100, start_ns=start * 10**9, seed=index)
         write_canonical_csv(tmp_path / f"r{index}.csv", written)
-    assert all(r.clock_shared for r in read_recordings(procedure("r0", "r1", "r2"), canonical, SENSOR, tmp_path))
+    assert all(
+        r.clock_shared for r in read_recordings(procedure("r0", "r1", "r2"), ingest_of(canonical), SENSOR, tmp_path)
+    )
     write_canonical_csv(tmp_path / "r1.csv", make_recording(100, start_ns=10**9 // 2, seed=9))
-    assert not any(r.clock_shared for r in read_recordings(procedure("r0", "r1", "r2"), canonical, SENSOR, tmp_path))
+    assert not any(
+        r.clock_shared for r in read_recordings(procedure("r0", "r1", "r2"), ingest_of(canonical), SENSOR, tmp_path)
+    )
 
 
 def test_source_names_file_digest_and_rows(tmp_path: Path, canonical: dict[str, Any]) -> None:
@@ -278,10 +283,10 @@ def test_source_names_file_digest_and_rows(tmp_path: Path, canonical: dict[str, 
 
 
 def test_xsens_log_is_joined_from_its_two_files(reference: Path) -> None:
-    sensor = {**SENSOR, "accelerometer": {"full_scale": 9.0}, "gyroscope": {"full_scale": 450.0}}
+    sensor = SENSOR.replaced(accelerometer=sheet_of(full_scale=9.0), gyroscope=sheet_of(full_scale=450.0))
     wanted = procedure("recording", optional=("static", "validation"))
     (read,) = read_recordings(
-        wanted, profile("xsens_mti_multi_position"), sensor, reference / "xsens_mti_multi_position"
+        wanted, ingest_of(profile("xsens_mti_multi_position")), sensor, reference / "xsens_mti_multi_position"
     )
     assert read.accelerometer is not None
     assert read.gyroscope is not None
@@ -321,18 +326,18 @@ def test_two_recordings_may_share_the_log_of_a_table_but_no_readings(tmp_path: P
             rows = np.zeros((200, 1)) if values is None else values
             table = np.column_stack([0.01 * np.arange(200), rows])
             np.savetxt(tmp_path / f"{name}_{file}.csv", table, delimiter=",", header=f"t,{names}", comments="")
-    read = read_recordings(procedure("a", "b"), canonical, SENSOR, tmp_path)
+    read = read_recordings(procedure("a", "b"), ingest_of(canonical), SENSOR, tmp_path)
     assert [len({f["sha256"] for r in read for f in r.source["joined"][k:][:1]}) for k in (0, 1)] == [2, 1]
     (tmp_path / "b_gyr.csv").write_bytes((tmp_path / "a_gyr.csv").read_bytes())
     with pytest.raises(IngestError, match="recordings a and b are the same file") as refused:
-        read_recordings(procedure("a", "b"), canonical, SENSOR, tmp_path)
+        read_recordings(procedure("a", "b"), ingest_of(canonical), SENSOR, tmp_path)
     assert refused.value.file == str(tmp_path / "b_gyr.csv")
 
 
 def test_mpu6050_log_has_its_preamble_skipped_and_its_time_counted(reference: Path, tmp_path: Path) -> None:
     lines = (reference / "mpu6050_multi_position" / "example_data_calibration.csv").read_text()
     (tmp_path / "recording.csv").write_text(lines)
-    (read,) = read_recordings(procedure("recording"), profile("mpu6050_multi_position"), SENSOR, tmp_path)
+    (read,) = read_recordings(procedure("recording"), ingest_of(profile("mpu6050_multi_position")), SENSOR, tmp_path)
     assert read.accelerometer is not None
     assert read.gyroscope is not None
     assert read.samples == 10245

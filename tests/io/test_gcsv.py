@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from sample_logs import SENSOR, procedure
+from unit_settings import ingest_of
 
 from pipeline.errors import IngestError
 from pipeline.io.read import read_recordings
@@ -27,7 +28,7 @@ def log(rows: str = ROWS, first: str = "GYROFLOW IMU LOG", names: str = "t,gx,gy
 
 def read(folder: Path, text: str, **sensor: Any) -> Recording:
     (folder / "log.gcsv").write_text(text)
-    return read_recordings(procedure("log"), {"name": "any"}, {**SENSOR, **sensor}, folder)[0]
+    return read_recordings(procedure("log"), ingest_of({"name": "any"}), SENSOR.replaced(**sensor), folder)[0]
 
 
 def test_counts_are_scaled_as_the_file_says_and_stay_integers(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from mcap_ros1.decoder import DecoderFactory as Ros1Factory
 from mcap_ros2.decoder import DecoderFactory as Ros2Factory
 from ros_messages import FIRST_NS, INNER, NAME, NUMPY, STEP_NS, RandomField, RandomLog
 from rosbags.typesys import Stores, get_typestore
+from unit_settings import ingest_of
 
 from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap import read_log
@@ -49,7 +50,7 @@ logs = st.builds(
 
 
 def read(path: Path, **mcap: Any) -> ChannelTable:
-    return read_log(path, mcap_format({"mcap": mcap}))
+    return read_log(path, mcap_format(ingest_of({"mcap": mcap})))
 
 
 def official(path: Path, factory: Any) -> list[Any]:

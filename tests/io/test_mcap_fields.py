@@ -12,6 +12,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 from sample_logs import SENSOR, procedure, profile
+from unit_settings import ingest_of
 
 from pipeline.errors import ConfigurationError, IngestError
 from pipeline.io.ingest_settings import mcap_format
@@ -33,7 +34,7 @@ MAPPED: dict[str, Any] = profile("mcap_fields")["mcap"]["topics"]["/imu"]
 
 
 def read(path: Path, **mcap: Any) -> ChannelTable:
-    return read_log(path, mcap_format({"mcap": mcap}))
+    return read_log(path, mcap_format(ingest_of({"mcap": mcap})))
 
 
 def write(path: Path, *topics: tuple[str, str, tuple[str, str, bytes], Sequence[bytes]], **options: Any) -> None:
@@ -284,7 +285,7 @@ def test_mapped_topic_that_is_not_there_is_refused(tmp_path: Path) -> None:
 def test_profile_of_fields_reads_a_recording(tmp_path: Path) -> None:
     messages = [json_imu(i, linear_acceleration={"x": 0, "y": 0, "z": GRAVITY}) for i in range(4)]
     write(tmp_path / "accel_x.mcap", ("/imu", "json", ("", "", b""), messages))
-    (recording,) = read_recordings(procedure("accel_x"), profile("mcap_fields"), SENSOR, tmp_path)
+    (recording,) = read_recordings(procedure("accel_x"), ingest_of(profile("mcap_fields")), SENSOR, tmp_path)
     assert recording.accelerometer is not None
     assert recording.accelerometer.tolist() == [[0.0, 0.0, 1.0]] * 4
 
@@ -302,7 +303,7 @@ def test_profile_of_fields_reads_a_recording(tmp_path: Path) -> None:
 )
 def test_faulty_map_is_refused_before_any_file(change: dict[str, Any], expected: str) -> None:
     with pytest.raises(ConfigurationError, match=expected):
-        mcap_format({"mcap": {"topics": {"/imu": {**MAPPED, **change}}}})
+        mcap_format(ingest_of({"mcap": {"topics": {"/imu": {**MAPPED, **change}}}}))
 
 
 @pytest.mark.parametrize(
@@ -310,7 +311,7 @@ def test_faulty_map_is_refused_before_any_file(change: dict[str, Any], expected:
 )
 def test_faulty_setting_is_refused(key: str, value: Any) -> None:
     with pytest.raises(ConfigurationError, match=rf"ingest\.mcap\.{key} is"):
-        mcap_format({"mcap": {key: value}})
+        mcap_format(ingest_of({"mcap": {key: value}}))
 
 
 def test_definition_without_end_is_refused(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 from sample_logs import SENSOR, channels, make_recording, procedure
+from unit_settings import ingest_of
 
 from pipeline.errors import InputError
 from pipeline.io.arrow import write_canonical_csv
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 def read(folder: Path, **mcap: Any) -> Recording:
     ingest = {"name": "mcap", "mcap": mcap}
-    return read_recordings(procedure("accel_x"), ingest, SENSOR, folder)[0]
+    return read_recordings(procedure("accel_x"), ingest_of(ingest), SENSOR, folder)[0]
 
 
 def header(seconds: int, nanoseconds: int = 0) -> dict[str, Any]:
@@ -68,7 +69,7 @@ def test_log_equals_its_text_twin_to_the_last_digit(tmp_path: Path, canonical: d
     recording = make_recording(500)
     names = ("accel_x_g", "accel_y_g", "accel_z_g", "gyro_x_dps", "gyro_y_dps", "gyro_z_dps", "table_rate_dps")
     write_canonical_csv(tmp_path / "a.csv", recording, dict.fromkeys(names, 9))
-    text = read_recordings(procedure("a"), canonical, SENSOR, tmp_path)[0]
+    text = read_recordings(procedure("a"), ingest_of(canonical), SENSOR, tmp_path)[0]
     write_mcap(tmp_path / "accel_x.mcap", text)
     log = read(tmp_path)
     for name, values in channels(text).items():

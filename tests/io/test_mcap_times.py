@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from mcap.writer import Writer
+from unit_settings import ingest_of
 
 from pipeline.errors import IngestError
 from pipeline.io.ingest_settings import mcap_format
@@ -50,7 +51,7 @@ def read(
             writer.add_message(channel, log_time, json.dumps({"t": stamp, "a": [number, 0, 1]}).encode(), log_time)
         writer.finish()
     topics = {"/imu": {**FIELDS, "time": {"field": "t", "unit": unit}}}
-    return read_log(path / "log.mcap", mcap_format({"mcap": {"topics": topics, **mcap}}))
+    return read_log(path / "log.mcap", mcap_format(ingest_of({"mcap": {"topics": topics, **mcap}})))
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("s", 10**9), ("ms", 10**6), ("us", 10**3)])
@@ -152,10 +153,10 @@ def test_file_of_another_kind_is_named(tmp_path: Path, case: str) -> None:
     data, expected = FOREIGN[case]
     (tmp_path / "a.mcap").write_bytes(data)
     with pytest.raises(IngestError, match=expected) as caught:
-        read_log(tmp_path / "a.mcap", mcap_format({}))
+        read_log(tmp_path / "a.mcap", mcap_format(ingest_of({})))
     assert caught.value.file == str(tmp_path / "a.mcap")
 
 
 def test_file_that_is_not_there_is_an_error_of_ingest(tmp_path: Path) -> None:
     with pytest.raises(IngestError, match="cannot be read: No such file"):
-        read_log(tmp_path / "a.mcap", mcap_format({}))
+        read_log(tmp_path / "a.mcap", mcap_format(ingest_of({})))

@@ -26,6 +26,7 @@ from pyulog import ULog
 from rosbags import rosbag2
 from sample_logs import SENSOR, procedure, profile
 from scipy.io import savemat
+from unit_settings import ingest_of
 
 from pipeline.commands.apply import main as apply
 from pipeline.commands.check import main as check
@@ -56,7 +57,7 @@ WRITERS: dict[str, tuple[Callable[..., Path], str]] = {
 
 
 def read(path: Path, ingest: str, **settings: Any) -> ChannelTable:
-    return read_log(path, mcap_format({"mcap": {**profile(ingest)["mcap"], **settings}}))
+    return read_log(path, mcap_format(ingest_of({"mcap": {**profile(ingest)["mcap"], **settings}})))
 
 
 def assert_is(table: ChannelTable, truth: Truth) -> None:
@@ -81,7 +82,7 @@ def test_each_format_gives_the_readings_that_were_written(name: str, tmp_path: P
 def test_a_procedure_finds_the_file_in_place_of_a_csv(name: str, tmp_path: Path) -> None:
     write, ingest = WRITERS[name]
     write(tmp_path / name, Truth())
-    recording = read_recordings(procedure("log"), profile(ingest), SENSOR, tmp_path)[0]
+    recording = read_recordings(procedure("log"), ingest_of(profile(ingest)), SENSOR, tmp_path)[0]
     assert recording.samples == 300
     assert {"N-NOCRC"} <= {n.code for n in recording.notes}
 
@@ -139,7 +140,7 @@ def test_the_raw_messages_of_one_sensor_of_a_board(tmp_path: Path) -> None:
     logged = {"sensor_accel": truth.force, "sensor_gyro": truth.rate}
     path = write_raw_ulog(tmp_path / "log.ulg", truth, {n: (message, v) for n, v in logged.items()}, instance=1)
     text = yaml.safe_load((CONFIGS / "ingest" / "px4_raw.yaml").read_text().replace("${ingest.instance}", "1"))
-    table = read_log(path, mcap_format(text))
+    table = read_log(path, mcap_format(ingest_of(text)))
     rows = (table.time_ns // 1000 - truth.time_us[0]) // 10_000
     assert len(rows) == 298
     np.testing.assert_allclose(table.values["accel_y"], truth.force[rows, 1] / GRAVITY, rtol=1e-15)
@@ -249,7 +250,7 @@ def test_check_proposes_a_profile_that_reads_the_log(
     saved = yaml.safe_load(profile_file.read_text())
     topic, time, unit = PROPOSED[name]
     assert saved["mcap"]["topics"][topic]["time"] == {"field": time, "unit": unit}
-    assert_is(read_log(log, mcap_format(saved)), truth)
+    assert_is(read_log(log, mcap_format(ingest_of(saved))), truth)
     assert "PROPOSED PROFILE" in capsys.readouterr().out
 
 
@@ -277,7 +278,7 @@ def test_the_time_in_the_first_column_of_an_array_is_no_reading(
                 file[name] = array
     assert check([str(log), "--save", str(profile_file)]) == 2
     assert "100 Hz (median interval 10 ms)" in capsys.readouterr().out
-    assert_is(read_log(log, mcap_format(yaml.safe_load(profile_file.read_text()))), truth)
+    assert_is(read_log(log, mcap_format(ingest_of(yaml.safe_load(profile_file.read_text())))), truth)
 
 
 def test_a_time_in_bursts_in_the_first_column_of_an_array_is_a_time(
@@ -305,7 +306,7 @@ def test_two_files_of_arrays_are_one_recording(tmp_path: Path, capsys: pytest.Ca
     assert "are one recording: place both in raw/<unit>/ under these names" in out
     ingest = yaml.safe_load(profile_file.read_text())
     assert [part["file"] for part in ingest["mcap"]["parts"]] == [file.name for file in files]
-    recording = read_recordings(procedure("recording"), ingest, SENSOR, tmp_path)[0]
+    recording = read_recordings(procedure("recording"), ingest_of(ingest), SENSOR, tmp_path)[0]
     assert recording.time_ns.tolist() == (truth.time_us * 1000).tolist()
     np.testing.assert_allclose(recording.accelerometer, truth.force / GRAVITY, rtol=1e-15)
     np.testing.assert_allclose(recording.gyroscope, np.degrees(truth.rate), rtol=1e-15)
@@ -320,10 +321,10 @@ def test_two_files_of_arrays_are_one_recording(tmp_path: Path, capsys: pytest.Ca
     np.testing.assert_allclose(written["gyro_y_dps"], 2.0 * np.degrees(truth.rate[:, 1]), rtol=0, atol=1e-9)
     savemat(files[1], {files[1].stem: in_columns(truth, "t", "w")[:-3]})
     with pytest.raises(InputError, match=r"1197 rows, but .* has 1200; parts of one recording need the same times"):
-        read_recordings(procedure("recording"), ingest, SENSOR, tmp_path)
+        read_recordings(procedure("recording"), ingest_of(ingest), SENSOR, tmp_path)
     ingest["mcap"]["topics"] = {"/": ingest["mcap"]["parts"][0]["topics"]["/"]}
     with pytest.raises(ConfigurationError, match=r"ingest\.mcap\.parts: topics stand in each part"):
-        check_ingest(ingest)
+        check_ingest(ingest_of(ingest))
 
 
 def test_arrays_without_a_time_are_counted_at_the_stated_rate(
@@ -339,19 +340,19 @@ def test_arrays_without_a_time_are_counted_at_the_stated_rate(
     saved = yaml.safe_load(text.replace('rate_hz: "???"', "rate_hz: 100"))
     for channel, entry in saved["mcap"]["topics"]["/"].items():
         entry["unit"] = unit.get(channel, entry["unit"])
-    table = read_log(log, mcap_format(saved))
+    table = read_log(log, mcap_format(ingest_of(saved)))
     assert table.time_ns.tolist() == (truth.time_us * 1000 - 2_000_000_000).tolist()
     np.testing.assert_allclose(table.values["gyro_x"], np.degrees(truth.rate[:, 0]), rtol=1e-15)
     (note,) = (n for n in table.notes if n.code == "N-SYNTHTIME")
     assert note.detail == "no times are read: messages counted at 100 Hz"
     saved["mcap"]["rate_hz"] = None
     with pytest.raises(ConfigurationError, match=r"time is missing: .* the sampling rate \(ingest\.mcap\.rate_hz\)"):
-        mcap_format(saved)
+        mcap_format(ingest_of(saved))
     savemat(log, {"acc": truth.force, "gyr": truth.rate[:-2]})
     fields = saved["mcap"]["topics"]["/"]
     apart = {f"/{s}": {c: e for c, e in fields.items() if c[:3] == s} for s in ("acc", "gyr")}
     with pytest.raises(IngestError, match="counts the messages of topics of one length"):
-        read_log(log, mcap_format({"mcap": {"rate_hz": 100.0, "topics": apart}}))
+        read_log(log, mcap_format(ingest_of({"mcap": {"rate_hz": 100.0, "topics": apart}})))
 
 
 def test_a_log_without_readings_is_told_what_it_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

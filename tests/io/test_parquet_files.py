@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 from pyarrow import parquet
 from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, profile
 from stage_files import load_recordings, save_recordings
+from unit_settings import ingest_of
 
 from pipeline.errors import InputError
 from pipeline.io.read import read_recordings
@@ -82,7 +83,9 @@ def counts(folder: Path) -> list[Recording]:
     rows[:, 2] = 16384
     text = "ax,ay,az,gx,gy,gz\n" + "".join(",".join(map(str, r)) + "\n" for r in rows.tolist())
     (folder / "accel_x.csv").write_text(text)
-    return read_recordings(procedure("accel_x"), ingest, {**SENSOR, "axis_map": ["+x", "-z", "+y"]}, folder)
+    return read_recordings(
+        procedure("accel_x"), ingest_of(ingest), SENSOR.replaced(axis_map=["+x", "-z", "+y"]), folder
+    )
 
 
 def test_counts_come_back_to_the_last_bit(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from sample_logs import procedure, profile
+from unit_settings import ingest_of
 
 from pipeline.config.compose import Composer
 from pipeline.errors import ConfigurationError
@@ -46,7 +47,7 @@ def test_a_profile_without_the_other_section_is_read_with_its_defaults(
     file.write_text(json.dumps({"name": "mine", section: stated}), encoding="utf-8")
     ingest = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])["ingest"]
     assert (ingest[section], ingest[other]) == (stated, {})
-    assert mcap_format(ingest).imu_topic == (None if section == "csv" else "/imu")
+    assert mcap_format(ingest_of(ingest)).imu_topic == (None if section == "csv" else "/imu")
 
 
 def test_counts_of_the_arduino_profile_follow_the_sensor(tmp_path: Path) -> None:
@@ -61,9 +62,9 @@ def test_counts_of_the_arduino_profile_follow_the_sensor(tmp_path: Path) -> None
 
 def test_file_names_need_only_the_standard_library() -> None:
     code = (
-        "import sys, pipeline.io.files as f; from pathlib import Path;"
-        "f.recording_files({'recordings': {'a': {'file': 'a'}}}, {}, Path('.'));"
-        "print([m for m in ('numpy', 'pyarrow', 'mcap', 'yaml', 'omegaconf') if m in sys.modules])"
+        "import sys, pipeline.io.files as f; from pathlib import Path; from types import SimpleNamespace as S;"
+        "f.recording_files(S(recordings={'a': S(file='a', optional=False)}), S(csv={}, mcap={}), Path('.'));"
+        "print([m for m in ('numpy', 'pyarrow', 'mcap', 'yaml', 'omegaconf', 'pydantic') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -85,20 +86,20 @@ def parts(*files: str) -> dict[str, Any]:
 
 
 def test_parts_with_fixed_names_belong_to_the_required_recording() -> None:
-    wanted = candidate_files(procedure("recording", optional=("static",)), parts("a.txt", "b.txt"))
+    wanted = candidate_files(procedure("recording", optional=("static",)), ingest_of(parts("a.txt", "b.txt")))
     assert wanted["recording"][:3] == [["a.txt", "b.txt"], ["recording.mcap"], ["recording.bag"]]
     assert wanted["static"][0] == ["static.mcap"]
 
 
 def test_parts_named_after_the_recording_belong_to_each() -> None:
-    wanted = candidate_files(procedure("r", optional=("s",)), parts("{file}_acc.txt", "{file}_gyr.txt"))
+    wanted = candidate_files(procedure("r", optional=("s",)), ingest_of(parts("{file}_acc.txt", "{file}_gyr.txt")))
     assert wanted["r"][:2] == [["r_acc.txt", "r_gyr.txt"], ["r.mcap"]]
     assert wanted["s"][:2] == [["s_acc.txt", "s_gyr.txt"], ["s.mcap"]]
 
 
 def test_parts_that_do_not_suit_the_procedure_are_refused() -> None:
     with pytest.raises(ConfigurationError, match="this one requires a, b"):
-        check_ingest(parts("a.txt", "b.txt"), procedure("a", "b"))
+        check_ingest(ingest_of(parts("a.txt", "b.txt")), procedure("a", "b"))
 
 
 @pytest.mark.parametrize(
@@ -118,4 +119,4 @@ def test_faulty_part_is_refused(index: int, change: dict[str, Any], message: str
     ingest = profile("xsens_mti_multi_position")
     ingest["csv"]["parts"][index].update(change)
     with pytest.raises(ConfigurationError, match=message):
-        check_ingest(ingest)
+        check_ingest(ingest_of(ingest))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from sample_logs import SENSOR, make_recording, procedure, profile
+from unit_settings import ingest_of
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.io.arrow import write_canonical_csv
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.records import Recording
+    from pipeline.settings import Sensor
 
 HEADER = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
 ROWS = [f"{i / 100:.2f},0.01,0.02,1.0{i},0.1,0.2,0.3" for i in range(8)]
@@ -29,8 +31,8 @@ def text(*rows: str, header: str = HEADER) -> str:
     return "\n".join([header, *rows]) + "\n"
 
 
-def read(folder: Path, ingest: dict[str, Any], sensor: dict[str, Any] = SENSOR) -> Recording:
-    return read_recordings(procedure("accel_x"), ingest, sensor, folder)[0]
+def read(folder: Path, ingest: dict[str, Any], sensor: Sensor = SENSOR) -> Recording:
+    return read_recordings(procedure("accel_x"), ingest_of(ingest), sensor, folder)[0]
 
 
 def with_row(row: int, line: str) -> str:
@@ -156,13 +158,13 @@ def test_all_faulty_files_of_a_unit_are_named_together(tmp_path: Path, canonical
     (tmp_path / "a.csv").write_text("time_s\n0\n1\n")
     (tmp_path / "b.csv").write_bytes(b"")
     with pytest.raises(MissingInputError, match=r"c \(tried .*a\.csv:1 \(missing_column\); .*b\.csv \(empty\)"):
-        read_recordings(procedure("a", "b", "c"), canonical, SENSOR, tmp_path)
+        read_recordings(procedure("a", "b", "c"), ingest_of(canonical), SENSOR, tmp_path)
 
 
 def test_missing_files_are_named_together_with_what_was_tried(tmp_path: Path, canonical: dict[str, Any]) -> None:
     write_canonical_csv(tmp_path / "b.csv", make_recording())
     with pytest.raises(MissingInputError) as caught:
-        read_recordings(procedure("a", "b", "c", optional=("d",)), canonical, SENSOR, tmp_path)
+        read_recordings(procedure("a", "b", "c", optional=("d",)), ingest_of(canonical), SENSOR, tmp_path)
     tried = "{0} (tried {0}.csv, .gcsv, .mcap, .bag, .db3, .ulg, .bin, .h5, .hdf5, .mat, .BIN)"
     assert caught.value.message == f"missing recordings: {tried.format('a')}; {tried.format('c')}"
     assert caught.value.file == str(tmp_path)
@@ -176,7 +178,7 @@ def test_missing_folder_is_named(tmp_path: Path, canonical: dict[str, Any]) -> N
 def test_missing_part_is_named(tmp_path: Path) -> None:
     (tmp_path / "accelerometer.txt").write_text("0 1 2 3\n")
     with pytest.raises(MissingInputError, match=re.escape("recording (gyroscope.txt)")):
-        read_recordings(procedure("recording"), profile("xsens_mti_multi_position"), SENSOR, tmp_path)
+        read_recordings(procedure("recording"), ingest_of(profile("xsens_mti_multi_position")), SENSOR, tmp_path)
 
 
 def test_parts_of_different_times_are_refused(tmp_path: Path) -> None:
@@ -184,16 +186,16 @@ def test_parts_of_different_times_are_refused(tmp_path: Path) -> None:
     (tmp_path / "accelerometer.txt").write_text("0.00 32768 32768 36838\n0.01 32768 32768 36838\n")
     (tmp_path / "gyroscope.txt").write_text("  0.00\t32768 32768 32768\n  0.02\t32768 32768 32768 \n")
     with pytest.raises(InputError, match=r"time 0.02 s differs from 0.01 s in .*accelerometer.txt:2") as caught:
-        read_recordings(procedure("recording"), ingest, SENSOR, tmp_path)
+        read_recordings(procedure("recording"), ingest_of(ingest), SENSOR, tmp_path)
     assert caught.value.file == f"{tmp_path / 'gyroscope.txt'}:2"
     (tmp_path / "gyroscope.txt").write_text("0.00 32768 32768 32768\n")
     with pytest.raises(InputError, match=r"1 rows, but .*accelerometer.txt has 2"):
-        read_recordings(procedure("recording"), ingest, SENSOR, tmp_path)
+        read_recordings(procedure("recording"), ingest_of(ingest), SENSOR, tmp_path)
 
 
 def test_fixed_parts_need_one_required_recording(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=re.escape("write {file} where the recording's name belongs")):
-        recording_files(procedure("a", "b"), profile("xsens_mti_multi_position"), tmp_path)
+        recording_files(procedure("a", "b"), ingest_of(profile("xsens_mti_multi_position")), tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".gcsv", ".mcap"])
@@ -216,7 +218,7 @@ def test_one_file_under_two_names_is_refused(tmp_path: Path, canonical: dict[str
     for name in "ab":
         write_canonical_csv(tmp_path / f"{name}.csv", make_recording())
     with pytest.raises(InputError, match="recordings a and b are the same file, byte for byte"):
-        read_recordings(procedure("a", "b"), canonical, SENSOR, tmp_path)
+        read_recordings(procedure("a", "b"), ingest_of(canonical), SENSOR, tmp_path)
 
 
 def test_second_kind_of_file_is_noted(tmp_path: Path, canonical: dict[str, Any]) -> None:
@@ -230,9 +232,9 @@ def test_second_kind_of_file_is_noted(tmp_path: Path, canonical: dict[str, Any])
 def test_files_are_found_csv_before_mcap_and_suffixes_as_they_are(tmp_path: Path, canonical: dict[str, Any]) -> None:
     for name in ("a.csv", "a.mcap", "b.mcap", "c.log"):
         (tmp_path / name).touch()
-    wanted = procedure("a", "b", "c", "d")
-    wanted["recordings"]["c"]["file"] = "c.log"
-    found = recording_files(wanted, canonical, tmp_path)
+    entries = procedure("a", "b", "c", "d").recordings
+    wanted = procedure().replaced(recordings=entries | {"c": entries["c"].replaced(file="c.log")})
+    found = recording_files(wanted, ingest_of(canonical), tmp_path)
     assert {n: [p.name for p in files] for n, files in found.items()} == {
         "a": ["a.csv"],
         "b": ["b.mcap"],
@@ -246,7 +248,7 @@ def test_files_are_found_csv_before_mcap_and_suffixes_as_they_are(tmp_path: Path
 def test_axis_map_of_another_form_is_refused(tmp_path: Path, canonical: dict[str, Any], axis_map: list[str]) -> None:
     (tmp_path / "accel_x.csv").write_text(text(*ROWS))
     with pytest.raises(ConfigurationError, match=r"sensor\.axis_map is"):
-        read(tmp_path, canonical, {**SENSOR, "axis_map": axis_map})
+        read(tmp_path, canonical, SENSOR.replaced(axis_map=axis_map))
 
 
 def change(ingest: dict[str, Any], key: str, value: Any) -> None:
@@ -288,12 +290,12 @@ def test_profile_that_no_file_suits_is_refused(canonical: dict[str, Any], key: s
     if key == "csv/columns":
         change(canonical, key, {"time": {"column": "t", "unit": "s"}})
     with pytest.raises(ConfigurationError, match=re.escape(message)):
-        check_ingest(canonical)
+        check_ingest(ingest_of(canonical))
 
 
 @pytest.mark.parametrize("name", ["canonical_csv", "mcap", "xsens_mti_multi_position", "mpu6050_multi_position"])
 def test_profiles_that_ship_are_sound(name: str) -> None:
-    check_ingest(profile(name))
+    check_ingest(ingest_of(profile(name)))
 
 
 def test_file_shorter_than_its_preamble_is_refused(tmp_path: Path) -> None:

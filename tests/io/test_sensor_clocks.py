@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 import pytest
+from unit_settings import ingest_of
 
 from pipeline.errors import IngestError
 from pipeline.io.ingest_settings import mcap_format
@@ -35,7 +36,7 @@ def read(path: Path, force: tuple[Any, Any], rate: tuple[Any, Any]) -> ChannelTa
         for name, (t, v) in {"acc": force, "gyr": rate}.items():
             file[f"{name}/t"], file[f"{name}/v"] = t, np.repeat(v[:, None], 3, axis=1)
     topics = {"/acc": {**TIME, **FORCE}, "/gyr": {**TIME, **RATE}}
-    return read_log(path, mcap_format({"mcap": {"topics": topics, "sensor_clock": "own"}}))
+    return read_log(path, mcap_format(ingest_of({"mcap": {"topics": topics, "sensor_clock": "own"}})))
 
 
 @pytest.mark.parametrize(("force_hz", "rate_hz"), [(100.0, 400.0), (250.0, 400.0), (63.0, 200.0), (400.0, 100.0)])
