@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from scipy.signal import lfilter
 
 from pipeline.io.quality_flags import CLIPPED
 from pipeline.model.calibration_file import implausible, sample_covariance, sentences
 from pipeline.records import FittedEffect, Recording, SensorCalibration
+from pipeline.settings import DataSheet
+from pipeline.simulation.description import shipped_settings
 from pipeline.stages.calibration import calibrated_range, judged
 
 CONFIGS = Path(__file__).parents[2] / "configs/sensor"
 
 
-def sheet(model: str, sensor: str) -> dict[str, Any]:
-    found: dict[str, Any] = yaml.safe_load((CONFIGS / f"{model}.yaml").read_text(encoding="utf-8"))[sensor]
-    return found
+def sheet(model: str, sensor: str) -> DataSheet:
+    return shipped_settings(sensor=model).sensor.of(sensor)
 
 
 def marked(model: str, sensor: str, K: np.ndarray, bias: float = 0.0, sigma: float = 1e-4, **effects: float) -> Any:
@@ -63,8 +63,8 @@ def test_sensors_at_their_limits_and_those_of_the_thesis_are_not_marked() -> Non
     for model in ("mpu6050", "stim300", "generic"):
         for sensor in ("accelerometer", "gyroscope"):
             s = sheet(model, sensor)
-            K = (1.0 + s["scale_factor"]) * np.eye(3) + s["cross_axis"] * (1.0 - np.eye(3))
-            assert marked(model, sensor, K, s["bias"]) == []
+            K = (1.0 + s.scale_factor) * np.eye(3) + s.cross_axis * (1.0 - np.eye(3))
+            assert marked(model, sensor, K, s.bias) == []
     assert marked("stim300", "accelerometer", 1.003 * np.eye(3), 0.0455) == []
 
 
@@ -99,7 +99,7 @@ def test_what_is_not_known_well_enough_is_not_marked() -> None:
 def test_the_user_can_accept_them() -> None:
     part = SensorCalibration("gyroscope", matrix=0.5 * np.eye(3)).to_json()
     plain, meant = (
-        judged("gyroscope", part, sheet("mpu6050", "gyroscope") | {"accept_implausible": a}) for a in (0, 1)
+        judged("gyroscope", part, sheet("mpu6050", "gyroscope").replaced(accept_implausible=bool(a))) for a in (0, 1)
     )
     assert [e["ratio"] for e in plain["implausible"]] == pytest.approx([1.0 / 0.03] * 3)
     assert meant["implausible"] == []

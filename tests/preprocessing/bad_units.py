@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription, shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,11 +20,8 @@ if TYPE_CHECKING:
     Change = Callable[[Unit], Unit]
 
 RADIAN = np.pi / 180.0
-SETTINGS: dict[str, Any] = {
-    "sensor": read_config("sensor", "mpu6050"),
-    "table": read_config("table", "acutronic"),
-    "ingest": read_config("ingest", "canonical_csv"),
-}
+SHIPPED = shipped_settings(sensor="mpu6050", table="acutronic")
+SETTINGS = SHIPPED.replaced(procedure=SHIPPED.procedure.replaced(recordings={}))  # whose recordings are not stated
 
 
 @cache

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import unit_settings
 from scipy.spatial.transform import Rotation
 
 from pipeline.preprocessing.bench import signed_axis
 from pipeline.records import Recording
+from pipeline.settings import RecordingFile, Settings
 
 INTERVAL_S = 0.12
 BIAS = {"accelerometer": np.array([0.03, -0.02, 0.05]), "gyroscope": np.array([1.2, -0.8, 0.5])}
@@ -65,9 +67,9 @@ class Setup:
             source={"file": f"{'accel' if role == 'accelerometer' else 'gyro'}_{self.axis}.csv"},
         )
 
-    def settings(self) -> dict[str, Any]:
+    def entry(self) -> RecordingFile:
         """Return the entry of the recording in the procedure that states the mounting."""
-        return {"up": self.up or None, "sense": self.sense, "zero_deg": self.zero}
+        return usual(self.axis).replaced(up=self.up or None, sense=self.sense, zero_deg=self.zero)
 
 
 def recordings_of(setups: dict[str, Setup], seed: int = 0, **both: Any) -> list[Recording]:
@@ -76,7 +78,14 @@ def recordings_of(setups: dict[str, Setup], seed: int = 0, **both: Any) -> list[
     return [setups.get(a, Setup(a)).recording(role, seed, **both) for role in roles for a in "xyz"]
 
 
-def settings_of(recordings: list[Recording], setups: dict[str, Setup] | None = None, **table: Any) -> dict[str, Any]:
-    """Return a configuration that states the mounting of some axes."""
-    entries = {r.name: (setups or {}).get(r.axis or "", Setup(r.axis or "x")).settings() for r in recordings}
-    return {"procedure": {"recordings": entries if setups else {r.name: {} for r in recordings}}, "table": table}
+def usual(axis: str) -> RecordingFile:
+    """Return the entry of a recording of turns about an axis that states no mounting."""
+    return RecordingFile(file="", role="gyroscope", axis=axis, optional=False)
+
+
+def settings_of(recordings: list[Recording], setups: dict[str, Setup] | None = None, **table: Any) -> Settings:
+    """Return settings that state the mounting of some axes."""
+    stated = {r.name: (setups or {}).get(r.axis or "", Setup(r.axis or "x")).entry() for r in recordings}
+    entries = stated if setups else {r.name: usual(r.axis or "x") for r in recordings}
+    ideal = unit_settings.settings_of(table=table)
+    return ideal.replaced(procedure=ideal.procedure.replaced(recordings=entries))

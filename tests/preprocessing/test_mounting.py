@@ -107,7 +107,7 @@ def setup_free(recording: Recording, setup: Setup, logged: list[Recording]) -> R
     if recording.axis != setup.axis:
         return recording
     own = next(r for r in logged if r.name == recording.name)
-    return check_mounting([own], {"procedure": {"recordings": {own.name: setup.settings()}}, "table": {}})[0]
+    return check_mounting([own], settings_of([own], {own.axis or "": setup}))[0]
 
 
 def test_the_table_states_sense_and_zero_for_all_recordings() -> None:

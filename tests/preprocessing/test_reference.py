@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from bad_units import SETTINGS, cases, sound
 from scipy.spatial.transform import Rotation
+from unit_settings import settings_of
 
 from pipeline.diagnosis.diagnose import doubts_of
 from pipeline.errors import IngestError
@@ -21,7 +22,7 @@ from pipeline.preprocessing.checks import check_recordings
 from pipeline.preprocessing.reference import _interval, check_motion
 from pipeline.records import Recording
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import read_config, read_description
+from pipeline.simulation.description import read_description
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, draw
 
@@ -75,7 +76,7 @@ def test_sound_units_are_left_alone_whatever_is_hidden_in_them(effects: str) -> 
 def test_slow_short_and_warm_turns_of_the_shipped_campaigns_are_not_refused(name: str) -> None:
     description = read_description(Path(__file__).parents[2] / "data" / name / "simulation.yaml")
     for number, unit in list(enumerate(description.units, 1))[::6]:
-        settings = SETTINGS | {g: read_config(g, getattr(unit, g)) for g in ("sensor", "table")}
+        settings = settings_of(SETTINGS, sensor=unit.sensor, table=unit.table)
         recordings, _ = simulate_unit(unit, description.seed, number)
         check_recordings([replace(r, source={"file": r.name}) for r in recordings], settings)
 
@@ -101,7 +102,7 @@ def test_a_static_recording_louder_or_quieter_than_the_rests_by_hand_is_in_doubt
     by_hand = Recording("recording", "rests", None, np.arange(4000) * 10**7, gyroscope=turning + noise)
     own = times * 0.05 * rng.standard_normal((3000, 3))
     static = Recording("static", "static", None, (5000 + np.arange(3000)) * 10**7, gyroscope=own)
-    found = check_static([by_hand, static], {"sensor": {"gyroscope": {"bias_wander": 0.01}}})[1]
+    found = check_static([by_hand, static], settings_of(**{"sensor.gyroscope.bias_wander": 0.01}))[1]
     assert [n.code for n in found.notes] == codes
 
 
@@ -121,14 +122,16 @@ def test_of_a_static_recording_that_tilts_slowly_only_what_rests_is_used() -> No
     force = np.column_stack([np.sin(tilt), np.zeros(3000), np.cos(tilt)])
     force += 2e-3 * np.random.default_rng(4).standard_normal(force.shape)
     static = Recording("static", "static", None, (time * 1e9).astype(np.int64), force)
-    (found,) = check_static([static], {"sensor": {"accelerometer": {"bias_wander": 1e-4, "noise_density": 9e-4}}})
+    (found,) = check_static(
+        [static], settings_of(**{"sensor.accelerometer.bias_wander": 1e-4, "sensor.accelerometer.noise_density": 9e-4})
+    )
     assert [note.code for note in found.notes] == ["N-MOVED"]
     assert found.time[0] == 0.0
     assert 190.0 < found.time[-1] < 220.0  # 12 mg, six standard deviations, are reached after 14 s
 
 
 def test_gravity_that_was_left_at_1_g_is_noted_with_that_of_the_latitude() -> None:
-    placed = SETTINGS | {"table": SETTINGS["table"] | {"latitude_deg": 52.2946, "azimuth_deg": 0.0}}
+    placed = settings_of(SETTINGS, **{"table.latitude_deg": 52.2946, "table.azimuth_deg": 0.0})
     details = [n.detail for r in check_recordings(list(sound()), placed) for n in r.notes if n.code == "N-GRAVITY"]
     (stated,) = (float(g) for g in re.findall(r"table.gravity_g=([\d.]+)", *details))
     assert stated == pytest.approx(9.81252 / 9.80665, abs=5e-5)  # PTB Braunschweig, 80 m above the sea
@@ -141,7 +144,7 @@ def test_the_azimuth_of_a_shaft_is_told_as_that_of_each_body_axis_on_a_left_hand
         r if r.axis is None else replace(r, table_angle=-r.table_angle, table_rate=-r.table_rate) for r in sound()
     ]
     place = {"latitude_deg": 52.0, "azimuth_deg": 352.0, "azimuth_of": "turn_axis", "gravity_g": 1.0007, "sense": -1}
-    checked = check_recordings(turned, SETTINGS | {"table": SETTINGS["table"] | place})
+    checked = check_recordings(turned, settings_of(SETTINGS, **{f"table.{k}": v for k, v in place.items()}))
     (note,) = (n for r in checked for n in r.notes if n.code == "N-AZIMUTH")
     assert "body x to 172 deg in accel_x, body y to 172 deg in accel_y" in note.detail
 
@@ -163,7 +166,7 @@ def test_a_turn_about_another_axis_is_not_told_as_a_wrong_unit_of_the_angle() ->
         table_angle=angle,
         source={"file": "gyro_x.csv"},
     )
-    (found,) = check_recordings([recording], SETTINGS | {"table": SETTINGS["table"] | {"seat_deg": 2.0}})
+    (found,) = check_recordings([recording], settings_of(SETTINGS, **{"table.seat_deg": 2.0}))
     assert found.axis == "y"
     assert [n.code for n in found.notes] == ["N-FOUND"]
 

@@ -227,7 +227,7 @@ def test_a_temperature_called_t_beside_times_in_ms_is_no_time(tmp_path: Path, de
     assert columns["time"] == {"column": "ms", "unit": "ms"}
     assert columns["temperature"] == {"column": "T", "unit": "degC", "optional": True}
     assert (columns["accel_x"]["counts_per_unit"], columns["gyro_z"]["counts_per_unit"]) == (4096.0, 65.5)
-    table = read_csv([file], csv_formats(ingest_of(proposal.ingest("mine", {}))))
+    table = read_csv([file], csv_formats(ingest_of(proposal.ingest("mine", None))))
     np.testing.assert_allclose(table.time_ns, time_s * 1e9, rtol=0, atol=1000)
     np.testing.assert_allclose(table.values["table_angle"], angle, rtol=0, atol=0.006)
     np.testing.assert_allclose(table.values["gyro_x"], rate, rtol=0, atol=0.008)
@@ -250,7 +250,7 @@ def test_units_of_samples_in_bursts_are_found_by_their_regular_clock(tmp_path: P
     assert proposal.complete, proposal.evidence
     assert proposal.columns[0]["gyro_x"]["unit"] == "deg/s"
     assert "rows in bursts" in proposal.evidence["time"]
-    table = read_csv([file], csv_formats(ingest_of(proposal.ingest("mine", {}))))
+    table = read_csv([file], csv_formats(ingest_of(proposal.ingest("mine", None))))
     assert [n.code for n in table.notes] == ["N-BURSTS"]
     assert np.diff(table.time_ns) == pytest.approx(np.full(len(data) - 1, 1e7), rel=1e-3)
 

@@ -15,6 +15,7 @@ from pipeline.io.encoder_log import unwrapped
 from pipeline.io.ingest_settings import Checks
 from pipeline.io.read import to_recording
 from pipeline.records import rate_of_attitude
+from pipeline.settings import RecordingFile, Window
 from pipeline.signal.segments import cut
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, course_of
@@ -125,22 +126,22 @@ def test_where_an_axis_turns_in_one_way_only_the_turns_serve_both_sensors() -> N
 def test_windows_take_the_place_of_what_is_found() -> None:
     whole = session()
     windows = [
-        {"role": "gyroscope", "axis": "z", "start_s": 5.0, "stop_s": 9.0},
-        {"role": "gyroscope", "axis": "z", "start_s": 10.0, "stop_s": 12.0},
-        {"role": "static", "axis": None, "start_s": 0.0, "stop_s": 3.0},
+        Window(role="gyroscope", axis="z", start_s=5.0, stop_s=9.0),
+        Window(role="gyroscope", axis="z", start_s=10.0, stop_s=12.0),
+        Window(role="static", start_s=0.0, stop_s=3.0),
     ]
     found = cut(whole, windows)
     assert [r.name for r in found] == ["gyro_z", "gyro_z_2", "static"]
     since = whole.time - whole.time[0]
     for part, window in zip(found, windows, strict=True):
-        inside = (since >= window["start_s"]) & (since < window["stop_s"])
+        inside = (since >= window.start_s) & (since < window.stop_s)
         np.testing.assert_array_equal(part.time_ns, whole.time_ns[inside])
     assert "given by a window" in found[0].notes[-1].detail
 
 
 def test_a_window_beyond_the_recording_is_refused() -> None:
     with pytest.raises(InputError, match=r"from 9000 to 9010 s holds 0 samples; the recording is \d+\.\d\d s long"):
-        cut(session(), [{"role": "static", "start_s": 9000.0, "stop_s": 9010.0}])
+        cut(session(), [Window(role="static", start_s=9000.0, stop_s=9010.0)])
 
 
 def test_without_a_table_or_a_turn_the_recording_is_refused_and_windows_are_named() -> None:
@@ -171,7 +172,8 @@ def test_an_attitude_alone_gives_the_rate_of_held_out_motion() -> None:
     assert part.table_attitude is not None
     values = {f"table_q{c}": part.table_attitude[:, i] for i, c in enumerate("wxyz")}
     table = ChannelTable("log", part.time_ns, values, {"file": "log"})
-    read = to_recording("validation", {"role": "validation", "axis": None}, unwrapped(table), {}, Checks())
+    entry = RecordingFile(file="validation", role="validation", axis=None, optional=False)
+    read = to_recording("validation", entry, unwrapped(table), None, Checks())
     assert read.table_rate is not None
     assert part.table_rate is not None
     np.testing.assert_allclose(read.table_rate, part.table_rate, atol=0.02)

@@ -20,7 +20,7 @@ from pipeline.preprocessing.evidence import Limits
 from pipeline.preprocessing.reference_scale import doubt_of_angle
 from pipeline.records import SENSORS, Recording
 from pipeline.simulation.campaign import simulate_unit, write_campaign
-from pipeline.simulation.description import UnitDescription, description_from, read_config, read_description
+from pipeline.simulation.description import UnitDescription, description_from, read_description, shipped_settings
 
 DEMO = Path(__file__).parents[2] / "data" / "demo"
 SHORT = {"step_deg": 30.0, "validation_s": 30.0, "static_s": 20.0}
@@ -32,12 +32,8 @@ def simulated(seed: int = 1, **keys: Any) -> tuple[dict[str, Recording], dict[st
 
 
 def read(folder: Path, procedure: str = "three_axis_turns", sensor: str = "mpu6050") -> dict[str, Recording]:
-    sections = (
-        read_config("procedure", procedure),
-        read_config("ingest", "canonical_csv"),
-        read_config("sensor", sensor),
-    )
-    return {r.name: r for r in read_recordings(*sections, folder)}
+    settings = shipped_settings(procedure=procedure, sensor=sensor)
+    return {r.name: r for r in read_recordings(settings.procedure, settings.ingest, settings.sensor, folder)}
 
 
 def residual(recording: Recording, truth: dict[str, Any], sensor: str) -> np.ndarray:
@@ -61,7 +57,7 @@ def test_long_rests_before_a_turn_give_no_refusal_and_no_doubt_but_faults_do() -
     rests = np.concatenate([r.table_rate == 0.0 for r in turns if r.table_rate is not None])
     assert rests.mean() > 0.95
     check_axes(recordings)
-    limits = Limits.of({"sensor": read_config("sensor", "mpu6050"), "table": read_config("table", "acutronic")})
+    limits = Limits.of(shipped_settings(sensor="mpu6050", table="acutronic"))
     assert [doubt_of_angle(turn, limits) for turn in turns] == [None] * 3
     wrong = [replace(r, table_angle=1.005 * r.table_angle) for r in turns if r.table_angle is not None]  # counts a turn
     told = [str(doubt_of_angle(turn, limits)).partition("turns ")[2].partition(" ")[0] for turn in wrong]
@@ -98,7 +94,7 @@ def test_noise_of_a_rest_is_what_the_data_sheet_says() -> None:
         assert reading is not None
         noise = truth[sensor]["noise"]
         differences = np.diff(reading, axis=0)  # the wander hardly changes from one sample to the next
-        step = 1.0 / read_config("sensor", "mpu6050")[sensor]["counts_per_unit"]
+        step = 1.0 / shipped_settings(sensor="mpu6050").sensor.of(sensor).counts_per_unit
         expected = np.sqrt(noise["white"] ** 2 + step**2 / 12.0)
         # 15 000 differences, neighbours correlated: relative standard error 1 / sqrt(2 * 15000 / 1.5)
         assert np.sqrt(np.mean(differences**2) / 2.0) == pytest.approx(expected, rel=0.03)
@@ -138,10 +134,10 @@ def test_both_formats_hold_the_same_values(tmp_path: Path, kind: str) -> None:
 
 def test_readings_are_whole_counts_after_printing(tmp_path: Path) -> None:
     write_campaign(description_from({"units": [{"unit": "U", "sensor": "stim300", "course": SHORT}]}, "test"), tmp_path)
-    for sensor, sheet in ((s, read_config("sensor", "stim300")[s]) for s in SENSORS):
+    for sensor, sheet in ((s, shipped_settings(sensor="stim300").sensor.of(s)) for s in SENSORS):
         reading = read(tmp_path / "raw" / "U", sensor="stim300")["gyro_x"].reading(sensor)
         assert reading is not None
-        counts = reading * sheet["counts_per_unit"]
+        counts = reading * sheet.counts_per_unit
         assert np.abs(counts - np.rint(counts)).max() < 0.1
 
 

@@ -13,7 +13,7 @@ from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import Owner, truth
 from pipeline.model.effects.formula_effect import FormulaEffect
 from pipeline.model.kinematics import earth_rate
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 from pipeline.simulation.sensor import (
     ALTERATIONS,
     STANDARD_GRAVITY,
@@ -167,7 +167,7 @@ def test_a_shaking_plate_is_felt_while_it_turns_only() -> None:
     np.testing.assert_array_equal(motion.angular_rate, plain.angular_rate)
 
 
-SHEETS = read_config("sensor", "mpu6050")
+SHEETS = shipped_settings(sensor="mpu6050").sensor
 
 # Sudsanguan 2019, tables 5.1 to 5.6 (biases, medians) and 5.23 (scale factors), as restated with the before-errors
 # that random attitudes give with them, g; the thesis prints 0.069, 0.023, 0.021 for its own motion.
@@ -187,7 +187,7 @@ def test_a_reading_is_bias_plus_the_inverse_matrix_times_the_truth_plus_effects(
     sensitivity = np.random.default_rng(1).normal(0.0, 0.1, 9)
     sensor = SimulatedSensor(
         "gyroscope",
-        SHEETS["gyroscope"],
+        SHEETS.gyroscope,
         np.array([1.0, -2.0, 0.5]),
         matrix,
         {"g_sensitivity": (effect("g_sensitivity"), sensitivity)},
@@ -199,16 +199,16 @@ def test_a_reading_is_bias_plus_the_inverse_matrix_times_the_truth_plus_effects(
 
 
 def test_white_noise_has_the_density_of_the_data_sheet_up_to_the_nyquist_frequency() -> None:
-    sensor = SimulatedSensor("gyroscope", SHEETS["gyroscope"], np.zeros(3), np.eye(3))
+    sensor = SimulatedSensor("gyroscope", SHEETS.gyroscope, np.zeros(3), np.eye(3))
     assert sensor.white(0.01) == pytest.approx(0.005 * np.sqrt(50.0))
     assert sensor.white(0.12) == pytest.approx(0.0102062, abs=1e-7)
 
 
 def test_readings_are_whole_counts_and_stop_at_full_scale() -> None:
-    sensor = SimulatedSensor("accelerometer", SHEETS["accelerometer"], np.zeros(3), np.eye(3))
+    sensor = SimulatedSensor("accelerometer", SHEETS.accelerometer, np.zeros(3), np.eye(3))
     counts = sensor.quantised(np.array([[0.1, -5.0, 5.0]])) * 16384.0
     assert counts.tolist() == [[1638.0, -32768.0, 32767.0]]
-    assert decimals_of(sensor.sensor_config) == 6  # half a unit of the last digit is 0.008 counts
+    assert decimals_of(sensor.data_sheet) == 6  # half a unit of the last digit is 0.008 counts
 
 
 def test_wander_has_unit_variance_and_its_correlation_time_within_recordings_and_across_pauses() -> None:
@@ -243,7 +243,7 @@ def test_wander_of_a_long_rest_has_the_allan_variance_of_a_gauss_markov_process(
 @pytest.mark.parametrize("device", DEVICES)
 def test_random_attitudes_with_the_published_parameters_give_the_published_error(device: str) -> None:
     bias, scale, published = DEVICES[device]
-    sensor = SimulatedSensor("accelerometer", SHEETS["accelerometer"], np.array(bias), np.diag(scale))
+    sensor = SimulatedSensor("accelerometer", SHEETS.accelerometer, np.array(bias), np.diag(scale))
     attitudes = np.random.default_rng(8).normal(size=(40000, 3))
     attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
     motion = replace(a_motion(), specific_force=attitudes)
