@@ -69,7 +69,7 @@ class Setup:
 
     def entry(self) -> RecordingFile:
         """Return the entry of the recording in the procedure that states the mounting."""
-        return usual(self.axis).replaced(up=self.up or None, sense=self.sense, zero_deg=self.zero)
+        return entry_of(self.axis).replaced(up=self.up or None, sense=self.sense, zero_deg=self.zero)
 
 
 def recordings_of(setups: dict[str, Setup], seed: int = 0, **both: Any) -> list[Recording]:
@@ -78,7 +78,7 @@ def recordings_of(setups: dict[str, Setup], seed: int = 0, **both: Any) -> list[
     return [setups.get(a, Setup(a)).recording(role, seed, **both) for role in roles for a in "xyz"]
 
 
-def usual(axis: str) -> RecordingFile:
+def entry_of(axis: str) -> RecordingFile:
     """Return the entry of a recording of turns about an axis that states no mounting."""
     return RecordingFile(file="", role="gyroscope", axis=axis, optional=False)
 
@@ -86,6 +86,11 @@ def usual(axis: str) -> RecordingFile:
 def settings_of(recordings: list[Recording], setups: dict[str, Setup] | None = None, **table: Any) -> Settings:
     """Return settings that state the mounting of some axes."""
     stated = {r.name: (setups or {}).get(r.axis or "", Setup(r.axis or "x")).entry() for r in recordings}
-    entries = stated if setups else {r.name: usual(r.axis or "x") for r in recordings}
+    entries = stated if setups else {r.name: entry_of(r.axis or "x") for r in recordings}
+    return stating(entries, **table)
+
+
+def stating(entries: dict[str, RecordingFile], **table: Any) -> Settings:
+    """Return settings with these entries of recordings."""
     ideal = unit_settings.settings_of(table=table)
     return ideal.replaced(procedure=ideal.procedure.replaced(recordings=entries))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import unit_settings
-from benches import BIAS, INTERVAL_S, RATE, Setup, recordings_of, settings_of
+from benches import BIAS, INTERVAL_S, RATE, Setup, entry_of, recordings_of, settings_of, stating
 from benches import K as TRUE_K
 from scipy.spatial.transform import Rotation
 
@@ -87,12 +87,14 @@ def test_what_is_found_is_used_with_a_note_that_names_the_setting_which_describe
         found = check_mounting(recordings, settings_of(recordings))
         notes = {r.name: n.detail for r in found for n in r.notes if n.code == "N-FOUND"}
         assert set(notes) == {f"accel_{axis}", f"gyro_{axis}"}
-        entries: dict[str, dict[str, Any]] = {r.name: {} for r in recordings}
+        entries = {r.name: entry_of(r.axis or "x") for r in recordings}
         for setting in notes[f"accel_{axis}"].split("set ")[1].split(" (")[0].split(", "):
             if setting.startswith("procedure."):
                 name, key, value = setting.removeprefix("procedure.recordings.").replace("=", ".", 1).split(".", 2)
-                entries[name][key] = value if key == "up" else float(value)
-        checked = check_mounting(recordings, {"procedure": {"recordings": entries}, "table": {}})
+                entries[name] = entries[name].replaced(
+                    **{key: value if key == "up" else int(value) if key == "sense" else float(value)}
+                )
+        checked = check_mounting(recordings, stating(entries))
         for before, stated, used in zip(recordings_of({}), checked, found, strict=True):
             right = reference_motion(setup_free(before, setup, recordings))
             assert right is not None
@@ -219,12 +221,14 @@ def test_frames_that_contradict_each_other_are_refused_with_the_map_that_is_righ
 
 def test_by_hand_gravity_and_the_gyroscope_belong_in_one_frame() -> None:
     recording = _by_hand()
-    assert check_mounting([recording], {}) == [recording]
-    assert check_mounting([_mapped(recording, -np.eye(3), np.eye(3))], {})  # gravity's opposite turns alike
+    assert check_mounting([recording], unit_settings.settings_of()) == [recording]
+    assert check_mounting(
+        [_mapped(recording, -np.eye(3), np.eye(3))], unit_settings.settings_of()
+    )  # gravity's opposite turns alike
     with pytest.raises(IngestError, match=r"gyroscope is mirrored: .*sensor\.gyroscope\.axis_map=\[\+x,\+y,-z\]"):
-        check_mounting([_mapped(recording, np.eye(3), MIRROR_Z)], {})
+        check_mounting([_mapped(recording, np.eye(3), MIRROR_Z)], unit_settings.settings_of())
     with pytest.raises(IngestError, match=r"contradict each other: in \d+ of 1\d moves"):
-        check_mounting([_mapped(recording, -np.eye(3))], {})
+        check_mounting([_mapped(recording, -np.eye(3))], unit_settings.settings_of())
 
 
 def _by_hand() -> Recording:
@@ -249,13 +253,16 @@ def test_a_vertical_turn_axis_is_stated_or_refused() -> None:
     recordings = level + recordings_of(upright)[3:]
     with pytest.raises(IngestError, match=r"gravity stays along body \+x .*gyro_x\.up=\+x, .*gyro_y\.up=-y"):
         check_mounting(recordings, settings_of(recordings))
-    entries = {r.name: {"up": upright[str(r.axis)].up} if r.role == "gyroscope" else {} for r in recordings}
-    checked = check_mounting(recordings, {"procedure": {"recordings": entries}, "table": {}})
+    entries = {r.name: entry_of(r.axis or "x") for r in recordings}
+    entries |= {
+        r.name: entries[r.name].replaced(up=upright[str(r.axis)].up) for r in recordings if r.role == "gyroscope"
+    }
+    checked = check_mounting(recordings, stating(entries))
     for recording in checked[3:]:
         force, reading = _pair(recording, "accelerometer")
         assert np.max(np.abs(reading - BIAS["accelerometer"] - force @ TRUE_K["accelerometer"].T)) < 5 * 8e-4
     with pytest.raises(IngestError, match="about a vertical axis gravity does not turn"):
-        check_mounting(recordings_of(upright)[:1], {"procedure": {"recordings": {"accel_x": {"up": "+x"}}}})
+        check_mounting(recordings_of(upright)[:1], stating({"accel_x": entry_of("x").replaced(up="+x")}))
 
 
 @pytest.mark.parametrize("up", ["+x", ""])
@@ -264,10 +271,10 @@ def test_where_gravity_does_not_turn_the_gyroscope_tells_the_sense(up: str, sens
     recording = Setup("x", up, sense).recording("gyroscope")
     if not up:
         recording = replace(recording, accelerometer=None)
-    (checked,) = check_mounting([recording], {"procedure": {"recordings": {"gyro_x": {"up": up, "sense": sense}}}})
+    (checked,) = check_mounting([recording], stating({"gyro_x": entry_of("x").replaced(up=up, sense=sense)}))
     assert checked.table_rate == pytest.approx(RATE)
     with pytest.raises(IngestError, match=f"gyro_x.sense={sense}") as caught:
-        check_mounting([recording], {"procedure": {"recordings": {"gyro_x": {"up": up, "sense": -sense}}}})
+        check_mounting([recording], stating({"gyro_x": entry_of("x").replaced(up=up, sense=-sense)}))
     assert caught.value.code == "wrong_sense"
 
 
@@ -289,10 +296,10 @@ def test_a_slow_turn_is_followed_although_the_bias_is_as_large_as_its_rate(rate_
     reading = bias + np.outer(rate, TRUE_K["gyroscope"][:, 1]) + noise
     time = (np.arange(len(rate)) * 120_000_000).astype(np.int64)
     recording = Recording("gyro_y", "gyroscope", "y", time, gyroscope=reading, table_rate=rate)
-    assert check_mounting([recording], {})
+    assert check_mounting([recording], unit_settings.settings_of())
     if rate_dps > 1.0:
         with pytest.raises(IngestError, match="said to turn about z, and the gyroscope turns about y"):
-            check_mounting([replace(recording, axis="z")], {})
+            check_mounting([replace(recording, axis="z")], unit_settings.settings_of())
 
 
 def test_a_bench_is_told_in_words() -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 CASES = cases()
 PAGE = Path(__file__).parents[2] / "docs" / "bad_inputs.md"
+NOISY = {f"sensor.{s}.noise_density": 1.0 for s in ("accelerometer", "gyroscope")}  # beyond what is tested
 
 
 def notes_of(before: list[Recording], after: list[Recording]) -> dict[str, tuple[Note, ...]]:
@@ -102,7 +103,7 @@ def test_a_static_recording_louder_or_quieter_than_the_rests_by_hand_is_in_doubt
     by_hand = Recording("recording", "rests", None, np.arange(4000) * 10**7, gyroscope=turning + noise)
     own = times * 0.05 * rng.standard_normal((3000, 3))
     static = Recording("static", "static", None, (5000 + np.arange(3000)) * 10**7, gyroscope=own)
-    found = check_static([by_hand, static], settings_of(**{"sensor.gyroscope.bias_wander": 0.01}))[1]
+    found = check_static([by_hand, static], settings_of(**NOISY, **{"sensor.gyroscope.bias_wander": 0.01}))[1]
     assert [n.code for n in found.notes] == codes
 
 
@@ -135,7 +136,7 @@ def test_gravity_that_was_left_at_1_g_is_noted_with_that_of_the_latitude() -> No
     details = [n.detail for r in check_recordings(list(sound()), placed) for n in r.notes if n.code == "N-GRAVITY"]
     (stated,) = (float(g) for g in re.findall(r"table.gravity_g=([\d.]+)", *details))
     assert stated == pytest.approx(9.81252 / 9.80665, abs=5e-5)  # PTB Braunschweig, 80 m above the sea
-    here = placed | {"table": placed["table"] | {"gravity_g": stated}}
+    here = settings_of(placed, **{"table.gravity_g": stated})
     assert not [n for r in check_recordings(list(sound()), here) for n in r.notes if n.code == "N-GRAVITY"]
 
 
