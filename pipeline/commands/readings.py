@@ -77,7 +77,7 @@ class Reading:
         return to_recording(self.name, entry, table, self.sensor_model, checks_of(ingest))
 
     def checked(self) -> Recording:
-        """Return the recording after the checks of a single recording; without a sensor, by the limits of ``generic``."""
+        """Return the recording after the checks of a single recording; without a sensor, by those of ``generic``."""
         generic = {} if self.sensor_model else {"sensor": shipped_settings(sensor="generic").sensor}
         return check_recordings([self.recording()], self.settings.replaced(**generic))[0]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -12,9 +12,11 @@ from scipy.signal import lfilter
 from pipeline.io.quality_flags import CLIPPED
 from pipeline.model.calibration_file import implausible, sample_covariance, sentences
 from pipeline.records import FittedEffect, Recording, SensorCalibration
-from pipeline.settings import DataSheet
 from pipeline.simulation.description import shipped_settings
 from pipeline.stages.calibration import calibrated_range, judged
+
+if TYPE_CHECKING:
+    from pipeline.settings import DataSheet
 
 CONFIGS = Path(__file__).parents[2] / "configs/sensor"
 
