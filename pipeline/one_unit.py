@@ -251,7 +251,7 @@ def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # 
     frames = {n: _text_of(n, r) for n, r in recordings.items() if not isinstance(r, str | os.PathLike)}
     paths = {n: str(Path(r).resolve()) for n, r in recordings.items() if n not in frames}
     columns = row.config.ingest.csv.get("columns")
-    if frames and not paths and columns and columns != canonical()["csv"]["columns"]:
+    if frames and not paths and columns and columns != canonical().csv["columns"]:
         message = "describes columns of files; a DataFrame has those of the canonical CSV: leave out the setting"
         raise ConfigurationError(f"ingest={row.config.ingest.name} {message} of ingest")
     entries = {n: e.replaced(file=paths.get(n, e.file)) for n, e in known.items() if n in recordings}

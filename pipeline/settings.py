@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Self, TypeVa
 from pydantic import BaseModel, ConfigDict, Field
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Mapping
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -26,19 +26,7 @@ Setting = TypeVar("Setting")
 AnySection = TypeVar("AnySection", bound="Section")
 
 
-if TYPE_CHECKING:
-
-    class _Mapping(Mapping[str, Any]):
-        """A mapping, for functions that do not yet take typed settings."""
-
-        def __getitem__(self, key: str) -> Any: ...  # noqa: ANN401
-        def __len__(self) -> int: ...
-
-else:
-    _Mapping = object
-
-
-class Section(BaseModel, _Mapping):  # type: ignore[misc]
+class Section(BaseModel):
     """A part of the configuration: strict types, no unknown keys."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
@@ -56,39 +44,6 @@ class Section(BaseModel, _Mapping):  # type: ignore[misc]
     def json_value(self) -> dict[str, Any]:
         """The settings as a JSON value, which must not be changed; computed once, as units share sections."""
         return self.model_dump(mode="json")
-
-    if not TYPE_CHECKING:  # access as to a mapping, of functions that do not yet take typed settings
-
-        def __getitem__(self, key: str) -> Any:  # noqa: ANN401
-            try:
-                return getattr(self, key)
-            except AttributeError:
-                raise KeyError(key) from None
-
-        def get(self, key: str, default: Any = None) -> Any:  # noqa: ANN401
-            """Return a setting, or the default."""
-            return getattr(self, key, default)
-
-        def __contains__(self, key: str) -> bool:
-            return key in self.keys()
-
-        def __iter__(self) -> Iterator[str]:
-            return iter(self.keys())
-
-        def __len__(self) -> int:
-            return len(self.keys())
-
-        def keys(self) -> list[str]:
-            """Return the names of the settings."""
-            return [name for name in type(self).model_fields if name in self.__dict__]
-
-        def items(self) -> list[tuple[str, Any]]:
-            """Return names and values."""
-            return [(name, self.__dict__[name]) for name in self.keys()]
-
-        def values(self) -> list[Any]:
-            """Return the values."""
-            return [self.__dict__[name] for name in self.keys()]
 
 
 def _constructed(model: type[AnySection], values: Mapping[str, Any]) -> AnySection:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.estimation.noise import with_noises
-from pipeline.settings import SECTIONS, DataSheet, Ingest, Procedure, Section, Sensor, Settings, Table
+from pipeline.settings import SECTIONS, DataSheet, Filter, Ingest, Procedure, Section, Sensor, Settings, Table
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
@@ -73,6 +73,11 @@ def settings_of(base: Settings | None = None, /, **values: Any) -> Settings:
             content = _merged(getattr(found, section).json_value, other)
             found = found.replaced(**{section: SECTIONS[section].model_validate(content, strict=False)})
     return found
+
+
+def filter_of(name: str, /, **values: Any) -> Filter:
+    """Return a shipped filter with other values, which are not checked."""
+    return shipped_settings(filter=name).filter.replaced(**values)
 
 
 def ingest_of(content: Mapping[str, Any]) -> Ingest:

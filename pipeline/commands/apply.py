@@ -122,9 +122,8 @@ def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:
         parts = sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS)
         if len(parts) > 1:
             from pipeline.commands.readings import grouped  # noqa: PLC0415  (imports Hydra: 0.3 s)
-            from pipeline.settings import Ingest  # noqa: PLC0415  (as above)
 
-            recordings = grouped(logs, Ingest.model_validate({"name": "of the log", **profile.ingest}))
+            recordings = grouped(logs, profile.ingest)
             if len(recordings) > 1:
                 raise ConfigurationError(f"{len(recordings)} recordings are named; apply reads one", str(logs[1]))
             return [recordings[0][part] for part in parts]

@@ -16,6 +16,8 @@ from pipeline.history import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.settings import Sensor
+
 NEEDED = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
 
 
@@ -68,15 +70,10 @@ def settings_of_ranges(sensor: Mapping[str, Any], wanted: Sequence[float | None]
     return found
 
 
-def assumed_figures(name: str, sensor: Mapping[str, Any]) -> str:
+def assumed_figures(name: str, sensor: Sensor) -> str:
     """Return the sentence that lists the figures of a ``completed`` sensor from ``generic``; empty for none."""
-    parts = [f"{', '.join(found)} of the {part}" for part in SENSORS if (found := sensor[part].get("assumed"))]
+    parts = [f"{', '.join(found)} of the {part}" for part in SENSORS if (found := sensor.of(part).assumed)]
     return f"the file of the sensor {name} does not state {', and '.join(parts)}: generic's are used" if parts else ""
-
-
-def as_stated(sensor_config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures that the sensor's file states, and None for figures from ``generic``."""
-    return {**sensor_config, **dict.fromkeys(sensor_config.get("assumed") or ())}
 
 
 def without_overridden(sensor: dict[str, Any], keys: set[str]) -> dict[str, Any]:

@@ -43,15 +43,16 @@ from __future__ import annotations
 
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.records import Integers, Note, Recording, Values, noise_of_steps, once_of_log
+from pipeline.settings import Filter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
 
 GAP = 1.5  # medians of the interval: a lost sample makes two of one
@@ -66,18 +67,16 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
 }
 
 
-def apply_filter(recording: Recording, settings: Mapping[str, Any]) -> Recording:
+def apply_filter(recording: Recording, settings: Filter) -> Recording:
     """Filter the accelerometer and gyroscope readings of a recording; all other channels are unchanged.
 
-    ``settings``: ``name`` (``none``, ``rc_low_pass``, ``low_pass``, ``high_pass``, ``band_pass``, ``band_stop``),
-    ``cutoff_hz``, ``time_constant_s``, ``low_hz``, ``high_hz``, ``order``, ``zero_phase``. ``filter`` of the result has
-    these settings, ``delay_s`` (at 0 Hz; for a band-pass at the middle of its band; 0 for a high-pass, which does not
-    delay signals far above its cutoff) and ``noise_gain``.
+    ``filter`` of the result has these settings, ``delay_s`` (at 0 Hz; for a band-pass at the middle of its band; 0 for a
+    high-pass, which does not delay signals far above its cutoff) and ``noise_gain``.
 
     Raises ``ConfigurationError`` if a setting is missing or a cutoff is not below half the sampling rate,
     ``InputError`` if the recording is too short to have a sampling interval.
     """
-    name = settings["name"]
+    name = settings.name
     if name == "none":
         return recording
     if recording.samples < 2:
@@ -86,13 +85,13 @@ def apply_filter(recording: Recording, settings: Mapping[str, Any]) -> Recording
             recording.source.get("file"),
         )
     sections, run = _filter_of(recording, settings)
-    zero_phase, interval = bool(settings["zero_phase"]), recording.interval
+    zero_phase, interval = settings.zero_phase, recording.interval
     return recording.with_readings(
         accelerometer=None if recording.accelerometer is None else run(recording.accelerometer),
         gyroscope=None if recording.gyroscope is None else run(recording.gyroscope),
         notes=recording.notes + (() if name == "rc_low_pass" else _timing_notes(recording)),
         filter={
-            **settings,
+            **settings.json_value,
             "delay_s": 0.0 if zero_phase or name == "high_pass" else _group_delay(settings, sections, interval),
             "noise_gain": _noise_gain(sections, zero_phase=zero_phase),
         },
@@ -101,13 +100,16 @@ def apply_filter(recording: Recording, settings: Mapping[str, Any]) -> Recording
 
 def filtered(values: Values, recording: Recording) -> Values:
     """Filter (n, k) values at the samples of a recording as its readings were filtered."""
-    return values if recording.filter["name"] == "none" else _filter_of(recording, recording.filter)[1](values)
+    if recording.filter["name"] == "none":
+        return values
+    applied = Filter.model_validate({key: recording.filter[key] for key in Filter.model_fields})
+    return _filter_of(recording, applied)[1](values)
 
 
-def _filter_of(recording: Recording, settings: Mapping[str, Any]) -> tuple[Values, Callable[[Values], Values]]:
+def _filter_of(recording: Recording, settings: Filter) -> tuple[Values, Callable[[Values], Values]]:
     """Return the second-order sections of a filter, and the function that filters values at a recording's samples."""
-    zero_phase, interval = bool(settings["zero_phase"]), recording.interval
-    if settings["name"] == "rc_low_pass":
+    zero_phase, interval = settings.zero_phase, recording.interval
+    if settings.name == "rc_low_pass":
         time_constant = _time_constant(settings, interval)
         k, time = interval / (interval + time_constant), recording.time
 
@@ -171,11 +173,11 @@ def _rc_low_pass(time: Values, reading: Values, time_constant: float) -> Values:
     return out
 
 
-def _group_delay(settings: Mapping[str, Any], sections: Values, interval: float) -> float:
+def _group_delay(settings: Filter, sections: Values, interval: float) -> float:
     """Return the group delay, s, of second-order sections b0 b1 b2 a0 a1 a2: at 0 Hz, or in the middle of a band."""
     n, omega = np.arange(3), 0.0  # rad a sample
-    if settings["name"] == "band_pass":  # the middle of the band as the bilinear transform maps it
-        edges = np.tan(np.pi * interval * np.array([settings["low_hz"], settings["high_hz"]]))
+    if settings.name == "band_pass":  # the middle of the band as the bilinear transform maps it
+        edges = np.tan(np.pi * interval * np.array([settings.low_hz, settings.high_hz]))
         omega = 2.0 * float(np.arctan(np.sqrt(np.prod(edges))))
     turn = np.exp(-1j * omega * n)
     numerator, denominator = ((c @ (n * turn)) / (c @ turn) for c in (sections[:, :3], sections[:, 3:]))
@@ -198,12 +200,12 @@ def _noise_gain(sections: Values, *, zero_phase: bool) -> float:
     return float(np.sqrt(weight @ response / size))
 
 
-def _time_constant(settings: Mapping[str, Any], interval: float) -> float:
+def _time_constant(settings: Filter, interval: float) -> float:
     """Return RC in s, from the cutoff where one is given."""
-    cutoff, time_constant = settings["cutoff_hz"], settings["time_constant_s"]
-    if cutoff is None and time_constant is None:
-        raise ConfigurationError("filter rc_low_pass needs filter.cutoff_hz (Hz) or filter.time_constant_s (s)")
+    cutoff, time_constant = settings.cutoff_hz, settings.time_constant_s
     if cutoff is None:
+        if time_constant is None:
+            raise ConfigurationError("filter rc_low_pass needs filter.cutoff_hz (Hz) or filter.time_constant_s (s)")
         if time_constant < 0:
             raise ConfigurationError(f"filter.time_constant_s is {time_constant:g} s; it cannot be negative")
         return float(time_constant)
@@ -222,18 +224,18 @@ def _require_below_nyquist(key: str, frequency: float | None, interval: float) -
         )
 
 
-def _butterworth_sections(settings: Mapping[str, Any], interval: float) -> Values:
+def _butterworth_sections(settings: Filter, interval: float) -> Values:
     from scipy.signal import butter  # noqa: PLC0415  (0.6 s that the default, no filter, does not pay)
 
-    name, order = settings["name"], settings["order"]
+    name, order = settings.name, settings.order
     if name not in BANDS:
         raise ConfigurationError(f"filter.name is {name!r}; it is one of none, rc_low_pass, {', '.join(BANDS)}")
     if not isinstance(order, int) or not 1 <= order <= 12:
         raise ConfigurationError(f"filter.order is {order!r}; it must be a whole number from 1 to 12")
     keys = ("low_hz", "high_hz") if name.startswith("band") else ("cutoff_hz",)
     for key in keys:
-        _require_below_nyquist(key, settings[key], interval)
-    edges = [float(settings[key]) for key in keys]
+        _require_below_nyquist(key, getattr(settings, key), interval)
+    edges = [float(getattr(settings, key)) for key in keys]
     if len(edges) == 2 and edges[0] >= edges[1]:
         raise ConfigurationError(f"filter.low_hz is {edges[0]:g} Hz; it must be below filter.high_hz, {edges[1]:g} Hz")
     band = edges if len(edges) == 2 else edges[0]

@@ -117,7 +117,7 @@ def simulate_unit(
     """
     streams, course = Streams(seed, number), course_of(unit)
     benches, effects = _drawn(unit, streams)
-    by_hand = benches[""].table.angle_accuracy_deg if benches[""].table["motion"] == "none" else 0.0
+    by_hand = benches[""].table.angle_accuracy_deg if benches[""].table.motion == "none" else 0.0
     mover = streams["motion"] if unit.motion is None else Streams(seed, unit.motion)["motion"]
     planned = [*_selected(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
     total = sum(p.trajectory.duration + course.pause_s for p in planned)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, Course, K, Session, record, values_of
-from unit_settings import settings_of, with_noise
+from unit_settings import filter_of, settings_of, with_noise
 
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.noise import estimate_noise
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 CONFIGS = Path(__file__).parents[2] / "configs"
 SHEET = shipped_settings(sensor="mpu6050").sensor
 TABLE = settings_of().table
-RC = {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": 0.24, "zero_phase": False}
+RC = filter_of("rc_low_pass", cutoff_hz=None, time_constant_s=0.24, zero_phase=False)
 MAGNITUDE = "held_out_magnitude_share"
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from bench_session import CONTINUOUS, STOP_AND_GO, WHITE, Session, record
-from unit_settings import settings_of
+from unit_settings import filter_of, settings_of
 
 from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.estimation.noise import estimate_noise
@@ -39,7 +39,7 @@ def test_the_filtered_rate_of_every_sample_that_is_used_is_that_of_a_log_with_ra
     for part in observe("gyroscope", filtered(without_rates(recordings), name), TABLE).parts:
         everything = next(r for r in filtered(recordings, name) if r.name == part.name)
         exact = apply_filter(
-            replace(everything, gyroscope=known_rate(everything), accelerometer=None), everything.filter
+            replace(everything, gyroscope=known_rate(everything), accelerometer=None), filter_of(name)
         ).gyroscope
         assert exact is not None
         at = np.searchsorted(everything.time, part.motion.time)

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.signal import lfilter
 from scipy.stats import norm
-from unit_settings import settings_of, with_noise
+from unit_settings import filter_of, settings_of, with_noise
 
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.gauss_markov import (
@@ -31,11 +31,10 @@ NO_WANDER = SHEET.replaced(bias_wander=0.0)
 GYROSCOPE = SHEET.replaced(noise_density=0.005, bias_wander=0.003)
 DT = 0.12
 WHITE = 8e-4
-OFF = {"cutoff_hz": None, "time_constant_s": None, "low_hz": None, "high_hz": None, "order": 2, "zero_phase": False}
 FILTERS = {
-    "none": {**OFF, "name": "none"},
-    "rc": {**OFF, "name": "rc_low_pass", "cutoff_hz": 1.0},
-    "butterworth": {**OFF, "name": "low_pass", "cutoff_hz": 1.5, "order": 4, "zero_phase": True},
+    "none": filter_of("none"),
+    "rc": filter_of("rc_low_pass", cutoff_hz=1.0, time_constant_s=None),
+    "butterworth": filter_of("low_pass", cutoff_hz=1.5, order=4, zero_phase=True),
 }
 
 
@@ -305,7 +304,7 @@ def test_what_a_filter_still_holds_of_a_turn_is_no_noise() -> None:
     readings = np.stack([turn, np.zeros(550), np.zeros(550)], 1) + rng.normal(0.0, 0.01, (550, 3))
     time_ns = np.arange(550) * 120_000_000
     recording = Recording("gyro_x", "gyroscope", "x", time_ns, gyroscope=readings, table_rate=turn)
-    settings = {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": 0.24, "zero_phase": False}
+    settings = filter_of("rc_low_pass", cutoff_hz=None, time_constant_s=0.24, zero_phase=False)
     noise = estimate_noise("gyroscope", [apply_filter(recording, settings)], GYROSCOPE)
     assert noise.source == "rests"
     assert noise.white == pytest.approx(0.01, rel=0.1)

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from table_turns import Bench, run_stages, settings, specific_force
+from unit_settings import filter_of
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.reference_least_squares import fit
@@ -12,12 +14,15 @@ from pipeline.model.kinematics import attitude_matrix, reference_motion
 from pipeline.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
 from pipeline.signal.filters import apply_filter
 
+if TYPE_CHECKING:
+    from pipeline.settings import Filter
+
 K = np.eye(3) + np.array([[0.004, 0.011, -0.006], [-0.009, -0.012, 0.003], [0.007, -0.002, 0.018]])
 MATRIX = np.linalg.solve(K, np.eye(3))
 ACCELEROMETER = {"sensor": "accelerometer", "bias": [0.049, -0.013, -0.127], "K": K}
 GYROSCOPE = {"sensor": "gyroscope", "bias": [-3.837, 0.003, 0.255], "K": K}
-RC = {"name": "rc_low_pass", "cutoff_hz": 1.0, "time_constant_s": None, "zero_phase": False}
-BUTTERWORTH = {"name": "low_pass", "cutoff_hz": 1.0, "order": 2, "zero_phase": False}
+RC = filter_of("rc_low_pass", cutoff_hz=1.0, time_constant_s=None, zero_phase=False)
+BUTTERWORTH = filter_of("low_pass", cutoff_hz=1.0, order=2, zero_phase=False)
 
 
 def calibrate(sensor: str, recordings: list[Recording], **table: float) -> SensorCalibration:
@@ -69,9 +74,9 @@ def test_an_attitude_log_is_a_reference_too() -> None:
 
 
 @pytest.mark.parametrize(
-    "applied", [RC, BUTTERWORTH, RC | {"zero_phase": True}], ids=["rc", "butterworth", "zero_phase"]
+    "applied", [RC, BUTTERWORTH, RC.replaced(zero_phase=True)], ids=["rc", "butterworth", "zero_phase"]
 )
-def test_a_filter_on_the_readings_changes_neither_scale_nor_misalignment(applied: dict) -> None:
+def test_a_filter_on_the_readings_changes_neither_scale_nor_misalignment(applied: Filter) -> None:
     for parameters, recordings in (
         (ACCELEROMETER, lambda bench: bench.continuous(30.0, stop=720.0)),
         (GYROSCOPE, lambda bench: bench.turns_at([60.0, -60.0])),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from table_turns import Bench, run_stages, settings, specific_force, stepped_angle
-from unit_settings import with_noise
+from unit_settings import filter_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.correction import corrected, steps_of
@@ -166,7 +166,7 @@ def test_as_printed_still_corrects_noise_free_readings_but_subtracts_the_level_r
 def test_a_delaying_filter_moves_both_extremes_alike_and_leaves_orthogonality_alone() -> None:
     recordings = Bench("accelerometer", BIAS, np.diag(1.0 / SCALE)).continuous(10.0, stop=1080.0)
     late = [
-        apply_filter(r, {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": 0.3, "zero_phase": False})
+        apply_filter(r, filter_of("rc_low_pass", cutoff_hz=None, time_constant_s=0.3, zero_phase=False))
         for r in recordings
     ]
     found = calibrate(late)
@@ -183,7 +183,7 @@ def test_a_rest_beside_a_turn_behind_a_delaying_filter_moves_neither_bias_nor_si
     rate = np.concatenate([np.zeros(25), np.full(103, 30.0), np.zeros(25)])  # one turn and 10 deg, with its rests
     angle = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2.0 * 0.12)])
     late = [
-        apply_filter(r, {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": 0.12, "zero_phase": False})
+        apply_filter(r, filter_of("rc_low_pass", cutoff_hz=None, time_constant_s=0.12, zero_phase=False))
         for r in (bench.turn(axis, angle, rate) for axis in "xyz")
     ]
     found = calibrate(late)

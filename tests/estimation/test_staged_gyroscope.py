@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from table_turns import INTERVAL, Bench, ramped_rate, run_stages, settings
-from unit_settings import with_noise
+from unit_settings import filter_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.correction import corrected, steps_of
@@ -153,7 +153,7 @@ def test_stated_uncertainty_covers_the_truth() -> None:
 
 @pytest.mark.parametrize("zero_phase", [False, True])
 def test_what_a_filter_still_holds_of_a_turn_is_no_rest(zero_phase: bool) -> None:  # noqa: FBT001
-    applied = {"name": "rc_low_pass", "cutoff_hz": 1.0, "time_constant_s": None, "zero_phase": zero_phase}
+    applied = filter_of("rc_low_pass", cutoff_hz=1.0, time_constant_s=None, zero_phase=zero_phase)
     recordings = [apply_filter(r, applied) for r in Bench("gyroscope", BIAS, K).turns_at([200.0])]
     found = calibrate(recordings)
     assert np.allclose(found.bias, BIAS, atol=1e-4)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from unit_settings import filter_of
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.records import Recording
@@ -15,11 +16,6 @@ from pipeline.signal.filters import apply_filter, smooth_temperature
 
 CONFIGS = Path(__file__).parents[2] / "configs/filter"
 FILTERS = ["rc_low_pass", "low_pass", "high_pass", "band_pass", "band_stop"]
-
-
-def _settings(name: str, /, **changes: Any) -> dict[str, Any]:
-    settings: dict[str, Any] = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
-    return {**settings, **changes}
 
 
 def _recording(accelerometer: Any, interval: float = 0.12, time: Any = None) -> Recording:
@@ -41,7 +37,7 @@ def _recording(accelerometer: Any, interval: float = 0.12, time: Any = None) -> 
 
 def test_no_filter_returns_the_recording_itself() -> None:
     recording = _recording(np.arange(5.0))
-    assert apply_filter(recording, _settings("none")) is recording
+    assert apply_filter(recording, filter_of("none")) is recording
 
 
 def test_the_rc_filter_is_equation_3_14_step_by_step() -> None:
@@ -55,7 +51,7 @@ def test_the_rc_filter_is_equation_3_14_step_by_step() -> None:
         dt = time[n] - time[n - 1]
         k = dt / (dt + rc)
         expected[n] = expected[n - 1] + k * (reading[n] - expected[n - 1])
-    out = apply_filter(_recording(reading, time=time), _settings("rc_low_pass", time_constant_s=rc))
+    out = apply_filter(_recording(reading, time=time), filter_of("rc_low_pass", time_constant_s=rc))
     assert out.accelerometer == pytest.approx(expected, abs=1e-9)  # times are rounded to ns
     assert out.gyroscope == pytest.approx(10.0 * expected, abs=1e-8)
 
@@ -63,7 +59,7 @@ def test_the_rc_filter_is_equation_3_14_step_by_step() -> None:
 @pytest.mark.parametrize("rc", [1e-4, 0.1, 50.0, 1e6])
 def test_the_rc_filter_keeps_its_digits_at_any_time_constant(rc: float) -> None:
     reading = np.random.default_rng(2).normal(size=4000)
-    settings = _settings("rc_low_pass", time_constant_s=rc)
+    settings = filter_of("rc_low_pass", time_constant_s=rc)
     out = apply_filter(_recording(reading), settings).accelerometer
     k = 0.12 / (0.12 + rc)
     level, expected = reading[0], [reading[0]]
@@ -76,15 +72,15 @@ def test_the_rc_filter_keeps_its_digits_at_any_time_constant(rc: float) -> None:
 
 def test_a_cutoff_stands_for_the_time_constant() -> None:
     reading = np.random.default_rng(3).normal(size=200)
-    by_cutoff = apply_filter(_recording(reading), _settings("rc_low_pass", cutoff_hz=1 / (2 * np.pi * 0.3)))
-    by_time = apply_filter(_recording(reading), _settings("rc_low_pass", time_constant_s=0.3))
+    by_cutoff = apply_filter(_recording(reading), filter_of("rc_low_pass", cutoff_hz=1 / (2 * np.pi * 0.3)))
+    by_time = apply_filter(_recording(reading), filter_of("rc_low_pass", time_constant_s=0.3))
     assert by_cutoff.accelerometer == pytest.approx(by_time.accelerometer, rel=1e-12)
 
 
 @pytest.mark.parametrize("zero_phase", [False, True])
 @pytest.mark.parametrize(("name", "gain"), [(f, 0.0 if f in {"high_pass", "band_pass"} else 1.0) for f in FILTERS])
 def test_a_constant_passes_without_a_start_up(name: str, gain: float, zero_phase: bool) -> None:  # noqa: FBT001
-    out = apply_filter(_recording(np.full(400, 0.98)), _settings(name, zero_phase=zero_phase))
+    out = apply_filter(_recording(np.full(400, 0.98)), filter_of(name, zero_phase=zero_phase))
     assert out.accelerometer is not None
     assert out.accelerometer[:, 0] == pytest.approx(np.full(400, gain * 0.98), abs=1e-9)
 
@@ -102,7 +98,7 @@ def test_a_constant_passes_without_a_start_up(name: str, gain: float, zero_phase
 def test_a_ramp_comes_out_late_by_delay_s(name: str, changes: dict[str, Any]) -> None:
     rate = 0.7  # g/s
     ramp = rate * np.arange(4000) * 0.12
-    out = apply_filter(_recording(ramp), _settings(name, **changes))
+    out = apply_filter(_recording(ramp), filter_of(name, **changes))
     assert out.accelerometer is not None
     late = (ramp[3000:] - out.accelerometer[3000:, 0]) / rate
     assert late == pytest.approx(np.full(1000, out.filter["delay_s"]), rel=1e-6)
@@ -110,12 +106,12 @@ def test_a_ramp_comes_out_late_by_delay_s(name: str, changes: dict[str, Any]) ->
 
 
 def test_the_rc_filter_is_late_by_its_time_constant() -> None:
-    assert apply_filter(_recording(np.zeros(50)), _settings("rc_low_pass")).filter["delay_s"] == pytest.approx(0.24)
+    assert apply_filter(_recording(np.zeros(50)), filter_of("rc_low_pass")).filter["delay_s"] == pytest.approx(0.24)
 
 
 def test_a_band_pass_delays_the_envelope_at_its_middle_by_delay_s() -> None:
     time = np.arange(6000) * 0.01
-    settings = _settings("band_pass", low_hz=4.0, high_hz=9.0)
+    settings = filter_of("band_pass", low_hz=4.0, high_hz=9.0)
     middle = np.arctan(np.sqrt(np.tan(np.pi * 0.04) * np.tan(np.pi * 0.09))) / (np.pi * 0.01)
     envelope = np.exp(-0.5 * ((time - 30.0) / 3.0) ** 2)
     out = apply_filter(_recording(envelope * np.cos(2 * np.pi * middle * time), interval=0.01), settings)
@@ -127,7 +123,7 @@ def test_a_band_pass_delays_the_envelope_at_its_middle_by_delay_s() -> None:
 @pytest.mark.parametrize("name", FILTERS)
 def test_zero_phase_has_no_delay(name: str) -> None:
     bump = np.exp(-0.5 * ((np.arange(2001) - 1000.0) / 40.0) ** 2)
-    out = apply_filter(_recording(bump), _settings(name, zero_phase=True))
+    out = apply_filter(_recording(bump), filter_of(name, zero_phase=True))
     assert out.filter["delay_s"] == 0.0
     assert out.accelerometer is not None
     assert out.accelerometer[:, 0] == pytest.approx(out.accelerometer[::-1, 0], abs=1e-7)
@@ -137,34 +133,34 @@ def test_zero_phase_has_no_delay(name: str) -> None:
 @pytest.mark.parametrize("name", FILTERS)
 def test_noise_gain_is_what_white_noise_shows(name: str, zero_phase: bool) -> None:  # noqa: FBT001
     noise = np.random.default_rng(4).normal(size=(200_000, 3))
-    out = apply_filter(_recording(noise), _settings(name, zero_phase=zero_phase))
+    out = apply_filter(_recording(noise), filter_of(name, zero_phase=zero_phase))
     assert out.accelerometer is not None
     assert np.std(out.accelerometer) == pytest.approx(out.filter["noise_gain"], rel=0.01)
 
 
 def test_noise_gain_of_the_rc_filter_has_its_closed_form() -> None:
-    out = apply_filter(_recording(np.zeros(50)), _settings("rc_low_pass"))  # k = 1/3: sqrt(k / (2 - k))
+    out = apply_filter(_recording(np.zeros(50)), filter_of("rc_low_pass"))  # k = 1/3: sqrt(k / (2 - k))
     assert out.filter["noise_gain"] == pytest.approx(np.sqrt(0.2), rel=1e-13)
 
 
 def test_noise_gain_is_the_root_of_the_squared_impulse_response() -> None:
     impulse = np.zeros(5000)
     impulse[1] = 1.0
-    out = apply_filter(_recording(impulse), _settings("low_pass", cutoff_hz=0.05, order=3))
+    out = apply_filter(_recording(impulse), filter_of("low_pass", cutoff_hz=0.05, order=3))
     assert out.accelerometer is not None
     assert out.filter["noise_gain"] == pytest.approx(np.sqrt(np.sum(out.accelerometer[:, 0] ** 2)), rel=1e-9)
 
 
 def test_a_cutoff_has_half_the_power() -> None:
     time = np.arange(20_000) * 0.01
-    out = apply_filter(_recording(np.sin(2 * np.pi * 3.0 * time), 0.01), _settings("low_pass", cutoff_hz=3.0, order=5))
+    out = apply_filter(_recording(np.sin(2 * np.pi * 3.0 * time), 0.01), filter_of("low_pass", cutoff_hz=3.0, order=5))
     assert out.accelerometer is not None
     assert np.std(out.accelerometer[5000:, 0]) == pytest.approx(0.5, rel=1e-6)
 
 
 def test_only_readings_are_filtered() -> None:
     recording = _recording(np.random.default_rng(5).normal(size=100))
-    out = apply_filter(recording, _settings("low_pass"))
+    out = apply_filter(recording, filter_of("low_pass"))
     assert out.temperature is recording.temperature
     assert out.table_angle is recording.table_angle
     assert out.filter["name"] == "low_pass"
@@ -174,7 +170,7 @@ def test_only_readings_are_filtered() -> None:
 def test_a_butterworth_filter_starts_anew_after_a_gap_and_says_so() -> None:
     time = np.arange(200) * 0.12 + np.where(np.arange(200) >= 100, 30.0, 0.0)
     step = np.where(np.arange(200) >= 100, 5.0, 1.0)
-    out = apply_filter(_recording(step, time=time), _settings("low_pass"))
+    out = apply_filter(_recording(step, time=time), filter_of("low_pass"))
     assert out.accelerometer is not None
     assert out.accelerometer[:, 0] == pytest.approx(step, abs=1e-12)
     assert [(n.code, n.count) for n in out.notes] == [("N-FILTER-RESTART", 1)]
@@ -182,7 +178,7 @@ def test_a_butterworth_filter_starts_anew_after_a_gap_and_says_so() -> None:
 
 def test_uneven_samples_are_noted() -> None:
     time = np.cumsum(np.random.default_rng(6).uniform(0.1, 0.14, 300))
-    assert [n.code for n in apply_filter(_recording(np.zeros(300), time=time), _settings("low_pass")).notes] == [
+    assert [n.code for n in apply_filter(_recording(np.zeros(300), time=time), filter_of("low_pass")).notes] == [
         "N-FILTER-JITTER"
     ]
 
@@ -204,18 +200,18 @@ def test_uneven_samples_are_noted() -> None:
 )
 def test_an_impossible_setting_is_refused_with_the_numbers(name: str, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        apply_filter(_recording(np.zeros(20)), _settings(name, **changes))
+        apply_filter(_recording(np.zeros(20)), filter_of(name, **changes))
 
 
 def test_a_single_sample_cannot_be_filtered() -> None:
     with pytest.raises(InputError, match="accel_x has 1 samples"):
-        apply_filter(_recording(np.zeros(1)), _settings("low_pass"))
+        apply_filter(_recording(np.zeros(1)), filter_of("low_pass"))
 
 
 def test_all_options_have_the_same_keys_each_with_a_comment() -> None:
-    keys = list(_settings("none"))
+    keys = [*yaml.safe_load((CONFIGS / "none.yaml").read_text(encoding="utf-8"))]
     for name in ["none", *FILTERS]:
-        assert list(_settings(name)) == keys
+        assert [*yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))] == keys
         lines = (CONFIGS / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
         assert all("#" in line for line in lines)
 

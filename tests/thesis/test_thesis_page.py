@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from unit_settings import filter_of
 
 from pipeline.io.yaml_file import read_yaml
 from pipeline.records import Recording
@@ -82,7 +83,7 @@ def test_a_conclusion_is_judged_by_its_interval_over_seeds(conclusion: str, verd
 def test_the_campaign_s_filter_takes_of_a_turn_what_the_page_says() -> None:
     time = np.arange(0.0, 120.0, INTERVAL_S)
     turn = np.radians(30.0) * time
-    settings = {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": TIME_CONSTANT_S, "zero_phase": False}
+    settings = filter_of("rc_low_pass", cutoff_hz=None, time_constant_s=TIME_CONSTANT_S, zero_phase=False)
     reading = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
     turning = Recording("x", "accelerometer", "x", np.round(time * 1e9).astype(np.int64), accelerometer=reading)
     left = np.linalg.norm(np.asarray(apply_filter(turning, settings).accelerometer)[100:], axis=1)

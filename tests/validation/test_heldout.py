@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from unit_settings import settings_of
+from unit_settings import filter_of, settings_of
 
 from pipeline.model.effects import effect
 from pipeline.model.kinematics import earth_rate, reference_motion
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 DT = 0.05
 SENSORS = ("accelerometer", "gyroscope")
 SIGMA = {"accelerometer": 8e-4, "gyroscope": 0.02}
-RC = {"name": "rc_low_pass", "cutoff_hz": 4.0, "time_constant_s": None, "zero_phase": False}
+RC = filter_of("rc_low_pass", cutoff_hz=4.0, time_constant_s=None, zero_phase=False)
 SETTINGS = settings_of(table={"gravity_g": 0.998}, procedure={"holdout_every": 3})
 
 
