@@ -70,7 +70,7 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
 def apply_filter(recording: Recording, settings: Filter) -> Recording:
     """Filter the accelerometer and gyroscope readings of a recording; all other channels are unchanged.
 
-    ``filter`` of the result has these settings, ``delay_s`` (at 0 Hz; for a band-pass at the middle of its band; 0 for a
+    ``filter`` of the result has these settings, ``delay_s`` (at 0 Hz; of a band-pass in the middle of its band; 0 of a
     high-pass, which does not delay signals far above its cutoff) and ``noise_gain``.
 
     Raises ``ConfigurationError`` if a setting is missing or a cutoff is not below half the sampling rate,
