@@ -10,8 +10,7 @@ import yaml
 from pipeline.config.compose import Composer
 from pipeline.config.options import Problem
 from pipeline.files import CONFIGS
-from pipeline.model.sensor_file import as_stated
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -126,18 +125,17 @@ def test_a_range_that_the_file_does_not_list_is_refused(layers: list[str], says:
 
 
 def test_figures_that_are_not_stated_are_those_of_generic_and_named(compose: Compose) -> None:
-    sensor = compose("sensor=bmi055", "sensor.gyroscope.bias=1")["sensor"]
+    sensor = compose("sensor=bmi055", "sensor.gyroscope.bias=1").sensor.json_value
     generic = FILES["generic"]
     for part, bias in (("accelerometer", generic["accelerometer"]["bias"]), ("gyroscope", 1)):
         assert sensor[part]["noise_density"] == generic[part]["noise_density"]
         assert sensor[part]["effects"] == generic[part]["effects"]
         assert sensor[part]["bias"] == bias
         assert ("bias" in sensor[part]["assumed"]) == (part == "accelerometer")
-        assert as_stated(sensor[part])["noise_density"] is None
-    assert (
-        read_config("sensor", "bmi055")["accelerometer"]["noise_density"] == generic["accelerometer"]["noise_density"]
-    )
-    assert read_config("sensor", "adxl355")["gyroscope"]["counts_per_unit"] == generic["gyroscope"]["counts_per_unit"]
+        assert "noise_density" in sensor[part]["assumed"]
+    shipped = {model: shipped_settings(sensor=model).sensor for model in ("bmi055", "adxl355")}
+    assert shipped["bmi055"].accelerometer.noise_density == generic["accelerometer"]["noise_density"]
+    assert shipped["adxl355"].gyroscope.counts_per_unit == generic["gyroscope"]["counts_per_unit"]
 
 
 def test_a_sheet_that_is_complete_stays_as_it_is(compose: Compose) -> None:
