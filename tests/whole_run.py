@@ -71,7 +71,7 @@ def run_campaign(directory: Path, **settings: Any) -> tuple[Campaign, int]:
     code = run_jobs(campaign)
     complete_record(campaign)
     owner, units = read_owner(campaign.results), campaign.units.items()
-    folders = {name: (row.config["procedure"], row.config["ingest"], campaign.folder(name)) for name, row in units}
+    folders = {name: (row.config.procedure, row.config.ingest, campaign.folder(name)) for name, row in units}
     assert owner is not None
     assert owner.units == {name: digests_of_files(*folder) for name, folder in folders.items()}  # read by ingest
     return campaign, code

@@ -29,9 +29,9 @@ def test_the_table_is_named_with_its_accuracy_and_other_ranges_are_set_as_the_co
     last = text.index("\n\n", first)
     uncommented = "\n".join(line.removeprefix("# ") for line in text[first:last].splitlines())
     settings.write_text(text[:first] + uncommented + text[last:])
-    sensor = load_campaign({"campaign": str(directory)}).units["U1"].config["sensor"]
-    assert [sensor["accelerometer"][k] for k in ("full_scale", "counts_per_unit")] == [4, 8192]
-    assert [sensor["gyroscope"][k] for k in ("full_scale", "counts_per_unit")] == [500, 65.5]
+    sensor = load_campaign({"campaign": str(directory)}).units["U1"].config.sensor
+    assert [getattr(sensor.accelerometer, k) for k in ("full_scale", "counts_per_unit")] == [4, 8192]
+    assert [getattr(sensor.gyroscope, k) for k in ("full_scale", "counts_per_unit")] == [500, 65.5]
 
 
 def test_without_a_choice_the_table_of_the_procedure_is_written_down(
@@ -41,21 +41,21 @@ def test_without_a_choice_the_table_of_the_procedure_is_written_down(
     assert "table acutronic: accuracy of its angles 0.00028 deg" in capsys.readouterr().out
     assert main([str(tmp_path / "b"), "--procedure", "six_positions"]) == 0
     assert "table hand: there is no table" in capsys.readouterr().out
-    assert load_campaign({"campaign": str(tmp_path / "b")}).units["U1"].config["table"]["name"] == "hand"
+    assert load_campaign({"campaign": str(tmp_path / "b")}).units["U1"].config.table.name == "hand"
 
 
 @pytest.mark.parametrize("procedure", ["multi_position", "orientations_24", "ferraris"])
 def test_a_campaign_by_hand_calibrates_both_sensors(tmp_path: Path, procedure: str) -> None:
     assert main([str(tmp_path / "a"), "--procedure", procedure]) == 0
-    method = load_campaign({"campaign": str(tmp_path / "a")}).units["U1"].config["method"]
-    assert (method["accelerometer"], method["gyroscope"]) == ("nonlinear_least_squares", "rests_and_moves")
+    method = load_campaign({"campaign": str(tmp_path / "a")}).units["U1"].config.method
+    assert (method.accelerometer, method.gyroscope) == ("nonlinear_least_squares", "rests_and_moves")
 
 
 def test_other_ranges_need_no_overrides_by_hand(tmp_path: Path) -> None:
     assert main([str(tmp_path / "a"), "--sensor", "mpu6050", "--range", "8"]) == 0
-    sensor = load_campaign({"campaign": str(tmp_path / "a")}).units["U1"].config["sensor"]
-    assert [sensor["accelerometer"][k] for k in ("full_scale", "counts_per_unit")] == [8, 4096]
-    assert sensor["gyroscope"]["full_scale"] == 250
+    sensor = load_campaign({"campaign": str(tmp_path / "a")}).units["U1"].config.sensor
+    assert [getattr(sensor.accelerometer, k) for k in ("full_scale", "counts_per_unit")] == [8, 4096]
+    assert sensor.gyroscope.full_scale == 250
     assert "campaign.yaml states the ranges" in (tmp_path / "a" / "README.md").read_text()
     with pytest.raises(ConfigurationError, match="in g, then of the gyroscope in deg/s"):
         main([str(tmp_path / "b"), "--range", "8", "500", "2"])

@@ -26,12 +26,12 @@ def test_each_layer_of_precedence_is_stronger_than_the_one_before(tmp_path: Path
     sheet = "unit,filter,overrides\nU1,,\nU2,rc_low_pass,\nU3,,filter.cutoff_hz=3\nU4,,filter.cutoff_hz=3\n"
     directory = campaign(tmp_path, sheet, "overrides: [filter=low_pass, filter.cutoff_hz=1]")
     units = load(directory).units
-    assert [units[u].config["filter"]["name"] for u in units] == ["low_pass", "rc_low_pass", "low_pass", "low_pass"]
-    assert [units[u].config["filter"]["cutoff_hz"] for u in units] == [1, 1, 3, 3]
+    assert [units[u].config.filter.name for u in units] == ["low_pass", "rc_low_pass", "low_pass", "low_pass"]
+    assert [units[u].config.filter.cutoff_hz for u in units] == [1, 1, 3, 3]
     run = load(directory, overrides=["filter.cutoff_hz=4"], unit_overrides={"U4": ["filter.cutoff_hz=5"]}).units
-    assert [run[u].config["filter"]["cutoff_hz"] for u in run] == [4, 4, 4, 5]
+    assert [run[u].config.filter.cutoff_hz for u in run] == [4, 4, 4, 5]
     swapped = load(directory, overrides="filter=none", unit_overrides={"U1": ["filter=high_pass"]}).units
-    assert [swapped[u].config["filter"]["name"] for u in swapped] == ["high_pass", "none", "none", "none"]
+    assert [swapped[u].config.filter.name for u in swapped] == ["high_pass", "none", "none", "none"]
 
 
 def test_the_command_line_is_stronger_than_the_campaign_for_settings_of_the_run(tmp_path: Path) -> None:
@@ -43,16 +43,16 @@ def test_the_command_line_is_stronger_than_the_campaign_for_settings_of_the_run(
 
 def test_a_plain_string_is_one_override(tmp_path: Path) -> None:
     directory = campaign(tmp_path, "unit\nU1\n")
-    assert load(directory, overrides="table.gravity_g=0.998").units["U1"].config["table"]["gravity_g"] == 0.998
+    assert load(directory, overrides="table.gravity_g=0.998").units["U1"].config.table.gravity_g == 0.998
 
 
 def test_a_semicolon_in_quotes_does_not_separate_overrides(tmp_path: Path) -> None:
     cell = '"ingest.csv.delimiter="";"";filter.cutoff_hz=3"'
     directory = campaign(tmp_path, f"unit,overrides\nU1,{cell}\nU2,ingest.csv.delimiter=semicolon\n")
     units = load(directory).units
-    assert units["U1"].config["ingest"]["csv"]["delimiter"] == ";"
-    assert units["U1"].config["filter"]["cutoff_hz"] == 3
-    assert units["U2"].config["ingest"]["csv"]["delimiter"] == "semicolon"
+    assert units["U1"].config.ingest.csv["delimiter"] == ";"
+    assert units["U1"].config.filter.cutoff_hz == 3
+    assert units["U2"].config.ingest.csv["delimiter"] == "semicolon"
 
 
 def test_an_edited_option_of_the_campaign_is_read_again(tmp_path: Path) -> None:
@@ -67,14 +67,14 @@ def test_an_edited_option_of_the_campaign_is_read_again(tmp_path: Path) -> None:
         lines = f"table: {table}\nmounting_tolerance_deg: {tolerance}\n"
         file.write_text(f"defaults: [three_axis_turns, _self_]\n{lines}")
         unit = load(directory).units["U1"].config
-        assert (unit["table"]["name"], unit["procedure"]["mounting_tolerance_deg"]) == (table, tolerance)
-        assert unit["method"]["name"] == wanted
+        assert (unit.table.name, unit.procedure.mounting_tolerance_deg) == (table, tolerance)
+        assert unit.method.name == wanted
 
 
 def test_defaults_follow_the_procedure_and_the_table(tmp_path: Path) -> None:
     sheet = "unit,procedure,table\nA,,\nB,multi_position,\nC,,hand\nD,six_positions,acutronic\n"
     units = load(campaign(tmp_path, sheet)).units
-    chosen = [(u.config["table"]["name"], u.config["method"]["name"]) for u in units.values()]
+    chosen = [(u.config.table.name, u.config.method.name) for u in units.values()]
     assert chosen == [
         ("acutronic", "reference_least_squares"),
         ("hand", "nonlinear_least_squares"),
@@ -86,15 +86,15 @@ def test_defaults_follow_the_procedure_and_the_table(tmp_path: Path) -> None:
 def test_a_procedure_may_choose_table_and_method(tmp_path: Path) -> None:
     sheet = "unit,procedure,method,overrides\nA,ferraris,,procedure.turns.accuracy_deg=0.5\nB,ferraris,staged,\n"
     units = load(campaign(tmp_path, sheet)).units
-    chosen = [(u.config["table"]["name"], u.config["method"]["name"]) for u in units.values()]
+    chosen = [(u.config.table.name, u.config.method.name) for u in units.values()]
     assert chosen == [("hand", "rests_and_moves"), ("hand", "staged")]
-    assert [u.config["procedure"]["turns"]["accuracy_deg"] for u in units.values()] == [0.5, 3.0]
+    assert [u.config.procedure.turns.accuracy_deg for u in units.values()] == [0.5, 3.0]
 
 
 def test_methods_are_chosen_sensor_by_sensor(tmp_path: Path) -> None:
     sheet = "unit,method,overrides\nA,staged,method.gyroscope=cholesky_lu\n"
-    config = load(campaign(tmp_path, sheet)).units["A"].config["method"]
-    assert config["stages"].json_value == {
+    config = load(campaign(tmp_path, sheet)).units["A"].config.method
+    assert config.stages.json_value == {
         "accelerometer": ["orthogonality", "misalignment", "bias", "scale_factor"],
         "gyroscope": ["bias", "cholesky_lu"],
     }
@@ -207,8 +207,8 @@ def test_a_campaigns_own_configs_are_options(tmp_path: Path) -> None:
     own.mkdir(parents=True)
     shipped = Path(__file__).parents[2] / "configs" / "table" / "acutronic.yaml"
     own.joinpath("mine.yaml").write_text(shipped.read_text().replace("gravity_g: 1.0", "gravity_g: 0.999"))
-    table = load(directory).units["A"].config["table"]
-    assert (table["name"], table["gravity_g"]) == ("mine", 0.999)
+    table = load(directory).units["A"].config.table
+    assert (table.name, table.gravity_g) == ("mine", 0.999)
 
 
 def test_a_campaign_whose_run_makes_the_recordings_reads_them_among_the_results(tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ def test_an_effect_of_one_setup_needs_a_recording_that_is_made_there(tmp_path: P
     entry = "{file: accel_x, role: accelerometer, axis: x, optional: false, setup: home}"
     text = f"table: acutronic\nfolder: raw/{{unit}}\nrecordings:\n  accel_x: {entry}\nholdout_every: 3\n"
     (own / "configs" / "procedure" / "two.yaml").write_text(text)
-    names = load(own).units["A"].config["effects"]["accelerometer"]
+    names = load(own).units["A"].config.effects.accelerometer
     assert names == ["table_tilt@home", "mounting@home"]
     with pytest.raises(
         ConfigurationError, match="bias@hom: no recording of procedure two has setup: hom; nearest: home"

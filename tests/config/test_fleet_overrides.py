@@ -66,7 +66,7 @@ def test_sheet_and_device_state_the_mounting(fleet: Path) -> None:
 
 def test_a_device_is_stronger_than_its_lot_and_a_lot_than_its_model(fleet: Path) -> None:
     units = load(fleet).units
-    told = {n: (u.config["filter"]["cutoff_hz"], u.config["table"]["gravity_g"]) for n, u in units.items()}
+    told = {n: (u.config.filter.cutoff_hz, u.config.table.gravity_g) for n, u in units.items()}
     assert told == {
         "U1": (1, 0.991),
         "U2": (2, 0.992),
@@ -75,16 +75,16 @@ def test_a_device_is_stronger_than_its_lot_and_a_lot_than_its_model(fleet: Path)
         "U5": (5, 0.991),
         "U6": (5, 0.991),
     }
-    assert [units[u].config["filter"]["name"] for u in ("U3", "U4")] == ["low_pass", "high_pass"]
-    assert [units[u].config["filter"]["order"] for u in ("U5", "U6")] == [3, 1]
-    assert units["U6"].config["table"]["name"] == "mark2"
+    assert [units[u].config.filter.name for u in ("U3", "U4")] == ["low_pass", "high_pass"]
+    assert [units[u].config.filter.order for u in ("U5", "U6")] == [3, 1]
+    assert units["U6"].config.table.name == "mark2"
     run = load(fleet, overrides="filter.cutoff_hz=8", unit_overrides={"U4": ["filter.cutoff_hz=9"]}).units
-    assert [run[u].config["filter"]["cutoff_hz"] for u in run] == [8, 8, 8, 9, 8, 8]
+    assert [run[u].config.filter.cutoff_hz for u in run] == [8, 8, 8, 9, 8, 8]
 
 
 def test_the_model_is_the_one_that_a_unit_ends_up_with(fleet: Path) -> None:
     changed = load(fleet, unit_overrides={"U1": ["sensor=stim300"]}).units["U1"].config
-    assert (changed["sensor"]["name"], changed["filter"]["cutoff_hz"]) == ("stim300", 2)
+    assert (changed.sensor.name, changed.filter.cutoff_hz) == ("stim300", 2)
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_no_resolver_is_run_wherever_it_stands(tmp_path: Path, monkeypatch: pyte
 def test_references_to_settings_stay_and_do_not_multiply(tmp_path: Path) -> None:
     own = campaign(tmp_path)
     loaded = load_campaign({"campaign": str(own), "overrides": ['procedure.folder="raw/${sensor.name}/{unit}"']})
-    assert loaded.units["U1"].config["procedure"]["folder"] == "raw/generic/U1"
+    assert loaded.units["U1"].config.procedure.folder == "raw/generic/U1"
     for value, message in {
         "${sensor.accelerometer}": "is a group of settings",
         "${table.rate_accuracy}": "is a group of settings or a reference",
@@ -164,7 +164,7 @@ def test_odd_names_of_units_and_columns_of_ones_own_are_taken(tmp_path: Path) ->
 def test_a_campaign_with_configs_of_its_own_may_lie_anywhere(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
     own = campaign(tmp_path / name, "unit,table\nU1,mine\n", **{"configs/table/mine.yaml": TABLE})
-    assert load_campaign({"campaign": str(own)}).units["U1"].config["table"]["name"] == "mine"
+    assert load_campaign({"campaign": str(own)}).units["U1"].config.table.name == "mine"
 
 
 @pytest.mark.parametrize("name", [b"a\xffb", b"a\nb"], ids=["not UTF-8", "line end"])

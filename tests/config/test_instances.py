@@ -56,7 +56,7 @@ def test_each_unit_of_a_shared_log_has_its_own_readings(tmp_path: Path) -> None:
     for sensor, truth in readings.items():
         config = campaign.units[f"{sensor}-unit"].config
         folder = campaign.folder(f"{sensor}-unit")
-        recording = read_recordings(config["procedure"], config["ingest"], config["sensor"], folder)[0]
+        recording = read_recordings(config.procedure, config.ingest, config.sensor, folder)[0]
         assert recording.accelerometer is not None
         np.testing.assert_allclose(recording.accelerometer, truth[:, :3], rtol=0, atol=1e-9)
         assert recording.gyroscope is not None
@@ -66,7 +66,7 @@ def test_each_unit_of_a_shared_log_has_its_own_readings(tmp_path: Path) -> None:
 def test_the_instance_of_a_topic_is_part_of_its_name(tmp_path: Path) -> None:
     composer = Composer(tmp_path)
     topics = [
-        list(composer.unit("U1", ["ingest=ardupilot", *layers])["ingest"]["mcap"]["topics"])
+        list(composer.unit("U1", ["ingest=ardupilot", *layers]).ingest.mcap["topics"])
         for layers in ([], ["ingest.instance=2"])
     ]
     assert topics == [["IMU[0]"], ["IMU[2]"]]

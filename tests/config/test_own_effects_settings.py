@@ -56,7 +56,7 @@ def test_a_limit_of_an_effect_that_does_not_exist_is_refused_with_the_nearest(be
     wrong = "+sensor.gyroscope.effects.g_sensitivty=0.01"
     with pytest.raises(ConfigurationError, match="no effect is called 'g_sensitivty'; nearest: g_sensitivity"):
         load(bench, overrides=[wrong])
-    limits = load(bench).units["U1"].config["sensor"]["gyroscope"]["effects"]
+    limits = load(bench).units["U1"].config.sensor.gyroscope.effects
     assert {"bend", "warm_up", "warm_up_time_constant"} <= limits.keys()
 
 
@@ -69,17 +69,17 @@ def carried(campaign: Campaign, output: str) -> tuple[list[str], int]:
 
 def test_a_file_beside_the_campaign_is_an_effect_with_its_limits(bench: Path) -> None:
     config = load(bench, overrides="effects.gyroscope=[bend]").units["U1"].config
-    assert config["effects"]["gyroscope"] == ["bend"]
-    assert config["sensor"]["gyroscope"]["effects"]["bend_k"] == 1e-3
-    assert "bend_k" not in config["sensor"]["accelerometer"]["effects"]
+    assert config.effects.gyroscope == ["bend"]
+    assert config.sensor.gyroscope.effects["bend_k"] == 1e-3
+    assert "bend_k" not in config.sensor.accelerometer.effects
     config = load(bench, overrides="sensor.gyroscope.effects.bend=0.5").units["U1"].config
-    assert [v for k, v in config["sensor"]["gyroscope"]["effects"].items() if k.startswith("bend")] == [0.5]
+    assert [v for k, v in config.sensor.gyroscope.effects.items() if k.startswith("bend")] == [0.5]
 
 
 def test_a_configuration_directory_of_the_campaign_may_hold_formulas_too(bench: Path) -> None:
     (bench / "configs" / "effect").mkdir(parents=True)
     (bench / "configs" / "effect" / "third.yaml").write_text(BEND.replace("bend", "third"))
-    assert load(bench, overrides="effects.gyroscope=[third]").units["U1"].config["effects"]["gyroscope"] == ["third"]
+    assert load(bench, overrides="effects.gyroscope=[third]").units["U1"].config.effects.gyroscope == ["third"]
     (bench / "configs" / "effect" / "bend.yaml").write_text(BEND)
     with pytest.raises(ConfigurationError, match="the effect bend is also in"):
         load(bench)

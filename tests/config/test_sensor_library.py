@@ -82,9 +82,9 @@ def test_counts_are_those_of_the_driver_and_fill_the_converter(name: str) -> Non
         assert bool(sheet) == bool(of_driver)
         if not sheet:
             continue
-        ranges = sheet.get("ranges") or {sheet["full_scale"]: sheet["counts_per_unit"]}
+        ranges = sheet.get("ranges") or {sheet.full_scale: sheet.counts_per_unit}
         assert set(ranges) == set(of_driver)
-        assert ranges[sheet["full_scale"]] == sheet["counts_per_unit"]
+        assert ranges[sheet.full_scale] == sheet.counts_per_unit
         for full_scale, counts in ranges.items():
             assert unit / counts == pytest.approx(of_driver[full_scale], rel=5e-3)
             assert full_scale * counts <= 2 ** (bits - 1) * 1.002, "the range is beyond the converter"
@@ -95,20 +95,20 @@ def test_each_range_is_chosen_by_one_override(name: str, compose: Compose) -> No
     for part in ("accelerometer", "gyroscope"):
         for full_scale, counts in ((FILES[name].get(part) or {}).get("ranges") or {}).items():
             config = compose(f"sensor={name}", f"sensor.{part}.range={full_scale:g}")
-            sheet = config["sensor"][part]
-            assert (sheet["full_scale"], sheet["counts_per_unit"]) == (full_scale, counts)
+            sheet = config.sensor.of(part)
+            assert (sheet.full_scale, sheet.counts_per_unit) == (full_scale, counts)
 
 
 def test_a_log_in_counts_follows_the_range(compose: Compose) -> None:
     layers = ["sensor=bmi088", "ingest=arduino_counts", "sensor.accelerometer.range=6"]
-    columns = compose(*layers)["ingest"]["csv"]["columns"]
+    columns = compose(*layers).ingest.csv["columns"]
     assert columns["accel_x"]["counts_per_unit"] == 5460
 
 
 def test_overrides_keep_their_precedence(compose: Compose) -> None:
     layers = ["sensor.accelerometer.range=6", "sensor=bmi088", "sensor.accelerometer.full_scale=5.5"]
-    sheet = compose(*layers)["sensor"]["accelerometer"]
-    assert (sheet["full_scale"], sheet["counts_per_unit"]) == (5.5, 5460)
+    sheet = compose(*layers).sensor.accelerometer
+    assert (sheet.full_scale, sheet.counts_per_unit) == (5.5, 5460)
 
 
 @pytest.mark.parametrize(
@@ -139,6 +139,6 @@ def test_figures_that_are_not_stated_are_those_of_generic_and_named(compose: Com
 
 
 def test_a_sheet_that_is_complete_stays_as_it_is(compose: Compose) -> None:
-    sensor = compose("sensor=mpu6050")["sensor"]
-    assert sensor["accelerometer"]["assumed"] == []
-    assert sensor["accelerometer"]["effects"] == FILES["mpu6050"]["accelerometer"]["effects"]
+    sensor = compose("sensor=mpu6050").sensor
+    assert sensor.accelerometer.assumed == []
+    assert sensor.accelerometer.effects == FILES["mpu6050"]["accelerometer"]["effects"]

@@ -32,9 +32,9 @@ PROFILES = (
 @pytest.mark.parametrize("name", PROFILES)
 def test_composed_profile_is_sound(tmp_path: Path, name: str) -> None:
     config = Composer(tmp_path).unit("U1", ["procedure=multi_position", "sensor=mpu6050", f"ingest={name}"])
-    check_ingest(config["ingest"], config["procedure"])
-    assert config["ingest"]["name"] == name
-    assert mcap_format(config["ingest"]).imu_topic is None
+    check_ingest(config.ingest, config.procedure)
+    assert config.ingest.name == name
+    assert mcap_format(config.ingest).imu_topic is None
 
 
 @pytest.mark.parametrize(("section", "other"), [("csv", "mcap"), ("mcap", "csv")])
@@ -45,17 +45,17 @@ def test_a_profile_without_the_other_section_is_read_with_its_defaults(
     file = tmp_path / "configs" / "ingest" / "mine.yaml"
     file.parent.mkdir(parents=True)
     file.write_text(json.dumps({"name": "mine", section: stated}), encoding="utf-8")
-    ingest = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])["ingest"]
-    assert (ingest[section], ingest[other]) == (stated, {})
-    assert mcap_format(ingest_of(ingest)).imu_topic == (None if section == "csv" else "/imu")
+    ingest = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"]).ingest
+    assert (getattr(ingest, section), getattr(ingest, other)) == (stated, {})
+    assert mcap_format(ingest).imu_topic == (None if section == "csv" else "/imu")
 
 
 def test_counts_of_the_arduino_profile_follow_the_sensor(tmp_path: Path) -> None:
     layers = ["sensor=mpu6050", "ingest=arduino_counts", "sensor.gyroscope.counts_per_unit=65.5"]
     config = Composer(tmp_path).unit("U1", layers)
-    (layout,) = csv_formats(config["ingest"])
+    (layout,) = csv_formats(config.ingest)
     scales = {c.channel: c.counts_per_unit for c in layout.columns}
-    assert scales["accel_x"] == config["sensor"]["accelerometer"]["counts_per_unit"] == 16384.0
+    assert scales["accel_x"] == config.sensor.accelerometer.counts_per_unit == 16384.0
     assert scales["gyro_z"] == 65.5
     assert scales["temperature"] == 340.0
 

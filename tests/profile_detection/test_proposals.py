@@ -54,7 +54,7 @@ def test_a_saved_proposal_works_as_a_profile(tmp_path: Path, kind: str) -> None:
     profile.parent.mkdir(parents=True)
     profile.write_text(as_yaml(proposed(file), "mine"), encoding="utf-8")
     config = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])
-    table = read_csv([file], csv_formats(config["ingest"]), Checks())
+    table = read_csv([file], csv_formats(config.ingest), Checks())
     data = motion()
     offset = LOGGERS[kind].offset
     tolerance = {"a": 0.02, "g": 0.06} if offset else {"a": 2e-3, "g": 2e-2}
@@ -128,8 +128,8 @@ def test_odd_names_of_columns_survive_yaml_and_hydra(tmp_path: Path, cell: str) 
     text = as_yaml(proposed(file), "mine")
     profile.write_text(text, encoding="utf-8")
     config = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])
-    assert config["ingest"]["csv"]["columns"]["time"]["column"] == names["time"]
-    assert read_csv([file], csv_formats(config["ingest"])).time_ns[-1] == 490_000_000
+    assert config.ingest.csv["columns"]["time"]["column"] == names["time"]
+    assert read_csv([file], csv_formats(config.ingest)).time_ns[-1] == 490_000_000
 
 
 def test_text_without_a_table_is_refused_with_its_beginning(tmp_path: Path) -> None:
@@ -185,9 +185,9 @@ def test_registers_under_names_that_differ_in_one_letter_are_read_as_counts(tmp_
     profile = tmp_path / "configs" / "ingest" / "mine.yaml"
     profile.parent.mkdir(parents=True)
     config = Composer(tmp_path).unit("U1", ["sensor=mpu6050", "sensor.accelerometer.range=4"])
-    (proposal,) = propose([layout], config["sensor"])
+    (proposal,) = propose([layout], config.sensor)
     profile.write_text(as_yaml(proposal, "mine"), encoding="utf-8")
-    csv = Composer(tmp_path).unit("U1", ["sensor=mpu6050", "ingest=mine"])["ingest"]["csv"]["columns"]
+    csv = Composer(tmp_path).unit("U1", ["sensor=mpu6050", "ingest=mine"]).ingest.csv["columns"]
     assert [csv[c]["counts_per_unit"] for c in ("accel_y", "gyro_y", "temperature")] == [8192.0, 65.5, 340.0]
     assert (-1182 - csv["temperature"]["offset"]) / 340.0 == pytest.approx(-1182 / 340 + 36.53)
 
@@ -196,12 +196,12 @@ def test_counts_that_a_log_at_rest_does_not_tell_are_those_of_the_stated_sensor(
     layout = find_layout(counts_of_a_slow_turn(turns=0.0).encode(), "log.csv")
     assert propose([layout])[0].unknown() == ["gyro_x", "gyro_y", "gyro_z", "temperature"]
     ranges = ["sensor=mpu6050", "sensor.accelerometer.range=4", "sensor.gyroscope.range=500"]
-    (proposal,) = propose([layout], Composer(tmp_path).unit("U1", ranges)["sensor"])
+    (proposal,) = propose([layout], Composer(tmp_path).unit("U1", ranges).sensor)
     profile = tmp_path / "configs" / "ingest" / "mine.yaml"
     profile.parent.mkdir(parents=True)
     profile.write_text(as_yaml(proposal, "mine"), encoding="utf-8")
     config = Composer(tmp_path).unit("U1", [*ranges, "ingest=mine"])
-    assert config["ingest"]["csv"]["columns"]["gyro_z"]["counts_per_unit"] == 65.5
+    assert config.ingest.csv["columns"]["gyro_z"]["counts_per_unit"] == 65.5
 
 
 @pytest.mark.parametrize("delimiter", [",", ";"])
