@@ -82,9 +82,9 @@ def test_counts_are_those_of_the_driver_and_fill_the_converter(name: str) -> Non
         assert bool(sheet) == bool(of_driver)
         if not sheet:
             continue
-        ranges = sheet.get("ranges") or {sheet.full_scale: sheet.counts_per_unit}
+        ranges = sheet.get("ranges") or {sheet["full_scale"]: sheet["counts_per_unit"]}
         assert set(ranges) == set(of_driver)
-        assert ranges[sheet.full_scale] == sheet.counts_per_unit
+        assert ranges[sheet["full_scale"]] == sheet["counts_per_unit"]
         for full_scale, counts in ranges.items():
             assert unit / counts == pytest.approx(of_driver[full_scale], rel=5e-3)
             assert full_scale * counts <= 2 ** (bits - 1) * 1.002, "the range is beyond the converter"
