@@ -25,6 +25,7 @@ from pipeline.io.files import candidate_files, wrong_name
 from pipeline.io.read import IN_MEMORY, canonical, of_one_sensor, tried
 from pipeline.model.effects import registered
 from pipeline.outcome import run_command
+from pipeline.settings import UserEffectFiles
 from pipeline.unit import Task, UnitFiles, UnitState, run_steps, tasks_of
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 if sys.platform == "linux":  # else threadpoolctl starts the program ldconfig to find the library, which is loaded
     getattr(ThreadpoolController, "_system_libraries", {}).setdefault("libc", CDLL(None))
+NO_EFFECTS = UserEffectFiles(formulas=[], python=[])
 NO_CAMPAIGN = Path(__file__).with_name("no_campaign")  # does not exist: no options or effects of a campaign
 
 
@@ -103,7 +105,8 @@ class ConfiguredUnit:
         The order of summation, and so the last digits, depend on the number of threads.
         """
         effects = self.row.config.user_effects
-        with registered(as_job_reads(effects.json_value) if effects else {}), threadpool_limits(1, "blas"):
+        files = UserEffectFiles.model_validate(as_job_reads(effects.json_value)) if effects else NO_EFFECTS
+        with registered(files), threadpool_limits(1, "blas"):
             yield
 
 

@@ -244,7 +244,7 @@ def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Name
     profile, sensor = arguments.ingest, arguments.sensor
     config = config_of_log(files[0], profile, sensor, campaign=campaign)
     if arguments.range:
-        ranges = settings_of_ranges(config.sensor.model_dump(), arguments.range)
+        ranges = settings_of_ranges({s: config.sensor.of(s) for s in SENSORS}, arguments.range)
         config = config_of_log(files[0], profile, sensor, ranges, campaign)
     ingest, sensor_model = config.ingest, config.sensor if sensor else None
     read_with = f"ingest={ingest.name}" + (f", sensor={sensor}" if sensor else "")

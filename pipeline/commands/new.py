@@ -14,11 +14,13 @@ from pipeline.outcome import run_command
 from pipeline.planning.changes import readme
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.pages import template
-from pipeline.simulation.description import UnitDescription, read_option
+from pipeline.simulation.description import UnitDescription, read_option, shipped_settings
 from pipeline.simulation.procedures import TABLE_PROCEDURES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from pipeline.settings import DataSheet
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
@@ -45,8 +47,9 @@ def main(argv: Sequence[str]) -> int:
     if units_table.exists():
         raise InputError("exists already; choose a directory without a campaign", str(units_table))
     sensor_name = _chosen("sensor", arguments.sensor, "generic")
-    sensor = read_option("sensor", sensor_name)
-    ranges = _chosen_ranges(sensor, arguments.range)
+    stated, completed = read_option("sensor", sensor_name), shipped_settings(sensor=sensor_name).sensor
+    data_sheets = {s: completed.of(s) for s in SENSORS if stated.get(s)}
+    ranges = _chosen_ranges(data_sheets, arguments.range)
     procedure_name = _chosen("procedure", arguments.procedure, "three_axis_turns")
     procedure = read_option("procedure", procedure_name)
     table_name = _chosen("table", arguments.table, procedure["table"])
@@ -59,13 +62,13 @@ def main(argv: Sequence[str]) -> int:
         )
     unit = UnitDescription(arguments.unit, sensor=sensor_name, table=table_name, procedure=procedure_name)
     text = readme(unit, arguments.directory.resolve().name)
-    if ranges != _ranges_of(sensor):
+    if ranges != _ranges_of(data_sheets):
         text += "\nThe sizes apply to the ranges in the sensor file; campaign.yaml states the ranges of this bench.\n"
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)
     folder.mkdir(parents=True, exist_ok=True)
     (arguments.directory / "README.md").write_text(text, encoding="utf-8")
     (arguments.directory / "campaign.yaml").write_text(
-        _campaign(procedure_name, sensor_name, sensor, ranges), encoding="utf-8"
+        _campaign(procedure_name, sensor_name, data_sheets, ranges), encoding="utf-8"
     )
     row = f"{arguments.unit},,,,{sensor_name},{table_name},{procedure_name},"
     units_table.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
@@ -99,9 +102,9 @@ def _chosen(group: str, given: str | None, default: str) -> str:
     return input(f"{group} [{default}]: ").strip() or default
 
 
-def _chosen_ranges(sensor: Mapping[str, Any], given: list[float] | None) -> list[float]:
+def _chosen_ranges(data_sheets: Mapping[str, DataSheet], given: list[float] | None) -> list[float]:
     """Return the range of each sensor: the given one, the user's answer on a terminal, or that of the sensor file."""
-    defaults = _ranges_of(sensor)
+    defaults = _ranges_of(data_sheets)
     if given is None and sys.stdin.isatty():
         shown = " ".join(f"{value:g}" for value in defaults)
         try:
@@ -111,27 +114,24 @@ def _chosen_ranges(sensor: Mapping[str, Any], given: list[float] | None) -> list
     return [*(given or []), *defaults[len(given or []) :]]
 
 
-def _ranges_of(sensor: Mapping[str, Any]) -> list[float]:
-    return [float(sensor[s]["full_scale"]) for s in SENSORS if sensor.get(s)]
+def _ranges_of(data_sheets: Mapping[str, DataSheet]) -> list[float]:
+    return [data_sheet.full_scale for data_sheet in data_sheets.values()]
 
 
-def _campaign(procedure: str, name: str, sensor: Mapping[str, Any], wanted: list[float]) -> str:
+def _campaign(procedure: str, name: str, data_sheets: Mapping[str, DataSheet], wanted: list[float]) -> str:
     """Return ``campaign.yaml``; settings of ranges that equal those of the sensor file are comments."""
-    defaults = [(s, sensor[s]["full_scale"], SENSOR_UNITS[s]) for s in SENSORS if sensor.get(s)]
-    changed = [
-        None if value == float(full_scale) else value
-        for value, (_, full_scale, _) in zip(wanted, defaults, strict=False)
+    defaults = _ranges_of(data_sheets)
+    changed = [None if value == full_scale else value for value, full_scale in zip(wanted, defaults, strict=False)]
+    larger = [
+        min((r for r in data_sheet.ranges or [2.0 * full_scale] if r > full_scale), default=full_scale)
+        for data_sheet, full_scale in zip(data_sheets.values(), defaults, strict=True)
     ]
-    larger = []
-    for s, full_scale, _ in defaults:
-        listed = [float(r) for r in sensor[s].get("ranges") or ()] or [2.0 * full_scale]
-        larger.append(min((r for r in listed if r > full_scale), default=full_scale))
     text: str = template("campaign.yaml").render(
         procedure=procedure,
         sensor=name,
-        held=defaults,
-        settings=settings_of_ranges(sensor, [*changed, *wanted[len(changed) :]]),
-        example=settings_of_ranges(sensor, larger),
+        held=[(s, data_sheet.full_scale, SENSOR_UNITS[s]) for s, data_sheet in data_sheets.items()],
+        settings=settings_of_ranges(data_sheets, [*changed, *wanted[len(changed) :]]),
+        example=settings_of_ranges(data_sheets, larger),
         groups={group: _options(group) for group in GROUPS},
     )
     return text

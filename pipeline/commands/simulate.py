@@ -87,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
         print(f"{text} ({number} of {total}{', ' * bool(left)}{left})", flush=True)
 
     for sensor in sorted({unit.sensor for unit in description.units}):
-        assumed = assumed_figures(sensor, shipped_settings(sensor=sensor).sensor)
+        assumed = assumed_figures(shipped_settings(sensor=sensor).sensor)
         print(f"note: {assumed}\n" if assumed else "", end="")
     hidden = [text.partition("=")[0] for text in arguments.get("effect", ())]
     for key, reason in (not_shown(description.units[0], hidden) if hidden else {}).items():

@@ -16,7 +16,7 @@ fewer digits, programs that write doubles give more.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -62,7 +62,7 @@ class LogChecks:
     ``compensated``: evidence that the log is already compensated; else empty. ``calibrated_range``: of the calibration.
     """
 
-    def __init__(self, calibrated_range: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, calibrated_range: Mapping[str, float | list[float]] | None = None) -> None:
         self.samples = self.reversed = self.repeated = self.window_count = 0
         self.first_reversed = ""
         self.last_time = -np.inf

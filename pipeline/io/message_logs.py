@@ -282,7 +282,7 @@ def _tree(group: Any) -> dict[str, Any]:  # noqa: ANN401  (h5py.Group)
     return found
 
 
-def _of_group(log: LogReader, place: str, tree: Mapping[str, Any]) -> Iterator[Rows]:
+def _of_group(log: LogReader, place: str, tree: Mapping[str, object]) -> Iterator[Rows]:
     """Yield the topics of a group and of the groups in it."""
     arrays: dict[str, NDArray[Any]] = {}
     units: dict[str, str] = {}

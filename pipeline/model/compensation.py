@@ -31,7 +31,7 @@ from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration, V
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from pipeline.model.measurement import Truths
 
@@ -181,7 +181,7 @@ class CompensationStream:
         return truths
 
 
-def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[Any]], bool]:
+def _checked(given: Mapping[str, ArrayLike | None]) -> tuple[dict[str, NDArray[Any]], bool]:
     """Return the signals that are given as arrays of one length, and whether it was a single sample."""
     if given["accelerometer"] is None and given["gyroscope"] is None:
         raise InputError("give accelerometer, gyroscope or both: there is nothing to compensate")
@@ -210,7 +210,7 @@ class Compensation:
     gyroscope: SensorCalibration | None
     unit: str = ""
     covariances: Mapping[str, Values] = field(default_factory=dict)
-    calibrated_range: Mapping[str, Any] = field(default_factory=dict)
+    calibrated_range: Mapping[str, float | list[float]] = field(default_factory=dict)
 
     def apply(
         self,

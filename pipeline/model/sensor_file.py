@@ -16,7 +16,7 @@ from pipeline.history import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.settings import Sensor
+    from pipeline.settings import DataSheet, Sensor
 
 NEEDED = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
 
@@ -25,10 +25,10 @@ def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str
     """Return a sensor's file in which figures that are not stated are taken from ``generic``."""
     out = dict(sensor)
     for part in SENSORS:
-        sensor_config = dict(sensor.get(part) or {k: generic[part][k] for k in ("full_scale", "counts_per_unit")})
-        missing = [key for key in NEEDED if sensor_config.get(key) is None]
+        data_sheet = dict(sensor.get(part) or {k: generic[part][k] for k in ("full_scale", "counts_per_unit")})
+        missing = [key for key in NEEDED if data_sheet.get(key) is None]
         if missing:
-            out[part] = sensor_config | {key: generic[part][key] for key in missing} | {"assumed": missing}
+            out[part] = data_sheet | {key: generic[part][key] for key in missing} | {"assumed": missing}
     return out
 
 
@@ -49,40 +49,40 @@ def range_settings(key: str, value: Any, sensor: Mapping[str, Any]) -> list[tupl
     return [(f"sensor.{part}.full_scale", float(value)), (f"sensor.{part}.counts_per_unit", ranges[float(value)])]
 
 
-def settings_of_ranges(sensor: Mapping[str, Any], wanted: Sequence[float | None]) -> list[str]:
+def settings_of_ranges(data_sheets: Mapping[str, DataSheet], wanted: Sequence[float | None]) -> list[str]:
     """Return the overrides that set the range of the accelerometer, g, then of the gyroscope, deg/s; None: unchanged.
 
-    An override sets ``range`` where the sensor's file lists ranges, else full scale and counts per unit. Raises
-    ``ConfigurationError`` if there are more ranges than sensors, one is not positive, or the file does not list it.
+    ``data_sheets``: of the sensors that the chip has. An override sets ``range`` where the sensor's file lists ranges,
+    else full scale and counts per unit. Raises ``ConfigurationError`` if there are more ranges than sensors, one is not
+    positive, or the file does not list it.
     """
-    parts = [part for part in SENSORS if sensor.get(part)]
-    if len(wanted) > len(parts) or not all(value is None or value > 0.0 for value in wanted):
+    if len(wanted) > len(data_sheets) or not all(value is None or value > 0.0 for value in wanted):
         raise ConfigurationError("--range takes the range of the accelerometer in g, then of the gyroscope in deg/s")
     found = []
-    for part, value in zip(parts, wanted, strict=False):
-        sensor_config = sensor[part]
-        if value is not None and sensor_config.get("ranges"):
-            range_settings(f"sensor.{part}.range", value, sensor)  # refuses what the file does not list
+    for (part, data_sheet), value in zip(data_sheets.items(), wanted, strict=False):
+        if value is not None and data_sheet.ranges:
+            range_settings(f"sensor.{part}.range", value, {part: data_sheet.json_value})  # refuses an unknown range
             found.append(f"sensor.{part}.range={value:g}")
         elif value is not None:
-            counts = float(sensor_config["counts_per_unit"]) * float(sensor_config["full_scale"]) / value
+            counts = data_sheet.counts_per_unit * data_sheet.full_scale / value
             found += [f"sensor.{part}.full_scale={value:g}", f"sensor.{part}.counts_per_unit={counts:.10g}"]
     return found
 
 
-def assumed_figures(name: str, sensor: Sensor) -> str:
+def assumed_figures(sensor: Sensor) -> str:
     """Return the sentence that lists the figures of a ``completed`` sensor from ``generic``; empty for none."""
     parts = [f"{', '.join(found)} of the {part}" for part in SENSORS if (found := sensor.of(part).assumed)]
-    return f"the file of the sensor {name} does not state {', and '.join(parts)}: generic's are used" if parts else ""
+    figures = ", and ".join(parts)
+    return f"the file of the sensor {sensor.name} does not state {figures}: generic's are used" if parts else ""
 
 
 def without_overridden(sensor: dict[str, Any], keys: set[str]) -> dict[str, Any]:
     """Remove figures that an override states (``sensor.gyroscope.bias``) from the ``assumed`` list of a sensor."""
     for part in SENSORS:
-        sensor_config = sensor.get(part) if isinstance(sensor, dict) else None
-        sensor_config = sensor_config if isinstance(sensor_config, dict) else {}
-        assumed = sensor_config.get("assumed")
+        data_sheet = sensor.get(part) if isinstance(sensor, dict) else None
+        data_sheet = data_sheet if isinstance(data_sheet, dict) else {}
+        assumed = data_sheet.get("assumed")
         remaining = [key for key in assumed or () if f"sensor.{part}.{key}" not in keys]
         if assumed and len(remaining) < len(assumed):
-            sensor = {**sensor, part: {**sensor_config, "assumed": remaining}}
+            sensor = {**sensor, part: {**data_sheet, "assumed": remaining}}
     return sensor

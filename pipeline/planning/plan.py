@@ -68,7 +68,7 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
         "at_a_table": simulated.settings.table.motion != "none",
         "minutes": simulated.minutes,
         "samples": sum(r.samples for r in simulated.recordings),
-        "warnings": _warnings(simulated, unit.sensor),
+        "warnings": _warnings(simulated),
         **{sensor: of_sensor(sensor, simulated, half_only=half_only) for sensor in SENSORS},
     }
 
@@ -213,11 +213,11 @@ def stated_noise(data_sheet: DataSheet, interval: float, *, long_rest: bool) -> 
     return Noise(np.full(3, white), wander, data_sheet.wander_time_s, "static" if long_rest else "rests")
 
 
-def _warnings(simulated: SimulatedProcedure, sensor: str) -> list[str]:
+def _warnings(simulated: SimulatedProcedure) -> list[str]:
     """Return the limitations of sensor and table in the procedure, and the assumed figures, as sentences."""
     full = simulated.settings.sensor.gyroscope.full_scale
     rates = [float(np.abs(r.table_rate).max()) for r in simulated.recordings if r.table_rate is not None]
-    fastest, assumed = max(rates, default=0.0), assumed_figures(sensor, simulated.settings.sensor)
+    fastest, assumed = max(rates, default=0.0), assumed_figures(simulated.settings.sensor)
     found = [assumed] if assumed else []
     if fastest > full:
         found.append(f"the fastest turn, {fastest:g} deg/s, is beyond the gyroscope's full scale of {full:g} deg/s")

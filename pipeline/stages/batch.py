@@ -24,7 +24,7 @@ from pipeline.errors import DamagedFileError, failure_of, is_of_run, omission
 from pipeline.files import read_json, write_json
 from pipeline.pack import FAILED, INCOMPLETE, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written, repetitions
-from pipeline.settings import Settings
+from pipeline.settings import Settings, UserEffectFiles
 from pipeline.stages import MODULES
 from pipeline.unit import STEPS, Task, run_step
 
@@ -164,7 +164,7 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
     if "user_effects" in content:
         from pipeline.model.effects import register_user_effects  # noqa: PLC0415  (numpy, where there are any)
 
-        register_user_effects(content["user_effects"])
+        register_user_effects(UserEffectFiles.model_validate(content["user_effects"]))
     of_units, output = content.pop("units"), arguments.pop("output")
     inputs = {name: Pack(arguments.pop(name)) for name in INPUTS[stage]}
     for name in ("recordings", "previous"):

@@ -34,6 +34,7 @@ from pipeline.model.effects.base import Layout, parameter_limits
 from pipeline.model.formula import FUNCTIONS, SIGNALS
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import FittedEffect, Motion, Recording, SensorCalibration
+from pipeline.settings import UserEffectFiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -252,7 +253,7 @@ def test_a_file_that_unfolds_without_end_is_refused(tmp_path: Path) -> None:
 
 
 def test_registered_effects_stand_beside_the_built_in_ones_and_never_for_one() -> None:
-    register_user_effects({"formulas": [read(GEAR)]})
+    register_user_effects(UserEffectFiles(formulas=[read(GEAR)], python=[]))
     assert list(catalogue()) == [*built_in(), "gear_mesh"]
     assert effect("gear_mesh").definition == read(GEAR)
     with pytest.raises(ConfigurationError, match="a built-in effect has this name"):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from pipeline.records import FittedEffect
-    from pipeline.settings import Table
+    from pipeline.settings import Table, UserEffectFiles
 
 FOLDER = CONFIGS / "effect"
 BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
@@ -86,23 +86,23 @@ def register(effect: Effect) -> None:
     _registered[effect.name] = effect
 
 
-def register_user_effects(section: Mapping[str, Any]) -> None:
-    """Register the effects of a job's configuration: ``formulas`` and ``python`` (paths and hashes).
+def register_user_effects(files: UserEffectFiles) -> None:
+    """Register the effects of a job's configuration.
 
     Raises ``ConfigurationError`` if one is faulty.
     """
-    for definition in section.get("formulas", ()):
+    for definition in files.formulas:
         register(effect_from(definition, f"effect {definition.get('name')} of the campaign"))
-    for entry in section.get("python", ()):
+    for entry in files.python:
         register(load_python_effect(entry["path"], entry["sha256"]))
 
 
 @contextmanager
-def registered(section: Mapping[str, Any]) -> Iterator[None]:
+def registered(files: UserEffectFiles) -> Iterator[None]:
     """Add the effects of a configuration to the catalogue within a ``with`` block (``register_user_effects``)."""
     before = dict(_registered)
     try:
-        register_user_effects(section)
+        register_user_effects(files)
         yield
     finally:
         _registered.clear()

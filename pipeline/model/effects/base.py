@@ -15,7 +15,7 @@ import abc
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -31,6 +31,13 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
 OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
 STEP_DEG = 5e-3  # above an encoder's resolution (1e-3 deg), below a step of a program (0.1 deg)
 TURNING_DPS = 0.25  # above a gyroscope's noise and residual bias, below a slow turn of a table (1 deg/s)
+
+
+class Quantity(TypedDict):
+    """A value with its unit, in a document."""
+
+    value: float
+    unit: str
 
 
 class Owner(StrEnum):
@@ -253,8 +260,8 @@ def unit_of(sensor: str) -> str:
     return SENSOR_UNITS[sensor]
 
 
-def largest_by_unit(limits: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Return the largest limit for each unit, from ``{parameter: {value, unit}}``."""
+def largest_by_unit(limits: Mapping[str, Quantity]) -> dict[str, float]:
+    """Return the largest limit for each unit, from the limit of each parameter."""
     found: dict[str, float] = {}
     for limit in limits.values():
         found[limit["unit"]] = max(limit["value"], found.get(limit["unit"], 0.0))

@@ -20,8 +20,11 @@ from pipeline.model.formula import OF_THE_MOTION, SIGNALS, c_number
 from pipeline.records import AXES, Motion, Values
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.model.effects.declaration import Declaration, Term
 
+    Signals = Mapping[str, Values | None]  # None: the recording has no turn axis
 
 AS_DECLARED = (
     *("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning", "excitation", "experiment"),
@@ -145,11 +148,11 @@ class FormulaEffect(DeclaredEffect):
             "record it, or remove the effect from the configuration"
         )
 
-    def _check_finite(self, signals: dict[str, Any], motion: Motion) -> None:
+    def _check_finite(self, signals: Signals, motion: Motion) -> None:
         """Raise ``InputError`` for a formula that is not finite where its signals are finite."""
         for axis, formula in (each for term in (*self._by_axis, *self._shared) for each in term.formulas.items()):
             used = {name: signal for name, signal in _of_axis(signals, axis).items() if name in formula.signals}
-            if any(signal is None for signal in used.values()):
+            if len(used) < len(formula.signals):
                 continue
             value, *given = np.broadcast_arrays(formula(used), *used.values())
             rows, columns = np.nonzero(~np.isfinite(value) & np.logical_and.reduce(np.isfinite(given)))
@@ -162,18 +165,21 @@ class FormulaEffect(DeclaredEffect):
                 )
 
 
-def _of_axis(signals: dict[str, Any], axis: str) -> dict[str, Any]:
-    """Return the signals with u of one axis; of all axes if ``axis`` is empty."""
-    c = AXES.index(axis) if axis else 0
-    return {**signals, "u": signals["u"][:, c : c + 1]} if axis and "u" in signals else signals
+def _of_axis(signals: Signals, axis: str) -> dict[str, Values]:
+    """Return the known signals, with u of one axis; of all axes if ``axis`` is empty."""
+    known = {name: signal for name, signal in signals.items() if signal is not None}
+    if axis and "u" in known:
+        c = AXES.index(axis)
+        known["u"] = known["u"][:, c : c + 1]
+    return known
 
 
-def _value(term: Term, signals: dict[str, Any], n: int) -> Values:
+def _value(term: Term, signals: Signals, n: int) -> Values:
     """Return a term's value, (n, 1) or (n, 3) array; zeros where the motion has no turn axis for its signals."""
     parts = []
     for axis, formula in term.formulas.items():
-        lacking = any(signals[name] is None for name in formula.signals)
-        part = np.zeros(1) if lacking else formula(_of_axis(signals, axis))
+        known = _of_axis(signals, axis)
+        part = formula(known) if formula.signals <= known.keys() else np.zeros(1)
         parts.append(part if part.ndim == 2 else np.broadcast_to(part, (n, 1)))
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
