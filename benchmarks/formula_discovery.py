@@ -47,7 +47,7 @@ from pipeline.model.formula import parse
 from pipeline.model.kinematics import reference_motion
 from pipeline.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.records import SENSORS, Recording
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 from pipeline.simulation.session import Streams, random_environment
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import CYCLE_DEGC, NOISES, Case, draw
@@ -153,7 +153,7 @@ def _span(signal: np.ndarray) -> tuple[float, float]:
 
 
 def _observed(case: Case, recordings: list[Recording]) -> Any:  # noqa: ANN401
-    return observe(case.sensor, recordings, read_config("table", "acutronic"))
+    return observe(case.sensor, recordings, shipped_settings(table="acutronic").table)
 
 
 def _columns(effect: Any, sensor: str, recordings: list[Recording], used: list[str]) -> np.ndarray:  # noqa: ANN401

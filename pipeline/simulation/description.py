@@ -19,7 +19,6 @@ Parameters that are not stated are drawn at random from the sensor file. The key
 from __future__ import annotations
 
 import os
-from copy import deepcopy
 from dataclasses import field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -201,11 +200,6 @@ def _read_mapping(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ConfigurationError("expected a mapping of settings", str(path))
     return data
-
-
-def read_config(group: str, name: str) -> dict[str, Any]:
-    """Return ``read_option``, for a sensor ``completed``; each call returns a new copy."""
-    return deepcopy(_config(group, name))
 
 
 @cache

@@ -33,7 +33,7 @@ from pipeline.model.kinematics import reference_motion
 from pipeline.one_unit import unit_of_recordings
 from pipeline.records import SENSORS, NotCalibrated, coverage_factor
 from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.study.scores import wilson
 
 TURNS = [f"{kind}_{axis}" for kind in ("accel", "gyro") for axis in "xyz"]
@@ -91,14 +91,14 @@ def drawn(
         imperfections=bench,
         effects={f"{sensor}.{effect}": None} if effect else {},
     )
-    rate_error = rng.normal(0.0, float(read_config("table", table)["rate_accuracy"]), 3)
+    rate_error = rng.normal(0.0, shipped_settings(table=table).table.rate_accuracy, 3)
     departure = {"seats": seats, "face": face, "rate_error": rate_error}
     return description, {**departure, "hidden": f"{sensor}.{effect}" if effect else ""}
 
 
 def _drawn_wander(model: str, sensor: str, rng: np.random.Generator) -> dict[str, float]:
     """Return a bias wander of the prior that a fit takes from the sensor file."""
-    prior = wander_prior(None, read_config("sensor", model)[sensor])
+    prior = wander_prior(None, shipped_settings(sensor=model).sensor.of(sensor))
     return {
         "bias_wander": prior.wander * float(np.exp(prior.width * rng.standard_normal())),
         "wander_time_s": prior.time * float(rng.choice(TIME_FACTORS, p=TIME_PRIOR)),

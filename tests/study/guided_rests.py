@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.planning.guide import fitted_by_hand, progress_of, propose
 from pipeline.records import Recording, coverage_factor
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from pipeline.planning.guide import Progress
@@ -29,8 +29,8 @@ RATE_HZ, MOVE_S, SETTLES_S = 20.0, 2.5, 0.5  # a rest is found half a second lat
 HAND_DEG = 1.0  # as configs/table/hand.yaml
 MOST = 90  # rests, after which a unit counts as never reaching the goal
 TRIALS = 4000  # of the bootstrap: its limits are then stable to 0.1 %
-SHEETS = read_config("sensor", "mpu6050")
-SHEET = SHEETS["accelerometer"]
+BY_HAND = shipped_settings(sensor="mpu6050", table="hand")
+SHEET = BY_HAND.sensor.accelerometer
 
 Array = np.ndarray
 
@@ -40,11 +40,11 @@ class Unit:
 
     def __init__(self, seed: tuple[int, ...], dwell: float) -> None:
         rng = np.random.default_rng(seed[:2])
-        self.bias = 0.5 * SHEET["bias"] * rng.uniform(-1, 1, 3)
-        self.gain = np.eye(3) + np.diag(0.5 * SHEET["scale_factor"] * rng.uniform(-1, 1, 3))
-        self.gain += (1 - np.eye(3)) * 0.5 * SHEET["cross_axis"] * rng.uniform(-1, 1, (3, 3))
+        self.bias = 0.5 * SHEET.bias * rng.uniform(-1, 1, 3)
+        self.gain = np.eye(3) + np.diag(0.5 * SHEET.scale_factor * rng.uniform(-1, 1, 3))
+        self.gain += (1 - np.eye(3)) * 0.5 * SHEET.cross_axis * rng.uniform(-1, 1, (3, 3))
         self.rng, self.dwell = np.random.default_rng(seed), dwell
-        self.wander = SHEET["bias_wander"] * self.rng.standard_normal(3)
+        self.wander = SHEET.bias_wander * self.rng.standard_normal(3)
         self.log: list[Array] = []
         self.up: Array | None = None
 
@@ -62,15 +62,15 @@ class Unit:
             move = np.cos(angle) * self.up + np.sin(angle) * across / max(size, 1e-9)
             shake = 0.05 * np.sin(np.pi * share)[:, None] * self.rng.standard_normal((count, 3))
             force = np.concatenate([move + shake, force])
-        keep = np.exp(-1 / RATE_HZ / SHEET["wander_time_s"])
-        steps = SHEET["bias_wander"] * np.sqrt(1 - keep**2) * self.rng.standard_normal(force.shape)
+        keep = np.exp(-1 / RATE_HZ / SHEET.wander_time_s)
+        steps = SHEET.bias_wander * np.sqrt(1 - keep**2) * self.rng.standard_normal(force.shape)
         wander = np.empty_like(force)
         for i, step in enumerate(steps):
             self.wander = keep * self.wander + step
             wander[i] = self.wander
-        white = SHEET["noise_density"] * np.sqrt(RATE_HZ / 2) * self.rng.standard_normal(force.shape)
+        white = SHEET.noise_density * np.sqrt(RATE_HZ / 2) * self.rng.standard_normal(force.shape)
         reading = self.bias + force @ self.gain.T + wander + white
-        self.log.append(np.round(reading * SHEET["counts_per_unit"]) / SHEET["counts_per_unit"])
+        self.log.append(np.round(reading * SHEET.counts_per_unit) / SHEET.counts_per_unit)
         self.up = up
 
     def inside(self, progress: Progress) -> float:
@@ -90,12 +90,7 @@ class Unit:
 
 def of_unit(seed: int, number: int, dwell: float, held_out: int) -> dict[str, float]:
     """Return the goal that orientations_24 sets, in g, and the rests by which the other two reach it."""
-    settings: dict[str, Any] = {
-        "sensor": SHEETS,
-        "table": read_config("table", "hand"),
-        "procedure": {"holdout_every": held_out},
-        "filter": {"name": "none"},
-    }
+    settings = BY_HAND.replaced(procedure=BY_HAND.procedure.replaced(holdout_every=held_out))
     fixed, guided, random = (Unit((seed, number, k), dwell) for k in range(3))
     angles = np.radians(np.arange(8) * 45.0)
     for axis in range(3):
