@@ -142,7 +142,7 @@ def canonical() -> Ingest:
     """Return the ingest profile of the canonical CSV."""
     from pipeline.io.yaml_file import read_yaml  # noqa: PLC0415  (a run reads profiles as settings)
 
-    return Ingest(name="canonical_csv", **read_yaml(CONFIGS / "ingest" / "canonical_csv.yaml"))
+    return Ingest.model_validate(read_yaml(CONFIGS / "ingest" / "canonical_csv.yaml"))
 
 
 def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[str], list[str], list[str]]:
