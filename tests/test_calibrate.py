@@ -511,7 +511,7 @@ def test_the_examples_of_the_document_run(
     configured: list[str] = []
 
     def calibrated(unit: ConfiguredUnit) -> UnitState:
-        configured.append(f"{unit.row.name} {unit.row.config['procedure']['name']}")
+        configured.append(f"{unit.row.name} {unit.row.config.procedure.name}")
         state.calibration = {**from_folder.calibration, "unit": unit.row.name}
         with_effect = [{"name": e, "parameters": {}} for e in unit.row.config.effects.gyroscope]
         state.calibration["gyroscope"] = from_folder.calibration["gyroscope"] | {"effects": with_effect}

@@ -114,8 +114,8 @@ def test_device_files_and_profiles_of_the_version_before_are_loaded(tmp_path: Pa
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
     config = load_campaign({"campaign": str(tmp_path / "bench")}).units["U1"].config
-    assert config["effects"]["gyroscope"] == ["g_sensitivity"]
-    assert config["ingest"]["csv"]["columns"]["accel_x"] == {"column": "ax", "unit": "m/s^2"}
+    assert config.effects.gyroscope == ["g_sensitivity"]
+    assert config.ingest.csv["columns"]["accel_x"] == {"column": "ax", "unit": "m/s^2"}
 
 
 @pytest.mark.parametrize("kind", ["calibration", "validation", "diagnosis"])
