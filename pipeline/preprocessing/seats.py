@@ -31,7 +31,7 @@ import numpy as np
 from pipeline.model.effects import effect
 from pipeline.model.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
 from pipeline.preprocessing.bench import ACROSS, angle_ahead, by_convention, unit
-from pipeline.records import AXES, Note, motion_at_rest
+from pipeline.records import AFTER_BASE, AXES, BASE_COUNT, MATRIX_NAMES, Note, motion_at_rest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,7 +50,8 @@ NOISE_C_G = 4e-3  # likewise in c: half of a K2 of 6e-3 1/g (twice 0.3 %), or 8 
 CLEARLY, OF_TWO_MORE = 1.0, 4.0  # chi-square by which leans have to be better than seats: 1 sigma; 2 sigma with tilt
 FITS = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
 GAUGE = 1e-6  # weight with which the seats have the smallest sum of squares
-OF_K, OF_BIAS, FURTHER = slice(0, 9), slice(9, 12), slice(12, None)  # columns of the design of ``_fit``
+# Columns of the design of ``_fit``: K comes before the bias.
+OF_K, OF_BIAS = slice(0, len(MATRIX_NAMES)), slice(len(MATRIX_NAMES), BASE_COUNT)
 QUARTERS = np.array([0.0, 90.0, 180.0, 270.0])
 TABLE = ("table_tilt", "table_axis_nonorthogonality")
 # Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
@@ -139,16 +140,16 @@ def _fit(turns: Sequence[_Conventional], K: Values, columns: Values, limits: Seq
 
     ``columns`` is (n, 3, 3, m): of each turn c, p and q with K the unit matrix.
     """
-    design = np.zeros((*columns.shape[:3], FURTHER.start + columns.shape[3]))
+    design = np.zeros((*columns.shape[:3], BASE_COUNT + columns.shape[3]))
     for k, turn in enumerate(turns):
         design[k, 1:, :, OF_K] = [np.kron(np.eye(3), ideal) for ideal in turn.ideal]
     design[:, 0, :, OF_BIAS] = np.eye(3)
-    design[..., FURTHER] = K @ columns
+    design[..., AFTER_BASE] = K @ columns
     weight = 1.0 / np.array([[NOISE_C_G], [NOISE_PQ_G], [NOISE_PQ_G]])
     A = (weight[..., None] * design).reshape(9 * len(turns), -1)
     y = (weight * np.array([turn.gravity for turn in turns])).ravel()
     values = np.linalg.lstsq(A, y, rcond=1e-9)[0]
-    exceeded = np.any(np.abs(values[FURTHER]) > np.array(limits))
+    exceeded = np.any(np.abs(values[AFTER_BASE]) > np.array(limits))
     return float("inf") if exceeded else float(np.sum((y - A @ values) ** 2))
 
 

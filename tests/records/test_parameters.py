@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import pipeline
 from pipeline.records import (
     AFTER_BASE,
     BASE,
@@ -71,3 +75,21 @@ def test_an_unknown_covariance_is_zero_and_all_parameters_have_the_common_degree
     assert parameters.units[:4] == ("deg/s", "deg/s", "deg/s", "1")
     assert parameters.coverage_factor == pytest.approx(2.776, abs=5e-4)  # GUM, table G.2
     assert not parameters.expanded_uncertainty.any()
+
+
+def test_no_module_selects_base_parameters_by_number() -> None:
+    """A slice that starts or ends at 12, of values that no call returns, would be of bias and matrix."""
+
+    def by_number(node: ast.AST) -> bool:
+        if isinstance(node, ast.Subscript) and not isinstance(node.value, ast.Call):
+            bounds = [b for s in ast.walk(node.slice) if isinstance(s, ast.Slice) for b in (s.lower, s.upper)]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "slice":
+            bounds = list(node.args)
+        else:
+            return False
+        return any(isinstance(bound, ast.Constant) and bound.value == len(BASE_NAMES) for bound in bounds)
+
+    files = Path(pipeline.__file__).parent.rglob("*.py")
+    found = [(file.name, node) for file in files for node in ast.walk(ast.parse(file.read_text("utf-8")))]
+    assert [(name, ast.unparse(node)) for name, node in found if by_number(node)] == []
+    assert by_number(ast.parse("covariance[3:12, 3:12]", mode="eval").body)
