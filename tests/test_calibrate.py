@@ -31,6 +31,7 @@ from pipeline.config import load_campaign
 from pipeline.errors import InputError, InternalError
 from pipeline.model.effects import catalogue
 from pipeline.one_unit import ConfiguredUnit, notes_of_campaign
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from pipeline.result import UnitResult
@@ -317,10 +318,10 @@ def test_a_result_is_copied_to_another_process(from_folder: UnitResult, frames: 
 
 
 def test_the_page_names_the_override_and_no_command_of_a_campaign(from_folder: UnitResult, tmp_path: Path) -> None:
-    sensor = {"verdict": "missing_effect", "selected": ["warm_up"], "override": "effects.gyroscope=[warm_up]"}
-    gyroscope = from_folder.diagnosis["gyroscope"] | sensor
-    state = from_folder._state
-    diagnosed = state.diagnosed._replace(document=from_folder.diagnosis | {"gyroscope": gyroscope})
+    state, override = from_folder._state, "effects.gyroscope=[warm_up]"
+    of_unit = state.diagnosed.sensors
+    found = replace(of_unit["gyroscope"], verdict=Verdict.MISSING_EFFECT, selected=["warm_up"], override=override)
+    diagnosed = replace(state.diagnosed, sensors=of_unit | {"gyroscope": found})
     missing = replace(from_folder, _state=replace(state, diagnosed=diagnosed))
     missing.report(tmp_path / "new" / "page.html")
     page = (tmp_path / "new" / "page.html").read_text(encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Diagnose which physical effect the model of a sensor lacks: the sensor's part of ``diagnoses/<unit>.json``.
+"""Diagnose which physical effect the model of a sensor lacks.
 
 ``turntable`` or, for rests and moves by hand, ``multi_position`` selects effects and returns ``Findings``.
-``document_of`` states them as a document. ``verdict`` compares this document with the error on held-out motion.
+``diagnosis_of`` states them as a diagnosis, which ``verdict`` compares with the error on held-out motion.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import ALIKE, EVIDENCE, INFLATED
 from pipeline.model.effects import effect
-from pipeline.records import Candidate, SensorDiagnosis
+from pipeline.records import Answer, Candidate, SensorDiagnosis
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -132,7 +132,7 @@ def diagnosis_of(findings: Findings, case: Case) -> SensorDiagnosis:
 def _probabilities(findings: Findings) -> dict[str, Any]:
     """Return probabilities, the answer set, how to reduce it, and upper limits of effects that were not selected."""
     answers = findings.answers
-    sets = [{"effects": list(names), "probability": min(p, CERTAIN)} for names, p in answers.answer_set()]
+    sets = [Answer(names, min(p, CERTAIN)) for names, p in answers.answer_set()]
     limits = {}
     for name, values in answers.upper_limit.items():
         if name in findings.selected or name.startswith(OTHER):

@@ -13,6 +13,7 @@ from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.posterior import CERTAIN
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, unit_of
+from pipeline.records import Answer
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"plain": plain, "listed": listed, "said": _said}
+    environment.filters |= {"plain": plain, "listed": listed, "said": lambda answer: _said(Answer(**answer))}
     environment.globals |= {"is_held": is_held, "largest_by_unit": largest_by_unit, "plus_minus": PLUS_MINUS}
     environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED, "Verdict": Verdict}
     return environment
@@ -72,7 +73,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
     """
     if part is None:
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
-    sets = part.get("answer_set") or []
+    sets = [Answer(**answer) for answer in part.get("answer_set") or []]
     more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
     by_reason: dict[str, list[str]] = {}
     for hidden in part["not_observable"]:
@@ -102,20 +103,20 @@ def listed(words: Sequence[str], conjunction: str = "and") -> str:
     return f" {conjunction} ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
 
 
-def _said(answer: Mapping[str, Any]) -> str:
+def _said(answer: Answer) -> str:
     """Return an answer of an answer set in words, with its probability."""
     names = [
         f"something else that follows the {name.removeprefix(OTHER)}" if name.startswith(OTHER) else plain(name)
-        for name in answer["effects"]
+        for name in answer.effects
     ]
-    return f"{' + '.join(names) or 'nothing'} ({answer['probability']:.2g})"
+    return f"{' + '.join(names) or 'nothing'} ({answer.probability:.2g})"
 
 
-def to_distinguish(sets: Sequence[Mapping[str, Any]], sensor: str, *, on_table: bool) -> str:
+def to_distinguish(sets: Sequence[Answer], sensor: str, *, on_table: bool) -> str:
     """Return the two most probable answers and the experiment that distinguishes them; empty if there is one only."""
     if len(sets) < 2:
         return ""
-    first, second = (each["effects"] for each in sets[:2])
+    first, second = (each.effects for each in sets[:2])
     answers = " from ".join(map(_said, sets[:2]))
     different = [name for name in first if name not in second] or [name for name in second if name not in first]
     if different[0].startswith(OTHER):
@@ -138,7 +139,7 @@ def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Fi
     if not findings.selected:
         if verdict == Verdict.NOTHING_MISSING and findings.answers.sets[0][0]:
             pair = findings.answers.sets[0], ((), dict(findings.answers.sets).get((), 0.0))
-            sets = [{"effects": names, "probability": min(p, CERTAIN)} for names, p in pair]
+            sets = [Answer(names, min(p, CERTAIN)) for names, p in pair]
             return f"to distinguish {to_distinguish(sets, findings.sensor, on_table=on_table)}"
         return findings.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
     entries = {entry.effect: entry for entry in ranking}

@@ -24,7 +24,7 @@ from pipeline.records.calibration import (
     calibrated,
     fit_from_json,
 )
-from pipeline.records.diagnosis import Candidate, SensorDiagnosis
+from pipeline.records.diagnosis import Answer, Candidate, SensorDiagnosis
 from pipeline.records.parameters import (
     AFTER_BASE,
     BASE,
@@ -98,6 +98,7 @@ __all__ = [
     "SENSORS",
     "SENSOR_UNITS",
     "Agreement",
+    "Answer",
     "Budget",
     "BudgetLine",
     "Candidate",

@@ -32,6 +32,18 @@ class Candidate:
 
 
 @dataclass(frozen=True)
+class Answer:
+    """A set of effects that may be what is missing; empty: nothing is."""
+
+    effects: Sequence[str]
+    probability: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of the answer set."""
+        return {"effects": list(self.effects), "probability": self.probability}
+
+
+@dataclass(frozen=True)
 class SensorDiagnosis:
     """A sensor's part of ``diagnoses/<unit>.json``, which ``pipeline/schemas/diagnosis.json`` describes."""
 
@@ -41,7 +53,7 @@ class SensorDiagnosis:
     selected: Sequence[str] = ()
     ranking: Sequence[Candidate] = ()
     probability: Mapping[str, float] = field(default_factory=dict)
-    answer_set: Sequence[Mapping[str, Any]] = ()
+    answer_set: Sequence[Answer] = ()
     upper_limit: Mapping[str, Any] = field(default_factory=dict)
     to_distinguish: str = ""
     not_observable: Mapping[str, str] = field(default_factory=dict)  # effect to the reason
@@ -70,7 +82,7 @@ class SensorDiagnosis:
             "selected": list(self.selected),
             "ranking": [entry.to_json() for entry in self.ranking],
             "probability": dict(self.probability),
-            "answer_set": list(self.answer_set),
+            "answer_set": [answer.to_json() for answer in self.answer_set],
             "upper_limit": dict(self.upper_limit),
             "to_distinguish": self.to_distinguish,
             "not_observable": [{"effect": name, "reason": reason} for name, reason in self.not_observable.items()],

@@ -16,7 +16,7 @@ from pipeline.model import effects
 from pipeline.model.effects import built_in, built_in_files, catalogue
 from pipeline.model.effects.base import Effect, Owner, parameter_limits
 from pipeline.model.kinematics import reference_motion
-from pipeline.records import SENSORS, Motion
+from pipeline.records import SENSORS, Answer, Motion
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "effect"
 BOTH = [
@@ -120,7 +120,7 @@ def test_effects_of_time_or_temperature_are_recognised_by_their_formulas() -> No
 
 
 def test_an_experiment_without_a_table_is_proposed_where_there_is_none() -> None:
-    sets = [{"effects": ["g_sensitivity"], "probability": 0.62}, {"effects": [], "probability": 0.31}]
+    sets = [Answer(["g_sensitivity"], 0.62), Answer([], 0.31)]
     at_table, by_hand = (to_distinguish(sets, "gyroscope", on_table=on_table) for on_table in (True, False))
     assert "rate table" in at_table
     assert by_hand == f"g sensitivity (0.62) from nothing (0.31): {built_in()['g_sensitivity'].experiment_by_hand}"

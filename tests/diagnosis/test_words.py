@@ -7,6 +7,7 @@ import pytest
 from pipeline.diagnosis.words import PLUS_MINUS, in_words, next_experiment
 from pipeline.estimation.posterior import Answers
 from pipeline.model.effects import catalogue
+from tests.published import candidate
 
 
 def part(verdict: str, selected: list[str], answers: list[tuple[list[str], float]]) -> dict[str, Any]:
@@ -131,7 +132,8 @@ def test_an_effect_that_contains_another_needs_no_distinction() -> None:
         selected = ("lever_arm",)
         on_table = True
 
-    entries = part("missing_effect", ["lever_arm"], [])["ranking"]
+    (found,) = part("missing_effect", ["lever_arm"], [])["ranking"]
+    entries = [candidate("lever_arm", look_alikes=found["look_alikes"])]
     said = next_experiment("missing_effect", entries, Found())  # type: ignore[arg-type]
     assert said == f"to confirm lever arm: {catalogue()['lever_arm'].experiment}"
     assert "moved by a known distance" in said
