@@ -204,8 +204,7 @@ class Selection:
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
-        passing = [s for s in scores if self._passes(s, self.names)]
-        values = {s.name: s.delta_bic - (0.0 if s.plausible else MIN_DELTA_BIC) for s in passing}
+        values = {s.name: s.delta_bic - (0.0 if s.plausible else MIN_DELTA_BIC) for s in scores if self._passes(s)}
         if not values:
             return None
         best = max(values, key=lambda name: values[name])
@@ -215,18 +214,21 @@ class Selection:
         name = best if best in DELAYS else tied[0]
         return next(s for s in scores if s.name == name)
 
-    def _passes(self, score: Score, selected: Sequence[str], partners: Sequence[int] = ()) -> bool:
-        """Return whether a candidate passes the gate; a lag cannot be negative, nor be distinguished from a delay.
+    def _passes(self, score: Score, partners: Sequence[int] = ()) -> bool:
+        """Return whether a candidate may be selected; a lag cannot be negative, nor be distinguished from a delay.
 
-        ``selected``: effects in the model of the score. ``partners``: indices of further candidates that were in it.
+        ``partners``: indices of candidates that were in the model of the score in addition to the selected effects.
         """
-        second_delay = score.name in DELAYS and any(name in DELAYS for name in selected)
+        second_delay = score.name in DELAYS and any(name in DELAYS for name in self.names)
         negative_lag = score.name == DELAYS[1] and score.values[0] <= 0
-        if second_delay or negative_lag or not self._possible(score.name, selected):
+        if second_delay or negative_lag or not self._possible(score.name, self.names):
             return False
+        return self._significant(score) and self._matters(score, partners)
+
+    def _significant(self, score: Score) -> bool:
+        """Return whether a candidate passes the gate and the selected effects do not already explain its signal."""
         gain = 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
-        significant = passes(score, self.observations.sensor, len(self.candidates), gain)
-        return score.admissible and significant and self._matters(score, selected, partners)
+        return score.admissible and passes(score, self.observations.sensor, len(self.candidates), gain)
 
     def _possible(self, name: str, selected: Sequence[str]) -> bool:
         """Return whether an effect can be added: it contains no effect of the model, nor is contained in one."""
@@ -235,11 +237,11 @@ class Selection:
         others = [*selected, *(term.effect.name for term in self.base.terms)]
         return not any(name in effect(other).contains or other in effect(name).contains for other in others)
 
-    def _matters(self, score: Score, names: Sequence[str], partners: Sequence[int]) -> bool:
+    def _matters(self, score: Score, partners: Sequence[int]) -> bool:
         """Return whether an effect explains a significant part of a residual that is far above the noise."""
         if self.noise is None:
             return True
-        selected = [*self.ranking.of_effects(names), *partners]
+        selected = [*self.ranking.of_effects(self.names), *partners]
         floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
         residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
         drop = score.drop / self.ranking.samples
@@ -318,8 +320,8 @@ class Selection:
             others = [n for n in self.names if n != name]
             scores = self._given(others)
             delta_bic = scores.pop(name).delta_bic if name in scores else float("-inf")
-            passing = (s for s in scores.values() if not effect(s.name).moves and self._passes(s, others))
-            rival = next(passing, None)
+            able = (s for s in scores.values() if self._significant(s) and not effect(s.name).moves)
+            rival = next((s for s in able if self._possible(s.name, others)), None)
             if rival is not None and rival.delta_bic > delta_bic + MIN_DELTA_BIC:
                 if self._accept(self._replaced(name, rival)):
                     self._refit()
@@ -379,6 +381,6 @@ class Selection:
         for member, partner in ((j, k), (k, j)):
             name = ranking.candidates[member].effect.name
             steps[name] = next(s for s in ranking.scores([partner], self.limits) if s.name == name)
-            if not self._passes(steps[name], [], [partner]) or steps[name].p_value * number >= MAX_FALSE_PROBABILITY:
+            if not self._passes(steps[name], [partner]) or steps[name].p_value * number >= MAX_FALSE_PROBABILITY:
                 return
         self._accept(steps)
