@@ -230,8 +230,9 @@ def test_an_uncertainty_that_no_file_states_is_null(folder: Path, tmp_path: Path
     assert in_part["standard_uncertainty"]["bias"] == pytest.approx([1e-4] * 3)
     assert in_part["expanded_uncertainty"]["matrix"] == [[None] * 3] * 3
     assert in_part["covariance"]["values"][3][3] is None
-    again = read_any(tmp_path / "calibration.json").sensors["accelerometer"].covariance
-    np.testing.assert_allclose(np.diag(again)[:4], [1e-8, 1e-8, 1e-8, 0.0])
+    again = read_any(tmp_path / "calibration.json")
+    np.testing.assert_allclose(np.diag(again.sensors["accelerometer"].covariance)[:4], [1e-8, 1e-8, 1e-8, 0.0])
+    assert "g, matrix not stated\n" in explain_calibration(again)
 
 
 def test_noise_that_both_formats_hold_is_kept_with_its_origin(folder: Path, tmp_path: Path) -> None:
