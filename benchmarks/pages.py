@@ -8,9 +8,7 @@ The least of several runs each.
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -19,14 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.words import in_words
-from pipeline.pack import Pack
-from pipeline.records import SENSORS, calibrated, fit_from_json
+from pipeline.config import load_campaign
+from pipeline.one_unit import unit_of_campaign
+from pipeline.records import SENSORS, calibrated
 from pipeline.report import campaign_page
-from pipeline.report.certificate import certificate, certificate_page
-from pipeline.report.unit_page import render, sensor_temperature
-from pipeline.stages.batch import merge_common
-from pipeline.stages.unit_files import recordings_of
+from pipeline.unit import Task, run_step
 from pipeline.validation.attitude import attitude
 
 if TYPE_CHECKING:
@@ -34,7 +29,6 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import CDPSession
 
-ROOT = Path(__file__).resolve().parents[1]
 UNIT = "mpu6050-2-hidden"
 SORT = "document.querySelector('#all thead tr:nth-child(2) th:nth-child(9) button').click()"
 FILTER = """(() => {
@@ -56,27 +50,15 @@ def least(work: Callable[[], object], runs: int) -> float:
     return 1e3 * min(took)
 
 
-def unit_costs(results: Path, runs: int) -> dict[str, float]:
+def unit_costs(runs: int) -> dict[str, float]:
     """Return CPU milliseconds of what is made of one unit."""
-    batches = results.glob("batches/*")
-    batch = next(b for b in batches if b.is_dir() and f"{UNIT}.html" in Pack(b / "report.zip"))
-    parts: dict[str, Any] = {}
-    for file in results.glob("configs/report-*.json"):
-        parts |= merge_common(json.loads(file.read_text()))["units"]
-    part = parts[UNIT]
-    documents = [Pack(batch / f"{stage}.zip").json(f"{UNIT}.json") for stage in ("calibration", "validate", "diagnose")]
-    recordings = recordings_of({stage: Pack(batch / f"{stage}.zip") for stage in ("ingest", "filter")}, UNIT)
-    last = {s: Pack(max((batch / "fit" / s).glob("*.zip"), key=lambda f: f.stat().st_mtime)) for s in SENSORS}
-    fits = calibrated({s: fit_from_json(s, pack.json(f"{UNIT}.json")) for s, pack in last.items()})
-    words = {s: in_words(documents[2][s], s) for s in SENSORS}
-
-    def report() -> str:
-        made = certificate(*documents[:2], part, sensor_temperature(recordings))
-        return json.dumps(made, indent=1) + certificate_page(UNIT, made)
-
+    unit = unit_of_campaign(load_campaign({"campaign": "demo"}), UNIT)
+    state = unit.run_to("calibration")
+    settings, fits = unit.settings(Task("report")), calibrated(state.fits)
+    assert state.recordings is not None  # noqa: S101
+    recordings = state.recordings.filtered
     return {
-        "page of a unit": least(lambda: render(*documents, recordings, part, words=words), runs),
-        "calibration report, JSON and page": least(report, runs),
+        "page and calibration report of a unit": least(lambda: run_step(Task("report"), state, settings), runs),
         "attitude": least(lambda: attitude(fits["accelerometer"], fits["gyroscope"], recordings), runs),
     }
 
@@ -140,11 +122,8 @@ def main() -> int:
     parser.add_argument("--units", type=int, default=10_000, help="units of the campaign's page")
     parser.add_argument("--runs", type=int, default=10)
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "snakemake", "--cores", "1", "-q", "all", "-s", str(ROOT / "Snakefile")]
-        subprocess.run([*command, "--config", f"results={folder}"], cwd=folder, check=True)
-        for name, cost in unit_costs(Path(folder) / "demo", arguments.runs).items():
-            print(f"{name}: {cost:.1f} ms CPU")
+    for name, cost in unit_costs(arguments.runs).items():
+        print(f"{name}: {cost:.1f} ms CPU")
     rows = fleet(arguments.units)
     page = campaign_page.render("fleet", rows, [])
     cost = least(lambda: campaign_page.render("fleet", rows, []), 3)
