@@ -20,7 +20,7 @@ from pipeline.simulation.procedures import TABLE_PROCEDURES
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.settings import DataSheet
+    from pipeline.settings import DataSheet, Table
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
@@ -53,8 +53,8 @@ def main(argv: Sequence[str]) -> int:
     procedure_name = _chosen("procedure", arguments.procedure, "three_axis_turns")
     procedure = read_option("procedure", procedure_name)
     table_name = _chosen("table", arguments.table, procedure["table"])
-    table = read_option("table", table_name)
-    if (table["motion"] == "none") == (procedure_name in TABLE_PROCEDURES):
+    table = shipped_settings(table=table_name).table
+    if (table.motion == "none") == (procedure_name in TABLE_PROCEDURES):
         known = ", ".join(TABLE_PROCEDURES)
         raise ConfigurationError(
             f"procedure {procedure_name} does not fit table {table_name}: {known} need a table, the others need none "
@@ -79,12 +79,12 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _accuracy(name: str, table: dict[str, Any]) -> str:
+def _accuracy(name: str, table: Table) -> str:
     """Return the assumed accuracy of the table, and how to state another, in words."""
-    if table["motion"] == "none":
+    if table.motion == "none":
         return f"table {name}: there is no table; the unit is placed by hand"
     others = ", ".join(option for option in _options("table") if option != name)
-    angle, rate = f"{table['angle_accuracy_deg']:g} deg", f"{100 * table['rate_accuracy']:g} %"
+    angle, rate = f"{table.angle_accuracy_deg:g} deg", f"{100 * table.rate_accuracy:g} %"
     return (
         f"table {name}: accuracy of its angles {angle}, of its rates {rate} (standard uncertainties); "
         f"for another table, write {others} or the name of your own file in configs/table/ into the column table"

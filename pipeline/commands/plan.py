@@ -17,7 +17,7 @@ from pipeline.planning.plan import plan_of, plan_text
 from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 
 FILE = "simulation.yaml"
@@ -36,16 +36,16 @@ examples:
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline plan``."""
-    arguments = vars(_parser().parse_args(_joined(argv)))
-    campaign: Path | None = arguments["campaign"]
+    arguments = _parser().parse_args(_joined(argv))
+    campaign: Path | None = arguments.campaign
     of_campaign = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
-    for effect in read_effect_files([*of_campaign, *arguments["effects"]]).values():
+    for effect in read_effect_files([*of_campaign, *arguments.effects]).values():
         register(effect)
     first = unit_of(arguments, _described_unit(arguments))
     document = plan_of(first)
-    second = plan_of(_other(arguments["against"], arguments, first)) if arguments["against"] is not None else None
-    gains = [] if second is not None or not arguments["extra"] else best_changes(first, document)
-    if arguments["json"]:
+    second = plan_of(_other(arguments.against, arguments, first)) if arguments.against is not None else None
+    gains = [] if second is not None or not arguments.extra else best_changes(first, document)
+    if arguments.json:
         more = {"against": second} if second is not None else {"extra": [_of_gain(gain) for gain in gains]}
         print(json.dumps({**document, **more}, indent=1))
         return 0
@@ -86,20 +86,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def unit_of(arguments: Mapping[str, Any], base: UnitDescription | None) -> UnitDescription:
+def unit_of(arguments: argparse.Namespace, base: UnitDescription | None) -> UnitDescription:
     """Return the unit to plan: a description, if there is one, in which the options replace values."""
-    options = described(arguments)
+    options = described(vars(arguments))
     if base is None:
         return UnitDescription(unit="plan", **options)
-    if not {"table", "procedure"} & set(arguments):
+    if "table" not in arguments and "procedure" not in arguments:
         del options["table"]
     course = {**base.course, **options.pop("course", {})}
     return replace(base, **options, course=course)
 
 
-def _described_unit(arguments: Mapping[str, Any]) -> UnitDescription | None:
+def _described_unit(arguments: argparse.Namespace) -> UnitDescription | None:
     """Return the unit of the description that the options name; None without a description."""
-    source, campaign, name = (arguments[key] for key in ("source", "campaign", "unit"))
+    source, campaign, name = arguments.source, arguments.campaign, arguments.unit
     if source is not None and campaign is not None:
         raise ConfigurationError("--from and --campaign both name a description; give one of them")
     if campaign is not None:
@@ -120,7 +120,7 @@ def _described_unit(arguments: Mapping[str, Any]) -> UnitDescription | None:
     return units[name] if name is not None else next(iter(units.values()))
 
 
-def _other(options: str, arguments: Mapping[str, Any], first: UnitDescription) -> UnitDescription:
+def _other(options: str, arguments: argparse.Namespace, first: UnitDescription) -> UnitDescription:
     """Return the second procedure: the first with changed options."""
     parser = argparse.ArgumentParser(prog="--against", argument_default=argparse.SUPPRESS, exit_on_error=False)
     add_recording_options(parser)
@@ -131,7 +131,7 @@ def _other(options: str, arguments: Mapping[str, Any], first: UnitDescription) -
     if unknown:
         raise ConfigurationError(f"--against {options!r}: {' '.join(unknown)} is not known; see plan --help")
     kept = {"table": first.table} if "table" in arguments and "procedure" not in given else {}
-    return unit_of({**kept, **vars(given)}, first)
+    return unit_of(argparse.Namespace(**{**kept, **vars(given)}), first)
 
 
 def _of_gain(gain: Gain) -> dict[str, Any]:

@@ -52,7 +52,7 @@ from pipeline.model.sensor_file import completed, range_settings, without_overri
 from pipeline.settings import OF_BENCH, SECTIONS, Method, Procedure, Section, Sensor, Settings, Stages, Unit
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from omegaconf import DictConfig
 
@@ -255,7 +255,7 @@ class Composer:
         if sensor not in applies:
             raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
 
-    def _check_limits(self, sensor: str, limits: Mapping[str, Any]) -> None:
+    def _check_limits(self, sensor: str, limits: Iterable[str]) -> None:
         """Refuse a limit that is neither of an effect nor of its parameter, such as ``warm_up_time_constant``."""
         for name in limits:
             if name not in self.effects and not any(name.startswith(f"{effect}_") for effect in self.effects):

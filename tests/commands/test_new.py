@@ -30,8 +30,8 @@ def test_the_table_is_named_with_its_accuracy_and_other_ranges_are_set_as_the_co
     uncommented = "\n".join(line.removeprefix("# ") for line in text[first:last].splitlines())
     settings.write_text(text[:first] + uncommented + text[last:])
     sensor = load_campaign({"campaign": str(directory)}).units["U1"].config.sensor
-    assert [getattr(sensor.accelerometer, k) for k in ("full_scale", "counts_per_unit")] == [4, 8192]
-    assert [getattr(sensor.gyroscope, k) for k in ("full_scale", "counts_per_unit")] == [500, 65.5]
+    assert [sensor.accelerometer.full_scale, sensor.accelerometer.counts_per_unit] == [4, 8192]
+    assert [sensor.gyroscope.full_scale, sensor.gyroscope.counts_per_unit] == [500, 65.5]
 
 
 def test_without_a_choice_the_table_of_the_procedure_is_written_down(
@@ -54,7 +54,7 @@ def test_a_campaign_by_hand_calibrates_both_sensors(tmp_path: Path, procedure: s
 def test_other_ranges_need_no_overrides_by_hand(tmp_path: Path) -> None:
     assert main([str(tmp_path / "a"), "--sensor", "mpu6050", "--range", "8"]) == 0
     sensor = load_campaign({"campaign": str(tmp_path / "a")}).units["U1"].config.sensor
-    assert [getattr(sensor.accelerometer, k) for k in ("full_scale", "counts_per_unit")] == [8, 4096]
+    assert [sensor.accelerometer.full_scale, sensor.accelerometer.counts_per_unit] == [8, 4096]
     assert sensor.gyroscope.full_scale == 250
     assert "campaign.yaml states the ranges" in (tmp_path / "a" / "README.md").read_text()
     with pytest.raises(ConfigurationError, match="in g, then of the gyroscope in deg/s"):

@@ -125,17 +125,19 @@ def test_a_range_that_the_file_does_not_list_is_refused(layers: list[str], says:
 
 
 def test_figures_that_are_not_stated_are_those_of_generic_and_named(compose: Compose) -> None:
-    sensor = compose("sensor=bmi055", "sensor.gyroscope.bias=1").sensor.json_value
+    sensor = compose("sensor=bmi055", "sensor.gyroscope.bias=1").sensor
     generic = FILES["generic"]
     for part, bias in (("accelerometer", generic["accelerometer"]["bias"]), ("gyroscope", 1)):
-        assert sensor[part]["noise_density"] == generic[part]["noise_density"]
-        assert sensor[part]["effects"] == generic[part]["effects"]
-        assert sensor[part]["bias"] == bias
-        assert ("bias" in sensor[part]["assumed"]) == (part == "accelerometer")
-        assert "noise_density" in sensor[part]["assumed"]
-    shipped = {model: shipped_settings(sensor=model).sensor for model in ("bmi055", "adxl355")}
-    assert shipped["bmi055"].accelerometer.noise_density == generic["accelerometer"]["noise_density"]
-    assert shipped["adxl355"].gyroscope.counts_per_unit == generic["gyroscope"]["counts_per_unit"]
+        sheet = sensor.of(part)
+        assert sheet.noise_density == generic[part]["noise_density"]
+        assert sheet.effects == generic[part]["effects"]
+        assert sheet.bias == bias
+        assert ("bias" in sheet.assumed) == (part == "accelerometer")
+        assert sheet.stated("noise_density") is None
+        assert sheet.stated("full_scale") == sheet.full_scale
+    bmi055, adxl355 = (shipped_settings(sensor=name).sensor for name in ("bmi055", "adxl355"))
+    assert bmi055.accelerometer.noise_density == generic["accelerometer"]["noise_density"]
+    assert adxl355.gyroscope.counts_per_unit == generic["gyroscope"]["counts_per_unit"]
 
 
 def test_a_sheet_that_is_complete_stays_as_it_is(compose: Compose) -> None:
