@@ -29,7 +29,7 @@ from pipeline.simulation.description import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 FILE = "simulation.yaml"
 EPILOG = """\
@@ -69,7 +69,7 @@ def main(argv: Sequence[str]) -> int:
     if source is not None:
         description = read_description(source)
     else:
-        data = _described(arguments)
+        data = _described(argparse.Namespace(**arguments))
         description = description_from(data, "the options")
         directory.mkdir(parents=True, exist_ok=True)
         text = "# Read by: python -m pipeline simulate\n" + yaml.safe_dump(data, sort_keys=False)
@@ -118,15 +118,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _described(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    effects = dict(_effect(text) for text in arguments.get("effect", ()))
-    count, prefix = arguments.get("units", 1), arguments.get("prefix", "U")
-    unit = {"unit": prefix if count > 1 else f"{prefix}001", "count": count, **described(arguments)}
+def _described(arguments: argparse.Namespace) -> dict[str, Any]:
+    effects = dict(_effect(text) for text in getattr(arguments, "effect", ()))
+    count, prefix = getattr(arguments, "units", 1), getattr(arguments, "prefix", "U")
+    unit = {"unit": prefix if count > 1 else f"{prefix}001", "count": count, **described(vars(arguments))}
     if "format" in arguments:
-        unit["format"] = arguments["format"]
+        unit["format"] = arguments.format
     if effects:
         unit["effects"] = effects
-    return {"seed": arguments.get("seed", 0), "units": [unit]}
+    return {"seed": getattr(arguments, "seed", 0), "units": [unit]}
 
 
 def _effect(text: str) -> tuple[str, Any]:

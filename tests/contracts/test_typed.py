@@ -1,10 +1,12 @@
-"""Functions take typed settings and objects; only modules that read or write documents take them as JSON."""
+"""Functions take typed settings and objects; only code that reads or writes documents takes JSON."""
 
 from __future__ import annotations
 
 import ast
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import pytest
 
 import pipeline.settings
 from pipeline.settings import Section
@@ -13,20 +15,74 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 ROOT = Path(pipeline.settings.__file__).parent
-UNTYPED = ("Mapping[str, Any]", "dict[str, Any]", "JSON")
-SECTIONS = {
-    name for name, kind in vars(pipeline.settings).items() if isinstance(kind, type) and issubclass(kind, Section)
-}
-DOCUMENTS: dict[str, str] = {}
+JSON = ("Mapping[str, Any]", "dict[str, Any]", "JSON")
+SECTIONS = {n for n, kind in vars(pipeline.settings).items() if isinstance(kind, type) and issubclass(kind, Section)}
+# Modules and packages with functions that take JSON, by the reason.
+TAKE_JSON = {
+    "the configuration as files and command line state it, before it is checked": (
+        "commands/config.py", "commands/new.py", "config/", "model/sensor_file.py", "settings.py",
+        "simulation/description.py",
+    ),
+    "documents of a run: written, read, and shown on pages, by commands and in formats of other programs": (
+        "commands/explain.py", "commands/noise.py", "exports/", "field_logs/compensate.py", "history.py",
+        "model/calibration_file.py", "model/compensation.py", "outcome.py", "records/", "report/", "result.py",
+        "results_folder.py", "stages/", "study/result.py", "thesis/page.py",
+    ),
+}  # fmt: skip
+# Packages with functions that still take settings, or parts of their results, as JSON.
+NOT_YET = (
+    "diagnosis/", "estimation/", "field_logs/", "io/", "model/", "planning/", "preprocessing/", "profile_detection/",
+    "signal/", "simulation/", "validation/",
+)  # fmt: skip
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+def functions() -> Iterator[tuple[str, Function]]:
     for file in sorted(ROOT.rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                yield file.relative_to(ROOT).as_posix(), node
+        module = file.relative_to(ROOT).as_posix()
+        found = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        yield from ((module, node) for node in found if isinstance(node, Function))
 
 
-def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> Iterator[tuple[str, str]]:
-    for each in (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs):
-        yield each.arg, "" if each.annotation is None else ast.unparse(each.annotation).strip("'\"")
+def parameters(function: Function) -> dict[str, str]:
+    """Return the annotation of each parameter, without quotes."""
+    of = function.args
+    each = [*of.posonlyargs, *of.args, *of.kwonlyargs]
+    return {a.arg: ast.unparse(a.annotation).replace("'", "") if a.annotation else "" for a in each}
+
+
+def test_only_modules_that_read_or_write_documents_take_json() -> None:
+    taking = {
+        module
+        for module, function in functions()
+        for annotation in parameters(function).values()
+        if any(kind in annotation for kind in JSON)
+    }
+    allowed = tuple(place for places in TAKE_JSON.values() for place in places)
+    assert sorted(module for module in taking if not module.startswith((*allowed, *NOT_YET))) == []
+    assert [place for place in allowed if not any(module.startswith(place) for module in taking)] == []
+
+
+def test_settings_have_no_default_beside_their_own() -> None:
+    """``settings.table.latitude_deg or {}`` hides what is not stated."""
+    found = []
+    for module, function in functions():
+        typed = {name for name, annotation in parameters(function).items() if annotation in SECTIONS}
+        for node in ast.walk(function):
+            if isinstance(node, ast.BoolOp) and isinstance(node.values[-1], ast.Dict) and not node.values[-1].keys:
+                names = {n.id for value in node.values for n in ast.walk(value) if isinstance(n, ast.Name)}
+                found += [f"{module}:{node.lineno}"] if names & typed else []
+    assert found == []
+
+
+@pytest.mark.parametrize("suffix", ["py", "j2", "html", "txt", "md"])
+def test_base_parameters_have_names(suffix: str) -> None:
+    """Bias and matrix are ``BIAS``, ``MATRIX`` and ``BASE`` of ``pipeline.records``, and not positions 0 to 12."""
+    by_number = ("[:12]", "[3:12]", "[12:]", "[3:12, 3:12]", "[:12, :12]", "[12:, 12:]")
+    found = []
+    for file in sorted(ROOT.rglob(f"*.{suffix}")):
+        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+            code = line.replace(")[:12])", "")  # the first names of a list
+            found += [f"{file.relative_to(ROOT)}:{number}"] if any(text in code for text in by_number) else []
+    assert found == []
