@@ -10,7 +10,7 @@ from stage_files import write_pack
 
 from pipeline.io.arrow import to_parquet
 from pipeline.pack import FAILED, Pack
-from pipeline.settings import Board, Sensor
+from pipeline.settings import Board
 from pipeline.simulation.description import shipped_settings
 from pipeline.stages.batch import Job
 from pipeline.stages.calibration import _on_board
@@ -35,10 +35,7 @@ def test_the_reference_of_a_board_says_how_the_others_sit(tmp_path: Path) -> Non
         files[sensor] = {f"{c.unit}.json": c.calibrations[sensor].to_json() for c in chips}
     inputs = {stage: Pack(write_pack(tmp_path / f"{stage}.zip", own)) for stage, own in files.items()}
     shipped = shipped_settings(sensor="mpu6050")
-    units = {
-        chip.unit: shipped.replaced(sensor=Sensor.model_validate({"name": "mpu6050", **chip.sensor_config}))
-        for chip in chips
-    }
+    units = {chip.unit: shipped.replaced(sensor=chip.sensor_model) for chip in chips}
     job = Job("calibration", units, {}, inputs, tmp_path / "out.zip", tmp_path)
     board = Board(name="B1", chips=[*names, "lost"])
     found = _on_board(job, names[0], board)
