@@ -6,8 +6,6 @@ import ast
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pytest
-
 import pipeline.settings
 from pipeline.settings import Section
 
@@ -20,7 +18,7 @@ SECTIONS = {n for n, kind in vars(pipeline.settings).items() if isinstance(kind,
 # Modules and packages with functions that take JSON, by the reason.
 TAKE_JSON = {
     "the configuration, effects, profiles and simulations as files state them, before they are checked": (
-        "commands/config.py", "commands/new.py", "config/", "io/ingest_settings.py", "io/message_logs.py",
+        "commands/config.py", "config/", "io/ingest_settings.py",
         "model/effects/", "model/sensor_file.py", "settings.py", "simulation/",
     ),
     "documents of a run: written, read, and shown on pages, by commands and in formats of other programs": (
@@ -71,18 +69,6 @@ def test_settings_have_no_default_beside_their_own() -> None:
                 places = [value for value in node.values if isinstance(value, ast.Name | ast.Attribute)]
                 names = {n.id for place in places for n in ast.walk(place) if isinstance(n, ast.Name)}
                 found += [f"{module}:{node.lineno}"] if names & typed else []
-    assert found == []
-
-
-@pytest.mark.parametrize("suffix", ["py", "j2", "html", "txt", "md"])
-def test_base_parameters_have_names(suffix: str) -> None:
-    """Bias and matrix are ``BIAS``, ``MATRIX`` and ``BASE`` of ``pipeline.records``, and not positions 0 to 12."""
-    by_number = ("[:12]", "[3:12]", "[12:]", "[3:12, 3:12]", "[:12, :12]", "[12:, 12:]")
-    found = []
-    for file in sorted(ROOT.rglob(f"*.{suffix}")):
-        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
-            code = line.replace(")[:12])", "")  # the first names of a list
-            found += [f"{file.relative_to(ROOT)}:{number}"] if any(text in code for text in by_number) else []
     assert found == []
 
 
