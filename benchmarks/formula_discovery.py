@@ -50,7 +50,7 @@ from pipeline.records import SENSORS, Recording
 from pipeline.simulation.description import shipped_settings
 from pipeline.simulation.session import Streams, random_environment
 from pipeline.study.bench import recordings_of
-from pipeline.study.cases import CYCLE_DEGC, NOISES, Case, draw
+from pipeline.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
 from pipeline.study.run import held_out_errors
 from pipeline.study.scores import wilson
 
@@ -65,7 +65,7 @@ WARM_UP = re.compile(r"exp\(\([\d.]+ - time\)")
 REPRODUCED, AT_FLOOR = 0.95, 1.05
 
 
-def signals_of(case: Case, recording: Recording) -> dict[str, Any]:
+def signals_of(case: StudyCase, recording: Recording) -> dict[str, Any]:
     """Return the true signals at every sample, u of all axes; None where a recording has no such signal."""
     room = random_environment(Streams(case.seed, case.number)["room"])
     if case.room_degc is not None:
@@ -120,7 +120,7 @@ def left(target: np.ndarray, columns: np.ndarray) -> float:
     return float(np.std(target - (columns / size) @ np.linalg.lstsq(columns / size, target, rcond=1e-9)[0]))
 
 
-def hide(case: Case) -> tuple[list[Recording], str, list[float]]:
+def hide(case: StudyCase) -> tuple[list[Recording], str, list[float]]:
     """Return recordings with a formula hidden in them, the formula, and its coefficient on each axis."""
     recordings = recordings_of(case)
     signals = {r.name: signals_of(case, r) for r in recordings}
@@ -152,7 +152,7 @@ def _span(signal: np.ndarray) -> tuple[float, float]:
     return float(signal.min()), float(signal.max())
 
 
-def _observed(case: Case, recordings: list[Recording]) -> Any:  # noqa: ANN401
+def _observed(case: StudyCase, recordings: list[Recording]) -> Any:  # noqa: ANN401
     return observe(case.sensor, recordings, shipped_settings(table="acutronic").table)
 
 
@@ -201,7 +201,7 @@ def _collect(node: ast.expr, power: float, powers: Counter[str]) -> None:
         powers[ast.unparse(node)] += power
 
 
-def same(hidden: str, found: list[str], recordings: list[Recording], case: Case) -> bool:
+def same(hidden: str, found: list[str], recordings: list[Recording], case: StudyCase) -> bool:
     """Return whether formulas have the form of the hidden one, and reproduce it where all signals are independent."""
     if signature([hidden]) != signature(found):
         return False
@@ -228,7 +228,7 @@ def hidden(number: int, seed: int, depth: str) -> JSON:
     rng = np.random.default_rng([seed, number])
     sensor = SENSORS[int(rng.integers(2))]
     way = str(rng.choice(["stop_and_go", "continuous"], p=[0.7, 0.3]))
-    case = Case("formula", number, seed, MODEL, sensor, way, room_degc=CYCLE_DEGC)
+    case = StudyCase("formula", number, seed, MODEL, sensor, way, room_degc=CYCLE_DEGC)
     recordings, text, size = hide(case)
     began = time.process_time()
     unit = unit_of(recordings, depth)

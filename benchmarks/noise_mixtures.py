@@ -25,7 +25,7 @@ from scipy.signal import fftconvolve, lfilter
 from scipy.stats import beta
 
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.estimation.noise_search import Search, best_of, count_of
+from pipeline.estimation.noise_search import CompositionSearch, best_of, count_of
 from pipeline.estimation.noise_terms import STOCHASTIC, solved, spectrum_of
 from pipeline.records import Recording
 
@@ -132,7 +132,7 @@ def long_enough(n: int, dt: float, terms: list[Term]) -> bool:
     columns = (*required, 1) if ramp else required
     order = sorted((term for term in terms if term[0] not in "RS"), key=lambda x: STOCHASTIC.index(NAMES[x[0]]))
     truth = np.array([2.0 * np.log(x[1]) for x in order] + [np.log(x[2]) if x[0] == "G" else 0.0 for x in order])
-    search = Search(spectrum, 0)
+    search = CompositionSearch(spectrum, 0)
     solved(spectrum, search.fit([(kinds, truth)], columns))
     best = solved(spectrum, best_of(search, required, [1]))
     if (best.kinds, best.columns) != (kinds, columns):

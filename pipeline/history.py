@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 FOLDER = "history"
 VALUES = "values"  # key of a state: the values of each configuration section
-DIGITS = 16  # of a digest
-LONGEST = 60  # characters of a value; a longer one is cut and ends in its digest
-NAMED = 4  # changed values and recordings that a text names
+DIGEST_DIGITS = 16  # of a digest
+MAX_VALUE_LENGTH = 60  # characters of a value; a longer one is cut and ends in its digest
+NAMED_CHANGES = 4  # changed values and recordings that a text names
 SENSORS = ("accelerometer", "gyroscope")
 
 
 @dataclass(frozen=True)
-class Change:
+class StateChange:
     """The differences between two states of a unit.
 
     ``added``, ``removed``: effects of each sensor; ``settings``: other overrides, each as ``key: before -> after``;
@@ -65,7 +65,7 @@ class Change:
 
 def digest(value: Any) -> str:  # noqa: ANN401  (any JSON value)
     """Return a digest of a value."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:DIGITS]
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:DIGEST_DIGITS]
 
 
 def flat(value: Any, above: str = "") -> dict[str, str]:  # noqa: ANN401  (any JSON value)
@@ -75,7 +75,11 @@ def flat(value: Any, above: str = "") -> dict[str, str]:  # noqa: ANN401  (any J
             k: v for key, below in value.items() for k, v in flat(below, f"{above}.{key}" if above else key).items()
         }
     text = value if isinstance(value, str) else json.dumps(value)
-    return {above: text if len(text) <= LONGEST else f"{text[: LONGEST - DIGITS]}... ({digest(value)})"}
+    return {
+        above: text
+        if len(text) <= MAX_VALUE_LENGTH
+        else f"{text[: MAX_VALUE_LENGTH - DIGEST_DIGITS]}... ({digest(value)})"
+    }
 
 
 def unit_state(
@@ -116,7 +120,7 @@ def _digest(entry: JSON) -> str:
     """Return the digest of a recording: of its file and the files that are joined to it."""
     digests = [str(file.get("sha256")) for file in (entry, *entry.get("joined", []))]
     whole = digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
-    return whole[:DIGITS]
+    return whole[:DIGEST_DIGITS]
 
 
 def _largest(uncertainty: Mapping[str, Any]) -> dict[str, float]:
@@ -189,7 +193,7 @@ def of_units(entries: Sequence[JSON]) -> dict[str, list[tuple[int, JSON]]]:
     return histories
 
 
-def difference(before: JSON, after: JSON) -> Change:
+def difference(before: JSON, after: JSON) -> StateChange:
     """Return the differences between two states of a unit."""
     fitted = [{s: (state.get(s) or {}).get("effects") or [] for s in SENSORS} for state in (before, after)]
     calibrated = [state.get("status") == "ok" for state in (before, after)]
@@ -214,11 +218,11 @@ def difference(before: JSON, after: JSON) -> Change:
         other.append(_named("other values in the files of the configuration", values))
     elif before and not (settings or other or any(added.values()) or any(removed.values())):
         other.append("computed again")
-    return Change(added, removed, settings, other)
+    return StateChange(added, removed, settings, other)
 
 
 def _named(what: str, names: Sequence[str]) -> str:
-    return f"{what}: {', '.join(first(names, NAMED))}" if names else what
+    return f"{what}: {', '.join(first(names, NAMED_CHANGES))}" if names else what
 
 
 def _changed_recordings(before: JSON, after: JSON) -> list[str]:

@@ -111,20 +111,20 @@ class ConfiguredUnit:
 
 
 @dataclass
-class Trial:
+class TriedUnit:
     """A unit after the steps that were tried, and the failure record of a run; None if no step failed."""
 
     state: UnitState
     failure: dict[str, Any] | None = None
 
 
-def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> Trial:
+def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> TriedUnit:
     """Run the steps of a unit as a run does, where an error stops only this unit."""
     state = unit.state()
     try:
-        return Trial(unit.run_to(until, fits=fits, state=state))
+        return TriedUnit(unit.run_to(until, fits=fits, state=state))
     except Exception as error:  # noqa: BLE001  (as in a run)
-        return Trial(state, failure_of(error, unit.row.name, state.task))
+        return TriedUnit(state, failure_of(error, unit.row.name, state.task))
 
 
 def unit_of_campaign(campaign: Campaign, unit: str) -> ConfiguredUnit:

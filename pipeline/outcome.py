@@ -29,7 +29,7 @@ UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 DIAGNOSIS_FAILED = "diagnosis_failed"  # stands for a verdict in lists; in documents it is ``Verdict.NOT_ENOUGH_DATA``
 ZERO = re.compile(r"(?<=zero_deg=)-?[0-9.]+")
 ALIKE_DEG = 0.1  # gravity shows a zero to some hundredths of a degree (docs/mounting.md, What is checked)
-NAMED = 5  # units that a line names, and lines of one kind
+NAMED_PER_LINE = 5  # units that a line names, and lines of one kind
 SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
@@ -139,7 +139,7 @@ def place(verdict: str | None) -> int:
 
 def lines_of(groups: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     """Return a line for each group of units; it names the first units of a large group."""
-    return [f"{what}: {', '.join(first(units, NAMED))}" for what, units in groups]
+    return [f"{what}: {', '.join(first(units, NAMED_PER_LINE))}" for what, units in groups]
 
 
 def commands_of(
@@ -201,16 +201,18 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     lines += lines_of(beyond_limits_groups(rows))
     lines += lines_of(_not_in_uncertainty(rows).items())
     for column, words in (("left_out", "left out"), ("incomplete", "not complete")):
-        lines += first([f"{r['unit']}, {words}: {what}" for r in rows if (what := r.get(column))], NAMED, "units")
+        lines += first(
+            [f"{r['unit']}, {words}: {what}" for r in rows if (what := r.get(column))], NAMED_PER_LINE, "units"
+        )
     entries = read_history(results) if of_this_run else []
     if entries:
-        lines += first(_changes(entries), NAMED, "sensors that changed")
+        lines += first(_changes(entries), NAMED_PER_LINE, "sensors that changed")
         no_longer = [
             f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; "
             f"to have it in every run: {add_command(settings, unit, effects, folder)}"
             for (unit, run), effects in dropped(entries).items()
         ]
-        lines += first(no_longer, NAMED, "units that no longer have an effect")
+        lines += first(no_longer, NAMED_PER_LINE, "units that no longer have an effect")
     lines += [f"{what}: {command}" for what, command in next_commands(findings, settings, folder)]
     return "\n".join(lines) + "\n"
 
@@ -234,7 +236,7 @@ def _reasons(results: Path, units: Sequence[str]) -> list[str]:
                 groups = kinds.setdefault(kind, {})
                 if doubt:
                     groups.setdefault(f"{sensor}, {doubt}", []).append(unit)
-    return [line for groups in kinds.values() for line in first(lines_of(groups.items()), NAMED, "reasons")]
+    return [line for groups in kinds.values() for line in first(lines_of(groups.items()), NAMED_PER_LINE, "reasons")]
 
 
 def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 Files = dict[str, Any]  # name to bytes, text, or a value that is written as JSON
-LEVEL = 1  # of zlib: takes 7.5 ms per MB of pages; level 6 takes 22 ms and saves 17 % (pages of data/demo)
+COMPRESSION_LEVEL = 1  # of zlib: takes 7.5 ms per MB of pages; level 6 takes 22 ms and saves 17 % (pages of data/demo)
 
 
 class Pack:
@@ -83,7 +83,7 @@ def new_pack(path: Path) -> Iterator[Callable[[Mapping[str, bytes]], None]]:
         def add(files: Mapping[str, bytes]) -> None:
             for name, content in files.items():
                 method = zipfile.ZIP_STORED if name.endswith(".parquet") else zipfile.ZIP_DEFLATED
-                archive.writestr(zipfile.ZipInfo(name), content, method, LEVEL)
+                archive.writestr(zipfile.ZipInfo(name), content, method, COMPRESSION_LEVEL)
 
         yield add
         archive.close()

@@ -56,13 +56,13 @@ BESIDE = (  # not published as a set
 OF_A_RUN = ("calibrations/*.json", f"{PACKS}/*/*.zip", "batches/*/*.zip", "history/*.json", "simulated/truth/*.json")
 RUN_LOCK, JOBS_LOCK, OWNER = ".run.lock", ".jobs.lock", ".owner.json"
 PACK = re.compile(rf"{PACKS}/([^/]+)/(?:{'|'.join((*STAGES, WITH_PRIOR))})\.zip")
-NEW = ".new"  # folder of a new set of files, below the results
+NEW_FOLDER = ".new"  # folder of a new set of files, below the results
 COMPLETE, PLAN, EXCHANGED = ".published", ".plan.json", ".exchanged.json"
 REPLACED = "replaced-"  # and the date: folder of the results for what a run replaced and did not write anew
-UNKNOWN = "_unknown.yaml"  # end of the name of a suggested formula: <unit>_<sensor>_unknown.yaml
+SUGGESTED_SUFFIX = "_unknown.yaml"  # end of the name of a suggested formula: <unit>_<sensor>_unknown.yaml
 DELAYED_SIGNALS = {signal.SIGINT, signal.SIGTERM}  # blocked during the exchange, which takes milliseconds
 SNAKEMAKE_TIMESTAMP = ".snakemake_timestamp"  # Snakemake writes it into every output folder
-HELD: list[IO[str]] = []  # locks, open until the process ends
+OPEN_LOCKS: list[IO[str]] = []  # locks, open until the process ends
 
 
 class BusyError(PipelineError):
@@ -81,7 +81,7 @@ def take_run(results: Path) -> None:
     stream.truncate(0)
     stream.write(f"process {os.getpid()} on {socket.gethostname()}")
     stream.flush()
-    HELD.append(stream)
+    OPEN_LOCKS.append(stream)
 
 
 def jobs_running(results: Path) -> bool:
@@ -95,7 +95,7 @@ def hold_as_job(results: Path) -> None:
     if results.is_dir():
         stream = _open(results / JOBS_LOCK)
         _locked(stream, fcntl.LOCK_SH)
-        HELD.append(stream)
+        OPEN_LOCKS.append(stream)
 
 
 def _open(path: Path) -> IO[str]:
@@ -148,7 +148,7 @@ def publish(
 
 def new_simulated(folder: Path) -> Path:
     """Return the empty folder for the recordings that ``publish_simulated`` exchanges with ``<results>/simulated``."""
-    new = folder.parent / NEW
+    new = folder.parent / NEW_FOLDER
     shutil.rmtree(new, ignore_errors=True)
     (new / folder.name).mkdir(parents=True)
     return new / folder.name
@@ -162,7 +162,7 @@ def publish_simulated(folder: Path) -> None:
         before = stamp.stat().st_mtime_ns
         states = _states(folder, folder.name)
         written = {path: s for path, s in states.items() if (results / path).lstat().st_mtime_ns <= before}
-    publish(results / NEW, results, again=_read_record(results, "")[0], paths=[folder.name], written=written)
+    publish(results / NEW_FOLDER, results, again=_read_record(results, "")[0], paths=[folder.name], written=written)
 
 
 def finish_publishing(results: Path) -> None:
@@ -266,8 +266,8 @@ def unit_of(path: str) -> str:
     folder, _, name = path.partition("/")
     if folder == "exports":
         return name.partition("/")[0]
-    if folder == "diagnoses" and name.endswith(UNKNOWN):
-        return name.removesuffix(UNKNOWN).rpartition("_")[0]
+    if folder == "diagnoses" and name.endswith(SUGGESTED_SUFFIX):
+        return name.removesuffix(SUGGESTED_SUFFIX).rpartition("_")[0]
     return name.rpartition(".")[0]
 
 
@@ -275,7 +275,7 @@ def _same_bytes(one: Path, other: Path) -> bool:
     return all(p.is_file() and not p.is_symlink() for p in (one, other)) and filecmp.cmp(one, other, shallow=False)
 
 
-class Owner(NamedTuple):
+class ResultsOwner(NamedTuple):
     """The campaign to which a results folder belongs, in ``.owner.json``.
 
     ``campaign``: its path; ``simulation``: SHA-256 of the description, if the run simulates the recordings; ``units``:
@@ -287,12 +287,12 @@ class Owner(NamedTuple):
     units: dict[str, list[str]]
 
 
-def read_owner(results: Path) -> Owner | None:
+def read_owner(results: Path) -> ResultsOwner | None:
     """Return the owner of a results folder; None where the file is missing or damaged."""
     try:
         found = json.loads((results / OWNER).read_text(encoding="utf-8"))
         units = {str(unit): [str(digest) for digest in digests] for unit, digests in found["units"].items()}
-        return Owner(str(found["campaign"]), found["simulation"], units)
+        return ResultsOwner(str(found["campaign"]), found["simulation"], units)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
@@ -321,7 +321,7 @@ def recorded_directories(results: Path) -> set[str]:
     return found
 
 
-def write_owner(results: Path, owner: Owner) -> None:
+def write_owner(results: Path, owner: ResultsOwner) -> None:
     """Record the owner of a results folder, unless the record says so already."""
     if owner != read_owner(results):
         write_atomically(results / OWNER, json.dumps(owner._asdict()))

@@ -50,19 +50,28 @@ PER_BATCH = (
 )  # fmt: skip
 AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
 EFFECTS = "fit effects"
-LEAST_SHARE = 0.1  # least remaining time of a current unit, as a share of its usual or its elapsed time
+MIN_REMAINING_SHARE = 0.1  # least remaining time of a current unit, as a share of its usual or its elapsed time
 LAST_STAGE = "report"  # its units are counted as done
-NAMED_JOBS, NAMED = 2, 10
+NAMED_JOBS, NAMED_UNITS_OF_RUN = 2, 10
 INTERVAL = {True: 1.0, False: 30.0}  # s between lines, on a terminal and elsewhere
 CLEAR_LINE = "\r\x1b[K"
-BLOCKS = ("JOB_INFO", "JOB_STARTED", "JOB_FINISHED", "PROGRESS", "SHELLCMD", "RUN_INFO", "RESOURCES_INFO", "GROUP_INFO")
+LOG_EVENTS = (
+    "JOB_INFO",
+    "JOB_STARTED",
+    "JOB_FINISHED",
+    "PROGRESS",
+    "SHELLCMD",
+    "RUN_INFO",
+    "RESOURCES_INFO",
+    "GROUP_INFO",
+)
 SCHEDULER_MESSAGES = ("Select jobs to execute", "Execute ")
 REFUSALS = ("LockException", "ProtectedOutputException")  # Snakemake's errors before any job
 INTERRUPTED = ("Terminating processes on user request", "Shutting down, this might take")  # Ctrl-C; SIGTERM
 
 
 @dataclass
-class Job:
+class RunJob:
     """A job of Snakemake: rule, displayed name, batch, number of units, log, start time in s, and duration in s."""
 
     rule: str
@@ -96,8 +105,8 @@ class Progress:
 
     batches: Mapping[str, int]
     wanted: Counter[str] = field(default_factory=Counter)
-    running: dict[int, Job] = field(default_factory=dict)
-    done: list[Job] = field(default_factory=list)
+    running: dict[int, RunJob] = field(default_factory=dict)
+    done: list[RunJob] = field(default_factory=list)
     lost: float = 0.0
     started: float = 0.0
     batches_at_work: list[str] = field(default_factory=list)  # in the order in which their first job was started
@@ -109,7 +118,7 @@ class Progress:
         batch = wildcards.get("batch", "")
         if batch in self.batches and batch not in self.batches_at_work:
             self.batches_at_work.append(batch)
-        self.running[number] = Job(rule, name, batch, self.batches.get(batch, 1), log, time.time())
+        self.running[number] = RunJob(rule, name, batch, self.batches.get(batch, 1), log, time.time())
 
     def finish(self, number: int, *, failed: bool = False) -> None:
         """Note that a job has ended."""
@@ -159,7 +168,7 @@ class Progress:
         measured += [(kind, 1, seconds) for kind, _, seconds in current if seconds > usual[kind]]
         usual = {kind: _usual(kind, scale, measured) for kind in usual}
         running = [
-            after * usual[kind] + max(usual[kind] - seconds, LEAST_SHARE * max(usual[kind], seconds))
+            after * usual[kind] + max(usual[kind] - seconds, MIN_REMAINING_SHARE * max(usual[kind], seconds))
             for kind, after, seconds in current
         ]
         waiting = self.wanted - Counter(job.kind for job in (*self.done, *self.running.values()))
@@ -306,7 +315,7 @@ class Monitor(logging.Handler):
         if edited:
             lines = [
                 "Changed or deleted since the last run, computed again:",
-                *(f"  {line}" for line in first(edited, NAMED)),
+                *(f"  {line}" for line in first(edited, NAMED_UNITS_OF_RUN)),
             ]
             print("\n".join(lines), file=self.stream, flush=True)
 
@@ -332,7 +341,7 @@ class Monitor(logging.Handler):
             count = f"{len(self.failed)} job{'s' * (len(self.failed) > 1)}"
             lines += [f"\n{count} failed; incomplete output is removed, all other jobs are done:"]
             causes = [f"{rule}: {_cause(log)} (all of it: {log})" for rule, log in self.failed]
-            lines += [f"  {line}" for line in first(causes, NAMED)]
+            lines += [f"  {line}" for line in first(causes, NAMED_UNITS_OF_RUN)]
             lines += ["Correct the cause, then run the same command again:", f"  {command}"]
         if lines:
             print("\n".join(lines), file=self.stream)
@@ -341,7 +350,7 @@ class Monitor(logging.Handler):
         """Suppress Snakemake's block for each job, and clear the progress line before its other messages."""
 
         def passes(record: logging.LogRecord) -> bool:
-            if _event(record) in BLOCKS or str(record.msg).startswith(SCHEDULER_MESSAGES):
+            if _event(record) in LOG_EVENTS or str(record.msg).startswith(SCHEDULER_MESSAGES):
                 return False
             self.stream.write(clear)
             return True

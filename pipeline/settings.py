@@ -189,7 +189,7 @@ class RecordingFile(Section):
     session: Annotated[int, Field(ge=1)] | None = None
 
 
-class Faces(Section):
+class FacesByHand(Section):
     """Faces that are placed up by hand."""
 
     accuracy_deg: Positive
@@ -215,7 +215,7 @@ class Procedure(Section):
     holdout_every: Annotated[int, Field(ge=0)]
     holdout_from: Annotated[int, Field(ge=0)] = 0
     mounting_tolerance_deg: Positive = 5.0
-    faces: Faces | None = None
+    faces: FacesByHand | None = None
     turns: HandTurns | None = None
 
 
@@ -284,7 +284,7 @@ class Uncertainty(Section):
     monte_carlo: Annotated[int, Field(ge=0, le=10_000_000)]
 
 
-class Diagnosis(Section):
+class DiagnosisSettings(Section):
     """Settings of the diagnosis."""
 
     depth: Literal["standard", "full"]
@@ -300,7 +300,7 @@ class SensorLimits(Section):
     scale_factor: Positive | None
 
 
-class Limits(OfSensors[SensorLimits]):
+class LimitsOfSensors(OfSensors[SensorLimits]):
     """The limits of each sensor."""
 
 
@@ -411,8 +411,8 @@ class Unit(Section):
     ingest: Ingest
     effects: Effects
     uncertainty: Uncertainty
-    diagnosis: Diagnosis
-    limits: Limits
+    diagnosis: DiagnosisSettings
+    limits: LimitsOfSensors
     certificate: Certificate
 
 

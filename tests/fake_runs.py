@@ -21,8 +21,8 @@ from pipeline.config.campaign import UnitRow
 from pipeline.config.owner import check_owner, claim, complete_record
 from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch
 from pipeline.results_folder import (
-    HELD,
-    NEW,
+    NEW_FOLDER,
+    OPEN_LOCKS,
     PUBLISHED,
     _digest,
     _record,
@@ -145,7 +145,7 @@ def run(
 def _publish(results: Path, units: list[str], again: int, *, packed: bool) -> None:
     """Do what the stage ``gather`` does, without the files about all units that it computes."""
     finish_publishing(results)
-    new, batch = results / NEW, Batch(results / "batches" / BATCH)
+    new, batch = results / NEW_FOLDER, Batch(results / "batches" / BATCH)
     shutil.rmtree(new, ignore_errors=True)
     for name in PUBLISHED:
         if "." not in name:
@@ -184,5 +184,5 @@ def as_of_version_1(results: Path) -> None:
 
 def release() -> None:
     """Release the locks, as the end of a process does."""
-    while HELD:
-        HELD.pop().close()
+    while OPEN_LOCKS:
+        OPEN_LOCKS.pop().close()

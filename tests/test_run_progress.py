@@ -78,19 +78,19 @@ def test_the_cause_of_a_broken_job_is_the_end_of_its_log(tmp_path: Path, log: st
 
 
 def test_results_are_held_by_one_run_and_jobs_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(results_folder, "HELD", [])
+    monkeypatch.setattr(results_folder, "OPEN_LOCKS", [])
     take_run(tmp_path)
     with pytest.raises(BusyError, match=r"another run works on these results \(process [0-9]+ on"):
         take_run(tmp_path)
     assert not jobs_running(tmp_path)
     hold_as_job(tmp_path)
     assert jobs_running(tmp_path)
-    for stream in results_folder.HELD:
+    for stream in results_folder.OPEN_LOCKS:
         stream.close()
     assert not jobs_running(tmp_path)
-    results_folder.HELD.clear()
+    results_folder.OPEN_LOCKS.clear()
     take_run(tmp_path)
-    results_folder.HELD[0].close()
+    results_folder.OPEN_LOCKS[0].close()
 
 
 def test_a_command_tells_the_time_left_on_a_terminal_and_each_half_minute_elsewhere(

@@ -19,15 +19,15 @@ from pipeline.config.options import nearest
 from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, first
 from pipeline.files import write_atomically
 from pipeline.io.files import FILE, SUFFIXES, recording_files
-from pipeline.model.calibration_file import LEFT_OUT
+from pipeline.model.calibration_file import LEFT_OUT_REASONS
 from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.one_unit import try_unit, unit_of_campaign
-from pipeline.outcome import NAMED, as_overrides, found_mountings
+from pipeline.outcome import NAMED_PER_LINE, as_overrides, found_mountings
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.profile_text import as_yaml, not_found
 from pipeline.profile_detection.proposal import propose
 from pipeline.profile_detection.recording_facts import as_text, counted, facts, topic_lines, topics_of
-from pipeline.profile_detection.unit_guesses import UNKNOWN
+from pipeline.profile_detection.unit_guesses import TO_DECIDE
 from pipeline.records import SENSORS
 from pipeline.run_progress import Countdown
 from pipeline.settings import Ingest
@@ -174,12 +174,12 @@ def _print_mountings(groups: Sequence[FoundMounting], units: int | None) -> None
         place = "campaign.yaml" if len(group.units) == units else of_units
         text = (
             f"MOUNTING: gravity shows another one than stated in {', '.join(group.recordings)} of "
-            f"{', '.join(first(group.units, NAMED, 'units'))}, and it is used as found (N-FOUND). If the bench is so, "
-            f"state it in {place}; else correct the columns or the mounting (docs/mounting.md):"
+            f"{', '.join(first(group.units, NAMED_PER_LINE, 'units'))}, and it is used as found (N-FOUND). If the "
+            f"bench is so, state it in {place}; else correct the columns or the mounting (docs/mounting.md):"
         )
         print(_wrapped(text) + f"\n\n{as_overrides(group.ways)}")
     if others := [unit for group in groups[MOST_IN_FULL:] for unit in group.units]:
-        units_named = ", ".join(first(others, NAMED, "units"))
+        units_named = ", ".join(first(others, NAMED_PER_LINE, "units"))
         print(_wrapped(f"MOUNTING: other settings describe {units_named}: check each with --unit") + "\n")
 
 
@@ -304,8 +304,8 @@ def _print_saved(saved: Mapping[Path, Sequence[str]]) -> None:
     """Print how a run uses the saved profiles that read what is refused; ``saved``: profile to the units or logs."""
     for file, names in saved.items():
         text = (
-            f"SAVED PROFILE: {file} describes the files of {', '.join(first(names, NAMED))}. A run uses it where the "
-            f"settings name it: write {file.stem} into the column ingest of units.csv, or for all units into "
+            f"SAVED PROFILE: {file} describes the files of {', '.join(first(names, NAMED_PER_LINE))}. A run uses it "
+            f"where the settings name it: write {file.stem} into the column ingest of units.csv, or for all units into "
             "campaign.yaml:"
         )
         print(_wrapped(text) + f"\n\n{as_overrides([[f'ingest={file.stem}']])}")
@@ -351,7 +351,7 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         noted: dict[str, dict[tuple[str, str], list[str]]] = {}
         for recording in checked:
             for note in (n for n in recording.notes if not n.settings):
-                place = f", line {note.first} to {note.last}" if note.code in LEFT_OUT and note.first else ""
+                place = f", line {note.first} to {note.last}" if note.code in LEFT_OUT_REASONS and note.first else ""
                 noted.setdefault(note.code, {}).setdefault((place, note.detail), []).append(recording.name)
         notes = [
             f"{code} {name}{place}: {detail}" + f"; likewise {', '.join(others)}" * bool(others)
@@ -478,7 +478,7 @@ def _print_proposals(proposals: Sequence[Proposal], sensor_model: Sensor | None,
         text = as_yaml(proposal, name)
         print(textwrap.indent(text, "    "))
         if proposal.unknown():
-            print(f"Fill in {UNKNOWN} for {', '.join(proposal.unknown())}.")
+            print(f"Fill in {TO_DECIDE} for {', '.join(proposal.unknown())}.")
         if save is not None:
             write_atomically(save, text)
             print(f"Saved as {save}. No configuration uses it yet.")

@@ -29,7 +29,7 @@ from pipeline.outcome import (
 )
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
-from pipeline.report.held_out_section import FAR
+from pipeline.report.held_out_section import MARK_ABOVE_FLOORS
 from pipeline.report.pages import template
 from pipeline.results_folder import is_owner, read_owner
 
@@ -155,7 +155,7 @@ def explain(folder: Path, diagnoses: dict[str, JSON], failures: dict[str, JSON])
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
     failed = [f"failed: {', '.join(failures)}"] if failures else []
     text: str = template("explain.txt").render(
-        far=FAR,
+        far=MARK_ABOVE_FLOORS,
         counted=f"{len(findings)} sensors of {len(diagnoses)} units: {counted}",
         groups=[*lines_of(verdict_groups(findings)), *failed],
         commands=next_commands(findings, settings, results)[:-1],  # the last is this command

@@ -20,8 +20,8 @@ from pipeline.io.files import recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.planning.guide import (
-    MOST,
-    Turn,
+    MAX_PLANNED_RESTS,
+    ProposedTurn,
     default_goal,
     fitted_by_hand,
     in_words,
@@ -40,14 +40,14 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
-    from pipeline.planning.guide import Progress
+    from pipeline.planning.guide import GuideProgress
     from pipeline.records import Recording, Values
     from pipeline.settings import Settings
     from pipeline.signal.rests import Rest
 
 POLL_S = 1.0  # between two readings of a growing log: short against a rest
 STILL_RESTING_S = 1.0  # from the end of a rest to that of the log, below which the rest may continue
-FIRST = Turn(0, 2, 180.0)  # about x, while nothing of the gyroscope is known
+FIRST = ProposedTurn(0, 2, 180.0)  # about x, while nothing of the gyroscope is known
 EPILOG = """\
 The next rest is the one that reduces the uncertainty of the accelerometer's calibration most. The goal is reached when
 the largest expanded uncertainty (95 %) of the bias, in mg, and of the matrix, in mg at 1 g, is below --goal. With
@@ -254,7 +254,7 @@ def _advice(recordings: Sequence[Recording], config: Settings, goals: Goals, dwe
 
 
 def _next_turn(
-    unit: UnitState, config: Settings, progress: Progress, goal: float, dwell: float
+    unit: UnitState, config: Settings, progress: GuideProgress, goal: float, dwell: float
 ) -> tuple[bool, list[str]]:
     """Return whether the gyroscope's goal is reached, and the next turn in words."""
     found = unit.fits["gyroscope"]
@@ -277,7 +277,7 @@ def _span(recording: Recording, rest: Rest) -> tuple[float, float]:
     return float(recording.time[rest.start]), float(recording.time[rest.stop - 1])
 
 
-def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str]]:
+def _next(progress: GuideProgress, goal: float, dwell: float) -> tuple[bool, list[str]]:
     """Return whether the goal is reached, and the next rest in words."""
     held = sum(progress.held_out)
     count = f"{progress.used} rests of the fit, {held} held out"
@@ -297,15 +297,15 @@ def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str
         lines.append(f"      ({repeated})")
     if proposal.expected > goal:
         lines.append(
-            f"expected: {1e3 * proposal.expected:.3g} mg after {MOST} more rests, so the goal is out of reach: rest "
-            "longer (--dwell) and more firmly, or choose a larger --goal"
+            f"expected: {1e3 * proposal.expected:.3g} mg after {MAX_PLANNED_RESTS} more rests, so the goal is out of "
+            "reach: rest longer (--dwell) and more firmly, or choose a larger --goal"
         )
     else:
         lines.append(f"expected: {1e3 * proposal.expected:.3g} mg after {proposal.further} more rests of the fit")
     return False, lines
 
 
-def _repeated_attitude(progress: Progress, up: Values) -> str:
+def _repeated_attitude(progress: GuideProgress, up: Values) -> str:
     """Return why an attitude is proposed that was recorded before; empty if no rest is near it."""
     near = progress.near(up)
     if not near:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import read_effect_files, register
-from pipeline.planning.changes import Gain, best_changes, helps_most
+from pipeline.planning.changes import PlanGain, best_changes, helps_most
 from pipeline.planning.plan import plan_of, plan_text
 from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description
 
@@ -134,7 +134,7 @@ def _other(options: str, arguments: argparse.Namespace, first: UnitDescription) 
     return unit_of(argparse.Namespace(**{**kept, **vars(given)}), first)
 
 
-def _of_gain(gain: Gain) -> dict[str, Any]:
+def _of_gain(gain: PlanGain) -> dict[str, Any]:
     return {
         "what": gain.change.what,
         "options": gain.change.options,

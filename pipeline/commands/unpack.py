@@ -15,7 +15,7 @@ from pipeline.history import read_history
 from pipeline.pack import PACKS, batches_of
 from pipeline.report.pages import linked
 from pipeline.results_folder import (
-    NEW,
+    NEW_FOLDER,
     BusyError,
     finish_publishing,
     is_as_written,
@@ -56,7 +56,7 @@ def main(argv: Sequence[str]) -> int:
         raise MissingInputError(
             f"no unit {', '.join(absent)}; there are {', '.join(sorted(batches)[:12])}", str(results)
         )
-    again, new, index = repetitions(results, "")[0], results / NEW, results / "index.html"
+    again, new, index = repetitions(results, "")[0], results / NEW_FOLDER, results / "index.html"
     shutil.rmtree(new, ignore_errors=True)
     paths = []
     with flushed_together(results):

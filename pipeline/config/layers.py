@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")  # all except tab and line ends
 KNOWN_COLUMNS = ("unit", "overrides", *GROUPS, "serial", "lot", "date", "board")
 SIMILARITY = 0.85  # of a misspelt name: overide 0.88, procedur 0.94; but material and serial: 0.71
-LARGEST_BYTES = 100_000_000  # a million units of 100 characters each
+MAX_SHEET_BYTES = 100_000_000  # a million units of 100 characters each
 
 
 class UnitsTable(NamedTuple):
@@ -97,7 +97,7 @@ def read_units_table(path: Path) -> UnitsTable:
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str | Any, Any]]]]:
     """Return the columns, and each row with the number of its last line."""
-    text = read_text(path, LARGEST_BYTES, "a units table")
+    text = read_text(path, MAX_SHEET_BYTES, "a units table")
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:
         columns = [c.strip() for c in reader.fieldnames or []]

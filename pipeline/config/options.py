@@ -30,7 +30,7 @@ RUN_SETTINGS = tuple(RunSettings.model_fields)
 LARGEST_CONFIG = 10_000  # values of an option; the largest in configs/ has 160
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
-LONGEST = 10_000  # characters of a value with references, such as a name or a unit
+MAX_REFERENCE_LENGTH = 10_000  # characters of a value with references, such as a name or a unit
 FORM = "a reference is ${group.key}, for example ${sensor.accelerometer.counts_per_unit}"
 
 
@@ -138,8 +138,10 @@ def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (d
             raise ConfigurationError(f"{node[:200]!r}: {token.group(2)} is null; set it")
         text += node[end : token.start()] + ("${" if token.group(1) else str(value))
         end = token.end()
-        if len(text) > LONGEST:
-            raise ConfigurationError(f"{node[:200]!r}: has more than {LONGEST} characters with its references")
+        if len(text) > MAX_REFERENCE_LENGTH:
+            raise ConfigurationError(
+                f"{node[:200]!r}: has more than {MAX_REFERENCE_LENGTH} characters with its references"
+            )
     return text + node[end:]
 
 

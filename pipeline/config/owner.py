@@ -25,12 +25,12 @@ from pipeline.io.digests import digests_in_pack, digests_of_entries, digests_of_
 from pipeline.pack import Pack, read_published
 from pipeline.results_folder import (
     BESIDE,
-    HELD,
-    NEW,
+    NEW_FOLDER,
+    OPEN_LOCKS,
     OWNER,
     PUBLISHED,
     REPLACED,
-    Owner,
+    ResultsOwner,
     finish_publishing,
     is_owner,
     read_owner,
@@ -57,7 +57,7 @@ class OtherCampaignError(PipelineError):
 class Checked(NamedTuple):
     """The record that was found in order, and the folder to which older results have moved."""
 
-    owner: Owner | None
+    owner: ResultsOwner | None
     moved: Path | None = None
 
 
@@ -98,7 +98,7 @@ def claim(campaign: Campaign, checked: Checked) -> None:
     if not same and (owner != checked.owner or campaign.take_over) and (reason := _difference(campaign)):
         raise _refusal(campaign, reason)
     units = owner.units if owner else {} if same else _recorded(campaign, {})
-    write_owner(campaign.results, Owner(str(campaign.directory), _description(campaign), units))
+    write_owner(campaign.results, ResultsOwner(str(campaign.directory), _description(campaign), units))
 
 
 def complete_record(campaign: Campaign) -> None:
@@ -208,7 +208,7 @@ def _move_all(campaign: Campaign) -> Path | None:
         if is_owner(results, campaign.directory):  # another process has moved them
             return None
         finish_publishing(results)
-        names = [name for name in (*PUBLISHED, *BESIDE, NEW, OWNER) if os.path.lexists(results / name)]
+        names = [name for name in (*PUBLISHED, *BESIDE, NEW_FOLDER, OWNER) if os.path.lexists(results / name)]
         return set_aside({name: results / name for name in names}, results)
     finally:
-        HELD.pop().close()
+        OPEN_LOCKS.pop().close()

@@ -17,7 +17,7 @@ from pipeline.errors import ConfigurationError, PipelineError
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
 from pipeline.io.files import read_text
-from pipeline.io.yaml_file import LARGEST_BYTES
+from pipeline.io.yaml_file import MAX_YAML_BYTES
 from pipeline.settings import OF_BENCH, UserEffectFiles
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[
         folder: [
             f
             for f in sorted(folder.glob("*.yaml"))
-            if not re.search(BUILT_IN, read_text(f, LARGEST_BYTES, "an effect"))
+            if not re.search(BUILT_IN, read_text(f, MAX_YAML_BYTES, "an effect"))
             or (f.resolve().is_relative_to(directory) and f.resolve().parent != shipped)
         ]
         for folder in folders

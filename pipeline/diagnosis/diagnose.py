@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis import multi_position, turntable
-from pipeline.diagnosis.findings import Case, Findings, diagnosis_of
-from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
+from pipeline.diagnosis.findings import DiagnosisInput, Findings, diagnosis_of
+from pipeline.diagnosis.verdict import EXPLAINED, MAX_UNKNOWN_PROBABILITY, HeldOut, VerdictInput, judged, may_be_unknown
 from pipeline.errors import ConvergenceError, NotObservableError
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
@@ -71,7 +71,7 @@ def diagnose(
         accelerometer = _mountings_by_gravity(recordings, settings)
     elif not by_hand:  # an accelerometer's fit is no prior of its own mountings
         accelerometer = None
-    case = Case(calibration, recordings, noise, settings, accelerometer, configured)
+    case = DiagnosisInput(calibration, recordings, noise, settings, accelerometer, configured)
     full = settings.diagnosis.depth == "full"
 
     def judge(findings: Findings | None, found: SensorDiagnosis) -> tuple[SensorDiagnosis, bool]:
@@ -119,8 +119,8 @@ def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = Tru
 
 
 def evidence_of(
-    found: SensorDiagnosis, case: Case, validation: SensorValidation | None, findings: Findings | None
-) -> Evidence:
+    found: SensorDiagnosis, case: DiagnosisInput, validation: SensorValidation | None, findings: Findings | None
+) -> VerdictInput:
     """Return the evidence for the verdict on ``found``, the diagnosis by the selection alone.
 
     The held-out errors of the free fits are computed only if that of the calibration is above its interval.
@@ -144,7 +144,7 @@ def evidence_of(
     accepted = settings.sensor.of(sensor).accept_implausible
     published = held_out_of(validation) if validation else error_of(free, smoothed=False)
     contradicted = published is not None and published.above
-    return Evidence(
+    return VerdictInput(
         sensor,
         found.verdict,
         tuple(found.selected),
@@ -164,7 +164,7 @@ def evidence_of(
         beyond=[
             name.removeprefix(OTHER)
             for name, probability in found.probability.items()
-            if name.startswith(OTHER) and probability > LIKELY
+            if name.startswith(OTHER) and probability > MAX_UNKNOWN_PROBABILITY
         ],
         implausible=() if accepted else [entry.effect for entry in found.chosen if not entry.plausible],
         held_out=found.details.get("held_out"),
@@ -188,7 +188,7 @@ def _seats_explained(found: SensorDiagnosis, sensor: str, findings: Findings | N
     return sensor == "accelerometer" and residual is not None and residual <= EXPLAINED
 
 
-def _doubts_of_gravity(accelerometer: SensorDiagnosis, case: Case) -> list[str]:
+def _doubts_of_gravity(accelerometer: SensorDiagnosis, case: DiagnosisInput) -> list[str]:
     """Return why the mountings that the accelerometer determines may be wrong, from its diagnosis.
 
     A missing tilt of the table causes no doubt if it shifts no mounting by more than the mounting's uncertainty.
@@ -203,7 +203,7 @@ def _doubts_of_gravity(accelerometer: SensorDiagnosis, case: Case) -> list[str]:
     return [f"{subject} misses {' and '.join(missing)}, {remedy}"]
 
 
-def _tilt_is_within_uncertainty(case: Case) -> bool:
+def _tilt_is_within_uncertainty(case: DiagnosisInput) -> bool:
     """Return whether a fitted tilt of the table shifts each mounting by gravity by less than its U."""
     effects, fit = case.settings.effects, case.accelerometer
     listed = effects.accelerometer

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 AVERAGING_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
-FEWEST = 8  # stretches, which determine a standard deviation to a quarter
+MIN_STRETCHES = 8  # stretches, which determine a standard deviation to a quarter
 
 
 def effective_noise(
@@ -121,7 +121,7 @@ def _density(parts: Sequence[tuple[Values, Values | None]], time: float) -> floa
         means = (values - values.mean(axis=0))[: stretches * size].reshape(stretches, size, -1).mean(axis=1)
         squares += float(np.sum(means**2)) / means.shape[1]
         count += stretches
-    return float(np.sqrt(time * squares / count)) if count >= FEWEST else None
+    return float(np.sqrt(time * squares / count)) if count >= MIN_STRETCHES else None
 
 
 def _motion(recordings: Sequence[Recording]) -> dict[str, float | None]:

@@ -15,12 +15,12 @@ import numpy as np
 
 from pipeline.diagnosis.verdict import if_observable
 from pipeline.diagnosis.words import next_experiment, to_distinguish
-from pipeline.estimation.design import Term, placed
+from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
-from pipeline.estimation.selection import ALIKE, EVIDENCE, INFLATED
+from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
 from pipeline.model.effects import effect
 from pipeline.records import Answer, Candidate, SensorDiagnosis
 
@@ -38,7 +38,7 @@ LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's
 
 
 @dataclass(frozen=True)
-class Case:
+class DiagnosisInput:
     """The input of a diagnosis; see ``diagnose``."""
 
     calibration: SensorCalibration
@@ -73,7 +73,7 @@ class Findings:
     verdict: Verdict  # by the selection alone
     steps: Mapping[str, Score]  # of each selected effect when it was accepted
     alone: Mapping[str, Score]  # of each candidate given base and configured effects
-    terms: Sequence[Term]  # configured and selected effects with their fitted values
+    terms: Sequence[EffectColumns]  # configured and selected effects with their fitted values
     covariance: Values  # of that fit; the parameters of the effects come last
     limits: Mapping[str, Values]  # of plausibility
     answers: Answers
@@ -102,7 +102,7 @@ class Findings:
     deeper: Callable[[], dict[str, Any]] | None = None  # further entries of the document if something is missing
 
 
-def diagnosis_of(findings: Findings, case: Case) -> SensorDiagnosis:
+def diagnosis_of(findings: Findings, case: DiagnosisInput) -> SensorDiagnosis:
     """Return the diagnosis of a sensor, with the verdict by the selection alone."""
     listed = [name for name in case.configured if name in case.settings.effects.of(case.sensor)]
     others = sorted(findings.alone.values(), key=lambda score: -score.delta_bic)
@@ -160,7 +160,7 @@ def _entry(findings: Findings, name: str) -> Candidate:
     excess = max(findings.excess, drop)
     estimates, plausible = _estimates(findings, score)
     shares = findings.shares(name) if score.delta_bic > MIN_DELTA_BIC else {}
-    alike = sorted(((share, other) for other, share in shares.items() if share > ALIKE), reverse=True)
+    alike = sorted(((share, other) for other, share in shares.items() if share > LOOK_ALIKE_SHARE), reverse=True)
     return Candidate(
         effect=name,
         delta_bic=score.delta_bic,

@@ -31,9 +31,9 @@ import numpy as np
 from pipeline.diagnosis import functional_forms as forms
 from pipeline.diagnosis.functional_forms import Form, Span
 from pipeline.diagnosis.residual_dependence import dependences
-from pipeline.diagnosis.residual_regression import Gain, ProjectedCurves, Scan
+from pipeline.diagnosis.residual_regression import FormGain, ProjectedCurves, Scan
 from pipeline.diagnosis.words import listed
-from pipeline.estimation.design import Term
+from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gates import MAX_MIN_DELTA_BIC, MIN_DELTA_BIC
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import without_each_recording, without_rows
@@ -45,29 +45,31 @@ from pipeline.model.formula import SIGNALS, parse
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
 
-    from pipeline.diagnosis.findings import Case
+    from pipeline.diagnosis.findings import DiagnosisInput
     from pipeline.records import Values
 
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
-MORE = 0.02  # least delta BIC of a further term over that of the first: less may be rounding of the first's constants
-MOST_TERMS = 3
+MIN_FURTHER_GAIN_SHARE = (
+    0.02  # least delta BIC of a further term over that of the first: less may be rounding of the first's constants
+)
+MAX_FORMULA_TERMS = 3
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
-ROUNDS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
+SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
 VALUES_AT_ONCE = 4_000_000  # of columns that are scanned together: 32 MB
 PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
-NEEDED = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
+OBSERVABLE_BY = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
 FINALISTS = 8  # forms that are compared in the resamples
-FOLDS = 5  # parts of every recording that are left out in turn
-LISTED = 6  # entries of the front
+RECORDING_FOLDS = 5  # parts of every recording that are left out in turn
+LISTED_FORMULAS = 6  # entries of the front
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredForm:
     """A form and its gain."""
 
     form: Form
-    gain: Gain
+    gain: FormGain
 
     @property
     def score(self) -> float:
@@ -104,14 +106,14 @@ class Forms:
         columns = np.stack([self.column(text) for text in form.factor.texts], axis=-1)
         return columns * self.column(form.modulator.texts[0])[:, :, None] if form.modulator else columns
 
-    def gains(self, tried: Sequence[Form], *, coarse: bool = False) -> list[Gain]:
+    def gains(self, tried: Sequence[Form], *, coarse: bool = False) -> list[FormGain]:
         """Return the gain of each form; ``coarse``: under the noise of the fit, the least wander and a middle one."""
         scan = self.scan
         if coarse:
             ordered = sorted(self.selection.settings, key=lambda setting: setting.ratio)
             few = dict.fromkeys([self.selection.fit.setting, ordered[0], ordered[len(ordered) // 2]])
             scan = Scan(replace(self.selection, settings=[*few]), self.explained)
-        found: dict[int, Gain] = {}
+        found: dict[int, FormGain] = {}
         alike: dict[tuple[int, int], list[int]] = {}  # forms whose columns have the same shape
         for k, form in enumerate(tried):
             alike.setdefault((len(form.factor.texts), 3 if "u" in form.signals else 1), []).append(k)
@@ -124,20 +126,20 @@ class Forms:
                 found |= dict(zip(some, scan.best_axes(scan.drops(columns), r, scanned), strict=True))
         return [found[k] for k in range(len(tried))]
 
-    def ranked(self) -> list[Scored]:
+    def ranked(self) -> list[ScoredForm]:
         """Return the best form of each name, best score first."""
         spans = self._spans
-        best = _best_of_each(map(Scored, self._tried, self.gains(self._tried, coarse=True)))[:REFINED]
+        best = _best_of_each(map(ScoredForm, self._tried, self.gains(self._tried, coarse=True)))[:REFINED]
         refined = [each.form for each in best]
-        best = _best_of_each(map(Scored, refined, self.gains(refined)))
-        for spacing in ROUNDS:
+        best = _best_of_each(map(ScoredForm, refined, self.gains(refined)))
+        for spacing in SCAN_REFINEMENTS:
             near = [
                 Form(factor, each.form.modulator)
                 for each in best
                 if each.form.factor.signal in spans
                 for factor in forms.finer(each.form.factor, spans[each.form.factor.signal], spacing)
             ]
-            best = _best_of_each([*best, *map(Scored, near, self.gains(near))])
+            best = _best_of_each([*best, *map(ScoredForm, near, self.gains(near))])
         return _best_of_each([*best, *(self._polynomial(span) for span in [*spans.values(), None])])
 
     @cached_property
@@ -171,7 +173,7 @@ class Forms:
                 distinct.append(form)
         return distinct + [Form(band) for band in (forms.bands(spans["speed"]) if "speed" in spans else [])]
 
-    def _polynomial(self, span: Span | None) -> Scored:
+    def _polynomial(self, span: Span | None) -> ScoredForm:
         """Return the polynomial of the best order, without powers that base or effects contain; None: in ``u``."""
         signal, of_u = ("u", "fz" if self.sensor == "accelerometer" else "wz") if span is None else (span.signal, "")
         texts = forms.powers(span or Span.of(self.selection.observations, of_u), signal)
@@ -182,7 +184,7 @@ class Forms:
         best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
         index = new[: best + 1]
         formulas = tuple(texts[k] for k in index)
-        return Scored(Form(forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)), gains[best])
+        return ScoredForm(Form(forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)), gains[best])
 
 
 def _digest(values: Values) -> bytes:
@@ -192,9 +194,9 @@ def _digest(values: Values) -> bytes:
     return np.round(values.reshape(len(values), -1) / (size * np.sign(first) or 1.0), 9).tobytes()
 
 
-def _best_of_each(scored: Iterable[Scored]) -> list[Scored]:
+def _best_of_each(scored: Iterable[ScoredForm]) -> list[ScoredForm]:
     """Return the form with the best constants of each name, best score first."""
-    best: dict[tuple[str, ...], Scored] = {}
+    best: dict[tuple[str, ...], ScoredForm] = {}
     for each in scored:
         name = each.form.name
         if name not in best or each.score > best[name].score:
@@ -202,14 +204,18 @@ def _best_of_each(scored: Iterable[Scored]) -> list[Scored]:
     return sorted(best.values(), key=lambda each: -each.score)
 
 
-def search(selection: Selection) -> tuple[list[Scored], list[Scored]]:
+def search(selection: Selection) -> tuple[list[ScoredForm], list[ScoredForm]]:
     """Return the terms of the best form, none if none is clear, and all forms of one term, best first."""
-    terms: list[Scored] = []
+    terms: list[ScoredForm] = []
     grammar = Forms(selection)
     first = ranked = grammar.ranked()
-    while ranked and ranked[0].clear and (not terms or ranked[0].gain.delta_bic > MORE * terms[0].gain.delta_bic):
+    while (
+        ranked
+        and ranked[0].clear
+        and (not terms or ranked[0].gain.delta_bic > MIN_FURTHER_GAIN_SHARE * terms[0].gain.delta_bic)
+    ):
         terms.append(ranked[0])
-        if len(terms) == MOST_TERMS:
+        if len(terms) == MAX_FORMULA_TERMS:
             break
         grammar.explain([text for term in terms for text in term.form.formulas])
         ranked = [each for each in grammar.ranked() if not any(each.form.refines(term.form) for term in terms)]
@@ -230,15 +236,15 @@ class Discovery:
 def why_not_suggested(discovery: Discovery, hidden: Mapping[str, str]) -> str | None:
     """Return why the form is not offered as an effect: unstable, or of a signal whose effects are not observable."""
     covariate = discovery.unknown[0]["covariate"]
-    if covariate in NEEDED and NEEDED[covariate] in hidden:
-        return f"effects of the {covariate} are not observable: {hidden[NEEDED[covariate]]}"
+    if covariate in OBSERVABLE_BY and OBSERVABLE_BY[covariate] in hidden:
+        return f"effects of the {covariate} are not observable: {hidden[OBSERVABLE_BY[covariate]]}"
     stability = discovery.front[0]["stability"] if discovery.front else None
     if stability is not None and stability < LEAST_STABLE:
         return f"it is not stable: another formula is the best in {100 * (1 - stability):.0f} % of the resamples"
     return None
 
 
-def discover(selection: Selection, unknown: list[dict[str, Any]], case: Case) -> Discovery:
+def discover(selection: Selection, unknown: list[dict[str, Any]], case: DiagnosisInput) -> Discovery:
     """Search for a formula in addition to base, configured and selected effects.
 
     ``unknown``: the ``dependences`` of the selection. No form is suggested if the residual with it is far above the
@@ -256,7 +262,7 @@ def discover(selection: Selection, unknown: list[dict[str, Any]], case: Case) ->
         definition = suggested_effect([entry], case.sensor, catalogue())
         assert definition is not None  # noqa: S101  (there is an entry)
         form = effect_from(definition, "a first guess")
-        added = [*context.fit.terms, Term(form, np.zeros(len(form.parameters(case.sensor))))]
+        added = [*context.fit.terms, EffectColumns(form, np.zeros(len(form.parameters(case.sensor))))]
         residual_rms = fit_terms(context.observations, added, context.start, context.settings).residual_rms
         if 0.0 < FAR_ABOVE * floor < residual_rms:
             continue
@@ -273,14 +279,14 @@ def discover(selection: Selection, unknown: list[dict[str, Any]], case: Case) ->
     return replace(best, unknown=_explained(best)) if best.suggested else best
 
 
-def _criterion(selection: Selection, terms: Sequence[Scored]) -> float:
+def _criterion(selection: Selection, terms: Sequence[ScoredForm]) -> float:
     """Return 2 log L minus the price of all parameters and of the formula."""
     fitted = sum(len(term.values) for term in selection.fit.terms) + sum(term.form.scanned for term in terms)
     price = PRICE * sum(term.form.complexity for term in terms)
     return 2.0 * selection.fit.log_likelihood - fitted * float(np.log(3.0 * selection.observations.samples)) - price
 
 
-def _entry(selection: Selection, terms: Sequence[Scored]) -> dict[str, Any]:
+def _entry(selection: Selection, terms: Sequence[ScoredForm]) -> dict[str, Any]:
     """Return a form as an entry of ``unexplained``: phrase, formulas, and the coefficients on each of its axes."""
     sensor, first = selection.observations.sensor, terms[0]
     texts = [text for term in terms for text in term.form.formulas]
@@ -316,15 +322,15 @@ def _explained(found: Discovery) -> list[dict[str, Any]]:
     return [form, *({**e, "explained_by": None if e["covariate"] in remaining else form["covariate"]} for e in rest)]
 
 
-def _front(selection: Selection, terms: Sequence[Scored], ranked: Sequence[Scored]) -> list[dict[str, Any]]:
+def _front(selection: Selection, terms: Sequence[ScoredForm], ranked: Sequence[ScoredForm]) -> list[dict[str, Any]]:
     """Return the forms of one term that gain more than all simpler ones, and before them the suggested one."""
     finalists = list(ranked[:FINALISTS])
     stable = _stability(selection, finalists)
-    shown: list[Scored] = []
+    shown: list[ScoredForm] = []
     for each in sorted(ranked, key=lambda each: (each.form.complexity + each.form.scanned, -each.gain.delta_bic)):
         if not shown or each.gain.delta_bic > shown[-1].gain.delta_bic:
             shown.append(each)
-    shown = [terms[0], *(each for each in shown if each.form is not terms[0].form)][:LISTED]
+    shown = [terms[0], *(each for each in shown if each.form is not terms[0].form)][:LISTED_FORMULAS]
     return [
         {
             "formula": " + ".join(each.form.formulas),
@@ -340,15 +346,15 @@ def _front(selection: Selection, terms: Sequence[Scored], ranked: Sequence[Score
     ]
 
 
-def _stability(selection: Selection, finalists: Sequence[Scored]) -> list[float]:
+def _stability(selection: Selection, finalists: Sequence[ScoredForm]) -> list[float]:
     """Return the share of the resamples with a clear score in which each form has the best score."""
     observations, lengths = selection.observations, [len(part.weight) for part in selection.observations.parts]
-    folds = ([np.arange(n) * FOLDS // n == fold for n in lengths] for fold in range(FOLDS))
+    folds = ([np.arange(n) * RECORDING_FOLDS // n == fold for n in lengths] for fold in range(RECORDING_FOLDS))
     resamples = chain(without_each_recording(observations), (without_rows(observations, rows) for rows in folds))
     wins, counted = np.zeros(len(finalists)), 0
     for resample in resamples:
         gains = Forms(replace(selection, observations=resample)).gains([each.form for each in finalists])
-        scores = [Scored(each.form, gain).score for each, gain in zip(finalists, gains, strict=True)]
+        scores = [ScoredForm(each.form, gain).score for each, gain in zip(finalists, gains, strict=True)]
         if max(scores) > MIN_DELTA_BIC:
             wins[int(np.argmax(scores))] += 1
             counted += 1

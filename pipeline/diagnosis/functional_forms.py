@@ -31,15 +31,17 @@ if TYPE_CHECKING:
 
 CYCLES = range(1, 13)
 POWERS = range(1, 6)
-ORDER = 5  # of a polynomial; as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
-PLACES = 20  # of a step in the coarse scan, which places it to 1/40 of the span
+POLYNOMIAL_ORDER = (
+    5  # of a polynomial; as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
+)
+COARSE_STEP_POSITIONS = 20  # of a step in the coarse scan, which places it to 1/40 of the span
 SPEEDS = 40  # largest number of speeds between which steps are tried
 SHARPEST = 1.0 / 80.0  # least width of a soft step, share of the span: smoothing makes a sharp step this wide
 CONSTANTS = tuple(
     np.geomspace(0.06, 1.5, 9)
 )  # share of the span; the finer scans close the factors of 1.5 between them
 FINER = 4  # places or constants to each side of the best one in each finer scan
-WIDTHS = (0.5, 1.0, 2.0)  # of a soft step in a finer scan, over that of the scan before
+SOFT_STEP_WIDTHS = (0.5, 1.0, 2.0)  # of a soft step in a finer scan, over that of the scan before
 SAME_SPEED = 0.02  # relative difference of values that are one speed of the procedure
 UNITS = {"temperature": "degC", "time": "s", "speed": "deg/s", "angle": "deg"} | {f"f{a}": "g" for a in "xyz"}
 ORIGIN = "(temperature - 25)"  # data sheets and the catalogue also state powers of the temperature above 25 degC
@@ -119,7 +121,7 @@ class Span:
     def places(self) -> Values:
         """Return the places of steps in the coarse scan: evenly over the span, or between constant speeds."""
         if self.signal != "speed":
-            return self.low + self.size * (np.arange(PLACES) + 0.5) / PLACES
+            return self.low + self.size * (np.arange(COARSE_STEP_POSITIONS) + 0.5) / COARSE_STEP_POSITIONS
         moving = self.values[self.values > SAME_SPEED * self.high / SPEEDS]
         speeds = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, SPEEDS)) if len(moving) else moving)
         speeds = np.concatenate([[0.0], speeds])
@@ -236,7 +238,7 @@ def factors(spans: dict[str, Span], *, turning: bool) -> list[Factor]:
         if span.signal in ("temperature", "time", "speed"):
             found += [step(span, a) for a in span.places()]
         if span.signal in ("temperature", "time"):
-            found += [step(span, a, span.size / PLACES) for a in span.places()]
+            found += [step(span, a, span.size / COARSE_STEP_POSITIONS) for a in span.places()]
             found += [exponential(span, c * span.size, growth=g) for c in CONSTANTS for g in (False, True)]
     return found + ([harmonic(n) for n in CYCLES] if turning else [])
 
@@ -284,7 +286,7 @@ def powers(span: Span, name: str) -> tuple[str, ...]:
     if name == "u" or name.startswith("f"):
         scale = f"{span.rounded(max(abs(span.low), abs(span.high))):g}"
         x = name if scale == "1" else f"({name} / {scale})"
-    return (x, *(f"{x} ** {p}" for p in range(2, ORDER + 1)))
+    return (x, *(f"{x} ** {p}" for p in range(2, POLYNOMIAL_ORDER + 1)))
 
 
 def polynomial(signal: str, formulas: tuple[str, ...], order: int) -> Factor:
@@ -297,10 +299,10 @@ def finer(factor: Factor, span: Span, spacing: float) -> Iterator[Factor]:
     """Yield factors of the same kind near one; ``spacing``: their largest distance over that of the coarse scan."""
     steps = spacing * np.arange(-FINER, FINER + 1) / FINER
     if factor.kind == "step":
-        places = factor.constants[0] + steps * span.size / PLACES
+        places = factor.constants[0] + steps * span.size / COARSE_STEP_POSITIONS
         widths: list[float | None] = [None]
         if len(factor.constants) > 1:
-            widths = [max(w * factor.constants[1], SHARPEST * span.size) for w in WIDTHS]
+            widths = [max(w * factor.constants[1], SHARPEST * span.size) for w in SOFT_STEP_WIDTHS]
         yield from (step(span, a, width) for width in widths for a in places)
     elif factor.kind in ("exponential", "growth"):
         constants = factor.constants[0] * (CONSTANTS[1] / CONSTANTS[0]) ** steps

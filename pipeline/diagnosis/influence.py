@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.design import Design, Term, placed
+from pipeline.estimation.design import Design, EffectColumns, placed
 from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
-from pipeline.estimation.generalized_least_squares import Fit, design_at
+from pipeline.estimation.generalized_least_squares import JointFit, design_at
 from pipeline.estimation.observations import without_each_recording
 from pipeline.estimation.ranking import projection, without
 from pipeline.records import BASE_COUNT
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     JSON = dict[str, Any]
 
 MOST_OF = 0.5  # share of the gain that the listed seconds have together
-MOST_STRETCHES = 5
+MAX_INFLUENTIAL_STRETCHES = 5
 DETERMINED = 1e-6  # least information on an effect's weakest direction, over that of all recordings
 
 
@@ -77,7 +77,9 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     return found
 
 
-def _shares_of_blocks(selection: Selection, design: Design, products: Values, term: Term, index: Index) -> Values:
+def _shares_of_blocks(
+    selection: Selection, design: Design, products: Values, term: EffectColumns, index: Index
+) -> Values:
     """Return the share of each block in the gain of an effect: (m,) array."""
     observations, fit = selection.observations.less_stop_errors, selection.fit
     change = np.zeros(design.count)
@@ -108,7 +110,7 @@ def _weakest(products: Values, index: Index) -> float:
     return float(np.linalg.eigvalsh(without(products, others)[0][np.ix_(index, index)] / np.outer(size, size))[0])
 
 
-def _refitted(fit: Fit, index: Index, least: float, products: Values, rest: Observations) -> JSON:
+def _refitted(fit: JointFit, index: Index, least: float, products: Values, rest: Observations) -> JSON:
     """Return delta BIC of an effect and the largest change of its parameters without a recording.
 
     Empty if the information of the other recordings, ``rest``, is below ``least``.
@@ -145,4 +147,4 @@ def _stretches(observations: Observations, shares: Values, of_block: Index) -> l
         }
         for run in np.split(chosen, breaks)
     ]
-    return sorted(found, key=lambda stretch: -stretch["share"])[:MOST_STRETCHES]
+    return sorted(found, key=lambda stretch: -stretch["share"])[:MAX_INFLUENTIAL_STRETCHES]

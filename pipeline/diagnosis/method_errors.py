@@ -7,8 +7,9 @@ z. In a motion u that the recording's filter turns into u_f, with E = M K - 1, t
     which two axes depart from 90 deg; antisymmetric: rotation]  +  M (z - z_m) [two_sided]  +  u_f - u [filter_delay]
 
 Each error e_k has the share ``mean(e_k^2) / sum_j mean(e_j^2)``, also of the error of the magnitude, ``|u_f + e_k| -
-|u_f|``, for the filter ``|u_f| - |u(t - delay)|``. An error is named if it exceeds ``SURE`` standard uncertainties of
-both fits and a fiftieth of either error. Both fits count as independent, which never makes the uncertainty too small.
+|u_f|``, for the filter ``|u_f| - |u(t - delay)|``. An error is named if it exceeds
+``SIGNIFICANT_METHOD_ERROR`` standard uncertainties of both fits and a fiftieth of either error. Both fits count as
+independent, which never makes the uncertainty too small.
 If an effect is missing, bias and sides are not compared, since the effect shifts both in the method's fit.
 """
 
@@ -21,7 +22,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pipeline.diagnosis.words import template
-from pipeline.estimation.generalized_least_squares import Fit, fit_terms
+from pipeline.estimation.generalized_least_squares import JointFit, fit_terms
 from pipeline.estimation.observations import filtered_motion
 from pipeline.estimation.stages import declarations
 from pipeline.model.effects import effect_of
@@ -36,8 +37,10 @@ if TYPE_CHECKING:
     from pipeline.records import Motion, Recording, SensorCalibration, Values
     from pipeline.settings import Settings, Table
 
-LEAST_SHARE = 0.02  # of the mean square: a smaller part adds less than 1 % to the rms error
-SURE = 5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
+MIN_MEAN_SQUARE_SHARE = 0.02  # of the mean square: a smaller part adds less than 1 % to the rms error
+SIGNIFICANT_METHOD_ERROR = (
+    5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
+)
 
 
 def method_errors(
@@ -133,7 +136,7 @@ class _Difference:
         }
         return cls(method, M @ (bias - method.bias), parts, np.sqrt(np.clip(variance, 0.0, None)))
 
-    def errors(self, motion: Motion, free: Fit) -> dict[str, Values]:
+    def errors(self, motion: Motion, free: JointFit) -> dict[str, Values]:
         """Return the error of the calibrated reading by cause, without that of the filter: (n, 3) arrays."""
         u, added = truth(self.method.sensor, motion), np.zeros((len(motion.time), 3))
         fitted = {term.effect.name: term.values for term in free.terms}
@@ -149,9 +152,9 @@ class _Difference:
     def certain(self, selected: Sequence[str]) -> dict[str, bool]:
         """Return which parts exceed the noise of the two fits."""
         u = matrix_of(self.uncertainty)
-        least = SURE * np.where(np.eye(3) > 0.0, u, np.hypot(u, u.T) / 2.0)
+        least = SIGNIFICANT_METHOD_ERROR * np.where(np.eye(3) > 0.0, u, np.hypot(u, u.T) / 2.0)
         complete = {effect.name for effect in self.method.effects}.issuperset(selected)
-        of_bias = complete and bool(np.any(np.abs(self.bias) > SURE * self.uncertainty[BIAS]))
+        of_bias = complete and bool(np.any(np.abs(self.bias) > SIGNIFICANT_METHOD_ERROR * self.uncertainty[BIAS]))
         of_matrix = {name: bool(np.any(np.abs(matrix) > least)) for name, matrix in self.matrices.items()}
         return {"two_sided": complete, "bias": of_bias, **of_matrix}
 
@@ -170,7 +173,7 @@ def _covariance(calibration: SensorCalibration, settings: Settings) -> Values:
 
 
 def _errors(
-    difference: _Difference, free: Fit, recordings: Sequence[Recording], table: Table
+    difference: _Difference, free: JointFit, recordings: Sequence[Recording], table: Table
 ) -> dict[str, tuple[Values, Values]]:
     """Return the errors by cause in the recordings with a known motion: (n, 3), and of the magnitude: (n,)."""
     sensor = difference.method.sensor
@@ -232,7 +235,8 @@ def _named(
             **{key: shares.get(name) for key, shares in held_out.items()},
         }
         for name, share in _shares(rms).items()
-        if max(share, held_out["held_out_magnitude_share"].get(name, 0.0)) > LEAST_SHARE and certain.get(name, True)
+        if max(share, held_out["held_out_magnitude_share"].get(name, 0.0)) > MIN_MEAN_SQUARE_SHARE
+        and certain.get(name, True)
     ]
     return sorted(found, key=lambda entry: -float(entry["share"]))
 

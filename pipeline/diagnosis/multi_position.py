@@ -4,8 +4,8 @@ The residual of the rests is compared with white noise and the expected bias ins
 unknown. So a larger scatter of the rests is reported, but alone it is no sign of a missing effect.
 
 Twenty rests are too few to hold some out of a selection. So the selection uses all of them, and cross-validation
-judges it: each of ``FOLDS`` models leaves out every third rest with the move before it. ``held_out_error`` of a ranking
-is that of the selected effects, fitted without those rests. ``cross_validation`` also repeats the selection.
+judges it: each of ``REST_FOLDS`` models leaves out every third rest with the move before it. ``held_out_error`` of a
+ranking is that of the selected effects, fitted without those rests. ``cross_validation`` also repeats the selection.
 
 The residual depends on time, temperature (powers 1 to 2 or 3 over their span) or the axis' own specific force
 (Chebyshev polynomials of degree 4 and 5) if such curves, with free coefficients on every axis, have delta BIC > 10 and
@@ -22,22 +22,22 @@ import numpy as np
 import scipy
 
 from pipeline.diagnosis import functional_forms as forms
-from pipeline.diagnosis.findings import Case, Findings
+from pipeline.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.diagnosis.method_errors import given_differences
-from pipeline.diagnosis.observability import MORE, never_shown, not_observable_by_hand
+from pipeline.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
 from pipeline.diagnosis.residual_dependence import significant
 from pipeline.diagnosis.residual_plots import added_variable_of_rests
 from pipeline.diagnosis.verdict import verdict_of_selection_by_hand
 from pipeline.diagnosis.words import listed, plain
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.design import Term
-from pipeline.estimation.gauss_markov import WHITE, Setting
+from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
 from pipeline.estimation.least_squares import ScaledColumns, cholesky
-from pipeline.estimation.multi_position.fit import Fit, fit
-from pipeline.estimation.multi_position.model import NEW, NoiseHypothesis, project_out
+from pipeline.estimation.multi_position.fit import FitByHand, fit
+from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import calibration_of, model_of
-from pipeline.estimation.multi_position.selection import Selection, posterior
+from pipeline.estimation.multi_position.selection import SelectionByHand, posterior
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import is_given
 from pipeline.model.effects import catalogue, effect_from
@@ -51,26 +51,26 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Noise, Recording, SensorCalibration
     from pipeline.settings import Settings
 
-NEEDED = MORE
+NEEDED_RECORDING_BY_HAND = MORE_RESTS
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
-FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
+REST_FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
 SPARE = 2  # least number of equations beyond the parameters in a fold
 LEAST_SPAN = 1.0  # s or degC: of a covariate
 FORCE = ("8 * u ** 4 - 8 * u ** 2 + 1", "16 * u ** 5 - 20 * u ** 3 + 5 * u")  # Chebyshev polynomials of u in g
 WORTH = 0.25  # least share of the residual's mean square that a possible cause explains at its limits
-MOST_NAMED = 3  # effects in a sentence
+MAX_NAMED_EFFECTS = 3  # effects in a sentence
 FIRM = 2.0  # times the noise: a larger scatter of the rests is reported
 
 
-def findings(case: Case) -> Findings:
+def findings(case: DiagnosisInput) -> Findings:
     """Return the findings of the selection in rests and moves by hand.
 
     Raises ``NotObservableError`` if there are no rests, or if they do not determine bias and matrix.
     """
     model, calibration, noise = _model_of_all_rests(case), case.calibration, _without_creep(case)
     given = calibration, case.configured, case.noise, case.data_sheet
-    selection = Selection(model, *given)
-    expected = NoiseHypothesis(WHITE, (0.0,) * model.kinds)
+    selection = SelectionByHand(model, *given)
+    expected = NoiseHypothesis(WHITE_SETTING, (0.0,) * model.kinds)
     if noise is not None:
         ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
         expected = replace(expected, bias=Setting(ratio, noise.correlation_time))
@@ -85,12 +85,12 @@ def findings(case: Case) -> Findings:
     best = selection.hypotheses[int(np.argmax(scores))]
     signal = selection.first.signal
 
-    def calibrated(fit: Fit) -> SensorCalibration:
+    def calibrated(fit: FitByHand) -> SensorCalibration:
         return calibration_of(model, fit, calibration, case.settings)
 
     def advice(verdict: Verdict) -> str:
         if verdict == Verdict.NOT_ENOUGH_DATA:
-            return f"{MORE}{WITH_FACES if case.settings.procedure.faces else ''}"
+            return f"{MORE_RESTS}{WITH_FACES if case.settings.procedure.faces else ''}"
         if left_over is not None and (left_over > FIRM or verdict == Verdict.UNEXPLAINED):
             return _of_scatter(_suspects(selection, hidden), left_over)
         warmth = catalogue()["bias_temperature"]
@@ -132,12 +132,12 @@ def findings(case: Case) -> Findings:
             "method_errors": given_differences(
                 calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
             ),
-            "cross_validation": _cross_validation(selection, lambda part: Selection(part, *given)),
+            "cross_validation": _cross_validation(selection, lambda part: SelectionByHand(part, *given)),
         },
     )
 
 
-def _model_of_all_rests(case: Case) -> Model:
+def _model_of_all_rests(case: DiagnosisInput) -> Model:
     """Return the model with no rest held out.
 
     The accelerometer is calibrated again by all rests, which shows rests that contradict the others, unless it has
@@ -185,7 +185,7 @@ def require_model(
     return model
 
 
-def _without_creep(case: Case) -> Noise | None:
+def _without_creep(case: DiagnosisInput) -> Noise | None:
     """Return the noise, with the wander of the sensor file unless a static recording determined it.
 
     In rests by hand a slow change of the attitude moves gravity between the axes and looks like a wander of the bias.
@@ -198,7 +198,7 @@ def _without_creep(case: Case) -> Noise | None:
     return replace(noise, wander=wander, correlation_time=time)
 
 
-def _shares(selection: Selection, name: str) -> dict[str, float]:
+def _shares(selection: SelectionByHand, name: str) -> dict[str, float]:
     """Return the share of an effect's fitted signal that each other effect reproduces."""
     scored = selection.own[name] if name in selection.names else selection.first
     signal = scored.signal.get(name)
@@ -209,18 +209,18 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
     return {other: min(float(np.sum((shown.T @ signal) ** 2)) / power, 1.0) for other, shown in others.items()}
 
 
-def _over_noise(model: Model, fit: Fit, expected: NoiseHypothesis) -> float | None:
+def _over_noise(model: Model, fit: FitByHand, expected: NoiseHypothesis) -> float | None:
     """Return the rms residual of the rests over that of noise alone; None without a degree of freedom."""
     equations, rests = model.equations(fit.state), slice(model.rests_equations)
     L = cholesky(equations.covariance(expected)[rests, rests])
     columns = np.asarray(np.linalg.solve(L, equations.columns[rests]), np.float64)
     readings = np.asarray(np.linalg.solve(L, equations.residual[rests]), np.float64)
-    factors = ScaledColumns.of(columns, NEW)
+    factors = ScaledColumns.of(columns, MIN_NEW_NORM_SHARE)
     residual, freedom = readings - columns @ factors.solve(readings), len(readings) - factors.rank
     return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None
 
 
-def _held_out_errors(selection: Selection) -> list[float | None]:
+def _held_out_errors(selection: SelectionByHand) -> list[float | None]:
     """Return the rms error, g or deg/s, of each fit of the selection on rests that are left out of it in turn."""
     model = selection.model
     if model.held_out_error(selection.fits[0].state) is not None:  # a recording for validation
@@ -236,7 +236,7 @@ def _held_out_errors(selection: Selection) -> list[float | None]:
     return errors
 
 
-def _cross_validation(selection: Selection, select: Callable[[Model], Selection]) -> dict[str, Any] | None:
+def _cross_validation(selection: SelectionByHand, select: Callable[[Model], SelectionByHand]) -> dict[str, Any] | None:
     """Return the errors of the whole procedure, selection included, on rests that are left out of it in turn.
 
     ``folds``, ``error_before, error_after`` (rms, g or deg/s), and ``named``: the number of folds that selected each
@@ -252,13 +252,13 @@ def _cross_validation(selection: Selection, select: Callable[[Model], Selection]
         named.update(selected.names)
         squares += held * np.array([_squared(part, selected.fits[k].state) for k in (0, -1)])
     before, after = np.sqrt(squares / len(model.rests.time)).tolist()
-    return {"folds": FOLDS, "error_before": before, "error_after": after, "named": dict(named)}
+    return {"folds": REST_FOLDS, "error_before": before, "error_after": after, "named": dict(named)}
 
 
 def _folds(model: Model) -> Iterator[tuple[Model, int]]:
     """Yield the models that leave out every third rest in turn, each with the number of rests left out."""
-    fold = np.arange(len(model.rests.time)) % FOLDS
-    for k in range(FOLDS):
+    fold = np.arange(len(model.rests.time)) % REST_FOLDS
+    for k in range(REST_FOLDS):
         held: Mask = fold == k
         yield model.without(held), int(held.sum())
 
@@ -267,7 +267,7 @@ def _squared(model: Model, state: State) -> float:
     return (model.held_out_error(state) or 0.0) ** 2
 
 
-def _dependences(selection: Selection) -> list[dict[str, Any]]:
+def _dependences(selection: SelectionByHand) -> list[dict[str, Any]]:
     """Return the covariates on which the residual depends, each with its p-value, the clearest first."""
     model, rests = selection.model, selection.model.rests
     tests: list[tuple[str, Sequence[str]]] = []  # covariate and formulas of its curves
@@ -283,7 +283,7 @@ def _dependences(selection: Selection) -> list[dict[str, Any]]:
         terms = {f"c{k}": {"formula": text, "unit": "1"} for k, text in enumerate(formulas)}
         effect = {"name": f"curves_of_{covariate}", "owner": "recording", "sensors": [model.sensor], "terms": terms}
         definition = effect_from({**effect, "meaning": "Curves."}, "a test of the residual")
-        curves.append(Term(definition, np.zeros(3 * len(formulas))))
+        curves.append(EffectColumns(definition, np.zeros(3 * len(formulas))))
     equations = model.equations(selection.fits[-1].state, curves)
     projected = project_out(equations, selection.hypotheses)
     before, setting = projected.of_model()
@@ -297,7 +297,7 @@ def _dependences(selection: Selection) -> list[dict[str, Any]]:
     return [{"covariate": name, "p_value": p} for name, (_, p) in significant(results).items()]
 
 
-def _suspects(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
+def _suspects(selection: SelectionByHand, hidden: Mapping[str, str]) -> list[str]:
     """Return the effects that are not observable, but could be a cause of the residual, the likeliest first.
 
     The effect shows in the equations, and at its limits explains at least the share ``WORTH`` of the residual's mean
@@ -321,7 +321,7 @@ def _of_scatter(suspects: Sequence[str], over_noise: float) -> str:
     scatter = f"the rests scatter {over_noise:.2g} times the noise"
     if not suspects:
         return f"set the unit down firmly for each rest: {scatter} and follow nothing that is recorded"
-    names = listed([plain(name) for name in suspects[:MOST_NAMED]], "or")
+    names = listed([plain(name) for name in suspects[:MAX_NAMED_EFFECTS]], "or")
     warm = any("temperature" in catalogue()[name].needs for name in suspects)
     temperature = ", with the temperature of the sensor" if warm else ""
-    return f"{MORE}{temperature}: {scatter}, and they cannot distinguish an unsteady hand from {names}"
+    return f"{MORE_RESTS}{temperature}: {scatter}, and they cannot distinguish an unsteady hand from {names}"

@@ -40,9 +40,11 @@ OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "lev
 UNDESCRIBED = "the table's log describes no sample at which the rate changes"
 DRIFT = "bias_drift"
 LEAST_WEIGHT = float(np.log(0.01))  # log of the likelihood of a noise hypothesis over that of the likeliest
-FEWEST = 3  # equations beyond bias and matrix, to judge an effect with one coefficient
-ENOUGH = 40  # rests for the effects of the catalogue
-MORE = f"record {ENOUGH} rests or more, each in another orientation, all three axes inclined in most of them"
+MIN_FURTHER_EQUATIONS = 3  # equations beyond bias and matrix, to judge an effect with one coefficient
+SUFFICIENT_RESTS = 40  # rests for the effects of the catalogue
+MORE_RESTS = (
+    f"record {SUFFICIENT_RESTS} rests or more, each in another orientation, all three axes inclined in most of them"
+)
 
 
 def at_its_limit(this: Effect, sensor: str, limit: float) -> str:
@@ -158,7 +160,7 @@ def _faint(this: Effect, selection: Selection) -> str:
     return f"{at_its_limit(this, sensor, limits[0])} be below the noise"
 
 
-def not_observable_by_hand(selection: by_hand.Selection, configured: Sequence[str]) -> dict[str, str]:
+def not_observable_by_hand(selection: by_hand.SelectionByHand, configured: Sequence[str]) -> dict[str, str]:
     """Return the reason for each effect that rests and moves cannot show, without those in the model."""
     modelled = [*configured, *selection.names]
     return _hidden(selection.model.sensor, modelled, lambda this: _reason_by_hand(this, selection))
@@ -168,7 +170,7 @@ def _steady(span: float) -> str:
     return f"the temperature changes by no more than {span:.2g} degC"
 
 
-def _reason_by_hand(this: Effect, selection: by_hand.Selection) -> str:
+def _reason_by_hand(this: Effect, selection: by_hand.SelectionByHand) -> str:
     """Return why rests and moves cannot show an effect; empty if they can."""
     model, base = selection.model, selection.fits[0]
     refused = refusal(this, model.sensor, model.rests)
@@ -180,16 +182,16 @@ def _reason_by_hand(this: Effect, selection: by_hand.Selection) -> str:
     score = selection.first.scores.get(this.name)
     if score is None and model.kinds == 1 and this.needs_motion:
         return "at rest nothing moves, and it adds nothing"
-    few = len(base.residual) - base.rank < FEWEST
+    few = len(base.residual) - base.rank < MIN_FURTHER_EQUATIONS
     if few if score is None else selection.first.spare[this.name] == 0.0:
-        return f"{len(model.rests.time)} rests are too few to distinguish it from their scatter; {MORE}"
+        return f"{len(model.rests.time)} rests are too few to distinguish it from their scatter; {MORE_RESTS}"
     if score is None:
         seen = "rests and moves by hand" if model.kinds > 1 else "rests"
         return f"in {seen} bias and matrix explain all that it would add"
     return "" if passes(score, model.sensor, len(selection.candidates)) else _faint_by_hand(this, score, selection)
 
 
-def _faint_by_hand(this: Effect, score: Score, selection: by_hand.Selection) -> str:
+def _faint_by_hand(this: Effect, score: Score, selection: by_hand.SelectionByHand) -> str:
     """Return why rests and moves would not show an effect at its limits; empty if they would."""
     n, rests = len(selection.fits[0].residual), selection.model.rests
     gate = min_gain(this, selection.model.sensor, score.parameters, n, len(selection.candidates))

@@ -45,11 +45,13 @@ if TYPE_CHECKING:
     Tests = tuple[list[str], Values, Index]  # covariate, delta BIC and number of parameters of each test
 
 DEGREE = 5  # up to four turning points over the span; faster changes are steps
-FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
+MIN_CYCLES, MAX_CYCLES = 3, 8  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # periods a turn; the catalogue contains one
-PLACES = 16  # of steps: the nearest one is within 1/32 of the span
-EQUATION = 0.05  # of the gain by effects of time or temperature: less may be the error of a smoothed temperature
-ABOVE = 1.1  # times the white noise: a larger residual may contain a step
+STEP_POSITIONS = 16  # of steps: the nearest one is within 1/32 of the span
+MAX_SHARE_OF_LINEARISATION = (
+    0.05  # of the gain by effects of time or temperature: less may be the error of a smoothed temperature
+)
+RESIDUAL_OVER_NOISE = 1.1  # times the white noise: a larger residual may contain a step
 SIGNALS = {"time": "time", "temperature": "temperature", "rate": "speed"}  # of covariates, for steps and polynomials
 SIMULATIONS = 199  # standard error of the share: 3.5 % at most
 
@@ -61,7 +63,7 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[d
     """
     found = _significant(selection, explained)
     if any(effect(name).uses_time_or_temperature for name in selection.names):
-        least = EQUATION * 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
+        least = MAX_SHARE_OF_LINEARISATION * 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
         found = {k: v for k, v in found.items() if v[0] > least or k not in ("temperature", "time")}
     if found and any(setting.prior for setting in selection.settings):
         least = min(setting.prior for setting in selection.settings)
@@ -88,7 +90,9 @@ def _significant(selection: Selection, explained: Curves | None) -> dict[str, tu
     """Return the significant covariates of a selection; see ``significant``."""
     scan, bases = Scan(selection, explained), _bases_of(selection)
     tests = [_tests_of_curves(bases, scan)]
-    if selection.names or selection.fit.residual_rms > ABOVE * float(np.sqrt(np.mean(selection.start.scale**2))):
+    if selection.names or selection.fit.residual_rms > RESIDUAL_OVER_NOISE * float(
+        np.sqrt(np.mean(selection.start.scale**2))
+    ):
         tests.append(_tests_of_steps(selection, [covariate for covariate, _, _ in bases], scan))
     names = [name for of_kind, _, _ in tests for name in of_kind]
     delta, parameters = (np.concatenate([test[k] for test in tests]) for k in (1, 2))
@@ -117,17 +121,17 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
     for covariate, signal in SIGNALS.items():
         if covariate in covariates:
             places = Span.of(observations, signal).places()
-            every = max(1, len(places) // PLACES)
+            every = max(1, len(places) // STEP_POSITIONS)
             scanned.append((signal, places[every // 2 :: every]))
             names += [covariate] * 2 * len(scanned[-1][1])
     steps = len(names)
-    ripples = (MOST - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in covariates else 0
+    ripples = (MAX_CYCLES - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in covariates else 0
 
     def curves(motion: Motion) -> Values:
         signals, columns = signals_of(motion), []
         for signal, places in scanned:
             above = np.asarray(signals[signal])[:, None] - places
-            columns += [(above >= 0).astype(float), np.tanh(above / (np.ptp(places) / PLACES + 1e-12))]
+            columns += [(above >= 0).astype(float), np.tanh(above / (np.ptp(places) / STEP_POSITIONS + 1e-12))]
         if ripples:
             rate = np.zeros(len(motion.time)) if motion.rate is None else motion.rate
             columns.append(rate[:, None] * _harmonics(motion, LEAST_RIPPLE))
@@ -212,7 +216,7 @@ def _bases_of(selection: Selection) -> list[Basis]:
         if signal in available:
             bases.append((covariate, _chebyshev(Span.of(observations, signal)), [(range(DEGREE), 2)]))
     if any(part.motion.axis is not None for part in observations.parts):
-        count = MOST - FEWEST + 1
+        count = MAX_CYCLES - MIN_CYCLES + 1
         single: list[Block] = [((j, count + j), 2) for j in range(count)]
         bases.append(("angle", _harmonics, [*single, (range(2 * count), 2 * count)]))
     return bases
@@ -228,11 +232,11 @@ def _chebyshev(span: Span) -> Callable[[Motion], Values]:
     return curves
 
 
-def _harmonics(motion: Motion, fewest: int = FEWEST) -> Values:
+def _harmonics(motion: Motion, fewest: int = MIN_CYCLES) -> Values:
     """Return cos and sin of the table's angle times ``fewest`` to 8: (n, 2 m) array."""
     if motion.angle is None:
-        return np.zeros((len(motion.time), 2 * (MOST - fewest + 1)))
-    turns = np.radians(motion.angle)[:, None] * np.arange(fewest, MOST + 1)
+        return np.zeros((len(motion.time), 2 * (MAX_CYCLES - fewest + 1)))
+    turns = np.radians(motion.angle)[:, None] * np.arange(fewest, MAX_CYCLES + 1)
     return np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
 
 

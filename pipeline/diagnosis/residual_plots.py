@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.functional_forms import columns_of, signals_of
-from pipeline.estimation.design import Term, placed
-from pipeline.estimation.gauss_markov import WHITE, Blocks, Products, Setting
+from pipeline.estimation.design import EffectColumns, placed
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, Products, Setting
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.ranking import projection
 from pipeline.model.effects.base import Layout, truth, unit_of
@@ -39,15 +39,17 @@ if TYPE_CHECKING:
 
     JSON = dict[str, Any]
 
-OWN = 4  # columns of the base on each axis
+OWN_BASE_COLUMNS = 4  # columns of the base on each axis
 RANK_OF_RESTS = 1e-8  # of singular values: columns that are the same to rounding
-BINS = 40  # points that are distinct in a plot
-DIGITS = 5  # more than a plot shows
+PLOT_BINS = 40  # points that are distinct in a plot
+PLOT_DIGITS = 5  # more than a plot shows
 CURVE = 60  # points of the curve of a suggested form
-LEAST_SHARE = 0.01  # of the information on a shared coefficient; an axis with less is not shown
-AT_REST = 0.9  # least share of a column's power in the rests; below it, a plot of rests does not show the effect
-MOST = 3  # plots of dependences
-SIGNALS = {"rate": "speed", "specific_force": "u"}  # abscissa of a covariate without a form, if not itself
+MIN_INFORMATION_SHARE = 0.01  # of the information on a shared coefficient; an axis with less is not shown
+MIN_REST_POWER_SHARE = (
+    0.9  # least share of a column's power in the rests; below it, a plot of rests does not show the effect
+)
+MAX_PLOTS = 3  # plots of dependences
+ABSCISSA_SIGNALS = {"rate": "speed", "specific_force": "u"}  # abscissa of a covariate without a form, if not itself
 
 
 def plots(
@@ -61,7 +63,7 @@ def plots(
     one for each axis, with the binned ``x, mean, standard_error``. Panels of an added variable also have the slope:
     ``parameter, unit, value, standard_uncertainty``. Panels of a suggested form also have ``curve_x, curve``.
     """
-    shown = [entry for entry in unexplained if not entry.get("explained_by")][:MOST]
+    shown = [entry for entry in unexplained if not entry.get("explained_by")][:MAX_PLOTS]
     regression = _Columns(selection) if shown else None
     return {
         "added_variable": _added_variable(_Columns(reported), reported) if reported.names else None,
@@ -80,13 +82,13 @@ def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     significant = _most_significant(term, sensor, np.abs(term.values) / uncertainty)
     chosen = []
     for c, j in enumerate(significant):
-        if j is not None and np.any(regression.columns[c][:, block.start - BASE_COUNT + OWN + j]):
+        if j is not None and np.any(regression.columns[c][:, block.start - BASE_COUNT + OWN_BASE_COLUMNS + j]):
             x = regression.left_of_column(c, block.start + j, products)
             chosen.append((c, j, x, regression.weight @ x**2 / sigma[c] ** 2))
     information = sum(each for *_, each in chosen)
     panels = []
     for c, j, x, of_axis in chosen:
-        if term.effect.layout == Layout.SHARED and of_axis < LEAST_SHARE * information:
+        if term.effect.layout == Layout.SHARED and of_axis < MIN_INFORMATION_SHARE * information:
             continue
         bins = Bins.of(x, regression.weight)
         points = bins.document(term.values[j] * x + white[:, c], sigma[c] ** 2 / bins.weight)
@@ -94,7 +96,7 @@ def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     return {"effect": selection.names[0], "unit": unit_of(sensor), "panels": panels}
 
 
-def added_variable_of_rests(selection: by_hand.Selection) -> JSON | None:
+def added_variable_of_rests(selection: by_hand.SelectionByHand) -> JSON | None:
     """Return the same for rests by hand; None if the first selected effect shows mostly in the moves."""
     model, fit = selection.model, selection.fits[-1]
     term, block = placed(fit.state.terms, model.directions.shape[1])[selection.names[0]]
@@ -113,7 +115,7 @@ def added_variable_of_rests(selection: by_hand.Selection) -> JSON | None:
         norm = np.linalg.norm(others, axis=0)
         others = others / np.where(norm > 0.0, norm, 1.0)
         x = column - others @ np.linalg.lstsq(others, column, rcond=RANK_OF_RESTS)[0]
-        if np.sum(x[rests] ** 2) < AT_REST * np.sum(x**2):
+        if np.sum(x[rests] ** 2) < MIN_REST_POWER_SHARE * np.sum(x**2):
             return None
         order = np.argsort(x[rests], kind="stable")
         panels.append(
@@ -128,13 +130,13 @@ def added_variable_of_rests(selection: by_hand.Selection) -> JSON | None:
     return {"effect": selection.names[0], "unit": unit_of(model.sensor), "panels": panels}
 
 
-def _coefficient(term: Term, sensor: str, j: int, uncertainty: float) -> JSON:
+def _coefficient(term: EffectColumns, sensor: str, j: int, uncertainty: float) -> JSON:
     described = term.effect.parameters(sensor)[j]
     known = {"parameter": described.name, "unit": described.unit, "value": float(term.values[j])}
     return known | {"standard_uncertainty": float(uncertainty)}
 
 
-def _most_significant(term: Term, sensor: str, ratio: Values) -> list[int | None]:
+def _most_significant(term: EffectColumns, sensor: str, ratio: Values) -> list[int | None]:
     """Return the coefficient to show on each axis, all of one unit, and linear if possible.
 
     ``ratio``: of each value to its uncertainty.
@@ -153,7 +155,7 @@ def _most_significant(term: Term, sensor: str, ratio: Values) -> list[int | None
 def _unexplained(regression: _Columns, selection: Selection, entry: Mapping[str, Any], noise: Noise | None) -> JSON:
     """Return the plot of the residual against a covariate, with the curve of the suggested form."""
     signal, forms = _signal_and_forms(selection, entry)
-    setting, values = WHITE, _values(selection, signal)
+    setting, values = WHITE_SETTING, _values(selection, signal)
     if noise is not None and np.any(noise.wander > 0):  # as expected: the fitted wander may contain the dependence
         setting = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
     sigma = regression.white_noise(regression.residual - regression.wander(selection.fit.setting))
@@ -181,7 +183,7 @@ def _signal_and_forms(
     """Return the signal of a covariate, and the values and coefficients of the form on each axis."""
     observations, formulas = selection.observations, entry.get("formulas") or []
     named = sorted({name for text in formulas for name in parse(text).signals})
-    signal = named[0] if named else SIGNALS.get(entry["covariate"], entry["covariate"])
+    signal = named[0] if named else ABSCISSA_SIGNALS.get(entry["covariate"], entry["covariate"])
     forms: list[tuple[Values, Sequence[float] | None]] = [(np.zeros(len(observations.weight)), None)] * 3
     if len(named) != 1:
         return signal, forms
@@ -229,7 +231,7 @@ class _Columns:
         places = self.design.places(c)[1][:-1]
         others, delta = np.flatnonzero(np.arange(len(products)) != index), np.zeros(len(products))
         delta[others] = projection(products[None], others)[0][:, index]
-        return np.asarray(self.columns[c][:, index - BASE_COUNT + OWN] - self.columns[c] @ delta[places])
+        return np.asarray(self.columns[c][:, index - BASE_COUNT + OWN_BASE_COLUMNS] - self.columns[c] @ delta[places])
 
     def left_of(self, c: int, values: Values, setting: Setting) -> Values:
         """Return the residual of (n,) values after a fit of base and effects, free on this axis: (n,) array."""
@@ -253,9 +255,9 @@ class Bins:
         """Return the bins of a covariate; its (n,) values are not finite if unknown."""
         known = np.isfinite(values)
         low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
-        place = np.full(len(values), BINS)
-        place[known] = np.minimum((values[known] - low) * (BINS / max(high - low, 1e-300)), BINS - 1)
-        filled, cell = np.unique(np.append(place, BINS), return_inverse=True)
+        place = np.full(len(values), PLOT_BINS)
+        place[known] = np.minimum((values[known] - low) * (PLOT_BINS / max(high - low, 1e-300)), PLOT_BINS - 1)
+        filled, cell = np.unique(np.append(place, PLOT_BINS), return_inverse=True)
         total: Values = np.bincount(cell[:-1], weight, len(filled))[:-1].astype(float)
         first = cls(cell[:-1], weight, total, np.zeros(0))
         return cls(first.cell, weight, total, first.mean(np.where(known, values, 0.0)))
@@ -286,4 +288,4 @@ class Bins:
 
 
 def _rounded(values: Values) -> list[float]:
-    return [float(f"{v:.{DIGITS}g}") for v in values.tolist()]
+    return [float(f"{v:.{PLOT_DIGITS}g}") for v in values.tolist()]

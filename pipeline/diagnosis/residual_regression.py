@@ -23,8 +23,8 @@ import numpy as np
 import scipy
 
 from pipeline.estimation.design import true_motion
-from pipeline.estimation.gauss_markov import WHITE, GaussMarkov
-from pipeline.estimation.ranking import LEFT, RIDGE
+from pipeline.estimation.gauss_markov import WHITE_SETTING, GaussMarkov
+from pipeline.estimation.ranking import MIN_LEFT_SQUARE_SHARE, UNIT_COLUMN_RIDGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -34,12 +34,14 @@ if TYPE_CHECKING:
 
 Curves: TypeAlias = "Callable[[Motion], Values]"  # to (n, 1, q), or (n, 3, q) if they differ between the axes
 
-NEW = 1e-3  # least remaining share of a new column's norm, without base and effects (EXCITED of the ranking)
-ROUNDING = float(np.finfo(np.float64).eps) / 2.0  # u
+MIN_NEW_COLUMN_SHARE = (
+    1e-3  # least remaining share of a new column's norm, without base and effects (EXCITED of the ranking)
+)
+UNIT_ROUNDOFF = float(np.finfo(np.float64).eps) / 2.0  # u
 
 
 @dataclass(frozen=True)
-class Gain:
+class FormGain:
     """The improvement of the fit by a functional form."""
 
     delta_bic: float
@@ -73,8 +75,8 @@ class Scan:
         self._motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
         self._blocks, self._weight = observations.blocks, observations.weight
         self._label = self._blocks.label(len(self._weight))
-        self._noise = GaussMarkov(self._blocks, [WHITE, *selection.settings])
-        self._unit = float(ROUNDING * np.sqrt(observations.samples)) ** 0.5
+        self._noise = GaussMarkov(self._blocks, [WHITE_SETTING, *selection.settings])
+        self._unit = float(UNIT_ROUNDOFF * np.sqrt(observations.samples)) ** 0.5
         design = selection.fit.design(observations)
         A, places = design.columns.columns, [design.places(c)[0] for c in range(3)]
         if explained is not None:
@@ -91,7 +93,7 @@ class Scan:
             size = np.sqrt(np.einsum("tpp->tp", products))
             size = np.where(size > 0.0, size, 1.0)
             over = size[:, :, None] * size[:, None, :]
-            inverse = np.linalg.inv(products / over + RIDGE * np.eye(len(known))) / over
+            inverse = np.linalg.inv(products / over + UNIT_COLUMN_RIDGE * np.eye(len(known))) / over
             self._fitted.append((np.array(known), target, inverse))
             cross = self._among[:, known, target]
             taken = np.einsum("tp,tpq,tq->t", cross, inverse, cross)
@@ -134,7 +136,7 @@ class Scan:
         found: Values = 2.0 * (best - self.before) - parameters * float(np.log(self.samples))
         return found
 
-    def best_axes(self, drops: Values, columns: int | Index, scanned: int | Index = 0) -> list[Gain]:
+    def best_axes(self, drops: Values, columns: int | Index, scanned: int | Index = 0) -> list[FormGain]:
         """Return the gain of each form on the axes that it improves.
 
         ``drops``: (t, 3, m). ``columns``: number of columns on each axis. ``scanned``: number of scanned constants.
@@ -147,7 +149,7 @@ class Scan:
         delta, p = gained - k * float(np.log(self.samples)), scipy.special.chdtrc(k, gained)
         best, at = delta.argmax(axis=0), likelihoods.argmax(axis=0)
         return [
-            Gain(float(delta[a, m]), float(p[a, m]), tuple(sorted(order[: a + 1, m].tolist())), int(at[a, m]))
+            FormGain(float(delta[a, m]), float(p[a, m]), tuple(sorted(order[: a + 1, m].tolist())), int(at[a, m]))
             for m, a in enumerate(best.tolist())
         ]
 
@@ -166,8 +168,9 @@ class Scan:
         """Return the products of m forms of r columns without their part in the model, white noise first.
 
         (t, 3, m, r, r) products of a form's columns, (t, 3, m, r) with the residual, and (t, 3, m, r) the error e of
-        each column. e exceeds the remaining norm of a column that is less than ``NEW`` under white noise, or rounding
-        alone under another noise. ``versions``: the columns of each axis, or one for all.
+        each column. e exceeds the remaining norm of a column that is less than ``MIN_NEW_COLUMN_SHARE``
+        under white noise, or rounding alone under another noise. ``versions``: the columns of each axis, or one for
+        all.
         """
 
         def split(values: Values) -> Values:
@@ -184,8 +187,8 @@ class Scan:
             inner = gram - split(taken) @ split(across[:, :, known]).swapaxes(-1, -2)
             cross = across[:, :, target] - (taken @ self._among[:, known, target, None])[:, :, 0]
             hidden = self._unit * (np.sqrt(own[0]) + (np.abs(taken) @ sizes[known]).reshape(own.shape))
-            error = np.maximum(hidden, np.sqrt(LEFT * own))
-            error[0] = np.maximum(error[0], NEW * np.sqrt(own[0]))
+            error = np.maximum(hidden, np.sqrt(MIN_LEFT_SQUARE_SHARE * own))
+            error[0] = np.maximum(error[0], MIN_NEW_COLUMN_SHARE * np.sqrt(own[0]))
             scale = self.scale[c]
             found.append((inner / scale**2, cross.reshape(own.shape) / scale**2, error / scale))
         inner, cross, error = (np.stack(each, axis=1) for each in zip(*found, strict=True))
@@ -211,7 +214,7 @@ class ProjectedCurves:
         """Return the curves of ``index`` that are independent of base, effects and the curves before them."""
         rest, new = self.white.copy(), []
         for j in index:
-            if rest[j, j] > (NEW * self.size[j]) ** 2:
+            if rest[j, j] > (MIN_NEW_COLUMN_SHARE * self.size[j]) ** 2:
                 new.append(int(j))
                 rest -= np.outer(rest[:, j], rest[j]) / rest[j, j]
         return new

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.diagnosis.findings import Case, Findings
+from pipeline.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.diagnosis.influence import influence
 from pipeline.diagnosis.method_errors import method_errors
@@ -23,7 +23,7 @@ from pipeline.diagnosis.words import FAR_OFF, plain
 from pipeline.errors import ConvergenceError
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.free_curves import free_curves
-from pipeline.estimation.generalized_least_squares import Fit, calibration_of, fit_in_mean_frame, fit_terms
+from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.posterior_turns import posterior
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
@@ -38,11 +38,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-NEEDED = "record turns about all three axes on a table whose angle and rate are logged"
-CLOSE = 1.1  # mean square of a residual over that of noise below which effects cannot explain a part of the excess
+NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
+UNEXPLAINABLE_RATIO = (
+    1.1  # mean square of a residual over that of noise below which effects cannot explain a part of the excess
+)
 
 
-def findings(case: Case) -> Findings:
+def findings(case: DiagnosisInput) -> Findings:
     """Return the findings of the selection in turns on a table.
 
     Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
@@ -76,7 +78,7 @@ def findings(case: Case) -> Findings:
     return replace(described, search=search)
 
 
-def _described(discovery: Discovery, case: Case) -> Findings:
+def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     """Return the findings of a selection and a discovery."""
     sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
@@ -90,7 +92,7 @@ def _described(discovery: Discovery, case: Case) -> Findings:
     reference = observations.less_stop_errors.expected_square
     noise_square = None if noise is None else float(np.mean(reference * noise.white**2 + noise.wander**2))
     least = squares[-1] if noise_square is None else noise_square
-    at_noise = not reported.names and squares[0] < CLOSE * least
+    at_noise = not reported.names and squares[0] < UNEXPLAINABLE_RATIO * least
     excess = squares[0] if at_noise else squares[0] - min(least, squares[-1])
     motions = [part.motion for part in observations.parts]
     bent = any(effect(name).of_the_room(sensor) for name in selection.names)
@@ -121,7 +123,7 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         proposed = next((this for name, this in catalogue().items() if this.proposed and name in hidden), None)
         return f"to make {plain(proposed.name)} observable: record {proposed.excitation}" if proposed else ""
 
-    def calibrated(fit: Fit) -> SensorCalibration:
+    def calibrated(fit: JointFit) -> SensorCalibration:
         return calibration_of(fit, selection.observations, None, case.settings)
 
     suggested = [str(discovery.suggested["name"])] if discovery.suggested else []  # in the base of ``reported``
@@ -167,7 +169,7 @@ def _described(discovery: Discovery, case: Case) -> Findings:
     )
 
 
-def _fits(selection: Selection) -> list[Fit]:
+def _fits(selection: Selection) -> list[JointFit]:
     """Return the fits of the base and with each further selected effect."""
     fits = [selection.base]
     fitted = {term.effect.name: term for term in selection.fit.terms}
@@ -177,7 +179,7 @@ def _fits(selection: Selection) -> list[Fit]:
     return [*fits, selection.fit] if selection.names else fits
 
 
-def _held_out_errors(selection: Selection, fits: Sequence[Fit], case: Case) -> tuple[list[float], float]:
+def _held_out_errors(selection: Selection, fits: Sequence[JointFit], case: DiagnosisInput) -> tuple[list[float], float]:
     """Return the held-out error of each fit, and the noise floor of the last; no errors without held-out motion."""
     noise = case.noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
     held = [r for r in case.recordings if r.role == "validation"] if selection.names else []
@@ -209,7 +211,7 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
     return selection.first.shares(selection.first.indices(name)[0], [], selection.alone[name].setting)
 
 
-def _over_noise(fit: Fit, case: Case, reference: float) -> float | None:
+def _over_noise(fit: JointFit, case: DiagnosisInput, reference: float) -> float | None:
     """Return the rms residual of a fit over that of noise alone; ``reference``: ``Observations.expected_square``."""
     if case.noise is None:
         return None

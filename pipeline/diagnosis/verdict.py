@@ -20,16 +20,24 @@ if TYPE_CHECKING:
     from pipeline.records import Agreement, SensorDiagnosis
 
 EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
-MOSTLY = 0.5  # least share of the residual's excess that selected effects explain if the residual has another cause too
+MIN_EXPLAINED_EXCESS = (
+    0.5  # least share of the residual's excess that selected effects explain if the residual has another cause too
+)
 BELIEVED = 3  # most effects at once; a selection takes more only to imitate physics outside the catalogue
 UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by the selected effects: least delta BIC of a covariate that counts
-LIKELY = 0.5  # probability of physics outside the catalogue above which the selected effects are no explanation
-SURE = 0.9  # the same if the held-out error with the selected effects is at the noise floor (thermal_ramp, long-004)
-WORSE = 0.3  # of the noise's mean square: largest increase of the held-out mean square by the selected effects
+MAX_UNKNOWN_PROBABILITY = (
+    0.5  # probability of physics outside the catalogue above which the selected effects are no explanation
+)
+LIKELY_AT_FLOOR = (
+    0.9  # the same if the held-out error with the selected effects is at the noise floor (thermal_ramp, long-004)
+)
+MAX_HELD_OUT_INCREASE = (
+    0.3  # of the noise's mean square: largest increase of the held-out mean square by the selected effects
+)
 HELPFUL = 0.1  # least relative reduction of the held-out mean square by an effect that is offered
 LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms of 3 x 1000 samples
 DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null families was 0.006
-QUIET = 0.6  # times the noise: a smaller residual contradicts the noise of the rests
+MIN_RESIDUAL_OVER_NOISE = 0.6  # times the noise: a smaller residual contradicts the noise of the rests
 FAR_ABOVE_BY_HAND = 10.0  # times the noise: nobody sets down or holds a unit so badly
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 STATIC_AGAIN = "record static again: ten minutes or more at rest, on a base that does not shake"
@@ -56,7 +64,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class VerdictInput:
     """The evidence for the verdict on a sensor."""
 
     sensor: str
@@ -126,7 +134,7 @@ class Evidence:
     @property
     def too_quiet(self) -> bool:
         """Whether the residual is too small for the noise estimate."""
-        small = self.over_noise is not None and self.over_noise < QUIET
+        small = self.over_noise is not None and self.over_noise < MIN_RESIDUAL_OVER_NOISE
         return small and self.on_table and self.found == Verdict.NOTHING_MISSING
 
     @property
@@ -180,9 +188,9 @@ def verdict_of_selection(
     if _made_worse(held_out) or len(names) > BELIEVED:
         return Verdict.UNEXPLAINED
     at_floor = held_out is not None and held_out["error_after"] <= held_out["floor"]
-    if names and beyond > (SURE if at_floor else LIKELY):
+    if names and beyond > (LIKELY_AT_FLOOR if at_floor else MAX_UNKNOWN_PROBABILITY):
         return Verdict.UNEXPLAINED
-    if (unknown or above_noise) and (not names or share < MOSTLY):
+    if (unknown or above_noise) and (not names or share < MIN_EXPLAINED_EXCESS):
         return Verdict.UNEXPLAINED
     if unknown and max(float(entry["delta_bic"]) for entry in unknown) > UNKNOWN_SHARE * gain:
         return Verdict.UNEXPLAINED
@@ -211,12 +219,12 @@ def _made_worse(held_out: Mapping[str, float] | None) -> bool:
     """Return whether the selected effects raise the held-out error: then they are not what is missing."""
     if held_out is None:
         return False
-    return held_out["error_after"] ** 2 - held_out["error_before"] ** 2 > WORSE * held_out["floor"] ** 2
+    return held_out["error_after"] ** 2 - held_out["error_before"] ** 2 > MAX_HELD_OUT_INCREASE * held_out["floor"] ** 2
 
 
 # Verdict, its reason (a macro of ``templates/reasons.txt``), and the condition. ``e.above``: the held-out error of the
 # calibration is above its interval.
-RULES: tuple[tuple[Verdict, str, Callable[[Evidence], object]], ...] = (
+RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.REFERENCE_IN_DOUBT, "doubts", lambda e: e.doubts),
     (Verdict.MISSING_EFFECT, "beyond", lambda e: e.above and e.missing and not (e.full and e.full.above)),
     (Verdict.UNEXPLAINED, "above_and_unexplained", lambda e: e.above and e.unexplained),
@@ -234,7 +242,7 @@ RULES: tuple[tuple[Verdict, str, Callable[[Evidence], object]], ...] = (
 )
 
 
-def decide(e: Evidence) -> tuple[Verdict, str]:
+def decide(e: VerdictInput) -> tuple[Verdict, str]:
     """Return the verdict and its reason in one or two sentences; without a reason if the selection decides."""
     for verdict, reason, applies in RULES:
         if applies(e):
@@ -242,7 +250,7 @@ def decide(e: Evidence) -> tuple[Verdict, str]:
     return e.found, ""
 
 
-def judged(diagnosis: SensorDiagnosis, e: Evidence) -> SensorDiagnosis:
+def judged(diagnosis: SensorDiagnosis, e: VerdictInput) -> SensorDiagnosis:
     """Return the diagnosis of a selection with the verdict by the evidence, its reason and the next experiment."""
     verdict, reason = decide(e)
     step = _next_step(verdict, diagnosis, e)
@@ -259,7 +267,7 @@ def judged(diagnosis: SensorDiagnosis, e: Evidence) -> SensorDiagnosis:
     )
 
 
-def may_be_unknown(verdict: Verdict, e: Evidence) -> bool:
+def may_be_unknown(verdict: Verdict, e: VerdictInput) -> bool:
     """Return whether physics outside the catalogue may be the cause, as no check of the recordings names another one.
 
     Also true if the held-out error with the selected effects is above the noise floor.
@@ -269,7 +277,7 @@ def may_be_unknown(verdict: Verdict, e: Evidence) -> bool:
     return verdict == Verdict.UNEXPLAINED or (verdict == Verdict.REFERENCE_IN_DOUBT and not e.doubts)
 
 
-def _offered(verdict: Verdict, diagnosis: SensorDiagnosis, e: Evidence) -> bool:
+def _offered(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) -> bool:
     """Return whether to offer the selected effects: if ``unexplained``, each must be plausible and help on held-out."""
     if e.given:
         return False
@@ -280,7 +288,7 @@ def _offered(verdict: Verdict, diagnosis: SensorDiagnosis, e: Evidence) -> bool:
     return bool(lower) and all(lower)
 
 
-def _next_step(verdict: Verdict, diagnosis: SensorDiagnosis, e: Evidence) -> str:
+def _next_step(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) -> str:
     """Return the next step if it differs from the one that the selection proposes; empty otherwise."""
     experiment = of_unknown(diagnosis.unexplained, on_table=e.on_table)
     if verdict == Verdict.UNEXPLAINED and e.implausible:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FileSystemLoader, Template
 
-from pipeline.estimation.candidates import HELD, TILT, is_held
+from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_held
 from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.posterior import CERTAIN
 from pipeline.model.effects import catalogue
@@ -87,7 +87,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
         catalogue=catalogue(),
         by_reason=by_reason.items(),
         answers=listed([*map(_said, sets[:MOST_ANSWERS]), *more], "or"),
-        held=HELD,
+        held=FIXED_AT_ZERO,
         tilt=TILT,
     )
     return [line for line in text.splitlines() if line]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.design import NormalPrior, Term
+from pipeline.estimation.design import EffectColumns, NormalPrior
 from pipeline.estimation.free_curves import BEND_SHARE, Bend
 from pipeline.model.effects import catalogue, effect, stated_priors
 from pipeline.model.effects.base import parameter_limits
-from pipeline.model.effects.mounting import OWN
+from pipeline.model.effects.mounting import SETUP_EFFECTS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis se
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
 TILTS = ("d_x", "d_y")  # parameters of ``table_tilt``
 HELD_DEG = 1e-4  # standard deviation of a tilt that is fixed at 0: a hundredth of a good encoder's accuracy
-HELD = (
+FIXED_AT_ZERO = (
     "A tilt about the shaft has the same signal as a common zero of the turns: the recordings do not determine it "
     "together with mountings or zeros. table.levelling_deg does not state it, so that it is fixed at 0."
 )
@@ -62,7 +62,7 @@ def starts_of(
     observed: Observations | str,
     known: SensorCalibration | None = None,
     accelerometer: SensorCalibration | None = None,
-) -> list[list[Term]]:
+) -> list[list[EffectColumns]]:
     """Return the terms from which a fit starts, every combination of the effects' starts.
 
     ``observed``: for recordings by hand only the sensor. ``known``: a calibration, at whose effects a fit starts.
@@ -80,7 +80,7 @@ def starts_of(
                 f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them"
             )
     fitted = {} if known is None else {e.name: e.values for e in known.effects}
-    choices: list[list[Term]] = []
+    choices: list[list[EffectColumns]] = []
     for name in names:
         this = effect(name).of_recordings(recordings)
         if sensor not in this.sensors:
@@ -91,7 +91,7 @@ def starts_of(
         starts = this.starts(sensor) if prior is None or this.nonlinear else [prior.mean]
         if name in fitted and len(fitted[name]) == len(this.parameters(sensor)):
             starts = [fitted[name]]
-        choices.append([Term(this, values, prior=prior) for values in starts])
+        choices.append([EffectColumns(this, values, prior=prior) for values in starts])
     return [list(terms) for terms in product(*choices)]
 
 
@@ -195,7 +195,7 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
     """Raise ``NotObservableError``, with advice, for an effect that needs signals which the recordings lack."""
     parts = observations.parts
     setups = {part.motion.setup for part in parts}
-    for own in OWN:
+    for own in SETUP_EFFECTS:
         if setups <= {name.partition("@")[2] for name in names if name.startswith(f"{own}@")}:
             base = "matrix" if own == "mounting" else "bias"
             raise NotObservableError(
@@ -220,8 +220,8 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
 
 
 def time_constants(
-    this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None, *, between: bool = True
-) -> list[tuple[Term, float]]:
+    this: Effect, sensor: str, fitted: EffectColumns | None = None, width: float | None = None, *, between: bool = True
+) -> list[tuple[EffectColumns, float]]:
     """Return an effect at several time constants or widths, with log weights of their prior; the fitted one first.
 
     ``between``: whether to add the geometric mean of each two successive starts of the effect. ``width``: standard
@@ -230,14 +230,14 @@ def time_constants(
     starts = this.starts(sensor)
     if isinstance(this, Bend):
         log_share = float(np.log(BEND_SHARE / len(this.forms)))
-        return [(Term(Bend(this.forms, k), starts[0]), log_share) for k in range(len(this.forms))]
+        return [(EffectColumns(Bend(this.forms, k), starts[0]), log_share) for k in range(len(this.forms))]
     if not this.nonlinear or this.moves:
-        return [(fitted or Term(this, np.zeros(len(starts[0]))), 0.0)]
+        return [(fitted or EffectColumns(this, np.zeros(len(starts[0]))), 0.0)]
     if between:
         middle = [np.sqrt(one * other) for one, other in pairwise(starts)]
         starts = sorted([*starts, *middle], key=lambda values: float(values[-1]))
     share = 1.0 / len(starts)
-    terms = [(Term(this, values), float(np.log(share))) for values in starts]
+    terms = [(EffectColumns(this, values), float(np.log(share))) for values in starts]
     if fitted is None:
         return terms
     if width is not None:

@@ -15,7 +15,7 @@ import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
-from pipeline.estimation.gauss_markov import Blocks, Prior
+from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.noise import noise_of, wander_prior
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects.base import STANDARD_GRAVITY
@@ -30,18 +30,20 @@ if TYPE_CHECKING:
 Signals: TypeAlias = "dict[str, Values]"
 
 ROW_S = 0.1  # rows: short against moves by hand, of seconds; longer ones lose angular acceleration
-BLOCK_S, MOST_BLOCKS = 4.0, 300  # of the bias's wander, as in ``observations``
+CHIP_BLOCK_S, MAX_CHIP_BLOCKS = 4.0, 300  # of the bias's wander, as in ``observations``
 LEAST_S = 10.0  # that two chips have in common: twelve blocks of a second separate five columns from noise
-CLEAR = 5.0  # standard deviations of noise, below which a signal is set to its mean; noise alone never exceeds them
+CLEAR_SIGNAL_DEVIATIONS = (
+    5.0  # standard deviations of noise, below which a signal is set to its mean; noise alone never exceeds them
+)
 FOLLOWED = 0.1  # fourth difference over the range of five samples, above which sampling does not follow the motion
 LEAST_SAMPLES = 12  # of a recording: a quintic spline and its edges
-GAP = 1.5  # sampling intervals
-EDGE = 2  # samples at each end of a stretch, where a spline's derivative errs
+MAX_CHIP_GAP_INTERVALS = 1.5  # sampling intervals
+SPLINE_EDGE_SAMPLES = 2  # samples at each end of a stretch, where a spline's derivative errs
 # Weak priors, which parameters keep that a recording does not show. Sizes of a device (assumption); the group delays of
 # an MPU-6050's low-pass filters differ by up to 19 ms (its register map, register 26).
 PRIORS = {"rotation": 1.0, "lever_arm": 0.3, "time_offset": 0.02}
 SHIFTS, SMALL_SHIFT_S = 4, 1e-6  # rounds in which the stamps of b are moved by its offset; below any uncertainty
-ROUNDS, SMALL = 20, 1e-10  # of Gauss-Newton steps; rad
+MAX_GAUSS_NEWTON_STEPS, SMALL_STEP_RAD = 20, 1e-10  # of Gauss-Newton steps; rad
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Chip:
     calibrations: Mapping[str, SensorCalibration | None]
     sensor_model: Sensor
 
-    def prior(self, sensor: str) -> Prior:
+    def prior(self, sensor: str) -> WanderPrior:
         """Return the prior of the wander of its bias."""
         data_sheet = self.sensor_model.of(sensor)
         return wander_prior(noise_of(sensor, self.recordings, data_sheet), data_sheet)
@@ -73,7 +75,9 @@ class Shared:
         """Return the rows by each chip, the second one's stamps moved by its offsets, s; None: there are none."""
         (time, other_time), (one, two), valid = self.time, self.truth, self.valid[0]
         if any(offsets.values()) or not np.array_equal(time, other_time):
-            known = (self.valid[1] & np.append(np.diff(other_time) <= GAP * self.interval, True)).astype(float)
+            known = (
+                self.valid[1] & np.append(np.diff(other_time) <= MAX_CHIP_GAP_INTERVALS * self.interval, True)
+            ).astype(float)
             moved = {}
             for sensor, values in two.items():
                 at = time - offsets[sensor]
@@ -117,13 +121,15 @@ def _truth(chip: Chip, recording: Recording, sensors: Sequence[str]) -> tuple[Si
 
 def _followed(rate: Values) -> Mask:
     """Return at which samples the sampling is fast enough for the motion, by the fourth difference: (n,) array."""
-    if len(rate) < 2 * EDGE + 1:
+    if len(rate) < 2 * SPLINE_EDGE_SAMPLES + 1:
         return np.zeros(len(rate), bool)
     fourth = np.abs(np.diff(rate, 4, axis=0))
     noise = noise_of_steps(np.abs(np.diff(rate, axis=0))) * np.sqrt(70.0)  # 1 + 16 + 36 + 16 + 1
-    windows = np.lib.stride_tricks.sliding_window_view(rate, 2 * EDGE + 1, axis=0)
-    lost = np.any((fourth > CLEAR * noise) & (fourth > FOLLOWED * np.ptp(windows, axis=2)), axis=1)
-    spread = np.convolve(lost, np.ones(4 * EDGE + 1))[EDGE : EDGE + len(rate)]
+    windows = np.lib.stride_tricks.sliding_window_view(rate, 2 * SPLINE_EDGE_SAMPLES + 1, axis=0)
+    lost = np.any((fourth > CLEAR_SIGNAL_DEVIATIONS * noise) & (fourth > FOLLOWED * np.ptp(windows, axis=2)), axis=1)
+    spread = np.convolve(lost, np.ones(4 * SPLINE_EDGE_SAMPLES + 1))[
+        SPLINE_EDGE_SAMPLES : SPLINE_EDGE_SAMPLES + len(rate)
+    ]
     return np.asarray(spread < 0.5)
 
 
@@ -131,13 +137,13 @@ def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: f
     """Return the rows of one chip: time, f, w, their derivatives, and the mean of omega omega^T (n, 3, 3)."""
     k = max(round(ROW_S / interval), 1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], valid, [False]]).astype(int)))
-    gaps = np.flatnonzero(np.diff(time) > GAP * interval) + 1
+    gaps = np.flatnonzero(np.diff(time) > MAX_CHIP_GAP_INTERVALS * interval) + 1
     rows: dict[str, list[Values]] = {}
     for first, last in edges.reshape(-1, 2):
         inner = gaps[(gaps > first) & (gaps < last)]
         for start, stop in zip([first, *inner], [*inner, last], strict=True):
-            n = (stop - start - 2 * EDGE) // k
-            if n < 1 or stop - start < 6 + 2 * EDGE:
+            n = (stop - start - 2 * SPLINE_EDGE_SAMPLES) // k
+            if n < 1 or stop - start < 6 + 2 * SPLINE_EDGE_SAMPLES:
                 continue
             row = {"time": time[start:stop]}
             for sensor, values in signals.items():
@@ -147,7 +153,7 @@ def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: f
                 omega = np.radians(row["gyroscope"])
                 row["turn"] = omega[:, :, None] * omega[:, None, :]
             for name, values in row.items():
-                cut = values[EDGE : EDGE + n * k]
+                cut = values[SPLINE_EDGE_SAMPLES : SPLINE_EDGE_SAMPLES + n * k]
                 rows.setdefault(name, []).append(cut.reshape(n, k, *cut.shape[1:]).mean(axis=1))
     return {name: np.concatenate(parts) for name, parts in rows.items()} or {"time": np.zeros(0)}
 
@@ -162,7 +168,7 @@ def clear_of(a: Signals, b: Signals, R: Values) -> Signals:
         difference = b[name] @ R - a[name]
         noise = MEDIAN_SIZE * np.median(np.abs(difference - np.median(difference, axis=0)), axis=0)
         centre = a[name].mean(axis=0) * (name == "accelerometer")
-        clear[name] = (np.abs(a[name] - centre) > CLEAR * noise).astype(float)
+        clear[name] = (np.abs(a[name] - centre) > CLEAR_SIGNAL_DEVIATIONS * noise).astype(float)
     if "gyroscope" in clear:
         clear["turn"] = clear["gyroscope"][:, :, None] * clear["gyroscope"][:, None, :]
     return clear
@@ -194,8 +200,8 @@ def turned(x: Signals, R: Values, clear: Mapping[str, Values]) -> Signals:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """The estimate by one sensor, linear about the rotation R of ``Fits``."""
+class RotationFit:
+    """The estimate by one sensor, linear about the rotation R of ``RotationFits``."""
 
     sensor: str
     names: list[str]  # (p,), kinds of the parameters
@@ -207,11 +213,11 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Fits:
+class RotationFits:
     """The rotation at which the fits are linear, the fits, and the rows of both chips."""
 
     R: Values
-    fits: list[Fit]
+    fits: list[RotationFit]
     rows: tuple[Signals, Signals]
     clear: Signals  # which signals are clear of noise
     blocks: Blocks  # stretches of time in which the difference of the biases is taken as constant
@@ -224,7 +230,7 @@ class Fits:
         return np.asarray(np.any(np.concatenate([self.clear[k] for k in names], axis=1) > 0.0, axis=1))
 
 
-def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> Fits:
+def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> RotationFits:
     """Fit each sensor of two chips; raise ``NotObservableError`` if the chips share too little time."""
     recordings, total = shared(reference, other, sensors), dict.fromkeys(sensors, 0.0)
     for _ in range(SHIFTS):
@@ -248,9 +254,9 @@ def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> Fits:
     held_out = [rows for held, rows in pairs if held]
     times = [rows[0]["time"] for rows in used]
     span = sum(float(np.ptp(t)) for t in times)
-    length = max(min(BLOCK_S, span / 12.0), span / MOST_BLOCKS)
+    length = max(min(CHIP_BLOCK_S, span / 12.0), span / MAX_CHIP_BLOCKS)
     blocks = Blocks.of_rows([(t, np.ones(len(t))) for t in times], range(len(times)), length)
-    return Fits(R, fits, (a, b), clear, blocks, _joined(held_out) if held_out else None)
+    return RotationFits(R, fits, (a, b), clear, blocks, _joined(held_out) if held_out else None)
 
 
 def _joined(pairs: Sequence[tuple[Signals, Signals]]) -> tuple[Signals, Signals]:
@@ -259,7 +265,7 @@ def _joined(pairs: Sequence[tuple[Signals, Signals]]) -> tuple[Signals, Signals]
     return a, b
 
 
-def _fitted(sensors: Sequence[str], a: Signals, b: Signals) -> tuple[Values, Signals, list[Fit]]:
+def _fitted(sensors: Sequence[str], a: Signals, b: Signals) -> tuple[Values, Signals, list[RotationFit]]:
     """Return the rotation at which the fits are linear, which signals are clear of noise, and the fits.
 
     The start is the rotation that maps the vectors of a best onto the vectors of b (Wahba's problem, Markley's SVD).
@@ -267,18 +273,18 @@ def _fitted(sensors: Sequence[str], a: Signals, b: Signals) -> tuple[Values, Sig
     U, _, Vt = np.linalg.svd(np.sum([m / np.linalg.norm(m) for m in (b[s].T @ a[s] for s in sensors)], axis=0))
     R = np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
     clear = clear_of(a, b, R)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_GAUSS_NEWTON_STEPS):
         fits = [_fit(s, R, a, b, clear) for s in sensors]
         weights = [scaled_inverse(fit.inverse[:3, :3]) for fit in fits]
         moments = [W @ fit.step[:3] for W, fit in zip(weights, fits, strict=True)]
         turn = np.linalg.solve(np.sum(weights, axis=0), np.sum(moments, axis=0))
         R = R @ turn_by_vector(turn)
-        if np.linalg.norm(turn) < SMALL:
+        if np.linalg.norm(turn) < SMALL_STEP_RAD:
             break
     return R, clear, [_fit(s, R, a, b, clear) for s in sensors]
 
 
-def _fit(sensor: str, R: Values, a: Signals, b: Signals, clear: Mapping[str, Values]) -> Fit:
+def _fit(sensor: str, R: Values, a: Signals, b: Signals, clear: Mapping[str, Values]) -> RotationFit:
     """Return the estimate by one sensor: instrumental variables with the weak priors."""
     columns = columns_of(sensor, turned(a, np.eye(3), clear))
     X = np.concatenate([c for _, c in columns], axis=2)
@@ -294,4 +300,4 @@ def _fit(sensor: str, R: Values, a: Signals, b: Signals, clear: Mapping[str, Val
     inverse = np.linalg.inv(products / scale**2 + prior)
     J = inverse / scale**2
     u, v, w = Z.transpose(1, 2, 0)
-    return Fit(sensor, names, step, LinearMap((u, v, w), (J, J, J)), y - X @ step, scale, inverse)
+    return RotationFit(sensor, names, step, LinearMap((u, v, w), (J, J, J)), y - X @ step, scale, inverse)

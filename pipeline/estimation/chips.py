@@ -26,9 +26,20 @@ import numpy as np
 import scipy
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.chip_fit import PRIORS, ROW_S, Chip, Fit, Fits, clear_of, columns_of, fit_chips, lever, turned
+from pipeline.estimation.chip_fit import (
+    PRIORS,
+    ROW_S,
+    Chip,
+    RotationFit,
+    RotationFits,
+    clear_of,
+    columns_of,
+    fit_chips,
+    lever,
+    turned,
+)
 from pipeline.estimation.engine import assess_noise, scaled_inverse
-from pipeline.estimation.gauss_markov import Prior
+from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, own_and_bench
 from pipeline.model.kinematics import turn_by_vector
 from pipeline.records import AXES, MATRIX, SENSOR_UNITS, SENSORS, SensorCalibration, Values, coverage_factor
@@ -38,9 +49,11 @@ if TYPE_CHECKING:
 
 
 OBSERVED = 0.5  # standard uncertainty over that of the prior, above which a parameter is not observable
-BY_HAND = 10.0  # times the standard deviation of the gyroscopes' rotation: a hundredth of the weight
-FEWEST_ROWS = 20  # at rest and in motion, whose noise is compared
-DOUBTFUL = 0.001  # p-value of the agreement of both rotations, below which it is in doubt (Pearson's chi^2, 3 degrees)
+ROTATION_DEVIATION_FACTOR = 10.0  # times the standard deviation of the gyroscopes' rotation: a hundredth of the weight
+MIN_COMPARED_ROWS = 20  # at rest and in motion, whose noise is compared
+DOUBTFUL_P_VALUE = (
+    0.001  # p-value of the agreement of both rotations, below which it is in doubt (Pearson's chi^2, 3 degrees)
+)
 ROUGHER = 2.0  # noise in motion over that at rest, above which the model does not explain the motion
 SHEAR = 1e-6  # relative, of the differences
 WHY = {
@@ -48,7 +61,7 @@ WHY = {
     "lever_arm": "no turn, or none about another axis, is fast enough for this direction",
     "time_offset": "no change of the motion is fast enough",
 }
-UNITS = {"rotation": "deg", "lever_arm": "m", "time_offset": "s"}
+MOUNTING_UNITS = {"rotation": "deg", "lever_arm": "m", "time_offset": "s"}
 
 
 @dataclass(frozen=True)
@@ -64,7 +77,7 @@ class Error:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ChipMounting:
     """The best linear combination of the fits: rotation from that of the fits, lever arm, time offsets."""
 
     names: list[str]  # (q,)
@@ -104,7 +117,7 @@ def _rms(values: Values) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _errors(fitted: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
+def _errors(fitted: RotationFits, chips: tuple[Chip, Chip]) -> list[Error]:
     """Return the sources of error of the fits' parameters, one after the other, without the biases."""
     fits, R, moving = fitted.fits, fitted.R, fitted.moving
     kept = [np.flatnonzero(np.array(fit.names) != "bias") for fit in fits]
@@ -113,7 +126,7 @@ def _errors(fitted: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
     errors, none = [], np.zeros((3, 3))
     for fit, k, place in zip(fits, kept, places, strict=True):
         priors = [chip.prior(fit.sensor) for chip in chips]
-        prior = Prior(float(np.linalg.norm([p.wander for p in priors])), max(p.time for p in priors))
+        prior = WanderPrior(float(np.linalg.norm([p.wander for p in priors])), max(p.time for p in priors))
         design = np.column_stack([np.ones(len(fit.residual)), fitted.rows[0][fit.sensor]])
         covariance, freedom = assess_noise(fit.residual, design, fitted.blocks, prior).posterior(fit.map).averaged()
         # Motion alone determines all but the accelerometers' rotation; its noise may be larger than that at rest.
@@ -152,7 +165,7 @@ def _errors(fitted: Fits, chips: tuple[Chip, Chip]) -> list[Error]:
     return errors
 
 
-def _change(fitted: Fits, fit: Fit, of: str, E_a: Values, E_b: Values) -> Values:
+def _change(fitted: RotationFits, fit: RotationFit, of: str, E_a: Values, E_b: Values) -> Values:
     """Return the change of a fit's readings, (n, 3), where the truths of a sensor are sheared."""
     a, b = fitted.rows
     change = np.zeros_like(fit.residual)
@@ -194,7 +207,7 @@ def _axes_change(chips: Sequence[Chip], R: Values, E_a: Values, E_b: Values) -> 
     return vector_of(less.T @ more) / (2.0 * SHEAR)
 
 
-def _combined(fits: Sequence[Fit], errors: Sequence[Error], *, on_table: bool) -> Estimate:
+def _combined(fits: Sequence[RotationFit], errors: Sequence[Error], *, on_table: bool) -> ChipMounting:
     """Return the best linear estimate by both sensors: one common rotation, and all other parameters.
 
     By hand the axes of a gyroscope are determined by those of its accelerometer, so that the errors of both rotations
@@ -215,16 +228,16 @@ def _combined(fits: Sequence[Fit], errors: Sequence[Error], *, on_table: bool) -
         chi2 = float(apart @ np.linalg.solve(D @ total @ D.T, apart))
         angle = float(np.degrees(np.linalg.norm(apart)))
         agreement = {"angle_deg": angle, "p_value": float(scipy.special.chdtrc(3, chi2))}
-        size[second] = 1.0 if on_table else BY_HAND
+        size[second] = 1.0 if on_table else ROTATION_DEVIATION_FACTOR
     W = scaled_inverse(total * np.outer(size, size))
     T = np.linalg.solve(H.T @ W @ H, H.T @ W)
-    return Estimate(names, T @ x, [replace(e, of_fits=T @ e.of_fits) for e in errors], agreement)
+    return ChipMounting(names, T @ x, [replace(e, of_fits=T @ e.of_fits) for e in errors], agreement)
 
 
-def _checks(fitted: Fits, R: Values, estimate: Estimate) -> dict[str, Any]:
+def _checks(fitted: RotationFits, R: Values, estimate: ChipMounting) -> dict[str, Any]:
     """Return the residuals of the fits, and doubts about them."""
     doubts, residual, held_out, agree, moving = [], {}, {}, estimate.agreement, fitted.moving
-    if agree and agree["p_value"] < DOUBTFUL:
+    if agree and agree["p_value"] < DOUBTFUL_P_VALUE:
         doubts.append(
             f"accelerometers and gyroscopes state rotations that differ by {agree['angle_deg']:.2g} deg (p = "
             f"{agree['p_value']:.1g}): one of the calibrations is wrong in its axes; see the chips' diagnoses"
@@ -234,7 +247,7 @@ def _checks(fitted: Fits, R: Values, estimate: Estimate) -> dict[str, Any]:
         parts = [fit.residual[moving], fit.residual[~moving]]
         in_motion, at_rest = (_rms(part) if len(part) else None for part in parts)
         residual[fit.sensor] = {"unit": unit, "rms": fit.scale, "in_motion": in_motion, "at_rest": at_rest}
-        if in_motion and at_rest and min(map(len, parts)) >= FEWEST_ROWS and in_motion > ROUGHER * at_rest:
+        if in_motion and at_rest and min(map(len, parts)) >= MIN_COMPARED_ROWS and in_motion > ROUGHER * at_rest:
             doubts.append(
                 f"in motion the {fit.sensor}s differ by {in_motion:.2g} {unit}, at rest by {at_rest:.2g} {unit}: the "
                 "board bends, the chips' filters differ, or an effect is missing in a calibration"
@@ -251,7 +264,7 @@ def _checks(fitted: Fits, R: Values, estimate: Estimate) -> dict[str, Any]:
     return {"residual": residual, "held_out": held_out or None, "agreement": agree, "doubts": doubts}
 
 
-def _estimated(R: Values, estimate: Estimate, chips: Sequence[Chip]) -> dict[str, Any]:
+def _estimated(R: Values, estimate: ChipMounting, chips: Sequence[Chip]) -> dict[str, Any]:
     """Return rotation, parameters with uncertainties, what is not observable, and the budget."""
     names, axes = list(estimate.names), None
     of_values, of_axes = np.eye(len(names)), np.zeros((len(names), 3))
@@ -279,7 +292,7 @@ def _estimated(R: Values, estimate: Estimate, chips: Sequence[Chip]) -> dict[str
         kind = next(k for k in PRIORS if k in name)
         parameters[name] = {
             "value": float(factor[i] * values[i]),
-            "unit": UNITS[kind],
+            "unit": MOUNTING_UNITS[kind],
             "standard_uncertainty": float(standard[i]),
             "expanded_uncertainty": float(expanded[i]),
             "observable": bool(standard[i] <= OBSERVED * PRIORS[kind] * factor[i]),
@@ -305,7 +318,7 @@ def _of_vector(R: Values) -> Values:
     return np.stack(columns, axis=1)
 
 
-def _not_observable(estimate: Estimate) -> list[dict[str, Any]]:
+def _not_observable(estimate: ChipMounting) -> list[dict[str, Any]]:
     """Return the directions of rotation and lever arm, and the time offsets, that the recordings do not show."""
     found = []
     for kind, prior in PRIORS.items():
@@ -320,7 +333,7 @@ def _not_observable(estimate: Estimate) -> list[dict[str, Any]]:
                         "parameter": kind if len(group) > 1 else estimate.names[group[0]],
                         "direction": along.tolist() if len(group) > 1 else None,
                         "expanded_uncertainty": float(np.degrees(size) if kind == "rotation" else size),
-                        "unit": UNITS[kind],
+                        "unit": MOUNTING_UNITS[kind],
                         "reason": WHY[kind],
                     })  # fmt: skip
     if not any(name.startswith("lever_arm") for name in estimate.names):

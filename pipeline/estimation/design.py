@@ -36,11 +36,14 @@ from pipeline.records import BASE_COUNT, MATRIX_ROWS, motion_at_rest
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.estimation.observations import Observations, Part
+    from pipeline.estimation.observations import Observations, RecordingRows
     from pipeline.records import Index, Motion, Noise, Values
 
 REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
-WEAKEST_DIRECTION, PART_OF_IT = 1e-3, 0.1  # singular value of unit columns that is determined; share of its vector
+MIN_DESIGN_SINGULAR_VALUE, PART_OF_IT = (
+    1e-3,
+    0.1,
+)  # singular value of unit columns that is determined; share of its vector
 SIGNALS = (  # fields of ``Motion`` on which formulas depend
     "time", "specific_force", "angular_rate", "angular_acceleration", "temperature", "angle", "rate", "level",
     "direction",
@@ -57,7 +60,7 @@ class NormalPrior:
 
 
 @dataclass(frozen=True)
-class Term:
+class EffectColumns:
     """The columns of an effect at given values of its parameters."""
 
     effect: Effect
@@ -79,20 +82,20 @@ class Term:
         return of(sensor, motion, K, self.values)
 
 
-def placed(terms: Sequence[Term], base: int = BASE_COUNT) -> dict[str, tuple[Term, slice]]:
+def placed(terms: Sequence[EffectColumns], base: int = BASE_COUNT) -> dict[str, tuple[EffectColumns, slice]]:
     """Return each term and the slice of its parameters, which follow ``base`` parameters, by the effect's name."""
     edges = np.cumsum([base, *(len(term.values) for term in terms)]).tolist()
     return {t.effect.name: (t, slice(*edge)) for t, edge in zip(terms, pairwise(edges), strict=True)}
 
 
-def stepped(terms: Sequence[Term], step: Values) -> tuple[list[Term], Values]:
+def stepped(terms: Sequence[EffectColumns], step: Values) -> tuple[list[EffectColumns], Values]:
     """Return terms after a step of their parameters, and the step taken, which effects may limit."""
     moved = [replace(t, values=t.effect.stepped(t.values, step[at])) for t, at in placed(terms, 0).values()]
     taken = [new.values - old.values for new, old in zip(moved, terms, strict=True)]
     return moved, np.concatenate([np.zeros(0), *taken])
 
 
-def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion:
+def true_motion(part: RecordingRows, terms: Sequence[EffectColumns], but: Effect | None = None) -> Motion:
     """Return the true motion of the sensor at the timestamps, with all effects of timing except ``but``."""
     movers = [term for term in terms if term.effect.moves and term.effect is not but and np.any(term.values)]
     if not movers:
@@ -105,7 +108,7 @@ def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) ->
     return part.moved[key]
 
 
-def without_unknown_motion(observations: Observations, terms: Sequence[Term]) -> Observations:
+def without_unknown_motion(observations: Observations, terms: Sequence[EffectColumns]) -> Observations:
     """Remove the rows that effects of timing shift to times of unknown motion; without any, return the same object."""
     known = [true_motion(part, terms).reference_valid for part in observations.parts]
     if all(mask is None or mask.all() for mask in known):
@@ -114,7 +117,7 @@ def without_unknown_motion(observations: Observations, terms: Sequence[Term]) ->
     return without_rows(observations, lost)
 
 
-def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
+def motions_of(part: RecordingRows, terms: Sequence[EffectColumns]) -> list[Motion]:
     """Return the motion on which each term acts, and last the motion of the base."""
     everything = true_motion(part, terms)
     acting = [term.effect if term.effect.moves and np.any(term.values) else None for term in terms]
@@ -134,7 +137,7 @@ def _joined(motions: Sequence[Motion]) -> list[tuple[Motion, list[Motion]]]:
     return joined
 
 
-def _of_samples(term: Term, sensor: str, joined: Sequence[tuple[Motion, list[Motion]]], K: Values) -> Values:
+def _of_samples(term: EffectColumns, sensor: str, joined: Sequence[tuple[Motion, list[Motion]]], K: Values) -> Values:
     """Return the columns of a term whose regressors at a sample depend on the motion there alone."""
     columns = []
     for motion, members in joined:
@@ -152,7 +155,7 @@ class Start:
     bias: Values  # (3,)
     K: Values  # (3, 3)
     scale: Values  # (3,); white noise of each axis, for the weights between the axes
-    terms: tuple[Term, ...] = ()  # the effects at their values
+    terms: tuple[EffectColumns, ...] = ()  # the effects at their values
 
 
 def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
@@ -168,7 +171,7 @@ def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
     u = np.concatenate([truth(observations.sensor, part.motion) for part in observations.parts])
     root = np.sqrt(observations.weight)[:, None]
     X, y = root * np.column_stack([np.ones(len(u)), u]), root * observations.reading
-    factors = ScaledColumns.of(X, WEAKEST_DIRECTION)
+    factors = ScaledColumns.of(X, MIN_DESIGN_SINGULAR_VALUE)
     weak = factors.undetermined(["bias", *(f"column {b} of the matrix" for b in "xyz")], PART_OF_IT)
     if weak:
         named = [name for name in weak if name != "bias"]
@@ -196,7 +199,7 @@ class Design:
     def __init__(
         self,
         observations: Observations,
-        terms: Sequence[Term],
+        terms: Sequence[EffectColumns],
         K: Values,
         scale: Values,
         *,
@@ -227,7 +230,7 @@ class Design:
         self._from = [np.add.outer(at * width, at).ravel() for at in self._at]
         self._to = [np.add.outer(index * count, index).ravel() for index in self._total]
 
-    def _add_stops(self, observations: Observations, terms: Sequence[Term], K: Values) -> None:
+    def _add_stops(self, observations: Observations, terms: Sequence[EffectColumns], K: Values) -> None:
         """Add the errors of the angle, as parameters after the readings, with separate columns for each axis."""
         motions = [true_motion(part, terms) for part in observations.parts]
         before, after, stop, last = errors_of_stops(observations.sensor, motions, K)
@@ -241,7 +244,7 @@ class Design:
             self._total[c] = np.append(self._total[c], self.count + 1 + np.arange(self.stops))
             self._at[c] = np.arange(len(self._total[c]))
 
-    def _place(self, sensor: str, terms: Sequence[Term]) -> None:
+    def _place(self, sensor: str, terms: Sequence[EffectColumns]) -> None:
         """Assign to each axis its columns of A, and the parameter of each column."""
         local: list[list[int]] = [[0, 1, 2, 3] for _ in range(3)]
         total: list[list[int]] = [[c, *range(row.start, row.stop)] for c, row in enumerate(MATRIX_ROWS)]
@@ -269,7 +272,7 @@ class Design:
         self._total = [np.array([*index, parameters]) for index in total]
         self.count, self._width = parameters, width + 3
 
-    def _fill(self, A: Values, observations: Observations, terms: Sequence[Term], K: Values) -> None:
+    def _fill(self, A: Values, observations: Observations, terms: Sequence[EffectColumns], K: Values) -> None:
         """Write the columns of base and terms; the first column is 1 already."""
         sensor = observations.sensor
         known: dict[tuple[int, ...], list[tuple[Motion, list[Motion]]]] = {}

@@ -8,8 +8,8 @@ Under one hypothesis about the noise (``pipeline.estimation.gauss_markov``) the 
 where ``a`` is A summed over the rows of each block, and n the number of samples of a row. One calibration does not
 determine q and tau well. So each hypothesis of the prior's grid has the weight of its restricted likelihood times its
 prior (Patterson & Thompson, Biometrika 58, 1971), and the error of a parameter is distributed as a mixture over all
-hypotheses (``Posterior``). The mixture is approximated by a scaled Student's t that has the same probabilities within
-one and within two standard uncertainties:
+hypotheses (``ErrorMixture``). The mixture is approximated by a scaled Student's t that has the same probabilities
+within one and within two standard uncertainties:
 
     P(|e| < x) = sum_i p_i (2 Phi(x / sigma_i) - 1),    x_P: P(|e| < x_P) = P
     t_95(nu) / t_68(nu) = x_95 / x_68,    u = x_95 / t_95(nu)
@@ -31,7 +31,7 @@ import numpy as np
 import scipy
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Prior, Setting
+from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior
 from pipeline.records import Index, Values, noise_of_steps
 
 if TYPE_CHECKING:
@@ -39,10 +39,12 @@ if TYPE_CHECKING:
 
 
 ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
-FEWEST = 2.0  # degrees of freedom: Student's t has no variance below
-STEPS, SMALL_STEP = 60, 1e-5  # of Newton's method for a quantile; relative
-NEGLIGIBLE = 1e-6  # weight of a hypothesis, relative to the largest, below which it does not change two digits of u
-RANK = 1e-12  # of the eigenvalues of a scaled matrix: the rounding of a double, with a margin
+MIN_DEGREES_OF_FREEDOM = 2.0  # degrees of freedom: Student's t has no variance below
+MAX_NEWTON_STEPS, SMALL_QUANTILE_STEP = 60, 1e-5  # of Newton's method for a quantile; relative
+NEGLIGIBLE_HYPOTHESIS_WEIGHT = (
+    1e-6  # weight of a hypothesis, relative to the largest, below which it does not change two digits of u
+)
+MIN_EIGENVALUE_SHARE = 1e-12  # of the eigenvalues of a scaled matrix: the rounding of a double, with a margin
 AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it does not absorb their noise
 
 
@@ -94,7 +96,7 @@ class LinearMap:
 
 
 @dataclass(frozen=True)
-class Posterior:
+class ErrorMixture:
     """The error of an estimate: a mixture of normal distributions, one for each hypothesis about the noise."""
 
     weight: Values  # (k,); they sum to 1
@@ -138,7 +140,7 @@ def scaled_inverse(matrix: Values) -> Values:
     """
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     scale = np.outer(size, size)
-    return np.asarray(np.linalg.pinv(matrix / scale, rcond=RANK, hermitian=True) / scale, np.float64)
+    return np.asarray(np.linalg.pinv(matrix / scale, rcond=MIN_EIGENVALUE_SHARE, hermitian=True) / scale, np.float64)
 
 
 def draw_normal(rng: np.random.Generator, covariance: Values, count: int) -> Values:
@@ -160,12 +162,12 @@ def _within(weight: Values, sigma: Values, probability: float) -> Values:
     quantile = float(scipy.special.ndtri(0.5 + probability / 2.0))
     sigma = np.maximum(sigma, 1e-9)
     x: Values = quantile * sigma.min(axis=0)
-    for _ in range(STEPS):
+    for _ in range(MAX_NEWTON_STEPS):
         ratio = x / sigma
         density = weight @ (np.exp(-0.5 * ratio**2) / sigma) * np.sqrt(2.0 / np.pi)
         step = (probability - weight @ (2.0 * scipy.special.ndtr(ratio) - 1.0)) / np.maximum(density, 1e-300)
         x = np.minimum(x + step, quantile * sigma.max(axis=0))
-        if np.all(np.abs(step) <= SMALL_STEP * x):
+        if np.all(np.abs(step) <= SMALL_QUANTILE_STEP * x):
             break
     return x
 
@@ -173,7 +175,7 @@ def _within(weight: Values, sigma: Values, probability: float) -> Values:
 @cache
 def _quantiles() -> tuple[Values, Values, Values]:
     """Return 1 / nu, the ratio of both quantiles of Student's t, and the outer one: (k,) arrays."""
-    inverse = np.linspace(0.0, 1.0 / FEWEST, 101)
+    inverse = np.linspace(0.0, 1.0 / MIN_DEGREES_OF_FREEDOM, 101)
     inner, outer = (
         np.append(scipy.special.ndtri(upper), scipy.special.stdtrit(1.0 / inverse[1:], upper))
         for upper in (0.5 + ONE_SIGMA / 2.0, 0.5 + COVERED / 2.0)
@@ -209,7 +211,7 @@ class ResidualNoise:
         """
         score = -0.5 * (logarithm + free * np.log(variance).sum(axis=1)) + np.array([s.prior for s in settings])
         weight = np.exp(score - score.max())
-        kept = np.flatnonzero(weight > NEGLIGIBLE)
+        kept = np.flatnonzero(weight > NEGLIGIBLE_HYPOTHESIS_WEIGHT)
         chosen = [settings[k] for k in kept.tolist()]
         return cls(blocks, chosen, weight[kept] / weight[kept].sum(), variance[kept], free, row_weight)
 
@@ -234,16 +236,16 @@ class ResidualNoise:
             drawn = rng.standard_normal((rows, 3)) + setting.ratio * bias.draw(rng, 3)[label]
             yield np.sqrt(self.white_variance[best]) * drawn
 
-    def posterior(self, fit: LinearMap) -> Posterior:
+    def posterior(self, fit: LinearMap) -> ErrorMixture:
         """Return the error of a fit's parameters."""
         total = np.zeros((len(self.weight), fit.parameters, fit.parameters))
         ratios = np.array([s.ratio**2 for s in self.settings])[:, None, None]
         products = self._products(fit, [s.time for s in self.settings])
         for J, variance, (white, slow) in zip(fit.derivative, self.white_variance.T, products, strict=True):
             total += variance[:, None, None] * (J @ (white + ratios * slow) @ J.T)
-        return Posterior(self.weight, total, self.spare)
+        return ErrorMixture(self.weight, total, self.spare)
 
-    def variances(self, fit: LinearMap, prior: Prior) -> tuple[Values, Values]:
+    def variances(self, fit: LinearMap, prior: WanderPrior) -> tuple[Values, Values]:
         """Return the variances by the estimated white noise, and by the bias instability of a prior: (p,) arrays."""
         white, wander = np.zeros(fit.parameters), np.zeros(fit.parameters)
         for J, s, (alone, slow) in zip(fit.derivative, self.white, self._products(fit, [prior.time]), strict=True):
@@ -265,7 +267,7 @@ class ResidualNoise:
 
 
 def assess_noise(
-    residuals: Values, design: Values, blocks: Blocks, prior: Prior, disturbance: Values | None = None
+    residuals: Values, design: Values, blocks: Blocks, prior: WanderPrior, disturbance: Values | None = None
 ) -> ResidualNoise:
     """Weight the hypotheses of a prior by the residuals of a fit, one sample a row.
 

@@ -30,14 +30,14 @@ Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
 Set: TypeAlias = frozenset[str]
 
 # The prior was chosen on 738 simulated sensors: docs/blind_study.md.
-SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the sensor file's limits
+LIMIT_SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the sensor file's limits
 SCALE_PRIOR = np.log([0.2375, 0.2375, 0.2375, 0.2375, 0.03, 0.02])
-NEGLIGIBLE = 1e-4  # weight below which a hypothesis or a component of a mixture is not used
+NEGLIGIBLE_MIXTURE_WEIGHT = 1e-4  # weight below which a hypothesis or a component of a mixture is not used
 READINGS, ZEROS = -2, -1  # columns of the padded products
 WIDE = 8  # columns of an effect above which LAPACK's factorisation costs less than a vectorised elimination
 FAR_TOO_MUCH = 2.0  # times the sum of squares that columns explain: rounding; at most 1 is possible
-ROUNDING = 1e-9  # of the largest eigenvalue: 1e7 times the rounding of a double, for products of products
-RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
+PRODUCT_ROUNDING = 1e-9  # of the largest eigenvalue: 1e7 times the rounding of a double, for products of products
+PRODUCT_RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Version:
 
 
 @dataclass(frozen=True)
-class Problem:
+class CandidateProblem:
     """Candidates in addition to a base, which is projected out, under t hypotheses about the noise."""
 
     products: Values  # (t, p + 1, p + 1); of columns per limit of their parameters, and last the readings
@@ -78,7 +78,7 @@ class Problem:
         """Return the estimate of sigma^2 from total sums of squares."""
         return np.maximum(total / self.free, self.least)
 
-    def under(self, kept: Values | slice) -> Problem:
+    def under(self, kept: Values | slice) -> CandidateProblem:
         """Return the problem under some of the hypotheses."""
         return replace(self, products=self.products[kept], prior=self.prior[kept])
 
@@ -107,7 +107,7 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
     new: float,
     within: float = 0.0,
     least: float = 0.0,
-) -> Problem:
+) -> CandidateProblem:
     """Return the problem of candidates at a fit.
 
     ``columns``: effect, log weight and place of the columns of each version, the fitted one first. ``products``: (t, p
@@ -115,7 +115,7 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
     norm of the columns before this projection. ``known``: values of the fitted effects, whose signal is added to the
     residual; and limits by the sensor file. An effect without a limit has as unit the parameter whose signal is as
     large as the noise of all ``samples``. ``new``: share of a column's norm below which the base explains it. Others:
-    of ``Problem``.
+    of ``CandidateProblem``.
     """
     (fitted, stated), values = known, np.zeros(products.shape[1])
     versions: dict[str, list[Version]] = {}
@@ -136,13 +136,13 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
         change = excited(inner, size[at], limits[name], new)
         scaled[:, :, at] = scaled[:, :, at] @ change
         scaled[:, at] = change.T @ scaled[:, at]
-    return Problem(scaled, prior, within, free, versions, limits, excluded, least)
+    return CandidateProblem(scaled, prior, within, free, versions, limits, excluded, least)
 
 
 class Given:
     """A problem given s sets of effects, each at chosen versions and scales."""
 
-    def __init__(self, problem: Problem, sets: Sequence[Mapping[str, Pick]]) -> None:
+    def __init__(self, problem: CandidateProblem, sets: Sequence[Mapping[str, Pick]]) -> None:
         self.problem, products = problem, problem.padded
         columns = [[problem.versions[name][v].columns for name, (v, _) in picks.items()] for picks in sets]
         shape = len(sets), max(sum(map(len, each)) for each in columns)
@@ -151,7 +151,7 @@ class Given:
             if each:
                 used = slice(sum(map(len, each)))
                 at[row, used] = np.concatenate(each)
-                scale[row, used] = np.repeat([SCALES[s] for _, s in picks.values()], [len(c) for c in each])
+                scale[row, used] = np.repeat([LIMIT_SCALES[s] for _, s in picks.values()], [len(c) for c in each])
         inner = products[:, at[:, :, None], at[:, None, :]] + scale[:, :, None] ** -2.0 * np.eye(shape[1])
         L = cholesky(inner)
         self._half = np.linalg.inv(L) @ products[:, at]  # its squares: the part of each column that the sets explain
@@ -183,9 +183,9 @@ class Given:
             score, inner, cross, squares = block.score[:, :, 0], block.inner[:, 0], block.cross[:, 0], block.squares
             top = np.maximum.reduceat(np.max(score, axis=(0, 1)), block.starts)
             owner = np.repeat(np.arange(len(block.names)), np.diff([*block.starts, score.shape[2]]))
-            kept = score > top[owner] + np.log(NEGLIGIBLE)
+            kept = score > top[owner] + np.log(NEGLIGIBLE_MIXTURE_WEIGHT)
             s, t, m = np.nonzero(kept)
-            inverse = np.linalg.inv(inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
+            inverse = np.linalg.inv(inner[t, m] + LIMIT_SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
             mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
             variance = np.einsum("nkk->nk", inverse) * self.problem.variance(squares[:, :, 0][kept])[:, None]
             deviation = np.sqrt(np.maximum(variance, 0.0))
@@ -194,7 +194,7 @@ class Given:
                 mixtures[name] = weight[of_effect], mean[of_effect], deviation[of_effect]
         return mixtures
 
-    def blocks(self, names: Sequence[str]) -> list[Block]:
+    def blocks(self, names: Sequence[str]) -> list[CandidateBlock]:
         """Return further effects, grouped by their number of columns."""
         by_size: dict[int, list[str]] = {}
         for name in names:
@@ -212,12 +212,12 @@ class Given:
             weight = SCALE_PRIOR[:, None, None, None] + [v.log_weight for versions in each for v in versions]
             score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, :, None] + weight
             starts = np.cumsum([0, *(len(versions) for versions in each[:-1])])
-            blocks.append(Block(members, starts, inner, cross, score, squares + self.problem.within))
+            blocks.append(CandidateBlock(members, starts, inner, cross, score, squares + self.problem.within))
         return blocks
 
 
 @dataclass(frozen=True)
-class Block:
+class CandidateBlock:
     """Effects with equal numbers of columns, given s sets; their m versions follow each other."""
 
     names: list[str]
@@ -236,8 +236,8 @@ def _explained(inner: Values, cross: Values, squares: Values) -> tuple[Values, V
     are at least ``D^-2``. Where rounding of products far above the noise leaves no positive definite matrix, the
     eigenvalues of G are used.
     """
-    k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
-    log_det = np.broadcast_to(-k * np.log(least), (len(SCALES), *inner.shape[:2])).copy()
+    k, least = inner.shape[-1], LIMIT_SCALES[:, None, None] ** -2.0
+    log_det = np.broadcast_to(-k * np.log(least), (len(LIMIT_SCALES), *inner.shape[:2])).copy()
     try:
         return (_by_cholesky if k > WIDE else _by_elimination)(inner, cross, squares, log_det)
     except np.linalg.LinAlgError:
@@ -246,10 +246,10 @@ def _explained(inner: Values, cross: Values, squares: Values) -> tuple[Values, V
 
 def _by_cholesky(inner: Values, cross: Values, squares: Values, log_det: Values) -> tuple[Values, Values]:
     """Return ``_explained`` by Cholesky factors; ``log_det``: ``log|D^2|``."""
-    k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
+    k, least = inner.shape[-1], LIMIT_SCALES[:, None, None] ** -2.0
     joined = np.zeros((*log_det.shape, k + 1, k + 1))
     joined[..., :k, :k], joined[..., k, :k], diagonal = inner, cross, np.arange(k)
-    joined[..., diagonal, diagonal] += least[..., None] + RIDGE * np.einsum("tmkk->tmk", inner)
+    joined[..., diagonal, diagonal] += least[..., None] + PRODUCT_RIDGE * np.einsum("tmkk->tmk", inner)
     joined[..., k, k] = 1.0 + 2.0 * squares[:, None]
     factor = np.linalg.cholesky(joined)
     log_det += 2.0 * np.sum(np.log(np.einsum("...kk->...k", factor)[..., :k]), axis=-1)
@@ -258,7 +258,7 @@ def _by_cholesky(inner: Values, cross: Values, squares: Values, log_det: Values)
 
 def _by_elimination(inner: Values, cross: Values, squares: Values, log_det: Values) -> tuple[Values, Values]:
     """Return ``_explained`` by a vectorised elimination; ``log_det``: ``log|D^2|``."""
-    k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
+    k, least = inner.shape[-1], LIMIT_SCALES[:, None, None] ** -2.0
     matrix = np.concatenate([inner, cross[..., None]], axis=3).transpose(2, 3, 0, 1)[:, :, None]
     matrix = matrix + np.eye(k, k + 1)[:, :, None, None, None] * least
     gain = np.zeros(log_det.shape)
@@ -277,8 +277,8 @@ def _by_elimination(inner: Values, cross: Values, squares: Values, log_det: Valu
 def _by_eigenvalues(inner: Values, cross: Values, squares: Values) -> tuple[Values, Values]:
     """Return ``_explained`` by the eigenvalues of G; those that are rounding of the largest one count as zero."""
     values, vectors = np.linalg.eigh(inner)
-    shown = np.where(values > ROUNDING * np.abs(values).max(axis=-1, keepdims=True), values, 0.0)
+    shown = np.where(values > PRODUCT_ROUNDING * np.abs(values).max(axis=-1, keepdims=True), values, 0.0)
     along = np.where(shown > 0.0, (cross[..., None, :] @ vectors)[..., 0, :], 0.0)
-    least = SCALES[:, None, None, None] ** -2.0
+    least = LIMIT_SCALES[:, None, None, None] ** -2.0
     gain = np.sum(along**2 / (shown + least), axis=-1)
     return np.minimum(gain, squares[:, None]), np.sum(np.log1p(shown / least), axis=-1)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, axis_parameters, length, truth, unit_of
+from pipeline.model.effects.base import Effect, EffectParameter, Layout, Owner, axis_parameters, length, truth, unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 OTHER = "other_"  # prefix of the names of free curves
 BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first
-WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
+BEND_WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
 # Prior probability of a bend over that of an effect. With it, a bend was an answer in all 54 simulated units (seed 61)
 # that hid one and selected a slow effect, and below 0.5 in all 34 (seed 62) that hid the slow effect.
 BEND_SHARE = 0.5
-DEGREE, CYCLES = 5, 8  # as in the tests that find a dependence (pipeline.diagnosis.residual_dependence)
+CURVE_DEGREE, MAX_CURVE_CYCLES = 5, 8  # as in the tests that find a dependence (pipeline.diagnosis.residual_dependence)
 
 
 class FreeCurve(Effect):
@@ -49,27 +49,29 @@ class FreeCurve(Effect):
         self.contains = (self.name + BEND,)
         self.middle, self.half = 0.5 * (low + high), 0.5 * (high - low)
         self.layout = Layout.PER_AXIS if covariate == "input" else Layout.EVERY_AXIS
-        self.count = {"input": DEGREE - 1, "angle": 2 * CYCLES, "rate": DEGREE + 2}.get(covariate, DEGREE)
+        self.count = {"input": CURVE_DEGREE - 1, "angle": 2 * MAX_CURVE_CYCLES, "rate": CURVE_DEGREE + 2}.get(
+            covariate, CURVE_DEGREE
+        )
 
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return a coefficient for each curve and axis."""
         return tuple(
-            Parameter(f"c{k}_{axis}", unit_of(sensor), "coefficient") for axis in "xyz" for k in range(self.count)
+            EffectParameter(f"c{k}_{axis}", unit_of(sensor), "coefficient") for axis in "xyz" for k in range(self.count)
         )
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the curves; zeros for a recording without the covariate."""
         del K, values
         if self.covariate == "input":
-            return np.asarray(legvander(truth(sensor, motion) / self.half, DEGREE)[..., 2:])
+            return np.asarray(legvander(truth(sensor, motion) / self.half, CURVE_DEGREE)[..., 2:])
         known = {"temperature": motion.temperature, "angle": motion.angle, "rate": length(motion.angular_rate)}
         covariate = known[self.covariate]
         if covariate is None:
             return np.zeros((len(motion.time), self.count))
         if self.covariate == "angle":
-            turns = np.radians(covariate)[:, None] * np.arange(1, CYCLES + 1)
+            turns = np.radians(covariate)[:, None] * np.arange(1, MAX_CURVE_CYCLES + 1)
             return np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
-        found = legvander((covariate - self.middle) / self.half, DEGREE)[:, 1:]
+        found = legvander((covariate - self.middle) / self.half, CURVE_DEGREE)[:, 1:]
         if self.covariate == "rate":
             found = np.concatenate([found, (motion.angular_rate[:, :2] / self.half) ** 2], axis=1)
         return np.asarray(found)
@@ -85,7 +87,7 @@ class Bend(Effect):
         self.forms = forms  # end of the span, degC, signed width, degC, and whether the form is that of tanh
         self.end, self.width, self.soft = forms[form]
 
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return a coefficient for each axis."""
         return axis_parameters("c", unit_of(sensor), "coefficient")
 
@@ -112,7 +114,7 @@ def free_curves(sensor: str, motions: Sequence[Motion], *, bent: bool) -> list[E
             curves.append(FreeCurve(covariate, float(low), float(high)))
             if bent and covariate == "temperature":
                 ends = (float(low), 1.0), (float(high), -1.0)
-                forms = product(ends, (False, True), WIDTHS * (high - low))
+                forms = product(ends, (False, True), BEND_WIDTHS * (high - low))
                 curves.append(Bend([(end, sign * width, soft) for (end, sign), soft, width in forms]))
     largest = max(float(np.abs(truth(sensor, m)).max()) for m in motions)
     return [*curves, *([FreeCurve("input", -largest, largest)] if largest > 0.0 else [])]

@@ -42,18 +42,24 @@ DEFAULT_TIME_S = 100.0  # correlation time if the sensor file gives none: of MEM
 STATED_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a sensor file gives: a factor of three
 SHARPEST_WIDTH = 0.15  # of the same logarithm, however long the static recording
 STATIC_WIDTH = (0.35, 1.1)  # the same for the coarse grid of ``selection_grid``, whose steps are factors of two
-FARTHEST = 3.0  # widths of the prior beyond which the residuals alone decide
-SURE = 9.0  # odds of no bias instability at all if none is stated
+MAX_PRIOR_WIDTHS = 3.0  # widths of the prior beyond which the residuals alone decide
+NO_INSTABILITY_ODDS = 9.0  # odds of no bias instability at all if none is stated
 TIME_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation times of the grid, over that of the prior
 TIME_PRIOR = (0.1, 0.2, 0.4, 0.2, 0.1)
-RATIOS = np.append(0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1))  # ratios of the grid: bias to white noise of a sample
+BIAS_RATIO_GRID = np.append(
+    0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1)
+)  # ratios of the grid: bias to white noise of a sample
 RANDOM_WALK = 8.0  # correlation time over the measured one, with the same variance of short differences
 # A random walk of the bias: factors on ratio and time of a setting, and its share of that setting's prior. Of 80
 # simulated random walks 17 showed an invented effect without it, and 6 with it.
 WALK_RATIO, WALK_TIME, WALK_SHARE = 8.0, 64.0, 0.3
 LARGEST_SPAN = 1e9  # of variances that a factorisation resolves: 1e7 times the rounding of a double
-SLOW = 0.3  # share of white noise's spectrum, see ``constant_bias_s``: right answers as with 0.05 (docs/blind_study.md)
-FAST_S = 25.0  # correlation time below which ``information`` replaces the model, because its blocks last seconds
+SLOW_SPECTRUM_SHARE = (
+    0.3  # share of white noise's spectrum, see ``constant_bias_s``: right answers as with 0.05 (docs/blind_study.md)
+)
+MIN_MODELLED_TIME_S = (
+    25.0  # correlation time below which ``information`` replaces the model, because its blocks last seconds
+)
 
 
 class Setting(NamedTuple):
@@ -64,33 +70,33 @@ class Setting(NamedTuple):
     prior: float = 0.0
 
 
-WHITE = Setting(0.0, 1.0)
+WHITE_SETTING = Setting(0.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Prior:
+class WanderPrior:
     """The prior of the bias instability."""
 
     wander: float = 0.0  # unit of the sensor; its standard deviation; 0: unknown
     time: float = DEFAULT_TIME_S  # s; its correlation time
     width: float = STATED_WIDTH  # standard deviation of the logarithm of ``wander``
-    stated: Prior | None = None  # the prior without the static recording
+    stated: WanderPrior | None = None  # the prior without the static recording
     # of a static recording: wanders, (w,), and its log likelihood at them, (t, w), by ``TIME_FACTORS``
     seen: tuple[Values, Values] | None = None
 
     def log_belief(self, wander: Values) -> Values:
         """Return the log prior, up to a constant, of (m,) standard deviations of which the first is 0.
 
-        If no wander is stated, the first has ``SURE`` times the weight of all others together.
+        If no wander is stated, the first has ``NO_INSTABILITY_ODDS`` times the weight of all others together.
         """
         if self.wander <= 0.0:
-            return np.append(np.log(SURE * (len(wander) - 1)), np.zeros(len(wander) - 1))
+            return np.append(np.log(NO_INSTABILITY_ODDS * (len(wander) - 1)), np.zeros(len(wander) - 1))
         far = np.abs(np.log(wander[1:] / self.wander)) / self.width
-        return np.append(-np.inf, -0.5 * np.minimum(far, FARTHEST) ** 2)
+        return np.append(-np.inf, -0.5 * np.minimum(far, MAX_PRIOR_WIDTHS) ** 2)
 
     def grid(self, white: float) -> list[Setting]:
         """Return the hypotheses over which a covariance is averaged, for white noise of ``white`` per sample."""
-        wander = RATIOS * white
+        wander = BIAS_RATIO_GRID * white
         belief = np.tile((self.stated or self).log_belief(wander), (len(TIME_FACTORS), 1))
         if self.seen is not None:
             belief += [np.interp(wander, self.seen[0], row) for row in self.seen[1]]
@@ -98,7 +104,7 @@ class Prior:
         return [
             Setting(ratio, factor * self.time, weight)
             for factor, row in zip(TIME_FACTORS, weights, strict=True)
-            for ratio, weight in zip(RATIOS.tolist(), row, strict=True)
+            for ratio, weight in zip(BIAS_RATIO_GRID.tolist(), row, strict=True)
             if math.isfinite(weight)
         ]
 
@@ -122,7 +128,7 @@ def selection_grid(
         return [Setting(r, noise.correlation_time * f, p) for r, p in pairs for f in (0.5, 2.0)] + [
             Setting(r * walk, noise.correlation_time * RANDOM_WALK, p - 1.0) for r, p in pairs
         ]
-    return [WHITE] + [Setting(ratio, time) for ratio in ratios for time in times]
+    return [WHITE_SETTING] + [Setting(ratio, time) for ratio in ratios for time in times]
 
 
 def random_walks(settings: Iterable[Setting]) -> dict[Setting, Setting]:
@@ -137,7 +143,7 @@ def random_walks(settings: Iterable[Setting]) -> dict[Setting, Setting]:
 
 def fast(noise: Noise | None) -> bool:
     """Return whether a static recording shows noise correlated over seconds: fewer samples are then independent."""
-    return noise is not None and noise.source == "static" and noise.correlation_time < FAST_S
+    return noise is not None and noise.source == "static" and noise.correlation_time < MIN_MODELLED_TIME_S
 
 
 def _static_ratio(noise: Noise | None) -> float:
@@ -160,14 +166,14 @@ def information(noise: Noise | None, interval: float) -> float:
 def constant_bias_s(noise: Noise | None, interval: float) -> float:
     """Return the time over which a bias is assumed constant, s: L with ``2 q L^2 / (pi^2 tau) = SLOW dt``.
 
-    At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is ``SLOW`` times that of white noise, dt.
-    At higher frequencies white noise is larger still. Without a static recording that shows slow wander, L is infinite.
-    ``interval``: s, dt.
+    At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is ``SLOW_SPECTRUM_SHARE`` times that of
+    white noise, dt. At higher frequencies white noise is larger still. Without a static recording that shows slow
+    wander, L is infinite. ``interval``: s, dt.
     """
     ratio = _static_ratio(noise)
     if noise is None or ratio == 0.0 or fast(noise):
         return float("inf")
-    return float(np.pi / ratio * np.sqrt(0.5 * SLOW * noise.correlation_time * interval))
+    return float(np.pi / ratio * np.sqrt(0.5 * SLOW_SPECTRUM_SHARE * noise.correlation_time * interval))
 
 
 def variance_of_average(length: Values, tau: float | Values) -> Values:

@@ -23,19 +23,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.candidates import HELD, TILT, is_held, parameter_names, require_available, starts_of
+from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_held, parameter_names, require_available, starts_of
 from pipeline.estimation.design import (
     Design,
+    EffectColumns,
     Start,
-    Term,
     motions_of,
     ordinary_base,
     placed,
     stepped,
     without_unknown_motion,
 )
-from pipeline.estimation.engine import RANK, Posterior, ResidualNoise, noise_outside_known_errors
-from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
+from pipeline.estimation.engine import MIN_EIGENVALUE_SHARE, ErrorMixture, ResidualNoise, noise_outside_known_errors
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
@@ -74,15 +74,15 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
 
 
-ROUNDS = 25  # of Gauss-Newton
-SMALL_STEP = 1e-3  # of a standard uncertainty
-RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)  # of bias to white noise: the grid of a fit
-TIMES = (30.0, 100.0, 300.0, 1000.0)  # s, correlation times of that grid
+MAX_ITERATIONS = 25  # of Gauss-Newton
+SMALL_STEP_UNCERTAINTIES = 1e-3  # of a standard uncertainty
+BIAS_TO_WHITE_GRID = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)  # of bias to white noise: the grid of a fit
+CORRELATION_TIME_GRID_S = (30.0, 100.0, 300.0, 1000.0)  # s, correlation times of that grid
 LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 3e-4 new
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(Start):
+class JointFit(Start):
     """The best fit of base and effects to the readings."""
 
     # (12 + p, 12 + p); of bias, K (row by row) and the effects' parameters, averaged over the noise settings of the fit
@@ -109,7 +109,9 @@ class Fit(Start):
         return self._designs[observations]
 
 
-def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
+def fit_terms(
+    observations: Observations, terms: Sequence[EffectColumns], start: Start, settings: Sequence[Setting]
+) -> JointFit:
     """Fit base and effects from a start.
 
     ``terms``: effects, at the start of their nonlinear parameters. ``settings``: noise settings over which the
@@ -119,13 +121,13 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     rounds, converged, state = 0, False, _with_all_columns(start, terms)
     design = design_at(observations, state)
     solved = _solve(design, observations, settings)
-    while rounds < ROUNDS and not converged:
+    while rounds < MAX_ITERATIONS and not converged:
         rounds += 1
         moved, taken = stepped(state.terms, solved.step[AFTER_BASE])
         taken = np.concatenate([solved.step[BASE], taken])
         K = state.K + matrix_of(taken)
         state = replace(state, bias=state.bias + taken[BIAS], K=K, terms=tuple(moved))
-        small = SMALL_STEP * np.sqrt(np.diag(solved.best_covariance))
+        small = SMALL_STEP_UNCERTAINTIES * np.sqrt(np.diag(solved.best_covariance))
         small[BASE] = np.maximum(small[BASE], 1e-12)
         converged = linear or bool(np.all(np.abs(taken) <= small))
         if not linear:
@@ -135,7 +137,7 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     noise = observations.less_stop_errors
     squares = np.sum(noise.weight[:, None] * residual**2) + np.sum(noise.scatter)
     covariance, freedom = solved.posterior.averaged()
-    found = Fit(
+    found = JointFit(
         state.bias,
         state.K,
         state.scale,
@@ -156,13 +158,13 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     return found
 
 
-def _with_all_columns(start: Start, terms: Sequence[Term]) -> Start:
+def _with_all_columns(start: Start, terms: Sequence[EffectColumns]) -> Start:
     """Return a base with terms whose parameters all have a column."""
     full = (replace(term, values=np.array(term.values, float), full=True) for term in terms)
     return Start(start.bias, start.K, start.scale, tuple(full))
 
 
-def design_at(observations: Observations, at: Start, candidates: Sequence[Term] | None = None) -> Design:
+def design_at(observations: Observations, at: Start, candidates: Sequence[EffectColumns] | None = None) -> Design:
     """Return the design of a model at given parameters with its residual, or that of the terms ``candidates``."""
     residual, base = _residual(observations, at)
     terms, project = (at.terms, False) if candidates is None else (candidates, True)
@@ -190,11 +192,11 @@ def _residual(observations: Observations, at: Start) -> tuple[Values, Values]:
 
 
 @dataclass(frozen=True)
-class _Solved:
+class _SolvedStep:
     """A Gauss-Newton step under the likeliest setting, and the covariance under each."""
 
     step: Values
-    posterior: Posterior
+    posterior: ErrorMixture
     best_covariance: Values
     log_likelihood: float
     setting: Setting
@@ -208,7 +210,7 @@ class _Solved:
     squares: Values
 
 
-def _solve(design: Design, observations: Observations, settings: Sequence[Setting]) -> _Solved:
+def _solve(design: Design, observations: Observations, settings: Sequence[Setting]) -> _SolvedStep:
     """Solve for the step under each noise setting, and return the most likely one."""
     n = 3.0 * observations.samples
     within = float(np.sum(observations.scatter / design.scale**2))
@@ -219,7 +221,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
     unit = np.sqrt(np.maximum(np.einsum("gpp->gp", gram), 1e-30))
     values, vectors = np.linalg.eigh(gram / (unit[:, :, None] * unit[:, None, :]))
-    kept = values > RANK * values[:, -1:]
+    kept = values > MIN_EIGENVALUE_SHARE * values[:, -1:]
     half = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :] / unit[:, :, None]
     determinants = np.sum(np.log(np.where(kept, values, 1.0)), axis=1) + 2.0 * np.sum(np.log(unit), axis=1)
     steps = np.einsum("gpi,gqi,gq->gp", half, half, rhs, optimize=True)
@@ -229,9 +231,9 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     best = int(np.argmax(scores))
     weight = np.exp(scores - scores[best])
     norm = unit[best] * np.sqrt(max(float(products[best, -1, -1]), 1e-300))
-    return _Solved(
+    return _SolvedStep(
         step=steps[best] / size,
-        posterior=Posterior(weight / weight.sum(), covariances, spare),
+        posterior=ErrorMixture(weight / weight.sum(), covariances, spare),
         best_covariance=covariances[best],
         log_likelihood=float(scores[best]),
         setting=settings[best],
@@ -265,15 +267,18 @@ def _residual_noise(
 
 
 def fit_best(
-    observations: Observations, combinations: Sequence[Sequence[Term]], start: Start, settings: Sequence[Setting]
-) -> Fit:
+    observations: Observations,
+    combinations: Sequence[Sequence[EffectColumns]],
+    start: Start,
+    settings: Sequence[Setting],
+) -> JointFit:
     """Fit from the combination of starts with the largest likelihood after one linear step.
 
     Effects of timing are first fitted with the base alone: far from their values a linear step is inaccurate, and other
     effects would absorb their signal.
     """
 
-    def likelihood(terms: Sequence[Term]) -> float:
+    def likelihood(terms: Sequence[EffectColumns]) -> float:
         design = design_at(observations, _with_all_columns(start, terms))
         return _solve(design, observations, settings).log_likelihood
 
@@ -286,7 +291,7 @@ def fit_best(
     return fit_terms(observations, chosen, start, settings)
 
 
-def require_observable(observations: Observations, fit: Fit) -> None:
+def require_observable(observations: Observations, fit: JointFit) -> None:
     """Raise ``NotObservableError``, with the parameters, if the recordings do not determine a fit."""
     design = fit.design(observations)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
@@ -295,7 +300,7 @@ def require_observable(observations: Observations, fit: Fit) -> None:
         free[place] = term.prior is None or np.linalg.matrix_rank(term.prior.precision) < len(term.values)
     names = [name for name, kept in zip(names, free, strict=True) if kept]
     size = design.sizes()[:-1][free]
-    products = design.products([WHITE])[0][0, :-1, :-1][np.ix_(free, free)]
+    products = design.products([WHITE_SETTING])[0][0, :-1, :-1][np.ix_(free, free)]
     values, vectors = np.linalg.eigh(products / np.outer(*[np.where(size > 0, size, 1.0)] * 2))
     undetermined = vectors[:, values < LEAST_EIGENVALUE].T
     weak = [name for name, s in zip(names, size, strict=True) if s == 0]
@@ -331,7 +336,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     combinations = starts_of(effects, observations, start, accelerometer)
     base = ordinary_base(observations, noise)
     require_available(observations, effects)
-    grid = selection_grid(noise, RATIOS, TIMES)
+    grid = selection_grid(noise, BIAS_TO_WHITE_GRID, CORRELATION_TIME_GRID_S)
     fit = fit_best(observations, combinations, base, grid)
     known = without_unknown_motion(observations, fit.terms)
     if known is not observations:
@@ -341,7 +346,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
 
 
 def calibration_of(
-    fit: Fit,
+    fit: JointFit,
     observations: Observations,
     before: SensorCalibration | None,
     settings: Settings | None = None,
@@ -405,13 +410,13 @@ def calibration_of(
 
     lines = [noise_contribution(errors, whole, prior)]
     for name, prior_part in design.prior_covariances(fit.setting).items():
-        remark = HELD if name == TILT and not observations.levelling_deg else ""
+        remark = FIXED_AT_ZERO if name == TILT and not observations.levelling_deg else ""
         part, freedom = change @ prior_part @ change.T, np.full(len(change), np.inf)
         lines.append(Contribution(name.replace("_", " "), "B", NORMAL, part, freedom, remark=remark))
     return budgeted(found, reference, whole, errors, lines, settings, results, names)
 
 
-def fit_in_mean_frame(fit: Fit) -> tuple[Fit, Values]:
+def fit_in_mean_frame(fit: JointFit) -> tuple[JointFit, Values]:
     """Return a fit in the frame of the mean mounting, and the map of its errors to that frame."""
     found = next((each for each in placed(fit.terms).values() if isinstance(each[0].effect, Mounting)), None)
     if found is None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.uncertainty_budget import with_uncertainty
-from pipeline.model.measurement import Part, compensate
+from pipeline.model.measurement import SensorEffects, compensate
 from pipeline.records import (
     BASE_NAMES,
     FittedEffect,
@@ -58,7 +58,10 @@ def subtracted(
     raises ``CannotCalibrateError`` if its role is one of ``needed``.
     """
     sensor, found = calibration.sensor, []
-    field, part = "specific_force" if sensor == "accelerometer" else "angular_rate", Part.of(calibration, known)
+    field, part = (
+        "specific_force" if sensor == "accelerometer" else "angular_rate",
+        SensorEffects.of(calibration, known),
+    )
     for recording in recordings:
         reading = recording.reading(sensor)
         if reading is None:

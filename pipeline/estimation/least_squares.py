@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 State = TypeVar("State")
-HALVINGS = 30  # of a step; a smaller one is rounding
+MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
 PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
 COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, times a factor for sums over many residuals
 STEP_AT_MINIMUM = 1e-10  # relative; well below any uncertainty, well above rounding
-RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
-ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
+ROW_SUM_RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
+SUM_OF_SQUARES_ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
 
 
 @dataclass(frozen=True)
@@ -106,13 +106,14 @@ def cholesky(matrix: Values) -> Values:
     """Return the lower Cholesky factor of covariance matrices: (..., n, n) array.
 
     Their elements may differ by more than the digits of a double, as those of stated errors and tiny white noise do.
-    Where rounding leaves no positive definite matrix, the diagonal is increased by the share ``RIDGE`` of itself.
+    Where rounding leaves no positive definite matrix, the diagonal is increased by the share ``ROW_SUM_RIDGE`` of
+    itself.
     """
     try:
         return np.asarray(np.linalg.cholesky(matrix), np.float64)
     except np.linalg.LinAlgError:
         diagonal = np.einsum("...kk->...k", matrix)[..., None] * np.eye(matrix.shape[-1])
-        return np.asarray(np.linalg.cholesky(matrix + RIDGE * diagonal), np.float64)
+        return np.asarray(np.linalg.cholesky(matrix + ROW_SUM_RIDGE * diagonal), np.float64)
 
 
 def gauss_newton(  # noqa: PLR0917  (what an iteration is)
@@ -139,16 +140,18 @@ def gauss_newton(  # noqa: PLR0917  (what an iteration is)
     for count in range(iterations):
         factors = ScaledColumns.of(J, tolerance)
         step, before = -factors.solve(r), r @ r
-        for halving in range(HALVINGS):
+        for halving in range(MAX_STEP_HALVINGS):
             new, taken = moved(state, step * 0.5**halving)
             r_new, J_new = residual_at(new)
             # Near the minimum the sum of squares is flat to rounding while the step is still larger than rounding.
-            if r_new @ r_new < before * (1.0 + (ROUNDING if halving == 0 else 0.0)) and np.all(np.isfinite(J_new)):
+            if r_new @ r_new < before * (1.0 + (SUM_OF_SQUARES_ROUNDING if halving == 0 else 0.0)) and np.all(
+                np.isfinite(J_new)
+            ):
                 break
         else:
             return state, (r, J), count
         size, last = float(np.linalg.norm(taken * factors.scale)), size
-        stalled = size >= last and r_new @ r_new >= (1.0 - ROUNDING) * before
+        stalled = size >= last and r_new @ r_new >= (1.0 - SUM_OF_SQUARES_ROUNDING) * before
         state, r, J = new, r_new, J_new
         if small(taken, factors) if small else stalled or size <= STEP_AT_MINIMUM * np.linalg.norm(r):
             return state, (r, J), count + 1

@@ -23,15 +23,17 @@ from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.records import MEDIAN_SIZE, Index, Mask, Values
 
-FEWEST = 8  # siblings; docs/fleet.md has the errors and intervals in lots of 12 units
-LEVEL = 0.05  # largest share of a lot without the prior by chance, which does no harm (measured: docs/fleet.md)
+MIN_SIBLINGS = 8  # siblings; docs/fleet.md has the errors and intervals in lots of 12 units
+MAX_FALSE_PRIOR_SHARE = (
+    0.05  # largest share of a lot without the prior by chance, which does no harm (measured: docs/fleet.md)
+)
 FAR_LEVEL = 0.001  # below it a unit is no sibling of others; 0.05 would exclude 4 % of a lot and narrow its spread
 GRID = np.geomspace(0.01, 10.0, 64)  # of tau, over the spread of the estimates; steps of 12 %
 OMEGA = 0.5  # standard deviation of log tau within a kind: axes differ by a factor of 1.6 (assumption)
-ALIKE = np.exp(-0.5 * (np.log(GRID[:, None] / GRID) / OMEGA) ** 2)
-ALIKE /= ALIKE.sum(axis=1, keepdims=True)  # (common tau of the kind, tau of a parameter)
+HETEROGENEITY_PRIOR = np.exp(-0.5 * (np.log(GRID[:, None] / GRID) / OMEGA) ** 2)
+HETEROGENEITY_PRIOR /= HETEROGENEITY_PRIOR.sum(axis=1, keepdims=True)  # (common tau of the kind, tau of a parameter)
 FAR_AT_FIRST = 5.0  # robust standard deviations, beyond which a unit is at first no sibling; all are tested again
-ROUNDS = 20  # at most, until the siblings stay the same; two sets that alternate end here
+MAX_SIBLING_ITERATIONS = 20  # at most, until the siblings stay the same; two sets that alternate end here
 
 
 class Prediction(NamedTuple):
@@ -57,7 +59,7 @@ class LotPrior(NamedTuple):
     @property
     def outlier(self) -> Mask:
         """Whether a unit differs from its siblings, ``probability < LEVEL``: (n,) array."""
-        return self.probability < LEVEL
+        return self.probability < MAX_FALSE_PRIOR_SHARE
 
 
 class WithPrior(NamedTuple):
@@ -86,8 +88,8 @@ def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tup
     able = able & np.isin(np.arange(len(x)), first)
     away = np.abs(x - np.median(x[able], axis=0))
     near = able & np.all(away <= FAR_AT_FIRST * MEDIAN_SIZE * np.median(away[able], axis=0), axis=1)
-    siblings = near if near.sum() > FEWEST else able
-    for _ in range(ROUNDS):
+    siblings = near if near.sum() > MIN_SIBLINGS else able
+    for _ in range(MAX_SIBLING_ITERATIONS):
         of_device = np.full(int(device.max()) + 1, -1)
         of_device[device[siblings]] = np.flatnonzero(siblings)
         itself = of_device[device]
@@ -95,7 +97,7 @@ def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tup
         z, probability = _tested(x, own, freedom, predicted)
         found = LotPrior(predicted, siblings.sum() - (itself >= 0), z, probability)
         remaining = able & (probability >= FAR_LEVEL)
-        if np.array_equal(remaining, siblings) or remaining.sum() <= FEWEST:
+        if np.array_equal(remaining, siblings) or remaining.sum() <= MIN_SIBLINGS:
             break
         siblings = remaining
     return found
@@ -109,11 +111,11 @@ def _predicted(x: Values, v: Values, siblings: Mask, itself: Index, kind: Index)
         y = x[:, columns] - np.median(x[siblings][:, columns], axis=0)
         tau2 = (max(float(np.std(y[siblings])), 1e-300) * GRID) ** 2
         given = [_given_tau(y[:, [k]], v[:, [j]], siblings, itself, tau2) for k, j in enumerate(columns)]
-        of_kind = [np.log(likelihood @ ALIKE.T) for *_, likelihood in given]
+        of_kind = [np.log(likelihood @ HETEROGENEITY_PRIOR.T) for *_, likelihood in given]
         for k, j in enumerate(columns):
             others = np.sum([m for i, m in enumerate(of_kind) if i != k], axis=0) + np.log(GRID)
             means, variances, likelihood = given[k]
-            tau = _normalized(others) @ ALIKE * likelihood
+            tau = _normalized(others) @ HETEROGENEITY_PRIOR * likelihood
             tau /= tau.sum(axis=1, keepdims=True)
             mean = np.sum(tau * means, axis=1, keepdims=True)
             off = (means - mean) ** 2

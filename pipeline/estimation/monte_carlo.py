@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.estimation.engine import Posterior, draw_normal
+from pipeline.estimation.engine import ErrorMixture, draw_normal
 from pipeline.records import AFTER_BASE, BIAS, MATRIX, MonteCarlo
 
 if TYPE_CHECKING:
@@ -38,7 +38,9 @@ SEED = 101  # any number
 BATCH = 500  # trials drawn at a time, which bounds the memory
 TWO_DIGITS = 1_000_000  # trials
 NEWTONS = 6  # each squares the relative error of a step; one by a wide prior starts at some 0.5
-RANK = 3e-7  # of the largest singular value of unit columns, the root of 1e-13: the rounding of their products
+MIN_SINGULAR_VALUE_SHARE = (
+    3e-7  # of the largest singular value of unit columns, the root of 1e-13: the rounding of their products
+)
 
 
 class Distribution(NamedTuple):
@@ -52,7 +54,7 @@ class Distribution(NamedTuple):
     symmetric: Values
 
 
-class Comparison(NamedTuple):
+class IntervalComparison(NamedTuple):
     """The interval by the law of propagation against the one by Monte Carlo: (n,) arrays.
 
     ``low``, ``high``: difference of the lower and of the upper ends. ``borne_out``: whether both are within delta, the
@@ -85,15 +87,15 @@ def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Val
 
 def compare(
     estimate: ArrayLike, expanded_uncertainty: ArrayLike, found: Distribution, *, digits: int = 2
-) -> Comparison:
+) -> IntervalComparison:
     """Compare ``y +- U`` by the law of propagation with the interval of a Monte Carlo run of the same probability."""
     y, U = np.atleast_1d(np.asarray(estimate, float)), np.atleast_1d(np.asarray(expanded_uncertainty, float))
     tolerance = numerical_tolerance(np.minimum(found.standard_uncertainty, U), digits)
     low, high = np.abs(y - U - found.symmetric[:, 0]), np.abs(y + U - found.symmetric[:, 1])
-    return Comparison(tolerance, low, high, (low <= tolerance) & (high <= tolerance))
+    return IntervalComparison(tolerance, low, high, (low <= tolerance) & (high <= tolerance))
 
 
-def through(posterior: Posterior, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
+def through(posterior: ErrorMixture, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
     """Return a function that draws parameters.
 
     ``posterior``: of the noise of q linear functions of the readings. ``stated``: (q, q), covariances by stated
@@ -166,12 +168,12 @@ def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Ca
 
     def step(e: Values) -> Values:
         white = e @ root.T
-        d = white @ np.linalg.pinv(X, rcond=RANK).T
+        d = white @ np.linalg.pinv(X, rcond=MIN_SINGULAR_VALUE_SHARE).T
         for _ in range(NEWTONS):
             bent = (d @ flat.T).reshape(len(d), n, p)
             J = X + bent
             gradient = np.einsum("tnp,tn->tp", J, d @ X.T + 0.5 * np.einsum("tnp,tp->tn", bent, d) - white)
-            normal = np.linalg.pinv(J.transpose(0, 2, 1) @ J, rcond=RANK**2, hermitian=True)
+            normal = np.linalg.pinv(J.transpose(0, 2, 1) @ J, rcond=MIN_SINGULAR_VALUE_SHARE**2, hermitian=True)
             d = d - np.einsum("tpq,tq->tp", normal, gradient)
         return np.asarray(d / size)
 

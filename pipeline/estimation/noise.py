@@ -54,14 +54,14 @@ import scipy
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.estimation.gauss_markov import (
-    FARTHEST,
+    MAX_PRIOR_WIDTHS,
     SHARPEST_WIDTH,
     STATED_WIDTH,
     TIME_FACTORS,
     Blocks,
     GaussMarkov,
-    Prior,
     Setting,
+    WanderPrior,
     fast,
     orthonormal,
     variance_of_average,
@@ -77,17 +77,17 @@ if TYPE_CHECKING:
     from pipeline.records import Integers, Mask, SensorCalibration, Values
     from pipeline.settings import DataSheet, Sensor
 
-TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times of the grid, over that of the sensor file
+CORRELATION_TIME_FACTORS = np.exp2(np.arange(-6.0, 4.0))  # correlation times of the grid, over that of the sensor file
 TIMES_BY_HAND = np.exp2(np.arange(-11.0, 4.0))  # the same by hand: from 0.05 s at 100 s; a tremor has 8 to 12 Hz
-SHORTEST_BLOCK = 8  # samples of a block
-FEWEST_SAMPLES = 60  # which determine the white noise to a tenth
-WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0  # samples, degree of the polynomial, largest turn within
+MIN_BLOCK_SAMPLES = 8  # samples of a block
+MIN_NOISE_SAMPLES = 60  # which determine the white noise to a tenth
+POLYNOMIAL_WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0  # samples, degree of the polynomial, largest turn within
 WARM_UP_S = (60.0, 180.0, 500.0)  # time constants of warm-up that are regressed out
 SMALLEST_WHITE = 1e-9  # keeps the weights of a noise-free recording finite
 DETECTION_GAIN, AGREEMENT_LOSS = 6.0, 4.0  # twice the difference in log-likelihood
-BLOCKS = 60  # of all rests together
-RATIOS = np.concatenate([[0.0], np.geomspace(2e-3, 5.0, 40)])  # sqrt(q) of the grid; a step is 22 %
-WEAKEST_DIRECTION = 1e-3  # singular value of unit columns, below which two nuisance columns count as one
+REST_BLOCKS = 60  # of all rests together
+SQRT_Q_GRID = np.concatenate([[0.0], np.geomspace(2e-3, 5.0, 40)])  # sqrt(q) of the grid; a step is 22 %
+MIN_NUISANCE_SINGULAR_VALUE = 1e-3  # singular value of unit columns, below which two nuisance columns count as one
 
 
 def estimate_noise(sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise:
@@ -116,17 +116,17 @@ def _of_recordings(sensor: str, fitted: list[Recording], data_sheet: DataSheet) 
     static = [r for r in fitted if r.role == "static"]
     static_rests, rests = (
         [
-            Rest(time, reading, 0 if recording.clock_shared else number)
+            RestReadings(time, reading, 0 if recording.clock_shared else number)
             for number, recording in enumerate(fitted, start=1)
             if (recording.role == "static") == whole
             for time, reading in rest_readings(recording, sensor, whole_recording=whole)
         ]
         for whole in (True, False)
     )
-    if sum(len(rest.time) for rest in static_rests) >= FEWEST_SAMPLES:
+    if sum(len(rest.time) for rest in static_rests) >= MIN_NOISE_SAMPLES:
         noise = _noise_of_rests(static_rests, static, data_sheet, "static", other_rests=rests)
         return replace(noise, length=sum(float(rest.time[-1] - rest.time[0]) for rest in static_rests))
-    if sum(len(rest.time) for rest in rests) >= FEWEST_SAMPLES:
+    if sum(len(rest.time) for rest in rests) >= MIN_NOISE_SAMPLES:
         if sensor == "accelerometer" and _by_hand(fitted):
             return _noise_along_gravity(rests, fitted, data_sheet)
         return _noise_of_rests(rests, fitted, data_sheet, "rests")
@@ -144,7 +144,7 @@ def _by_hand(recordings: list[Recording]) -> bool:
     return any(r.role == "rests" for r in recordings) and not logged
 
 
-def _noise_along_gravity(rests: list[Rest], recordings: list[Recording], data_sheet: DataSheet) -> Noise:
+def _noise_along_gravity(rests: list[RestReadings], recordings: list[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise of an accelerometer in a unit that may creep: see the module, 2."""
     components = [component_along_gravity(rest.time, rest.reading) for rest in rests]
     along = [replace(rest, reading=values[:, None]) for rest, (values, _) in zip(rests, components, strict=True)]
@@ -159,18 +159,18 @@ def _noise_along_gravity(rests: list[Rest], recordings: list[Recording], data_sh
 
 
 def _noise_of_rests(
-    rests: list[Rest],
+    rests: list[RestReadings],
     recordings: list[Recording],
     data_sheet: DataSheet,
     source: str,
     *,
-    other_rests: Sequence[Rest] = (),
+    other_rests: Sequence[RestReadings] = (),
     creeping: Sequence[int] = (),
 ) -> Noise:
     """Return the noise of ``rests``; the scatter within ``other_rests`` is used for the white noise only."""
     covariance = filter_autocovariance(recordings[0])
     memory = int(np.searchsorted(-np.abs(covariance), -0.01 * covariance[0]))
-    shortest = max(SHORTEST_BLOCK, 4 * memory)
+    shortest = max(MIN_BLOCK_SAMPLES, 4 * memory)
     blocks = _blocks_of(rests, shortest)
     if other_rests and len(covariance) == 1:  # a filter still settles in a short rest after a move
         blocks = _with_scatter(blocks, _blocks_of(other_rests, shortest))
@@ -215,7 +215,7 @@ def _most_likely(
 
     ``longest``: largest possible correlation time by hand, s.
     """
-    times = (TIMES if np.isinf(longest) else TIMES_BY_HAND) * data_sheet.wander_time_s
+    times = (CORRELATION_TIME_FACTORS if np.isinf(longest) else TIMES_BY_HAND) * data_sheet.wander_time_s
     log_likelihood, white = _likelihood(blocks, design, covariance, times)
     gain = 2.0 * (log_likelihood - log_likelihood[:, :1])
     pooled = gain.sum(axis=2).max(axis=1)
@@ -226,7 +226,7 @@ def _most_likely(
         row, time_source = stated_row, "data_sheet"
     if pooled[row] < DETECTION_GAIN:  # the sensor file's wander if the likelihood allows it, else 0
         noise = _with_stated_wander(white[stated_row, 0], data_sheet, source)
-        nearest = np.argmin(np.abs(RATIOS[:, None] - noise.wander / noise.white), axis=0)
+        nearest = np.argmin(np.abs(SQRT_Q_GRID[:, None] - noise.wander / noise.white), axis=0)
         if -float(np.take_along_axis(gain[stated_row], nearest[None], axis=0).sum()) >= AGREEMENT_LOSS:
             noise = replace(noise, wander=np.zeros(3), wander_source=source)
     else:
@@ -234,12 +234,12 @@ def _most_likely(
         axes_differ = gain[row].max(axis=0).sum() - pooled[row] > DETECTION_GAIN
         axes = [slice(c, c + 1) for c in columns] if axes_differ else [slice(None)] * len(columns)
         ratio = np.array([_peak(gain[row][:, axis].sum(axis=1)) for axis in axes])
-        likeliest = np.maximum([np.interp(ratio[c], RATIOS, white[row, :, c]) for c in columns], SMALLEST_WHITE)
+        likeliest = np.maximum([np.interp(ratio[c], SQRT_Q_GRID, white[row, :, c]) for c in columns], SMALLEST_WHITE)
         noise = Noise(likeliest, likeliest * ratio, float(times[row]), source, source, time_source)
     if source != "static":
         return noise
     near = np.clip(row + np.log2(TIME_FACTORS).astype(int), 0, len(times) - 1)
-    wander = RATIOS * float(np.sqrt(np.mean(noise.white**2)))
+    wander = SQRT_Q_GRID * float(np.sqrt(np.mean(noise.white**2)))
     return replace(noise, likelihood=WanderLikelihood(times[near], wander, 0.5 * gain[near].sum(axis=2)))
 
 
@@ -247,8 +247,8 @@ def _peak(gain: Values) -> float:
     """Return the ratio at the maximum, by a parabola through the three points about it."""
     k = int(np.argmax(gain))
     if k < 2 or k == len(gain) - 1:
-        return float(RATIOS[k])
-    x, (a, b, c) = np.log(RATIOS[k - 1 : k + 2]), gain[k - 1 : k + 2]
+        return float(SQRT_Q_GRID[k])
+    x, (a, b, c) = np.log(SQRT_Q_GRID[k - 1 : k + 2]), gain[k - 1 : k + 2]
     bend = a - 2.0 * b + c
     return float(np.exp(x[1] + (0.5 * (a - c) / bend * (x[1] - x[0]) if bend < 0 else 0.0)))
 
@@ -261,21 +261,21 @@ def _with_stated_wander(white: Values, data_sheet: DataSheet, source: str) -> No
 def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
     """Return the white noise from short windows about a local polynomial, or None if there are too few."""
     squares, nu = [], 1.0
-    basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, WINDOW), WINDOW_DEGREE + 1))
-    P = np.eye(WINDOW) - basis @ basis.T
+    basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, POLYNOMIAL_WINDOW), WINDOW_DEGREE + 1))
+    P = np.eye(POLYNOMIAL_WINDOW) - basis @ basis.T
     for recording in recordings:
         values = recording.reading(sensor)
         assert values is not None  # noqa: S101
         slow = usable(recording, values)
         if recording.table_rate is not None:
-            slow &= np.abs(recording.table_rate) * recording.interval * WINDOW < WINDOW_ARC_DEG
-        lags = filter_autocovariance(recording)[:WINDOW]
-        PR = P @ scipy.linalg.toeplitz(np.pad(lags, (0, WINDOW - len(lags))))
+            slow &= np.abs(recording.table_rate) * recording.interval * POLYNOMIAL_WINDOW < WINDOW_ARC_DEG
+        lags = filter_autocovariance(recording)[:POLYNOMIAL_WINDOW]
+        PR = P @ scipy.linalg.toeplitz(np.pad(lags, (0, POLYNOMIAL_WINDOW - len(lags))))
         trace = float(np.trace(PR))
         nu = trace**2 / float(np.sum(PR * PR.T))
         for start, stop in stretches_of(recording, slow):
-            count = (stop - start) // WINDOW
-            windows = values[start : start + count * WINDOW].reshape(count, WINDOW, 3)
+            count = (stop - start) // POLYNOMIAL_WINDOW
+            windows = values[start : start + count * POLYNOMIAL_WINDOW].reshape(count, POLYNOMIAL_WINDOW, 3)
             squares.append(np.sum(np.einsum("ij,njc->nic", P, windows) ** 2, axis=1) / trace)
     scatter = np.concatenate(squares) if squares else np.empty((0, 3))
     if len(scatter) < 5:
@@ -284,7 +284,7 @@ def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestReadings:
     """Times, s, and readings of a rest; rests with the same ``clock`` have a common time."""
 
     time: Values
@@ -307,10 +307,10 @@ class _RestBlocks:
     scatter: Values  # (3,); sum of squares about the block means
 
 
-def _blocks_of(rests: Sequence[Rest], shortest: int) -> _RestBlocks:
+def _blocks_of(rests: Sequence[RestReadings], shortest: int) -> _RestBlocks:
     """Cut rests into blocks of at least ``shortest`` samples; a shorter rest is one block."""
     sizes = np.array([len(rest.time) for rest in rests])
-    size = max(shortest, int(np.ceil(sizes.sum() / BLOCKS)))
+    size = max(shortest, int(np.ceil(sizes.sum() / REST_BLOCKS)))
     if not np.any(sizes >= 2 * size):  # many rests, all short: cut each in two rather than none
         size = max(shortest, int(sizes.max()) // 2)
     pieces = np.maximum(1, sizes // size)
@@ -345,7 +345,7 @@ def _with_scatter(blocks: _RestBlocks, others: _RestBlocks) -> _RestBlocks:
 def _likelihood(
     blocks: _RestBlocks, design: Values, covariance: Values, correlation_times: Values
 ) -> tuple[Values, Values]:
-    """Return the log likelihood at each correlation time, by ``RATIOS``, by axis, and the white noise there: (t, r, 3).
+    """Return the log likelihood and the white noise: (t, r, 3), by correlation time, ``SQRT_Q_GRID`` and axis.
 
     ``design``: (c, p), the nuisance columns d, at the c blocks that are ``cut``. ``covariance``: (l,), the filter's
     autocovariance r. ``correlation_times``: (t,), s.
@@ -356,15 +356,15 @@ def _likelihood(
     nu = max(float(np.sum(blocks.count - 1)) * correlated, 1e-9)
     cut = blocks.cut
     cut_blocks = Blocks(np.arange(cut.sum()), 1.0 / v[cut], blocks.start[cut], blocks.length[cut], blocks.clock[cut])
-    settings = [Setting(float(ratio), float(tau)) for tau in correlation_times for ratio in RATIOS]
-    basis = orthonormal(design, v[cut], WEAKEST_DIRECTION)
+    settings = [Setting(float(ratio), float(tau)) for tau in correlation_times for ratio in SQRT_Q_GRID]
+    basis = orthonormal(design, v[cut], MIN_NUISANCE_SINGULAR_VALUE)
     log_determinant, squares = GaussMarkov(cut_blocks, settings).restricted(basis, blocks.mean[cut])
     inner = [np.sum(blocks.count * (1.0 - variance_of_average(blocks.length, tau))) for tau in correlation_times]
-    expected = within + np.outer(inner, RATIOS**2).ravel()
+    expected = within + np.outer(inner, SQRT_Q_GRID**2).ravel()
     free = len(cut_blocks.weight) - basis.shape[1] + nu
     variance = np.maximum((squares + nu * blocks.scatter / expected[:, None]) / free, 1e-18)
     log_likelihood = -0.5 * ((log_determinant + nu * np.log(expected))[:, None] + free * np.log(variance))
-    shape = (len(correlation_times), len(RATIOS), -1)
+    shape = (len(correlation_times), len(SQRT_Q_GRID), -1)
     return log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape)
 
 
@@ -396,7 +396,7 @@ def required_noises(
     }
 
 
-def wander_prior(noise: Noise | None, data_sheet: DataSheet) -> Prior:
+def wander_prior(noise: Noise | None, data_sheet: DataSheet) -> WanderPrior:
     """Return the prior of the bias wander from the sensor file and the noise of a static recording.
 
     It is the prior of the sensor file times the likelihood of the static recording at each wander and correlation time.
@@ -408,12 +408,12 @@ def wander_prior(noise: Noise | None, data_sheet: DataSheet) -> Prior:
     does not determine a slow wander, and is white noise in the means of the blocks of a fit: then the prior is that of
     the sensor file.
     """
-    stated = Prior(data_sheet.bias_wander, data_sheet.wander_time_s)
+    stated = WanderPrior(data_sheet.bias_wander, data_sheet.wander_time_s)
     if noise is None or noise.source != "static" or noise.likelihood is None or fast(noise):
         return stated
     width = float(np.sqrt(noise.correlation_time / noise.length))
     log_likelihood = noise.likelihood.log_likelihood * min(1.0, (width / SHARPEST_WIDTH) ** 2)
     largest = int(np.argmax(log_likelihood.max(axis=0)))
-    log_likelihood[:, largest:] = np.maximum(log_likelihood[:, largest:], log_likelihood.max() - FARTHEST**2)
+    log_likelihood[:, largest:] = np.maximum(log_likelihood[:, largest:], log_likelihood.max() - MAX_PRIOR_WIDTHS**2)
     wander, width = float(np.sqrt(np.mean(noise.wander**2))), float(np.clip(width, SHARPEST_WIDTH, STATED_WIDTH))
-    return Prior(wander, noise.correlation_time, width, stated, (noise.likelihood.wander, log_likelihood))
+    return WanderPrior(wander, noise.correlation_time, width, stated, (noise.likelihood.wander, log_likelihood))

@@ -25,9 +25,9 @@ import scipy
 from pipeline.estimation.noise_search import (
     ONE_SIDED,
     QUANTILE,
+    CompositionSearch,
     Regression,
-    Search,
-    Stretch,
+    RestStretch,
     best_of,
     limits,
 )
@@ -36,7 +36,7 @@ from pipeline.estimation.noise_terms import (
     SINGLE,
     STOCHASTIC,
     WHITE,
-    Trial,
+    TermTrial,
     allan_deviation,
     allan_variance,
     at_once,
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
     JSON = dict[str, Any]
 
-FEWEST_SAMPLES = 60  # which determine the white noise to a tenth
+MIN_SPECTRUM_SAMPLES = 60  # which determine the white noise to a tenth
 SHORTEST_STRETCH = 16  # samples
 GAP_INTERVALS = 1.5  # sampling intervals; a longer step of time is a gap
 MOST_JITTER = 0.5  # rms scatter of the sampling intervals, relative, above which equal counts are not equal times
@@ -71,7 +71,7 @@ LONGEST_AVERAGE_SHARE = 0.25  # longest averaging time that the Allan deviation 
 AVERAGES_PER_DECADE = 8
 MOST_PUBLISHED = 12  # compositions
 DERIVATIVE_STEP = 1.01  # of a correlation time, for a derivative
-SLOW = ("bias_instability", "random_walk", "gauss_markov", "ramp", "temperature")
+SLOW_TERMS = ("bias_instability", "random_walk", "gauss_markov", "ramp", "temperature")
 STILL = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
 OF_RESTS = "no static recording: what is slower than a rest is not seen, and in rests by hand the unit moves"
 NOT_FITTED = {
@@ -108,7 +108,7 @@ def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
     return documents
 
 
-def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[Stretch]]:
+def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[RestStretch]]:
     """Return the document of a sensor's noise so far and its stretches, or no stretches and the reason."""
     known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
@@ -120,13 +120,13 @@ def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[St
         return empty | {"reason": f"{reason}: equal counts of samples are not equal times"}, []
     static, others = ([r for r in even if (r.role == "static") == is_static] for is_static in (True, False))
     source, chosen, stretches = "static", static, [s for r in static for s in static_stretches(sensor, r)]
-    if _samples(stretches) < FEWEST_SAMPLES and others:
+    if _samples(stretches) < MIN_SPECTRUM_SAMPLES and others:
         rests = [each for r in others for each in rest_readings(r, sensor, whole_recording=False)]
-        stretches = [Stretch(time, reading) for time, reading in rests if len(time) >= SHORTEST_STRETCH]
+        stretches = [RestStretch(time, reading) for time, reading in rests if len(time) >= SHORTEST_STRETCH]
         source, chosen = "rests", others
     count = _samples(stretches)
-    if count < FEWEST_SAMPLES:
-        reason = f"the rests hold {count} evenly sampled readings; {FEWEST_SAMPLES} are needed: record static"
+    if count < MIN_SPECTRUM_SAMPLES:
+        reason = f"the rests hold {count} evenly sampled readings; {MIN_SPECTRUM_SAMPLES} are needed: record static"
         return empty | {"reason": reason}, []
     intervals = np.array([(s.time[-1] - s.time[0]) / (len(s.time) - 1) for s in stretches])
     interval = float(np.median(intervals))
@@ -149,11 +149,11 @@ def _scatter_of_intervals(recording: Recording) -> float:
     return float(np.sqrt(np.mean((steps[steps <= GAP_INTERVALS] - 1.0) ** 2)))
 
 
-def _samples(stretches: Sequence[Stretch]) -> int:
+def _samples(stretches: Sequence[RestStretch]) -> int:
     return sum(len(s.time) for s in stretches)
 
 
-def static_stretches(sensor: str, recording: Recording) -> list[Stretch]:
+def static_stretches(sensor: str, recording: Recording) -> list[RestStretch]:
     """Return the evenly sampled stretches of a static recording; straight lines fill gaps of up to ``LONGEST_FILL``."""
     values = recording.reading(sensor)
     assert values is not None  # noqa: S101
@@ -170,7 +170,7 @@ def static_stretches(sensor: str, recording: Recording) -> list[Stretch]:
         grid, rows = np.arange(place[-1] + 1), good[index]
         reading = np.stack([np.interp(grid, place, values[rows, c]) for c in range(3)], axis=1)
         time = np.linspace(recording.time[rows[0]], recording.time[rows[-1]], len(grid))
-        stretches.append(Stretch(time, reading, None if warm is None else np.interp(grid, place, warm[rows])))
+        stretches.append(RestStretch(time, reading, None if warm is None else np.interp(grid, place, warm[rows])))
     return stretches
 
 
@@ -180,7 +180,7 @@ def _axes(regressions: Sequence[Regression]) -> list[JSON]:
     most = max(values.shape[1] for values in columns[0])  # an axis with fewer sinusoids has columns of zeros
     padded = [np.stack([np.pad(v, ((0, 0), (0, most - v.shape[1]))) for v in of_axes]) for of_axes in columns]
     spectrum = spectrum_of(padded, regressions[0].interval)
-    searches = [Search(spectrum, i) for i in range(len(regressions))]
+    searches = [CompositionSearch(spectrum, i) for i in range(len(regressions))]
     pairs = list(zip(searches, regressions, strict=True))
     best = solved(spectrum, at_once([best_of(s, r.required(), range(1, 1 + len(r.optional))) for s, r in pairs]))
     bounds = solved(spectrum, at_once([limits(spectrum, candidate) for candidate in best]))
@@ -195,7 +195,7 @@ def _axes(regressions: Sequence[Regression]) -> list[JSON]:
 
 def _axis(
     regression: Regression,
-    search: Search,
+    search: CompositionSearch,
     best: Candidate,
     bounds: tuple[Values, dict[int, float]],
     measured: tuple[Values, Values],
@@ -292,7 +292,7 @@ def _allan(  # noqa: PLR0917  (the curve and its terms)
 
 def _reason(kind: int, names: Sequence[str], spectrum: Spectrum) -> str:
     """Return why a term is not in a composition of these names."""
-    slow = [name for name in names if name in SLOW]
+    slow = [name for name in names if name in SLOW_TERMS]
     if kind < WHITE or slow:
         others = [name.replace("_", " ") for name in dict.fromkeys(slow if kind > WHITE else names)]
         return f"not detected in the presence of {' and '.join(others)}"
@@ -329,7 +329,7 @@ def _slope(regression: Regression, best: Candidate, spectrum: Spectrum, name: st
         return absent | {"reason": NOT_FITTED[name]}
     column = 1 + regression.optional.index(name)
     columns = tuple(sorted({*best.columns, column}))
-    fit = evaluate(spectrum, [Trial(int(best.fit.axis[0]), best.kinds, columns, best.parameters)])
+    fit = evaluate(spectrum, [TermTrial(int(best.fit.axis[0]), best.kinds, columns, best.parameters)])
     value = regression.scale / per * float(fit.beta[0, column - 1])
     spread = regression.scale / per * float(np.sqrt(fit.beta_covariance[0, column - 1, column - 1]))
     if column in best.columns:

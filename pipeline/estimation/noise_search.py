@@ -36,8 +36,8 @@ from pipeline.estimation.noise_terms import (
     STOCHASTIC,
     WHITE,
     Composition,
-    Fits,
-    Trial,
+    TermFits,
+    TermTrial,
     active,
     at_once,
     evaluate,
@@ -85,7 +85,7 @@ class Candidate:
     columns: tuple[int, ...]
     parameters: Values  # as in ``Trial.parameters``
     bic: float
-    fit: Fits  # of one row
+    fit: TermFits  # of one row
 
 
 def count_of(kinds: Composition, columns: Iterable[int]) -> int:
@@ -93,7 +93,7 @@ def count_of(kinds: Composition, columns: Iterable[int]) -> int:
     return len(kinds) + kinds.count(MARKOV) + len(tuple(columns))
 
 
-class Search:
+class CompositionSearch:
     """The fitted compositions of one axis."""
 
     def __init__(self, spectrum: Spectrum, axis: int) -> None:
@@ -132,7 +132,7 @@ class Search:
 
     def fit(self, starts: Sequence[tuple[Composition, Values]], columns: tuple[int, ...]) -> Work[None]:
         """Fit compositions from their starts, and store the best fit of each."""
-        trials = [Trial(self.axis, k, columns, p) for k, p in starts if (k, columns) not in self.found]
+        trials = [TermTrial(self.axis, k, columns, p) for k, p in starts if (k, columns) not in self.found]
         if not trials:
             return
         fits = yield trials
@@ -177,7 +177,7 @@ def _with_term(candidate: Candidate, kind: int, size: float, log_time: float) ->
     return (*kinds[:place], kind, *kinds[place:]), start
 
 
-def _scores(spectrum: Spectrum, fit: Fits, shapes: Values) -> tuple[Values, Values, Values]:
+def _scores(spectrum: Spectrum, fit: TermFits, shapes: Values) -> tuple[Values, Values, Values]:
     """Return for terms the predicted gain of -2 log L, the squared coefficients after one step, and their spread.
 
     ``fit``: of one row. ``shapes``: (l, b), spectra of the terms.
@@ -201,7 +201,7 @@ def limits(spectrum: Spectrum, best: Candidate) -> Work[tuple[Values, dict[int, 
     The intervals are a (2, 2 k) array, NaN for terms without a correlation time; the limits are of squared
     coefficients.
     """
-    trial = Trial(int(best.fit.axis[0]), best.kinds, best.columns, best.parameters)
+    trial = TermTrial(int(best.fit.axis[0]), best.kinds, best.columns, best.parameters)
     spread = np.sqrt(np.diag(best.fit.covariance(spectrum.count)[0]))
     n, terms = len(best.kinds), best.fit.kinds.shape[1]
     spread = spread[[*range(n), *range(terms, terms + n)]]
@@ -223,7 +223,7 @@ def limits(spectrum: Spectrum, best: Candidate) -> Work[tuple[Values, dict[int, 
     return within, dict(zip(absent, upper.tolist(), strict=True))
 
 
-def _crossing(best: Candidate, trial: Trial, j: int, step: float, *, one_sided: bool = False) -> Work[float]:
+def _crossing(best: Candidate, trial: TermTrial, j: int, step: float, *, one_sided: bool = False) -> Work[float]:
     """Return the change of parameter j at which -2 log L of the profile rises by the square of the quantile.
 
     ``step``: a first guess.
@@ -250,14 +250,14 @@ def _crossing(best: Candidate, trial: Trial, j: int, step: float, *, one_sided: 
     return sign * size
 
 
-def best_of(search: Search, required: tuple[int, ...], optional: Sequence[int]) -> Work[Candidate]:
+def best_of(search: CompositionSearch, required: tuple[int, ...], optional: Sequence[int]) -> Work[Candidate]:
     """Return the best composition over all choices of the optional deterministic columns.
 
     With white noise only, a column that gains less than ``SLIGHT_GAIN`` of -2 log L is not used.
     """
     best = yield from search.run(required)
     if optional and len(best.kinds) == 1:
-        fit = evaluate(search.spectrum, [Trial(search.axis, best.kinds, (*required, *optional), best.parameters)])
+        fit = evaluate(search.spectrum, [TermTrial(search.axis, best.kinds, (*required, *optional), best.parameters)])
         optional = [c for c in optional if fit.beta[0, c - 1] ** 2 > SLIGHT_GAIN * fit.beta_covariance[0, c - 1, c - 1]]
     for size in range(1, len(optional) + 1):
         for chosen in combinations(optional, size):
@@ -267,7 +267,7 @@ def best_of(search: Search, required: tuple[int, ...], optional: Sequence[int]) 
 
 
 @dataclass(frozen=True)
-class Stretch:
+class RestStretch:
     """Evenly sampled readings at rest: times (n,) in s, readings (n, 3), smoothed temperature (n,) or None."""
 
     time: Values
@@ -292,7 +292,7 @@ class Regression:
     """
 
     def __init__(
-        self, unit: str, stretches: list[Stretch], column: int, interval: float, steps: Values, *, single: bool
+        self, unit: str, stretches: list[RestStretch], column: int, interval: float, steps: Values, *, single: bool
     ) -> None:
         self.unit, self.stretches, self.column, self.interval = unit, stretches, column, interval
         self.scale = float(np.sqrt(np.mean(steps**2) / 2.0))  # the standard deviation, if it is white
@@ -303,7 +303,7 @@ class Regression:
         self.lines = self._lines() if single else []
         for _ in range(MOST_ROUNDS if self.lines else 0):
             spectrum = spectrum_of([self.columns(s)[None] for s in stretches], interval)
-            fit = solved(spectrum, Search(spectrum, 0).run(self.required())).fit
+            fit = solved(spectrum, CompositionSearch(spectrum, 0).run(self.required())).fit
             if self._settled(fit.beta[0], fit.beta_covariance[0]) or not self.lines:
                 break
 
@@ -327,7 +327,7 @@ class Regression:
         deterministic = [names[c - 1] for c in sorted(candidate.columns)]
         return [STOCHASTIC[k] for k in candidate.kinds] + [name for name in deterministic if name]
 
-    def columns(self, stretch: Stretch) -> Values:
+    def columns(self, stretch: RestStretch) -> Values:
         """Return readings and columns of a stretch: (n, 1 + d) array."""
         t = stretch.time - self.middle
         columns = [stretch.reading[:, self.column] / self.scale]

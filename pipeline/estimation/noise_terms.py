@@ -30,7 +30,7 @@ where s_j is the spectrum of term j, exp(theta_j) its squared coefficient, e uni
 the deterministic columns (ramp, sinusoids, temperature). beta follows by generalised least squares, and the last term
 makes the likelihood a restricted one. Sums over the coefficients are computed once, in bins whose edges have the ratio
 ``BIN_RATIO``. Fits of all axes, compositions and columns run together, by Fisher scoring with the damping of Levenberg
-and Marquardt. A search is a generator: it yields the ``Trial``s that it needs next and receives their ``Fits``;
+and Marquardt. A search is a generator: it yields the ``TermTrial``s that it needs next and receives their ``TermFits``;
 ``at_once`` joins the trials of several searches.
 
 Sources: IEEE Std 952-1997, annex C; Riley, NIST SP 1065, section 5.2.4; Strang, SIAM Review 41, 1999 (the transform);
@@ -185,7 +185,7 @@ def spectrum_of(stretches: Sequence[Values], interval: float) -> Spectrum:
     return Spectrum(np.add.reduceat(w, first) / count, count, products, interval, length)
 
 
-class Trial(NamedTuple):
+class TermTrial(NamedTuple):
     """A sum of terms to be fitted: axis, terms, numbers of its deterministic columns from 1, and the start."""
 
     axis: int
@@ -196,7 +196,7 @@ class Trial(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fits:
+class TermFits:
     """g sums of up to J terms, fitted together."""
 
     axis: Integers  # (g,)
@@ -213,11 +213,11 @@ class Fits:
     beta: Values  # (g, d)
     beta_covariance: Values  # (g, d, d)
 
-    def rows(self, index: Integers | Mask | slice) -> Fits:
+    def rows(self, index: Integers | Mask | slice) -> TermFits:
         """Return some of the fits."""
-        return Fits(*(getattr(self, name)[index] for name in NAMES))
+        return TermFits(*(getattr(self, name)[index] for name in NAMES))
 
-    def replace(self, index: Integers | Mask, others: Fits) -> None:
+    def replace(self, index: Integers | Mask, others: TermFits) -> None:
         """Replace some of the fits."""
         for name in NAMES[3:]:
             getattr(self, name)[index] = getattr(others, name)
@@ -238,10 +238,10 @@ class Fits:
         return np.asarray(np.linalg.inv(self.information(count)), np.float64)
 
 
-NAMES = tuple(f.name for f in fields(Fits))
+NAMES = tuple(f.name for f in fields(TermFits))
 Result = TypeVar("Result")
 if TYPE_CHECKING:
-    Work = Generator[list[Trial], Fits, Result]  # yields trials, receives their fits, returns a result
+    Work = Generator[list[TermTrial], TermFits, Result]  # yields trials, receives their fits, returns a result
 
 
 def active(kinds: Integers) -> Mask:
@@ -252,9 +252,9 @@ def active(kinds: Integers) -> Mask:
 def at_once(works: Sequence[Work[Result]]) -> Work[list[Result]]:
     """Join the trials of several generators and yield them; return the results of the generators."""
     results: dict[int, Result] = {}
-    replies: dict[int, Fits | None] = dict.fromkeys(range(len(works)))
+    replies: dict[int, TermFits | None] = dict.fromkeys(range(len(works)))
     while True:
-        wanted: dict[int, list[Trial]] = {}
+        wanted: dict[int, list[TermTrial]] = {}
         for i, reply in replies.items():
             try:
                 wanted[i] = works[i].send(reply)  # type: ignore[arg-type]
@@ -269,7 +269,7 @@ def at_once(works: Sequence[Work[Result]]) -> Work[list[Result]]:
 
 def solved(spectrum: Spectrum, work: Work[Result]) -> Result:
     """Maximise the likelihood of all trials that a generator yields; return its result."""
-    fits: Fits | None = None
+    fits: TermFits | None = None
     while True:
         try:
             fits = maximised(spectrum, work.send(fits))  # type: ignore[arg-type]
@@ -278,13 +278,13 @@ def solved(spectrum: Spectrum, work: Work[Result]) -> Result:
             return result
 
 
-def evaluate(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
+def evaluate(spectrum: Spectrum, trials: Sequence[TermTrial]) -> TermFits:
     """Return likelihood and derivatives at the parameters of trials."""
     return _evaluated(spectrum, *_packed(spectrum, trials)[:4])
 
 
-def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[Integers, Integers, Mask, Values, Mask]:
-    """Return axis, kinds, columns and parameters of trials, as in ``Fits``, and which parameters are free."""
+def _packed(spectrum: Spectrum, trials: Sequence[TermTrial]) -> tuple[Integers, Integers, Mask, Values, Mask]:
+    """Return axis, kinds, columns and parameters of trials, as in ``TermFits``, and which parameters are free."""
     g, terms = len(trials), max(len(trial.kinds) for trial in trials)
     kinds, parameters = np.full((g, terms), -1), np.zeros((g, 2 * terms))
     columns, held = np.zeros((g, spectrum.products.shape[2]), bool), np.zeros((g, 2 * terms), bool)
@@ -298,7 +298,7 @@ def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[Integers, Inte
     return np.array([trial.axis for trial in trials]), kinds, columns[:, 1:], parameters, active(kinds) & ~held
 
 
-def _evaluated(spectrum: Spectrum, axis: Integers, kinds: Integers, columns: Mask, parameters: Values) -> Fits:
+def _evaluated(spectrum: Spectrum, axis: Integers, kinds: Integers, columns: Mask, parameters: Values) -> TermFits:
     terms = kinds.shape[1]
     theta, log_time = parameters[:, :terms], parameters[:, terms:]
     shapes = spectrum.shapes[kinds]
@@ -335,13 +335,13 @@ def _evaluated(spectrum: Spectrum, axis: Integers, kinds: Integers, columns: Mas
         restricted = (products @ outer.reshape(g, -1, 1))[:, :, 0]
         beta[:, used], covariance[:, used[:, None], used] = -signed[:, 1:], inverse
     unrestricted = np.log(total) @ spectrum.count + (power * weight).sum(axis=1)
-    return Fits(
+    return TermFits(
         axis, kinds, columns, parameters, unrestricted + determinant, unrestricted, total, restricted, slopes, beta,
         covariance,
     )  # fmt: skip
 
 
-def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
+def maximised(spectrum: Spectrum, trials: Sequence[TermTrial]) -> TermFits:
     """Maximise the restricted likelihood of trials."""
     axis, kinds, columns, start, free = _packed(spectrum, trials)
     low = np.log(spectrum.interval)

@@ -22,7 +22,7 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import Blocks, constant_bias_s, information
 from pipeline.estimation.table_errors import errors_of_stops
-from pipeline.estimation.turns import Rows, reference_valid, rows_of
+from pipeline.estimation.turns import RowGroups, reference_valid, rows_of
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
@@ -38,19 +38,22 @@ if TYPE_CHECKING:
 
 
 ROLES = ("accelerometer", "gyroscope", "static")
-BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
+BIAS_BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
 SHORTEST_BLOCK_S = 4.0  # a fraction of the shortest correlation time of the grid
-MOST_BLOCKS = 600  # if the bias changes within longer ones: as many as give the right answers (docs/blind_study.md)
-FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # error by unknown rates in the filter's output: share of the largest rate; deg/s
+MAX_BIAS_BLOCKS = 600  # if the bias changes within longer ones: as many as give the right answers (docs/blind_study.md)
+FORGOTTEN_RATE_SHARE, FORGOTTEN_DPS = (
+    1e-5,
+    1e-4,
+)  # error by unknown rates in the filter's output: share of the largest rate; deg/s
 LONGEST_RESPONSE = 400  # samples of a filter's impulse response on each side
 # Variance of the angle's errors at a stop over that of noise, below which they count as noise: gains in 2 log L by
 # chance are then a tenth larger, and the gates of ``selection`` require 10 and more.
 HIDDEN_ANGLE = 0.1
-LEFT_OUT = 1e-9  # factor on the weight of rows that are not used: not 0, so that no block is empty
+UNUSED_ROW_WEIGHT = 1e-9  # factor on the weight of rows that are not used: not 0, so that no block is empty
 
 
 @dataclass(frozen=True)
-class Part:
+class RecordingRows:
     """The rows of one recording."""
 
     name: str
@@ -70,7 +73,7 @@ class Observations:
     """The data of one sensor for a fit."""
 
     sensor: str
-    parts: tuple[Part, ...]  # in the order of time if the clock is shared
+    parts: tuple[RecordingRows, ...]  # in the order of time if the clock is shared
     earth: bool  # whether Earth's rotation is in the motion
     bench: Mapping[str, float] = field(default_factory=dict)  # standard deviations by effect (``bench_priors``)
     mounting_in_doubt: bool = False  # whether one mounting does not explain all turns (note ``N-SEATS``)
@@ -133,10 +136,10 @@ class Observations:
 
     def _blocks(self, longest: float) -> Blocks:
         span = sum(float(np.ptp(part.motion.time)) for part in self.parts)
-        length = min(longest, max(SHORTEST_BLOCK_S, span / BLOCKS))
+        length = min(longest, max(SHORTEST_BLOCK_S, span / BIAS_BLOCKS))
         apart = [not _follows(before, part) for before, part in pairwise(self.parts)]
         rows = [(part.motion.time, part.weight) for part in self.parts]
-        return Blocks.of_rows(rows, np.cumsum([0, *apart]).tolist(), max(length, span / MOST_BLOCKS))
+        return Blocks.of_rows(rows, np.cumsum([0, *apart]).tolist(), max(length, span / MAX_BIAS_BLOCKS))
 
     @property
     def clock_shared(self) -> bool:
@@ -144,7 +147,7 @@ class Observations:
         return all(part.clock_shared for part in self.parts) or len(self.parts) == 1
 
 
-def _follows(before: Part, part: Part) -> bool:
+def _follows(before: RecordingRows, part: RecordingRows) -> bool:
     """Return whether the time between two recordings is known: one clock for all, or one session in order."""
     in_session = before.motion.setup == part.motion.setup != "" and before.motion.time[-1] < part.motion.time[0]
     return (before.clock_shared and part.clock_shared) or bool(in_session)
@@ -154,7 +157,7 @@ def without_rows(observations: Observations, left_out: Sequence[Mask]) -> Observ
     """Return observations with zero weight for rows, one mask for each recording."""
     parts = []
     for part, out in zip(observations.parts, left_out, strict=True):
-        weight = np.where(out, LEFT_OUT, 1.0) * part.weight
+        weight = np.where(out, UNUSED_ROW_WEIGHT, 1.0) * part.weight
         share = float(weight.sum() / part.weight.sum())
         parts.append(replace(part, weight=weight, scatter=share * part.scatter))
     return replace(observations, parts=tuple(parts))
@@ -185,7 +188,7 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
     return reduced if max(lost, default=0.0) > HIDDEN_ANGLE else replace(reduced, angle_deg=0.0)
 
 
-def _lost_at_stops(part: Part, observations: Observations) -> Values:
+def _lost_at_stops(part: RecordingRows, observations: Observations) -> Values:
     """Return the variance of the angle's error over that of the noise, ``W d^2 / s^2``, of each row's stop: (m,) array.
 
     Rows at one stop, or in the turn from it to the next, have a common error of the size d. With the total weight W,
@@ -209,7 +212,7 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Table) -> Obser
     logged = [(r, table_motion(r, table)) for r in used if r.reading(sensor) is not None]
     parts = [part for r, motion in logged if motion is not None and (part := _part(r, sensor, motion)) is not None]
 
-    def in_time(part: Part) -> tuple[bool, str, float]:
+    def in_time(part: RecordingRows) -> tuple[bool, str, float]:
         """Order recordings in time, within the unit or else within their setup."""
         setup = "" if part.clock_shared else part.motion.setup
         return not part.clock_shared, setup, float(part.motion.time[0]) if part.clock_shared or setup else 0.0
@@ -226,7 +229,7 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Table) -> Obser
 
 
 @once
-def _part(recording: Recording, sensor: str, motion: Motion) -> Part | None:
+def _part(recording: Recording, sensor: str, motion: Motion) -> RecordingRows | None:
     reading = recording.reading(sensor)
     assert reading is not None  # noqa: S101
     filtered = recording.filter["name"] != "none"
@@ -241,7 +244,7 @@ def _part(recording: Recording, sensor: str, motion: Motion) -> Part | None:
     means = rows.means(reading)
     squares = (reading[rows.kept] - np.repeat(means, rows.count.astype(int), axis=0)) ** 2
     by_angle = rate_by_angle(recording) if sensor == "gyroscope" and recording.axis is not None else None
-    return Part(
+    return RecordingRows(
         recording.name,
         rows.motion(motion) if filtered else _motion_at(recording, motion, rows),
         means,
@@ -254,7 +257,7 @@ def _part(recording: Recording, sensor: str, motion: Motion) -> Part | None:
 
 
 @once_of_log
-def _motion_at(recording: Recording, motion: Motion, rows: Rows) -> Motion:  # noqa: ARG001  (which keeps the result)
+def _motion_at(recording: Recording, motion: Motion, rows: RowGroups) -> Motion:  # noqa: ARG001  (which keeps the result)
     """Return the motion at the rows, which is mostly the same for both sensors of a recording."""
     return rows.motion(_with_direction(motion))
 
@@ -301,4 +304,4 @@ def _filter_settled(motion: Motion, recording: Recording) -> Mask:
     wide = np.max([bend, np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])], axis=0)
     response = np.abs(impulse_response(recording, 2 * min(recording.samples, LONGEST_RESPONSE) + 1))
     error = np.convolve(np.where(sure, 0.0, 0.5 * wide), response)[len(response) // 2 :][: len(rate)]
-    return np.logical_and(sure, error <= max(FORGOTTEN * float(np.abs(rate).max()), FORGOTTEN_DPS))
+    return np.logical_and(sure, error <= max(FORGOTTEN_RATE_SHARE * float(np.abs(rate).max()), FORGOTTEN_DPS))

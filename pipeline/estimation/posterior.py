@@ -4,10 +4,10 @@ Every effect is in a set with the prior probability ``INCLUSION``. ``pipeline.es
 of a set, which is averaged over its scales by the product of their conditionals at the best scales (Chib, JASA 90,
 1995). Sets are found by a beam search, then by exchange of each member.
 
-An upper limit is the ``BELOW`` quantile of a parameter's absolute value, given that its effect is present, averaged
-over sets, scales and noises. It is stated only for effects that were not selected. At the detection size these are two
-of three units (26 of 40 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones. Source:
-Hoeting et al., Statistical Science 14 (1999), 382-417; conjugate prior of Zellner.
+An upper limit is the ``UPPER_LIMIT_SHARE`` quantile of a parameter's absolute value, given that its effect is present,
+averaged over sets, scales and noises. It is stated only for effects that were not selected. At the detection size these
+are two of three units (26 of 40 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones.
+Source: Hoeting et al., Statistical Science 14 (1999), 382-417; conjugate prior of Zellner.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.estimation.evidence import NEGLIGIBLE, SCALE_PRIOR, SCALES, Given, Pick, Problem, Set
+from pipeline.estimation.evidence import (
+    LIMIT_SCALES,
+    NEGLIGIBLE_MIXTURE_WEIGHT,
+    SCALE_PRIOR,
+    CandidateProblem,
+    Given,
+    Pick,
+    Set,
+)
 from pipeline.estimation.free_curves import BEND
 from pipeline.estimation.selection import DELAYS
 
@@ -30,18 +38,23 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 INCLUSION = 0.02  # prior probability of each effect
-FIRST = 0, 3  # version and scale at which the search for the best ones of a set begins
+FIRST_VERSION_AND_SCALE = 0, 3  # version and scale at which the search for the best ones of a set begins
 ODDS = float(np.log(INCLUSION / (1.0 - INCLUSION)))
-BEAM, MOST = 6, 5  # sets that are extended, and their largest size
-FAR = 12.0  # of log E below the best, beyond which a set of the beam is not examined further
-NEAR = 7.0  # of log E below the best, within which a set is extended, and its best scales are determined
-MOST_NEAR, ROUNDS = 16, 3  # number of these sets; iterations of the search for the best scales, and of exchanges
+BEAM, MAX_SET_SIZE = 6, 5  # sets that are extended, and their largest size
+BEAM_LOG_EVIDENCE = 12.0  # of log E below the best, beyond which a set of the beam is not examined further
+EXTENDED_LOG_EVIDENCE = (
+    7.0  # of log E below the best, within which a set is extended, and its best scales are determined
+)
+MOST_NEAR, SCALE_SEARCH_ITERATIONS = (
+    16,
+    3,
+)  # number of these sets; iterations of the search for the best scales, and of exchanges
 CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in those sensors
-ENOUGH = 0.95  # probability of an answer set
-BELOW = 29.0 / 30.0  # of an upper limit, see above
-LIKELY = 0.05  # share of the best probability, above which a set is used for upper limits
-HALVINGS, EXACT = 40, 1e-9  # iterations for a quantile; their relative precision
-FARTHEST = 40.0  # standard deviations: beyond them the normal distribution is 0 or 1 in doubles
+ANSWER_SET_PROBABILITY = 0.95  # probability of an answer set
+UPPER_LIMIT_SHARE = 29.0 / 30.0  # of an upper limit, see above
+LIMIT_SET_SHARE = 0.05  # share of the best probability, above which a set is used for upper limits
+QUANTILE_ITERATIONS, QUANTILE_PRECISION = 40, 1e-9  # iterations for a quantile; their relative precision
+MAX_NORMAL_DEVIATIONS = 40.0  # standard deviations: beyond them the normal distribution is 0 or 1 in doubles
 
 
 @dataclass(frozen=True)
@@ -68,16 +81,18 @@ class Answers:
     def answer_set(self) -> list[tuple[tuple[str, ...], float]]:
         """Return the smallest number of sets with 95 % of the probability."""
         total = np.cumsum([weight for _, weight in self.sets])
-        return self.sets[: int(np.searchsorted(total, ENOUGH * total[-1])) + 1]
+        return self.sets[: int(np.searchsorted(total, ANSWER_SET_PROBABILITY * total[-1])) + 1]
 
 
-class Search:
+class SetSearch:
     """Search for the probable sets of effects of a problem.
 
     ``required``: effects that are in every set. ``seeds``: sets from which the search begins.
     """
 
-    def __init__(self, problem: Problem, required: Iterable[str] = (), seeds: Iterable[Iterable[str]] = ()) -> None:
+    def __init__(
+        self, problem: CandidateProblem, required: Iterable[str] = (), seeds: Iterable[Iterable[str]] = ()
+    ) -> None:
         self.problem, self.required = problem, frozenset(required)
         self.pool: dict[Set, Found] = {}
         self._extended: set[Set] = set()
@@ -87,7 +102,7 @@ class Search:
             self._finish(names)
         self._beam()
         self._exchange()
-        for names in self._best(MOST_NEAR, NEAR):
+        for names in self._best(MOST_NEAR, EXTENDED_LOG_EVIDENCE):
             self._finish(names)
 
     def best(self, among: Iterable[Set] = ()) -> Set:
@@ -102,11 +117,11 @@ class Search:
         """Remove the noise hypotheses that have no weight given any of the sets ``seeds``."""
         kept = np.zeros(len(self.problem.prior), bool)
         for names in seeds:
-            given = Given(self.problem, [dict.fromkeys(sorted(names), FIRST)])
+            given = Given(self.problem, [dict.fromkeys(sorted(names), FIRST_VERSION_AND_SCALE)])
             blocks = given.blocks(self._allowed(names))
             best = [np.maximum.reduceat(np.max(b.score[:, :, 0], axis=0), b.starts, axis=1) for b in blocks]
             scores = np.concatenate([given.alone(), *best], axis=1)
-            kept |= np.any(scores > scores.max(axis=0) + np.log(NEGLIGIBLE), axis=1)
+            kept |= np.any(scores > scores.max(axis=0) + np.log(NEGLIGIBLE_MIXTURE_WEIGHT), axis=1)
         self.problem = self.problem.under(kept)
 
     def _allowed(self, names: Set) -> list[str]:
@@ -116,10 +131,12 @@ class Search:
     def _beam(self) -> None:
         level = [self.required]
         while level:
-            level = self._near(sorted(self._extend(level), key=lambda names: -self.pool[names].score)[:BEAM], FAR)
+            level = self._near(
+                sorted(self._extend(level), key=lambda names: -self.pool[names].score)[:BEAM], BEAM_LOG_EVIDENCE
+            )
             for names in level:
                 self._finish(names)
-            level = self._near(level, NEAR)
+            level = self._near(level, EXTENDED_LOG_EVIDENCE)
 
     def _near(self, level: list[Set], within: float) -> list[Set]:
         """Return the sets that are within a distance of the best of all, and all single effects."""
@@ -128,10 +145,10 @@ class Search:
 
     def _exchange(self) -> None:
         """Replace each member of the best set by every other effect."""
-        for _ in range(ROUNDS):
+        for _ in range(SCALE_SEARCH_ITERATIONS):
             best = self.best()
             self._extend([best - {name} for name in sorted(best - self.required)])  # in the same order in each process
-            for names in self._best(BEAM, NEAR):
+            for names in self._best(BEAM, EXTENDED_LOG_EVIDENCE):
                 self._finish(names)
             if self.best() == best:
                 self._extend([best])
@@ -144,7 +161,7 @@ class Search:
 
     def _extend(self, level: Sequence[Set]) -> list[Set]:
         """Add every allowed effect to some sets; return the new sets."""
-        level = [names for names in level if len(names) < MOST + len(self.required)]
+        level = [names for names in level if len(names) < MAX_SET_SIZE + len(self.required)]
         new = [names for names in level if names not in self._extended]
         self._extended.update(new)
         for names in new:
@@ -167,9 +184,9 @@ class Search:
         known = self.pool.get(names)
         if known is not None and known.final:
             return
-        picks: dict[str, Pick] = dict(known.picks) if known else dict.fromkeys(sorted(names), FIRST)
+        picks: dict[str, Pick] = dict(known.picks) if known else dict.fromkeys(sorted(names), FIRST_VERSION_AND_SCALE)
         spread = score = 0.0
-        for _ in range(ROUNDS):
+        for _ in range(SCALE_SEARCH_ITERATIONS):
             before, spread = dict(picks), 0.0
             for name in picks:
                 others = {n: pick for n, pick in picks.items() if n != name}
@@ -189,7 +206,7 @@ def _largest(evidence: Values) -> tuple[float, Pick]:
     return float(evidence[v, s]), (v, s)
 
 
-def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], names: Iterable[str]) -> Answers:
+def answers(searches: Sequence[SetSearch | None], owner: Callable[[Set], int], names: Iterable[str]) -> Answers:
     """Combine the results of several searches of the same readings.
 
     ``searches``: None if none of its sets is possible. ``owner``: index of the search to which a set belongs.
@@ -212,11 +229,11 @@ def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], name
         stated = tuple(sorted(name.removesuffix(BEND) for name in keys[i]))
         probability[stated] = probability.get(stated, 0.0) + float(weight[i])
     sets = sorted(probability.items(), key=lambda each: -each[1])
-    likely = [(pool[keys[i]][0], keys[i]) for i in order[:BEAM] if weight[i] > LIKELY * weight[order[0]]]
+    likely = [(pool[keys[i]][0], keys[i]) for i in order[:BEAM] if weight[i] > LIMIT_SET_SHARE * weight[order[0]]]
     return Answers(sets, _upper_limits([name for name in names if not name.endswith(BEND)], likely))
 
 
-def _upper_limits(names: Sequence[str], likely: Sequence[tuple[Search, Set]]) -> dict[str, Values]:
+def _upper_limits(names: Sequence[str], likely: Sequence[tuple[SetSearch, Set]]) -> dict[str, Values]:
     """Return the upper limits of effects' parameters, given that each is present in addition to likely sets."""
     parts: dict[str, list[tuple[Values, Values, Values]]] = {}
     seen = set()
@@ -237,13 +254,13 @@ def _upper_limits(names: Sequence[str], likely: Sequence[tuple[Search, Set]]) ->
         weight, mean, deviation = (np.concatenate(each) for each in zip(*parts[name], strict=True))
         weight = np.exp(weight - weight.max())
         weight /= weight.sum()
-        kept = weight > NEGLIGIBLE
+        kept = weight > NEGLIGIBLE_MIXTURE_WEIGHT
         mixtures[name] = weight[kept], mean[kept], deviation[kept]
     return dict(zip(mixtures, quantiles([*mixtures.values()]), strict=True))
 
 
 def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]:
-    """Return the ``BELOW`` quantiles of the absolute values of k quantities, mixtures of m normal distributions.
+    """Return the ``UPPER_LIMIT_SHARE`` quantiles of the absolute values of k mixtures of m normal distributions.
 
     ``mixtures``: weights (m,), means and standard deviations (m, k). Returns a (k,) array of each.
     """
@@ -262,14 +279,17 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
     whole = np.add.reduceat(weight, first)
     low, high = np.zeros(len(sizes)), np.maximum.reduceat(mean + 5.0 * deviation, first)
     x = np.minimum(2.0 * np.sqrt(total(mean**2 + deviation**2) / whole), high)
-    for _ in range(HALVINGS):  # a step of Newton's method, or a halving if the step leaves the interval
-        upper, lower = (np.clip((x[of] + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0))
-        excess = total(scipy.special.ndtr(upper) - scipy.special.ndtr(-lower)) - BELOW * whole
+    for _ in range(QUANTILE_ITERATIONS):  # a step of Newton's method, or a halving if the step leaves the interval
+        upper, lower = (
+            np.clip((x[of] + side * mean) / deviation, -MAX_NORMAL_DEVIATIONS, MAX_NORMAL_DEVIATIONS)
+            for side in (-1.0, 1.0)
+        )
+        excess = total(scipy.special.ndtr(upper) - scipy.special.ndtr(-lower)) - UPPER_LIMIT_SHARE * whole
         density = total((np.exp(-0.5 * upper**2) + np.exp(-0.5 * lower**2)) / deviation) / np.sqrt(2.0 * np.pi)
         low, high = np.where(excess < 0.0, x, low), np.where(excess < 0.0, high, x)
         before, x = x, x - excess / np.maximum(density, 1e-300)
         x = np.where((x > low) & (x < high), x, 0.5 * (low + high))
-        if np.all(np.abs(x - before) <= EXACT * high):
+        if np.all(np.abs(x - before) <= QUANTILE_PRECISION * high):
             break
     return np.split(x, np.cumsum(counts)[:-1])
 
@@ -277,7 +297,7 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
 @cache
 def prior_limit() -> float:
     """Return the upper limit that the prior gives without any reading, over the sensor file's limit."""
-    return float(quantiles([(np.exp(SCALE_PRIOR), np.zeros((len(SCALES), 1)), SCALES[:, None])])[0][0])
+    return float(quantiles([(np.exp(SCALE_PRIOR), np.zeros((len(LIMIT_SCALES), 1)), LIMIT_SCALES[:, None])])[0][0])
 
 
 def excluded(effects: Sequence[Effect]) -> dict[str, Set]:

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
-from pipeline.estimation.design import Design, Term, placed
-from pipeline.estimation.evidence import Problem, linear_problem
-from pipeline.estimation.gauss_markov import WHITE, random_walks
-from pipeline.estimation.generalized_least_squares import Fit, design_at, fit_terms
-from pipeline.estimation.posterior import Answers, Search, answers, excluded
+from pipeline.estimation.design import Design, EffectColumns, placed
+from pipeline.estimation.evidence import CandidateProblem, linear_problem
+from pipeline.estimation.gauss_markov import WHITE_SETTING, random_walks
+from pipeline.estimation.generalized_least_squares import JointFit, design_at, fit_terms
+from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import EXCITED, without
 from pipeline.estimation.selection import DELAYS, Selection
 from pipeline.records import BASE_COUNT
@@ -43,15 +43,15 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
     candidates = {term.effect.name: term for term in reversed(selection.first.candidates)}
     shown = {*(candidates.keys() - set(hidden)), *selection.names}
     candidates = {name: term for name, term in sorted(candidates.items()) if name in shown}
-    candidates |= {this.name: Term(this, np.zeros(len(this.parameters(sensor)))) for this in others}
+    candidates |= {this.name: EffectColumns(this, np.zeros(len(this.parameters(sensor)))) for this in others}
     selected, moving = frozenset(selection.names), frozenset(n for n, term in candidates.items() if term.effect.moves)
-    first = Search(_problem(selection, selection.fit, candidates), seeds=[selected])
+    first = SetSearch(_problem(selection, selection.fit, candidates), seeds=[selected])
     curves = {this.name for this in others}
     best = first.best([key for key in first.pool if not key & curves])  # a fit has no free curves
     changed = best ^ selected
     if changed and not changed & moving and any(candidates[n].effect.nonlinear for n in changed):
-        first = Search(_problem(selection, _fit(selection, best, candidates), candidates), seeds=[selected, best])
-    searches: list[Search | None] = [first]
+        first = SetSearch(_problem(selection, _fit(selection, best, candidates), candidates), seeds=[selected, best])
+    searches: list[SetSearch | None] = [first]
     fitted = [selected & moving]
     for movers in _worth_a_fit(first, moving, selected & moving):
         names = first.best([key for key in first.pool if key & moving == movers]) - curves
@@ -60,7 +60,7 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
         lag = next((t.values[0] for t in fit.terms if t.effect.name == DELAYS[1]), np.inf)
         possible = DELAYS[1] not in movers or lag > LEAST_LAG_S  # a lag cannot be negative
         still = {name: term for name, term in candidates.items() if name not in moving - movers}
-        searches.append(Search(_problem(selection, fit, still), movers) if possible else None)
+        searches.append(SetSearch(_problem(selection, fit, still), movers) if possible else None)
 
     def owner(key: frozenset[str]) -> int:
         return fitted.index(key & moving) if key & moving in fitted else 0
@@ -68,7 +68,7 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
     return answers(searches, owner, candidates)
 
 
-def _worth_a_fit(search: Search, moving: frozenset[str], fitted: frozenset[str]) -> list[frozenset[str]]:
+def _worth_a_fit(search: SetSearch, moving: frozenset[str], fitted: frozenset[str]) -> list[frozenset[str]]:
     """Return the probable sets of timing effects other than the fitted one, the most probable first."""
     pool = search.pool
     total = float(np.logaddexp.reduce([found.score for found in pool.values()]))
@@ -80,7 +80,7 @@ def _worth_a_fit(search: Search, moving: frozenset[str], fitted: frozenset[str])
     return sorted(other, key=lambda key: -probability[key])[:MOST_FITS]
 
 
-def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, Term]) -> Fit:
+def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, EffectColumns]) -> JointFit:
     """Fit base, configured effects and a set of others."""
     fitted = {term.effect.name: term for term in selection.fit.terms}
     terms = list(selection.base.terms)
@@ -94,7 +94,7 @@ def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, 
     return fit_terms(selection.observations, terms, selection.fit, selection.settings)
 
 
-def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
+def _versions(sensor: str, fit: JointFit, term: EffectColumns) -> list[tuple[EffectColumns, float]]:
     """Return the terms of an effect and their prior log weights."""
     fitted, place = placed(fit.terms).get(term.effect.name, (None, slice(0)))
     width = None
@@ -107,7 +107,7 @@ def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
 
 
 def _products(
-    selection: Selection, fit: Fit, listed: Sequence[tuple[str, Term, float]], known: int
+    selection: Selection, fit: JointFit, listed: Sequence[tuple[str, EffectColumns, float]], known: int
 ) -> tuple[Design, Values, Values, Values, list[slice]]:
     """Return a design at a fit, the products of its base, those of the other columns, log determinants, and places.
 
@@ -123,7 +123,7 @@ def _products(
     if fit.terms or any(key not in places for key in keys):
         configured = fit.terms[: len(selection.base.terms)]
         design = design_at(selection.observations, fit, [*configured, *(term for _, term, _ in listed)])
-        stacked, logarithms = design.products([WHITE, *selection.settings, *walks])
+        stacked, logarithms = design.products([WHITE_SETTING, *selection.settings, *walks])
         projected = without(stacked, np.arange(known))[:, known:, known:]
         return design, stacked[:, :known, :known], projected, logarithms, design.slices[len(configured) :]
     stacked, logarithms = ranking.design.products(walks)
@@ -133,7 +133,7 @@ def _products(
     return ranking.design, base, projected, np.append(ranking.logarithms, logarithms), [places[key] for key in keys]
 
 
-def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> Problem:
+def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, EffectColumns]) -> CandidateProblem:
     """Return the linear problem at a fit."""
     observations = selection.observations
     configured = fit.terms[: len(selection.base.terms)]
@@ -145,7 +145,7 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
     ]
     known = BASE_COUNT + sum(len(term.values) for term in configured)
     design, base, products, logarithms, places = _products(selection, fit, listed, known)
-    settings = [WHITE, *selection.settings, *random_walks(selection.settings).values()]
+    settings = [WHITE_SETTING, *selection.settings, *random_walks(selection.settings).values()]
     size = np.where(design.sizes() > 0.0, design.sizes(), 1.0)
     base = base / np.outer(size[:known], size[:known])
     prior = np.array([s.prior for s in settings]) - 0.5 * (logarithms + np.linalg.slogdet(base)[1])

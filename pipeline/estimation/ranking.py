@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.estimation.design import Design, Start, Term
-from pipeline.estimation.gauss_markov import WHITE, Setting
+from pipeline.estimation.design import Design, EffectColumns, Start
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
 from pipeline.records import BASE_COUNT
 
 if TYPE_CHECKING:
@@ -26,9 +26,13 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Values
 
 EXCITED = 1e-3  # share of a column's norm, after projection of the base, from which on it is determined
-NEW = 1e-4  # the same of the variance of a candidate's weakest direction, after projection of the selected effects
-RIDGE = 1e-11  # of unit columns: 1e5 times the rounding of a double
-LEFT = 1e-10  # share of a column's square after a projection, below which it is rounding: ten times that of the ridge
+MIN_NEW_VARIANCE = (
+    1e-4  # the same of the variance of a candidate's weakest direction, after projection of the selected effects
+)
+UNIT_COLUMN_RIDGE = 1e-11  # of unit columns: 1e5 times the rounding of a double
+MIN_LEFT_SQUARE_SHARE = (
+    1e-10  # share of a column's square after a projection, below which it is rounding: ten times that of the ridge
+)
 
 
 @dataclass(frozen=True)
@@ -62,19 +66,21 @@ class Ranking:
         observations: Observations,
         base: Start,
         fit: Start,
-        candidates: Mapping[str, Term],
+        candidates: Mapping[str, EffectColumns],
         settings: Sequence[Setting],
     ) -> None:
-        self.settings = [WHITE, *settings]
+        self.settings = [WHITE_SETTING, *settings]
         self.samples = 3.0 * observations.samples
         self.within = float(np.sum(observations.scatter / fit.scale**2))
         fitted = {term.effect.name: replace(term, full=False) for term in fit.terms}
-        self.candidates: list[Term] = []
+        self.candidates: list[EffectColumns] = []
         for name, term in candidates.items():
             if name in fitted or term.effect.moves:
                 self.candidates.append(fitted.get(name, term))
             else:
-                self.candidates += [Term(term.effect, values) for values in term.effect.starts(observations.sensor)]
+                self.candidates += [
+                    EffectColumns(term.effect, values) for values in term.effect.starts(observations.sensor)
+                ]
         configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
         design = Design(observations, [*configured, *self.candidates], fit.K, fit.scale, project=True)
         stacked, logarithms = design.products(self.settings)
@@ -158,7 +164,9 @@ class Ranking:
         inner = np.stack([products[:, at, at] for at in places])
         cross = np.stack([products[:, at, -1] for at in places])
         squares = np.einsum("tii->ti", self.products)
-        definite = inner + RIDGE * np.stack([squares[:, at] for at in places])[..., None] * np.eye(inner.shape[-1])
+        definite = inner + UNIT_COLUMN_RIDGE * np.stack([squares[:, at] for at in places])[..., None] * np.eye(
+            inner.shape[-1]
+        )
         solved = np.linalg.solve(definite, cross[..., None])[..., 0]
         rss = products[:, -1, -1] - np.sum(cross * solved, axis=2)
         likelihood = self.log_likelihood(rss)
@@ -178,7 +186,7 @@ class Ranking:
                 values=values,
                 uncertainty=uncertainty,
                 setting=best,
-                admissible=bool(weakest[i] > NEW),
+                admissible=bool(weakest[i] > MIN_NEW_VARIANCE),
                 plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits.get(this.name, np.inf))),
                 drop=float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal),
             )
@@ -202,7 +210,7 @@ class Ranking:
         """
         others = [i for i in selected if i != j]
         products = self.chosen(others)[setting]
-        definite = products + RIDGE * np.diag(np.diag(self.products[setting]))
+        definite = products + UNIT_COLUMN_RIDGE * np.diag(np.diag(self.products[setting]))
         place = self.places[j]
         signal = np.linalg.solve(definite[np.ix_(place, place)], products[place, -1])
         power = float(signal @ products[np.ix_(place, place)] @ signal)
@@ -221,13 +229,13 @@ class Ranking:
         return {
             term.effect.name
             for i, (term, at) in enumerate(zip(self.candidates, self.places, strict=True))
-            if i != j and len(at) and np.linalg.eigvalsh(rest[np.ix_(at, at)])[-1] < NEW
+            if i != j and len(at) and np.linalg.eigvalsh(rest[np.ix_(at, at)])[-1] < MIN_NEW_VARIANCE
         }
 
     def explained(self) -> Values:
         """Return the decrease of the base's whitened sum of squares by each candidate, white noise: (c,) array."""
         products = self.products[0]
-        definite = products + RIDGE * np.eye(len(products))
+        definite = products + UNIT_COLUMN_RIDGE * np.eye(len(products))
         solved = [np.linalg.solve(definite[np.ix_(at, at)], products[at, -1]) for at in self.places]
         return np.array([float(products[at, -1] @ x) for at, x in zip(self.places, solved, strict=True)])
 
@@ -247,7 +255,7 @@ def without(products: Values, index: Index) -> Values:
     if len(index) == 0:
         return products
     rest = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
-    new = np.einsum("tpp->tp", rest) > LEFT * np.einsum("tpp->tp", products)
+    new = np.einsum("tpp->tp", rest) > MIN_LEFT_SQUARE_SHARE * np.einsum("tpp->tp", products)
     new[:, -1] = True
     rest *= new[:, :, None] & new[:, None, :]
     return np.asarray(rest)
@@ -257,5 +265,5 @@ def projection(products: Values, index: Index) -> Values:
     """Return the coefficients of the projection of each column onto some of the columns, ``index``: (t, q, p) array."""
     inner, cross = products[:, index[:, None], index], products[:, index, :]
     size = np.sqrt(np.maximum(np.einsum("tii->ti", inner), 1e-300))
-    scaled = inner / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(len(index))
+    scaled = inner / (size[:, :, None] * size[:, None, :]) + UNIT_COLUMN_RIDGE * np.eye(len(index))
     return np.asarray(np.linalg.solve(scaled, cross / size[:, :, None]) / size[:, :, None])

@@ -38,7 +38,7 @@ from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import Part, noise_of_fit, parts_of, settled, used_motions
+from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, settled, used_motions
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import truth
@@ -52,8 +52,8 @@ if TYPE_CHECKING:
 
 NAME = "reference_least_squares"
 FIT_STAGES = {NAME: FitStage(accepts=("readings",), changes=("bias", "matrix", "effects"), free=True, reference=True)}
-COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
-WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
+PARAMETER_COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
+MIN_REFERENCE_SINGULAR_VALUE = 1e-3  # smallest singular value of unit columns that still counts as determined
 SHARP_CHANGE = 1e-3  # of the largest rate between two samples, where the rate is not logged
 ADVICE = {
     "accelerometer": "turns about at least two axes bring gravity along all three",
@@ -122,7 +122,7 @@ def of_channels(values: Values) -> Values:
     return np.concatenate([channels[:, :, 0], channels[:, :, 1:].reshape(-1, 9)], axis=1)
 
 
-def _select(sensor: str, part: Part) -> Part:
+def _select(sensor: str, part: TurnPart) -> TurnPart:
     """Return a part with the samples that the fit uses."""
     if sensor == "accelerometer":
         return replace(part, keep=settled(part))
@@ -134,7 +134,7 @@ def _select(sensor: str, part: Part) -> Part:
     return replace(part, keep=part.keep & ~sharp)
 
 
-def _reference(sensor: str, part: Part) -> Values:
+def _reference(sensor: str, part: TurnPart) -> Values:
     """Return the reading of an ideal sensor after the recording's filter: (n, 3) array."""
     recording, motion = part.recording, part.motion
     try:
@@ -153,10 +153,10 @@ def _require_observable(sensor: str, X: Values) -> float:
     _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
     singular = np.zeros(4)
     singular[: len(s)] = s
-    null = Vt[singular < WEAKEST_DIRECTION * singular[0]]
+    null = Vt[singular < MIN_REFERENCE_SINGULAR_VALUE * singular[0]]
     if len(null):
         share = np.linalg.norm(null, axis=0)
-        lost = [name for name, part in zip(COLUMNS, share, strict=True) if part > 0.1]
+        lost = [name for name, part in zip(PARAMETER_COLUMNS, share, strict=True) if part > 0.1]
         raise NotObservableError(
             f"{sensor}: the recordings do not determine {', '.join(lost)}"
             f"{' independently of each other' if len(lost) > 1 else ''}: {ADVICE[sensor]}"

@@ -22,11 +22,11 @@ import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
-from pipeline.estimation.design import Start, Term, ordinary_base, placed, without_unknown_motion
+from pipeline.estimation.design import EffectColumns, Start, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gates import MAX_FALSE_PROBABILITY, MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import Setting, selection_grid
-from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms, require_observable
+from pipeline.estimation.generalized_least_squares import JointFit, fit_best, fit_terms, require_observable
 from pipeline.estimation.observations import Observations, weighted
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.model.effects import effect
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from pipeline.settings import DataSheet
 
 
-MOST = 5  # effects that one selection adds
+MAX_SELECTED_EFFECTS = 5  # effects that one selection adds
 INFLATED = 3.0  # times the expected wander, see above
 EVIDENCE = 5.0  # difference in log L: a Bayes factor of 150, "very strong" (Kass and Raftery, JASA 90, 1995)
-ALIKE = 0.8  # share of an effect's signal that another reproduces, above which it is a look-alike
+LOOK_ALIKE_SHARE = 0.8  # share of an effect's signal that another reproduces, above which it is a look-alike
 MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of timing is fitted to its optimum
 CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start is near its optimum
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is selected unless the second is clearly better
-CLEARLY = 6.0  # delta BIC: "strong" evidence (Raftery 1995)
+STRONG_DELTA_BIC = 6.0  # delta BIC: "strong" evidence (Raftery 1995)
 TIE = 0.5  # delta BIC below which the catalogue's order decides
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that lacks more than one effect of the catalogue
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
@@ -77,7 +77,9 @@ def select(
         candidates = {}
         for this in candidates_for(observations, configured):
             prior = prior_of(this, observations, accelerometer, configured)
-            candidates[this.name] = Term(this, np.zeros(len(this.parameters(observations.sensor))), prior=prior)
+            candidates[this.name] = EffectColumns(
+                this, np.zeros(len(this.parameters(observations.sensor))), prior=prior
+            )
         ranking = Ranking(observations, base, base, candidates, grid)
         limits = limits_of(observations.sensor, data_sheet)
         selection = Selection(
@@ -102,14 +104,14 @@ class Selection:
     start: Start
     settings: list[Setting]
     limits: dict[str, Values]
-    candidates: dict[str, Term]  # before any fit, with their priors
-    base: Fit  # base and configured effects
-    fit: Fit  # base, configured and selected effects
+    candidates: dict[str, EffectColumns]  # before any fit, with their priors
+    base: JointFit  # base and configured effects
+    fit: JointFit  # base, configured and selected effects
     first: Ranking  # the linear problem of the base
     ranking: Ranking  # the linear problem with the selected effects at their values
     steps: dict[str, Score] = field(default_factory=dict)  # of each selected effect, in order, when it was accepted
     alone: dict[str, Score] = field(default_factory=dict)  # of each candidate against the base
-    fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)  # of base, configured and further effects
+    fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)  # of base, configured and further effects
     refused: set[frozenset[str]] = field(default_factory=set)  # sets with a time constant that is not determined
 
     @property
@@ -134,8 +136,8 @@ class Selection:
                 self._fit_selected()
 
     def _forward(self) -> None:
-        for _ in range(3 * MOST):
-            if len(self.names) == MOST:
+        for _ in range(3 * MAX_SELECTED_EFFECTS):
+            if len(self.names) == MAX_SELECTED_EFFECTS:
                 return
             best = self._best(self._scores() if self.names else list(self.alone.values()))
             if best is None:
@@ -186,7 +188,7 @@ class Selection:
         values = score.values
         if this.name == DELAYS[1]:
             values = np.maximum(values, this.starts(self.observations.sensor)[0])
-        terms = [*self.base.terms, *self._terms(), Term(this, values)]
+        terms = [*self.base.terms, *self._terms(), EffectColumns(this, values)]
         fit = fit_terms(self.observations, terms, self.start, self.settings)
         self.fits[*self.names, score.name] = replace(fit)  # without its design: there are many candidates
         before, _ = self.ranking.of_model(self.ranking.of_effects(self.names))
@@ -208,7 +210,7 @@ class Selection:
         if not values:
             return None
         best = max(values, key=lambda name: values[name])
-        if best == DELAYS[1] and values.get(DELAYS[0], 0.0) > values[best] - CLEARLY:
+        if best == DELAYS[1] and values.get(DELAYS[0], 0.0) > values[best] - STRONG_DELTA_BIC:
             best = DELAYS[0]
         tied = [name for name in self.candidates if values.get(name, 0.0) > values[best] - TIE]
         name = best if best in DELAYS else tied[0]
@@ -259,7 +261,7 @@ class Selection:
             self.fits[key] = fit_terms(self.observations, terms, self.fit, self.settings)
         self.fit = self.fits[key]
 
-    def _terms(self) -> list[Term]:
+    def _terms(self) -> list[EffectColumns]:
         """Return the selected effects at their fitted values, or at those of the step that accepted them."""
         fitted = {term.effect.name: term for term in self.fit.terms}
         return [fitted.get(n) or replace(self.candidates[n], values=self.steps[n].values) for n in self.names]
@@ -338,10 +340,10 @@ class Selection:
         place = self.names.index(name)
         terms = self._terms()
         value = np.maximum(-terms[place].values, effect(other).starts(self.observations.sensor)[0])
-        terms[place] = Term(effect(other), value)
+        terms[place] = EffectColumns(effect(other), value)
         fit = fit_terms(self.observations, [*self.base.terms, *terms], self.fit, self.settings)
         gain = 2.0 * (fit.log_likelihood - self.fit.log_likelihood)
-        if gain <= (CLEARLY if other == DELAYS[1] else 0.0):
+        if gain <= (STRONG_DELTA_BIC if other == DELAYS[1] else 0.0):
             return False
         term, at = placed(fit.terms)[other]
         score = replace(self.steps[name], name=other, values=term.values)

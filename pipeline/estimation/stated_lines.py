@@ -34,7 +34,7 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.preprocessing.evidence import EXPANDED
-from pipeline.preprocessing.reference_scale import SIGNIFICANT, rate_against_angle
+from pipeline.preprocessing.reference_scale import SIGNIFICANT_UNCERTAINTIES, rate_against_angle
 from pipeline.records import (
     BIAS,
     MATRIX,
@@ -146,7 +146,10 @@ def _rate_off_angle(
         return []
     turns = [r for r in recordings if r.role == "gyroscope" and r.table_angle is not None]
     found = filter(None, map(rate_against_angle, turns))
-    off = max((abs(ratio - 1.0) for ratio, spread, _ in found if abs(ratio - 1.0) > SIGNIFICANT * spread), default=0.0)
+    off = max(
+        (abs(ratio - 1.0) for ratio, spread, _ in found if abs(ratio - 1.0) > SIGNIFICANT_UNCERTAINTIES * spread),
+        default=0.0,
+    )
     if off <= EXPANDED * table.rate_accuracy:
         return []
     remark = f"the table's rate and the change of its angle differ by up to {1e6 * off:.3g} ppm"

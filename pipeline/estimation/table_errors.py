@@ -35,13 +35,13 @@ from pipeline.signal.rests import RATE_AT_REST_DPS
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.estimation.gauss_markov import Blocks, Prior
+    from pipeline.estimation.gauss_markov import Blocks, WanderPrior
     from pipeline.settings import Table
 
-ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
+INPUT_EFFECT_ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
 COUNTED_STOPS = 4  # stops of a recording above which its steps are counted, so that the rate adds no error
-TILTS = ("angle_accuracy_deg", "orthogonality_deg", "wobble_deg", "levelling_deg")
+TILT_ACCURACIES = ("angle_accuracy_deg", "orthogonality_deg", "wobble_deg", "levelling_deg")
 
 TIME_BASE = "time base"
 TIMED_BY_SENSOR = (
@@ -122,7 +122,7 @@ def type_b(  # noqa: PLR0917  (the columns of a budget's line)
 
 def _without_rounding(effect: Values) -> Values:
     """Return the effect of inputs on parameters with zeros in place of values that are rounding."""
-    return np.where(np.abs(effect) > ROUNDING * np.abs(effect).max(initial=0.0), effect, 0.0)
+    return np.where(np.abs(effect) > INPUT_EFFECT_ROUNDING * np.abs(effect).max(initial=0.0), effect, 0.0)
 
 
 def table_errors(
@@ -184,7 +184,7 @@ def disturbance(
 
 
 def noise_on_table(
-    reference: Reference, residuals: Values, design: Values, blocks: Blocks, prior: Prior
+    reference: Reference, residuals: Values, design: Values, blocks: Blocks, prior: WanderPrior
 ) -> ResidualNoise:
     """Weight the hypotheses of a prior by the residuals of a fit on a table; arguments: see ``assess_noise``."""
     return assess_noise(residuals, design, blocks, prior, disturbance(reference, residuals, blocks))
@@ -193,7 +193,7 @@ def noise_on_table(
 def _largest(reference: Reference) -> float:
     """Return the approximate largest error of the truth by the stated accuracies, g or deg/s."""
     table, size = reference.table, 0.0
-    tilt = np.radians(max(float(getattr(table, key) or 0.0) for key in TILTS))
+    tilt = np.radians(max(float(getattr(table, key) or 0.0) for key in TILT_ACCURACIES))
     for motion in reference.motions:
         u = truth(reference.sensor, motion)
         size = max(size, tilt * float(np.abs(u).max()))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError
-from pipeline.estimation.gauss_markov import Blocks, Prior
+from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.model.kinematics import table_motion
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from pipeline.settings import Table
 
 
-BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
+FIT_BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
 DISTINCT_DIRECTION_G = 0.01  # attitudes 0.6 deg apart differ
 SLOWEST_SHARE = 0.02  # of the largest rate, below which the table is not taken as turning
 CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
-EDGE_S = 0.15  # excluded at either end of a steady turn, where the table still accelerates
+TURN_EDGE_S = 0.15  # excluded at either end of a steady turn, where the table still accelerates
 LONGEST_TAIL = 0.4  # of a steady turn
 DELAYS_TO_FOLLOW = 5.0  # after which an RC filter holds less than 1 % of a change of rate
 MEAN_S = 1.0  # a mean hides no motion at rest, and keeps the readings' change with temperature
@@ -37,7 +37,7 @@ BEND_DPS, BEND_SHARE = 0.05, 1e-3  # see ``reference_valid``
 
 
 @dataclass(frozen=True)
-class Part:
+class TurnPart:
     """The samples of one recording that a fit uses, and the motion of the table."""
 
     recording: Recording
@@ -56,12 +56,12 @@ class Part:
         return reading[self.keep]
 
 
-def used_motions(parts: Sequence[Part]) -> list[Motion]:
+def used_motions(parts: Sequence[TurnPart]) -> list[Motion]:
     """Return the motion at the used samples of each part; a part without any is left out."""
     return [part.used_motion for part in parts if part.keep.any()]
 
 
-def parts_of(recordings: Sequence[Recording], sensor: str, table: Table, method: str) -> list[Part]:
+def parts_of(recordings: Sequence[Recording], sensor: str, table: Table, method: str) -> list[TurnPart]:
     """Return the recordings made for a sensor with its readings and the table's motion, without invalid samples.
 
     ``method``: name of the method, for the message. Raises ``CannotCalibrateError`` if there is none.
@@ -71,7 +71,7 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Table, method:
     for recording in usable:
         motion = table_motion(recording, table)
         if motion is not None:
-            parts.append(Part(recording, motion, recording.valid))
+            parts.append(TurnPart(recording, motion, recording.valid))
     if not parts:
         lack = "none of them logs the table's angle" if usable else f"no recording of role {sensor} holds its readings"
         raise CannotCalibrateError(
@@ -93,12 +93,12 @@ def stop_and_go(motion: Motion) -> bool:
     return len(np.unique(np.round(means / DISTINCT_DIRECTION_G), axis=0)) >= 4
 
 
-def settled(part: Part) -> Mask:
+def settled(part: TurnPart) -> Mask:
     """Return the samples of a part that an accelerometer's fit uses: its rests if it stops and goes, else all."""
     return part.keep & part.motion.still if stop_and_go(part.motion) else part.keep
 
 
-def steady_turns(part: Part, memory: float) -> Mask:
+def steady_turns(part: TurnPart, memory: float) -> Mask:
     """Return the samples in the steady parts of a turn about one axis, without the settling of a filter.
 
     ``memory``: the settling time, s. Of a shorter turn the middle is used: the filter's error there is a small share of
@@ -114,12 +114,12 @@ def steady_turns(part: Part, memory: float) -> Mask:
     for start, stop in runs(steady):
         time = motion.time[start:stop]
         tail = min(memory, LONGEST_TAIL * (time[-1] - time[0]))
-        since, until = (EDGE_S + tail if start else 0.0), EDGE_S + both_ways * tail
+        since, until = (TURN_EDGE_S + tail if start else 0.0), TURN_EDGE_S + both_ways * tail
         steady[start:stop] = (time >= time[0] + since) & (time <= time[-1] - until)
     return steady
 
 
-def filtered_alike(part: Part) -> Mask:
+def filtered_alike(part: TurnPart) -> Mask:
     """Return the samples of ``settled`` that a filter changes equally.
 
     Without a filter, and for rests, these are all samples. In a continuous turn with a filter they are the samples in
@@ -132,13 +132,15 @@ def filtered_alike(part: Part) -> Mask:
 
 
 def noise_of_fit(
-    parts: Sequence[Part], reference: Reference, residuals: Values, design: Values, prior: Prior
+    parts: Sequence[TurnPart], reference: Reference, residuals: Values, design: Values, prior: WanderPrior
 ) -> ResidualNoise:
     """Return the noise of a fit to the stacked samples of parts, from its residuals."""
     return noise_on_table(reference, residuals, design, blocks_of_samples(parts), prior)
 
 
-def noise_of_turns(parts: Sequence[Part], prior: Prior, table: Table, *, two_sided: bool = False) -> ResidualNoise:
+def noise_of_turns(
+    parts: Sequence[TurnPart], prior: WanderPrior, table: Table, *, two_sided: bool = False
+) -> ResidualNoise:
     """Return the noise of an accelerometer on a table, from the residuals of ``y = b + K u``, or ``+ C |u|`` too."""
     motions = used_motions(parts)
     u = np.concatenate([motion.specific_force for motion in motions])
@@ -149,13 +151,13 @@ def noise_of_turns(parts: Sequence[Part], prior: Prior, table: Table, *, two_sid
     return noise_of_fit(parts, reference, reading - X @ beta, X, prior)
 
 
-def blocks_of_samples(parts: Sequence[Part]) -> Blocks:
-    """Divide the used samples of parts, stacked in their order, into about ``BLOCKS`` blocks of equal size.
+def blocks_of_samples(parts: Sequence[TurnPart]) -> Blocks:
+    """Divide the used samples of parts, stacked in their order, into about ``FIT_BLOCKS`` blocks of equal size.
 
     Recordings of one session, one after the other, share a clock.
     """
     used = [int(part.keep.sum()) for part in parts]
-    size = max(1, -(-sum(used) // BLOCKS))
+    size = max(1, -(-sum(used) // FIT_BLOCKS))
     rows = []
     sessions: dict[str, tuple[int, float]] = {}  # clock and end of the last recording of each session
     for number, (part, samples) in enumerate(zip(parts, used, strict=True), start=1):
@@ -175,7 +177,7 @@ def blocks_of_samples(parts: Sequence[Part]) -> Blocks:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class RowGroups:
     """Groups of a recording's samples whose means are the rows of a fit; equal ones are one argument of ``once``."""
 
     kept: Index  # (k,); indices of the samples
@@ -188,12 +190,12 @@ class Rows:
         return self.kept.tobytes(), self.first.tobytes(), self.total
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Rows) and self._key == other._key
+        return isinstance(other, RowGroups) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
 
-    def settled(self, reading: Values) -> Rows:
+    def settled(self, reading: Values) -> RowGroups:
         """Split groups whose readings, (n, 3), scatter too much into single samples.
 
         They are at rest by the table's log; with an error of the sensor's clock, the sensor still moves at their edges.
@@ -252,7 +254,7 @@ class Rows:
         return self.motion(motion)
 
 
-def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> Rows:
+def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> RowGroups:
     """Select the samples of a fit, and group the samples of each rest.
 
     ``valid``: (n,), samples with valid readings. ``together``: whether the samples of a rest are equivalent, which they
@@ -263,14 +265,14 @@ def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> Rows:
         moving = np.abs(motion.rate) > RATE_AT_REST_DPS
     kept = np.flatnonzero(valid & (motion.still | moving) & reference_valid(motion))
     if len(kept) == 0:
-        return Rows(kept, kept, np.zeros(0), len(valid))
+        return RowGroups(kept, kept, np.zeros(0), len(valid))
     still, time = motion.still[kept], motion.time[kept]
     alike = still[1:] & still[:-1] & (np.diff(kept) == 1) & together
     rest = np.concatenate([[0], np.cumsum(~alike)])
     begin = time[np.concatenate([[True], ~alike])]
     piece = np.floor((time - begin[rest]) / MEAN_S + 1e-9)
     first = np.flatnonzero(np.concatenate([[True], ~alike | (np.diff(piece) != 0)]))
-    return Rows(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(valid))
+    return RowGroups(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(valid))
 
 
 def reference_valid(motion: Motion) -> Mask:

@@ -47,12 +47,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from pipeline.estimation.design import Term
+    from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.engine import LinearMap, ResidualNoise
-    from pipeline.estimation.gauss_markov import Prior
+    from pipeline.estimation.gauss_markov import WanderPrior
     from pipeline.settings import Settings, Table
 
-BY_CHANCE = 0.1  # share of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
+CHANCE_VARIANCE_SHARE = (
+    0.1  # share of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
+)
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not show it: calibrate the unit again after switching it off"
@@ -77,7 +79,7 @@ def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: A
     return np.asarray(np.divide(total, share, out=np.full(u.shape[1], np.inf), where=share > 0.0))
 
 
-def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: Prior) -> Contribution:
+def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: WanderPrior) -> Contribution:
     """Return the contribution of white noise, bias instability and lack of fit."""
     covariance, freedom = noise.posterior(fit).averaged()
     total = np.diag(covariance)
@@ -243,7 +245,7 @@ def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Val
     of_bench = np.zeros(len(C))
     for line in calibration.lines:
         part, whole = np.square(line.parts.get(shared, 0.0)), np.square(line.standard_uncertainty)
-        of_bench += np.where(part > BY_CHANCE * whole, part, 0.0)
+        of_bench += np.where(part > CHANCE_VARIANCE_SHARE * whole, part, 0.0)
         of_bench += whole * (line.kind == "B" and line.source != LIMIT)
     share = np.clip(of_bench / np.maximum(np.diag(C), 1e-300), 0.0, 1.0)
     return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
@@ -265,7 +267,7 @@ def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Value
 
 
 def effect_parameters(
-    sensor: str, terms: Sequence[Term], covariance: Values
+    sensor: str, terms: Sequence[EffectColumns], covariance: Values
 ) -> tuple[tuple[FittedEffect, ...], dict[str, dict[str, Any]]]:
     """Return the fitted effects, and their parameters as published with a stage; they follow bias and matrix."""
     u = iter(np.sqrt(np.clip(np.diag(covariance)[AFTER_BASE], 0.0, None)).tolist())

@@ -58,7 +58,9 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 TEMPLATES = Path(__file__).parent / "templates"
-ROUNDS = 12  # of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal
+FIXED_POINT_ITERATIONS = (
+    12  # of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal
+)
 IN_C = set(SIGNALS) - {"specific_force_rate"}
 CALL = re.compile(r"(\w+)\(")  # of a function in C
 
@@ -287,8 +289,8 @@ def plan_of(sensors: dict[str, ExportedSensor]) -> JSON:
         "past": past,
         "temperature": "temperature" in used,
         "with_time": sorted(with_time),
-        "rounds": ROUNDS if circular_sensors else 1,
-        "ends": ROUNDS if circular_sensors and past else 1,
+        "rounds": FIXED_POINT_ITERATIONS if circular_sensors else 1,
+        "ends": FIXED_POINT_ITERATIONS if circular_sensors and past else 1,
         "functions": {name for p in plans.values() for line in p.steady + p.moving for name in CALL.findall(line)},
         "memory": SMOOTHING_S,
         "reference": c_number(REFERENCE_TEMPERATURE),

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 JSON = dict[str, Any]
-TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding
+CONVERSION_TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding
 WALK_S = 100.0  # correlation time of the wander that represents a random walk: K = s sqrt(2 / T), for any T
 
 
@@ -151,16 +151,16 @@ def _differences(before: SensorCalibration, after: SensorCalibration, *, all_eff
     unit = SENSOR_UNITS[before.sensor]
     bias, matrix = (np.abs(getattr(after, key) - getattr(before, key)).max() for key in ("bias", "matrix"))
     lines = []
-    if bias > TOLERANCE:
+    if bias > CONVERSION_TOLERANCE:
         left_out = np.any(before.bias) and not np.any(after.bias)
         lines.append("the bias" if left_out else f"the bias is rounded, by up to {bias:.2g} {unit}")
-    if matrix > TOLERANCE:
+    if matrix > CONVERSION_TOLERANCE:
         lines.append(f"elements of the matrix change by up to {matrix:.2g}")
     values = {e.name: e.values for e in after.effects}
     for effect in () if all_effects else before.effects:
         if effect.name not in values:
             lines.append(f"the effect {effect.name}")
-        elif (change := np.abs(values[effect.name] - effect.values).max()) > TOLERANCE:
+        elif (change := np.abs(values[effect.name] - effect.values).max()) > CONVERSION_TOLERANCE:
             lines.append(f"the effect {effect.name} changes by up to {change:.2g}")
     return lines
 

@@ -41,13 +41,15 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.json``
-LARGEST_BYTES = 50_000_000  # of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100
+MAX_CALIBRATION_BYTES = (
+    50_000_000  # of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100
+)
 UNIT_SCALE = (0.5, 2.0)  # range of the singular values of a matrix if readings and truth have the same unit
 EFFECT_IN_C = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
 TURNED_READINGS = re.compile(r"Turn\s+the\s+readings\s+to\s+body\s+axes\s+first:\s[^.]*\.")  # a remark in our exports
 OWNER = re.compile(r"the (\w+)'s x along")  # in such a remark: a sensor, or "sensor" for both
 BODY_AXIS = re.compile(r"along body ([+-][xyz])")
-ROUNDING = 1e-12  # rounding errors of the formats' arithmetic, relative to the largest number
+FORMAT_ROUNDING = 1e-12  # rounding errors of the formats' arithmetic, relative to the largest number
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def _files_of(file: Path, declared: Format) -> list[Path]:
 
 
 def _text(file: Path) -> str:
-    return read_text(file, LARGEST_BYTES, "a calibration") if file.exists() else read_published(file).decode()
+    return read_text(file, MAX_CALIBRATION_BYTES, "a calibration") if file.exists() else read_published(file).decode()
 
 
 def _read_file(
@@ -249,7 +251,7 @@ def _calibration(
     if not all(np.isfinite(array).all() for array in (polynomial, matrix)):
         raise ValueError(f"{sensor}: a number is not finite")
     polynomial = polynomial / raw
-    if (largest := float(np.abs(arrays.get("left_out", 0.0)).max())) > ROUNDING:
+    if (largest := float(np.abs(arrays.get("left_out", 0.0)).max())) > FORMAT_ROUNDING:
         notes.append(f"{sensor}: cross-axis terms change by up to {largest:.2g} per degC, which is not read")
     effects = _thermal(sensor, polynomial, notes)
     for name, unit in (("g_sensitivity", raw), ("scale_factor_temperature", 1.0)):
@@ -266,7 +268,7 @@ def _calibration(
 
 def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEffect]:
     """Return the effect of a bias that is a polynomial in T - 25 degC: coefficients (3, k)."""
-    polynomial = np.where(np.abs(polynomial) > ROUNDING * np.abs(polynomial).max(), polynomial, 0.0)
+    polynomial = np.where(np.abs(polynomial) > FORMAT_ROUNDING * np.abs(polynomial).max(), polynomial, 0.0)
     if np.any(polynomial[:, 3:]):
         notes.append(f"{sensor}: the bias beyond the second order of the temperature is left out")
     if np.any(polynomial[:, 2:3]):

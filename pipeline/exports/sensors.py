@@ -4,7 +4,7 @@ truth = matrix @ (reading - bias - effects),    reading = bias + K @ truth + eff
 
 White noise n and random walk k, for estimators with only these two terms, follow from the terms identified at rest:
 
-    n^2 = N^2 + sum 2 G^2 T  (T < ``FAST_S``)
+    n^2 = N^2 + sum 2 G^2 T  (T < ``MIN_EXPORTED_TIME_S``)
     k^2 = K^2 + sum 2 G^2 / T  (other processes) + 3 (2 ln 2 / pi)^2 B^4 / n^2
 
 A fast Gauss-Markov process is white over the averaging times of estimators; a slow one begins like the random walk with
@@ -26,7 +26,7 @@ import numpy as np
 import scipy
 
 from pipeline.io.channel_table import STRAIGHT, maps_of_log
-from pipeline.model.calibration_file import FAST_S, sentences
+from pipeline.model.calibration_file import MIN_EXPORTED_TIME_S, sentences
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
 from pipeline.records import AXES, BIAS, SENSORS
@@ -132,8 +132,18 @@ def _white_and_walk(terms: JSON) -> list[Values | None]:
         return [np.array([p["value"], *p["interval"]], float) for p in parts if p["value"] is not None]
 
     processes = [(part, part["correlation_time_s"]["value"]) for part in terms["gauss_markov"]]
-    fast = [np.sqrt(2.0 * time) * value for part, time in processes if time < FAST_S for value in intervals(part)]
-    slow = [np.sqrt(2.0 / time) * value for part, time in processes if time >= FAST_S for value in intervals(part)]
+    fast = [
+        np.sqrt(2.0 * time) * value
+        for part, time in processes
+        if time < MIN_EXPORTED_TIME_S
+        for value in intervals(part)
+    ]
+    slow = [
+        np.sqrt(2.0 / time) * value
+        for part, time in processes
+        if time >= MIN_EXPORTED_TIME_S
+        for value in intervals(part)
+    ]
     white, walk = [*intervals(terms["white"]), *fast], [*intervals(terms["random_walk"]), *slow]
     if white:
         density = np.sqrt(np.sum(np.square(white), axis=0))[0]

@@ -91,7 +91,7 @@ class LogProfile:
 
 
 @dataclass
-class Stretch:
+class CalibratedStretch:
     """The calibrated readings in an interval of a log, s from its first sample, collected block by block."""
 
     first: float
@@ -200,7 +200,7 @@ def compensate_log(
         gyroscope = compensation.gyroscope
         if gyroscope is None:
             raise ConfigurationError("the calibration holds no gyroscope: leave out --rest", str(source))
-        stretch = Stretch(*rest)
+        stretch = CalibratedStretch(*rest)
         write(LogStream(compensation, smoothed, progress, stretch), Path(os.devnull))
         rate, note = stretch.mean_rate(str(source))
         gyroscope = replace(gyroscope, bias=gyroscope.bias + np.linalg.solve(gyroscope.matrix, rate))
@@ -218,7 +218,7 @@ class LogStream:
         compensation: Compensation,
         smoothing: float,
         progress: Callable[[int, int], None] | None,
-        stretch: Stretch | None = None,
+        stretch: CalibratedStretch | None = None,
     ) -> None:
         self.stretch = stretch
         self.compensation, self.stream, self.progress = compensation, compensation.stream(smoothing), progress

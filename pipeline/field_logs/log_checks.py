@@ -35,25 +35,27 @@ DECIMALS = 12  # in the output of ``apply``: far below the resolution of sensors
 RANGES = {"accelerometer": "specific_force_g", "gyroscope": "angular_rate_dps"}  # of ``calibrated_range``
 # Margins of the calibrated range, by convention: the sign of the bias of a low-cost sensor, some % of 1 g, differs
 # between directions; the temperature of a room, and of a chip from one power-on to the next, changes by 1 degC.
-MARGIN, MARGIN_DEGC = 0.1, 1.0  # share of the largest magnitude; degC
-WINDOW = 100  # samples: 0.1 to 1 s at usual rates
+RANGE_MARGIN, MARGIN_DEGC = 0.1, 1.0  # share of the largest magnitude; degC
+WINDOW_SAMPLES = 100  # samples: 0.1 to 1 s at usual rates
 MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: limits the memory
-QUIET, QUIETEST = 2.0, 0.1  # ratio of scatters, and share of the windows; see above
+QUIET_SCATTER_RATIO, QUIET_WINDOW_SHARE = 2.0, 0.1  # ratio of scatters, and share of the windows; see above
 FEWEST_RESTS = 3  # directions of gravity, for three axes
 DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is known to 0.1 / sqrt(100) rad = 0.6 deg
 # Largest ratio of the errors after and before. If a drift is as large as the bias, with three components each, a ratio
 # of 3 occurs by chance with P(F(3, 3) < 1/9) = 4 %. An accelerometer is only checked with three directions or more, and
 # if the correction is at least half of the error after it.
-WORSE = {"accelerometer": 1.2, "gyroscope": 3.0}
+WORSE_FACTORS = {"accelerometer": 1.2, "gyroscope": 3.0}
 # g and deg/s: larger changes of the bias are unusual. By the temperature limits of the MPU-6050 (1.4 mg/degC and 0.32
 # deg/s/degC, configs/sensor/mpu6050.yaml) they need 36 degC and 16 degC.
 CHANGED = {"accelerometer": 0.05, "gyroscope": 5.0}
-SIGNIFICANT = 5.0  # least error after compensation, in standard errors of the mean of a rest
+SIGNIFICANT_ERRORS = 5.0  # least error after compensation, in standard errors of the mean of a rest
 APART_DEG = 30.0  # least angle between different orientations, and least turn of gravity for the check of the rate
-NEAR = 0.15  # relative difference between the median |a| and the factor of a unit that identifies the unit
+UNIT_FACTOR_DISTANCE = (
+    0.15  # relative difference between the median |a| and the factor of a unit that identifies the unit
+)
 USUAL_G = (0.5, 2.0)  # median |a| of a log, also of walking, driving and flying
 CELLS, LEAST_CELLS, SHARE = 200, 10, 0.6  # of a column; least share of cells with 12 decimals, 0.9 expected
-WHOLE = 10  # least number of different integers that indicates raw counts
+MIN_DIFFERENT_COUNTS = 10  # least number of different integers that indicates raw counts
 
 
 class LogChecks:
@@ -109,8 +111,8 @@ class LogChecks:
         for sensor, values in raw.items():
             finite = values[np.isfinite(values)]
             if self.whole.get(sensor, True) and len(finite):
-                self.whole[sensor] = bool(np.all(finite[:WINDOW] == np.round(finite[:WINDOW]))) and (
-                    sensor in self.whole or len(np.unique(finite[: 10 * WINDOW])) >= WHOLE
+                self.whole[sensor] = bool(np.all(finite[:WINDOW_SAMPLES] == np.round(finite[:WINDOW_SAMPLES]))) and (
+                    sensor in self.whole or len(np.unique(finite[: 10 * WINDOW_SAMPLES])) >= MIN_DIFFERENT_COUNTS
                 )
         self._add_windows(raw, calibrated, time)
 
@@ -120,7 +122,7 @@ class LogChecks:
         values |= {} if temperature is None else {"temperature_degc": temperature}
         for key in values.keys() & self.ranges.keys():
             low, high = self.ranges[key]
-            margin = MARGIN_DEGC if key == "temperature_degc" else MARGIN * high
+            margin = MARGIN_DEGC if key == "temperature_degc" else RANGE_MARGIN * high
             beyond = values[key][(values[key] < low - margin) | (values[key] > high + margin)]
             if len(beyond):
                 count, least, most = self.extremes.get(key, [0, np.inf, -np.inf])
@@ -150,21 +152,21 @@ class LogChecks:
 
     def _add_windows(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
         """Store means and scatter of the windows of a block."""
-        count = min(len(next(iter(raw.values()), ())) // WINDOW, MOST_WINDOWS - self.window_count)
+        count = min(len(next(iter(raw.values()), ())) // WINDOW_SAMPLES, MOST_WINDOWS - self.window_count)
         if count <= 0:
             return
         self.window_count += count
         part: dict[str, Values] = {}
         for sensor, values in raw.items():
-            windows = values[: count * WINDOW].reshape(count, WINDOW, 3)
+            windows = values[: count * WINDOW_SAMPLES].reshape(count, WINDOW_SAMPLES, 3)
             part[sensor] = windows.mean(axis=1)
             part[f"{sensor} scatter"] = np.sqrt(np.sum(windows.var(axis=1), axis=1))
             part[f"{sensor} noise"] = np.sqrt(np.sum(np.diff(windows, axis=1) ** 2, axis=2).mean(axis=1) / 2.0)
-            after = calibrated[sensor][: count * WINDOW].reshape(count, WINDOW, 3)
+            after = calibrated[sensor][: count * WINDOW_SAMPLES].reshape(count, WINDOW_SAMPLES, 3)
             part[f"{sensor} size"] = np.linalg.norm(after, axis=2).mean(axis=1)  # the matrix may contain the unit
             part[f"{sensor} after"] = after.mean(axis=1)
         if time is not None:
-            part["time"] = time[: count * WINDOW].reshape(count, WINDOW).mean(axis=1)
+            part["time"] = time[: count * WINDOW_SAMPLES].reshape(count, WINDOW_SAMPLES).mean(axis=1)
         self.windows.append(part)
 
     def warnings(self, calibrated: set[str]) -> list[str]:
@@ -200,7 +202,7 @@ class LogChecks:
         size = float(np.median(table["accelerometer size"]))
         if USUAL_G[0] <= size <= USUAL_G[1]:
             return []
-        near = [unit for unit, factor in FORCE_UNITS.items() if abs(size / factor - 1.0) < NEAR]
+        near = [unit for unit, factor in FORCE_UNITS.items() if abs(size / factor - 1.0) < UNIT_FACTOR_DISTANCE]
         cause = f"the readings look like {near[0]}" if near else "another unit, another range, or no rest in the log"
         contradiction = f"half of the log has |a| above {size:.3g} g, expected about 1 g: {cause}"
         return [f"{contradiction}; --ingest names a profile with the unit of each column"]
@@ -211,7 +213,9 @@ class LogChecks:
         still = np.ones(len(table[present[0]]), bool)
         for sensor in present:
             scatter = table[f"{sensor} scatter"]
-            still &= scatter <= QUIET * np.minimum(np.quantile(scatter, QUIETEST), table[f"{sensor} noise"])
+            still &= scatter <= QUIET_SCATTER_RATIO * np.minimum(
+                np.quantile(scatter, QUIET_WINDOW_SHARE), table[f"{sensor} noise"]
+            )
         if "accelerometer" in table:
             size = np.linalg.norm(table["accelerometer"], axis=1)
             still &= table["accelerometer scatter"] < DIRECTED * size
@@ -221,11 +225,13 @@ class LogChecks:
         for sensor in (s for s in present if s in calibrated):
             raw, compensated = table[sensor][still], table[f"{sensor} after"][still]
             before, after = _error(sensor, raw), _error(sensor, compensated)
-            standard_error = float(np.median(table[f"{sensor} scatter"][still])) / np.sqrt(WINDOW)
+            standard_error = float(np.median(table[f"{sensor} scatter"][still])) / np.sqrt(WINDOW_SAMPLES)
             change = np.linalg.norm(compensated, axis=1) - np.linalg.norm(raw, axis=1)
             enough = len(_directions(raw)) >= FEWEST_RESTS and np.sqrt(np.mean(change**2)) > after / 2.0
             unit = "g from 1 g" if sensor == "accelerometer" else "deg/s from zero"
-            if (sensor == "gyroscope" or enough) and after > max(WORSE[sensor] * before, SIGNIFICANT * standard_error):
+            if (sensor == "gyroscope" or enough) and after > max(
+                WORSE_FACTORS[sensor] * before, SIGNIFICANT_ERRORS * standard_error
+            ):
                 worse.append(f"the {sensor} is {before:.2g} {unit} before and {after:.2g} after")
             least = float(np.min(_distances(sensor, compensated)))
             if least > CHANGED[sensor]:

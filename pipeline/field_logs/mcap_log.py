@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Result
     from pipeline.io.ingest_settings import McapFormat
-    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_chunk import ChannelMessages
     from pipeline.io.message_decoder import TopicDecoder
     from pipeline.records import Integers, Values
 
@@ -92,7 +92,7 @@ class McapLog:
             raise IngestError(message, str(self.source), code="missing_topic", hint=hint)
         return self._finish(self.readings.topic)
 
-    def _add_calibrated(self, rows: Rows, decoder: TopicDecoder) -> None:
+    def _add_calibrated(self, rows: ChannelMessages, decoder: TopicDecoder) -> None:
         """Add the calibrated messages for some readings."""
         self.readings = self.readings or decoder
         if decoder is not self.readings:
@@ -207,7 +207,7 @@ class Temperatures:
         hint = "name the topic in ingest.mcap.temperature_topic of a profile (--ingest)"
         raise IngestError(message, str(self.path), code="missing_topic", hint=hint)
 
-    def take(self, run: list[Rows], reader: McapReader) -> None:
+    def take(self, run: list[ChannelMessages], reader: McapReader) -> None:
         """Decode the temperatures of a run."""
         parts: list[tuple[Integers, Integers, Values]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
         for rows in run if not self.in_readings else []:

@@ -21,7 +21,7 @@ from pipeline.errors import InputError
 from pipeline.field_logs.log_checks import DECIMALS
 from pipeline.io.arrow import text_scalar, times_as_decimals, to_arrow, to_numpy
 from pipeline.io.channel_table import in_house_unit
-from pipeline.io.csv_layout import Layout, find_faults, other_separator
+from pipeline.io.csv_layout import TextLayout, find_faults, other_separator
 from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_formats
 from pipeline.io.text_log import TextLog
@@ -108,7 +108,7 @@ class CsvLog:
         places = [
             (self.columns[c], i) for s, where in self.places.items() for c, i in zip(SIGNALS[s], where, strict=True)
         ]
-        self.layout = Layout(str(self.source), head.names, places, head.delimiter, self.settings.decimal)
+        self.layout = TextLayout(str(self.source), head.names, places, head.delimiter, self.settings.decimal)
         new = list(head.names)
         for sensor in (s for s in SENSORS if s in self.places):
             for channel, i in zip(TRIADS[sensor], self.places[sensor], strict=True):

@@ -38,14 +38,19 @@ IN_BURST = 0.5  # of the mean interval: at least half of the intervals are short
 FEWEST_UNTIMED = 0.01  # share of rows without a time of their own, above which it is no single fault
 UNTIMED = 0.95  # share of the rows of bursts that have no time of their own, if none has
 REPEATED = 0.5  # share of such rows that repeat the row before them, above which they were logged twice
-FEWEST = 3  # bursts, to call them so
+MIN_BURSTS = 3  # bursts, to call them so
 FEWEST_BURSTS = 10  # that determine a clock
-LARGEST_UNCERTAINTY = 1e-3  # of the interval: a tenth of what the clock of a MEMS sensor may be off (configs/sensor)
-MARGIN = 0.5  # of the interval
+MAX_INTERVAL_UNCERTAINTY = (
+    1e-3  # of the interval: a tenth of what the clock of a MEMS sensor may be off (configs/sensor)
+)
+MARGIN_INTERVALS = 0.5  # of the interval
 ONE_SENSOR = 6.0  # standard errors
-SAME_SIZE, LONGEST_GAP = 0.8, 1.5  # share of bursts of the usual size +-1; times the usual distance
+SAME_SIZE, MAX_BURST_DISTANCE = 0.8, 1.5  # share of bursts of the usual size +-1; times the usual distance
 READ_OUT_NS, LARGEST_FIFO = 2_000_000, 4096  # interval of rows while a FIFO is read by I2C, and its rows
-SHORT, LONGEST_NS = 0.25, 1e9  # of the time between bursts, and of a burst; longer ones are of a logger that pauses
+MAX_BURST_SHARE, LONGEST_NS = (
+    0.25,
+    1e9,
+)  # of the time between bursts, and of a burst; longer ones are of a logger that pauses
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,7 @@ def setting_of_rate(path: str, rate_hz: float, *, text: bool) -> str:
 def find_bursts(time_ns: Integers, values: Mapping[str, Values]) -> Bursts | None:
     """Return the bursts of a log, None for samples that arrive one by one; ``values``: of the rows, by channel."""
     steps = np.diff(time_ns)
-    if len(steps) < 2 * FEWEST or steps.min() < 0 or time_ns[-1] == time_ns[0]:
+    if len(steps) < 2 * MIN_BURSTS or steps.min() < 0 or time_ns[-1] == time_ns[0]:
         return None
     mean = float(time_ns[-1] - time_ns[0]) / len(steps)
     untimed, short = steps < SHORTEST_NS, steps <= IN_BURST * mean
@@ -114,9 +119,9 @@ def find_bursts(time_ns: Integers, values: Mapping[str, Values]) -> Bursts | Non
     repeated = np.ones(same.size, np.bool_)
     for column in columns:
         repeated &= column[same + 1] == column[same]
-    if len(sizes) < FEWEST or (same.size and repeated.mean() > REPEATED):
+    if len(sizes) < MIN_BURSTS or (same.size and repeated.mean() > REPEATED):
         return None
-    size, near = int(np.median(sizes)), apart <= LONGEST_GAP * np.median(apart)
+    size, near = int(np.median(sizes)), apart <= MAX_BURST_DISTANCE * np.median(apart)
     usual = near & (np.abs(sizes - size) <= 1)
     usual = usual if usual.any() else near
     found = Bursts(
@@ -129,7 +134,7 @@ def find_bursts(time_ns: Integers, values: Mapping[str, Values]) -> Bursts | Non
     )
     if in_bursts and np.count_nonzero(untimed & short) < UNTIMED * np.count_nonzero(short):
         even = np.mean(np.abs(sizes - found.size) <= 1) >= SAME_SIZE and bool(near.all())
-        even = even and (found.size - 1) * found.within_ns <= min(SHORT * found.apart_ns, LONGEST_NS)
+        even = even and (found.size - 1) * found.within_ns <= min(MAX_BURST_SHARE * found.apart_ns, LONGEST_NS)
         read_out = found.within_ns <= READ_OUT_NS and len(sizes) >= FEWEST_BURSTS and found.size <= LARGEST_FIFO
         lacks = "the times of a FIFO's readout, or a logger that pauses, which ingest.checks.missing_time allows"
         return replace(found, lacks=lacks) if even or read_out else None
@@ -149,11 +154,11 @@ def _with_clock(bursts: Bursts, time_ns: Integers, first: Index, columns: list[V
     uncertainty = max(uncertainty, 1.5 * interval / len(time_ns))
     departure = float(np.abs(residual).max())
     found = replace(bursts, interval_ns=interval, uncertainty_ns=uncertainty, departure_ns=departure)
-    if np.ptp(residual) > (1.0 + MARGIN) * interval:
+    if np.ptp(residual) > (1.0 + MARGIN_INTERVALS) * interval:
         off = f"{departure / interval:.3g} intervals"
         return replace(found, lacks=f"they depart from a regular clock by up to {off}, as if rows were missing")
-    if uncertainty > LARGEST_UNCERTAINTY * interval:
-        within = f"{uncertainty / interval:.2g} of it, where {LARGEST_UNCERTAINTY:g} is needed"
+    if uncertainty > MAX_INTERVAL_UNCERTAINTY * interval:
+        within = f"{uncertainty / interval:.2g} of it, where {MAX_INTERVAL_UNCERTAINTY:g} is needed"
         return replace(found, lacks=f"they determine the interval of the samples only to within {within}")
     if not _of_one_sensor(first, columns):
         return replace(found, lacks="their rows differ as those of two sensors or of two merged logs do")

@@ -43,9 +43,9 @@ COARSE_S = 0.01  # step of the grid of offsets
 MOST_PLACES, WORTH_A_LOOK = 40, 0.3  # offsets refined, and their least correlation relative to the best
 SAMPLES_OF_A_LOOK = 20_000  # bounds the cost of up to 40 offsets
 AMBIGUOUS = 1.1  # ratio of the second-best mean squared residual to the best
-SHARED = 0.5  # share of the shorter log that both must cover
-STEPS, ROUNDING_S = 20, 1e-9  # Gauss-Newton stops below 1 ns, the resolution of the times
-FEWEST_BLOCKS = 3.0  # bounds the factor nu / (nu - 2), the variance of Student's t, for few blocks
+MIN_SHARED_DURATION = 0.5  # share of the shorter log that both must cover
+MAX_CLOCK_STEPS, ROUNDING_S = 20, 1e-9  # Gauss-Newton stops below 1 ns, the resolution of the times
+MIN_CLOCK_BLOCKS = 3.0  # bounds the factor nu / (nu - 2), the variance of Student's t, for few blocks
 RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
 
 
@@ -158,7 +158,7 @@ def _left(sensed: SensorSignals, signals: Signals, offset: float, *, beyond: boo
     """
     inside = signals.covers(sensed.time + offset)
     shared = float(np.mean(inside)) * sensed.time[-1]
-    if shared < SHARED * min(sensed.time[-1], signals.duration):
+    if shared < MIN_SHARED_DURATION * min(sensed.time[-1], signals.duration):
         return np.inf
     covered = sensed if beyond else sensed.part(inside)
     rates, directions, *_ = signals.at(covered.time + offset)
@@ -181,7 +181,7 @@ def _groups(sensed: SensorSignals, rates: Values, directions: Values) -> list[tu
 
 def _refine(sensed: SensorSignals, signals: Signals, offset: float) -> ClockFit:
     d, k, middle = offset, 0.0, float(sensed.time[-1]) / 2
-    for _ in range(STEPS):
+    for _ in range(MAX_CLOCK_STEPS):
         J, e, weight, correlation = _linearised(sensed, signals, d + k * (sensed.time - middle), middle)
         moved = float(np.average(sensed.time, weights=weight)) if weight.sum() > 0 else middle
         if abs(moved - middle) > 1e-3 * sensed.time[-1]:
@@ -237,4 +237,4 @@ def _uncertainties_by_blocks(J: Values, e: Values, sensed: SensorSignals, covari
     information = np.add.reduceat((J**2).reshape(channels, len(sensed.time), 2).sum(axis=0), starts)
     spread = np.linalg.norm(covariance @ scores.T, axis=1)
     blocks = information.sum(axis=0) ** 2 / np.sum(information**2, axis=0)
-    return np.asarray(spread * np.sqrt(blocks / np.maximum(blocks - 2.0, 1.0 / FEWEST_BLOCKS)))
+    return np.asarray(spread * np.sqrt(blocks / np.maximum(blocks - 2.0, 1.0 / MIN_CLOCK_BLOCKS)))

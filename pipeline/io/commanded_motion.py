@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Values
 
 
-STEP_S = 0.005  # grid of the program and of its derivative, half the interval of a log at 100 Hz
+PROGRAM_STEP_S = 0.005  # grid of the program and of its derivative, half the interval of a log at 100 Hz
 BEFORE_S = 1.0  # rest that is added at both ends
-ROUNDS = 12  # iterations at most; they end where no move changes by 1 us
-FARTHEST = 0.5  # of the rest before or after a move
+MAX_FIT_ITERATIONS = 12  # iterations at most; they end where no move changes by 1 us
+MAX_SHARE_OF_REST = 0.5  # of the rest before or after a move
 
 
 def follow_program(table: ChannelTable, program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> ChannelTable:
     """Add the angle and rate of a table with this program to a log; the gyroscope must show the moves."""
     pause = ProgramRest(rest_s=BEFORE_S)
     commanded = Program([pause, *_flat(program), pause])
-    times = np.arange(0.0, commanded.duration, STEP_S)
+    times = np.arange(0.0, commanded.duration, PROGRAM_STEP_S)
     angle, rate, *_ = commanded.at(times)
     log = {"table_angle": angle, "table_rate": rate}
     fit = fit_clocks(table, ChannelTable(table.path, np.rint(times * 1e9).astype(np.int64), log, table.source))
@@ -127,14 +127,14 @@ def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> tup
     low, high = np.append(-np.inf, end[:-1])[near], np.append(begin[1:], np.inf)[near]  # between its neighbours
     at = np.interp(middle, tau, t)
     since = t - at[near]
-    reach = FARTHEST * np.minimum(np.append(np.inf, gaps), np.append(gaps, np.inf))
+    reach = MAX_SHARE_OF_REST * np.minimum(np.append(np.inf, gaps), np.append(gaps, np.inf))
     reach = np.minimum(reach, end - begin + 1.0)
     shifts, drift = np.zeros(n), 0.0
-    for _ in range(ROUNDS):
+    for _ in range(MAX_FIT_ITERATIONS):
         now = np.clip(middle[near] + (1.0 + drift) * since + shifts[near], low, high)
         commanded = program.at(now)[1]
         sensed = _about_the_moves(table, commanded)
-        slope = (program.at(now + STEP_S)[1] - program.at(now - STEP_S)[1]) / (2 * STEP_S)
+        slope = (program.at(now + PROGRAM_STEP_S)[1] - program.at(now - PROGRAM_STEP_S)[1]) / (2 * PROGRAM_STEP_S)
         off = slope * (sensed - commanded)
         info = np.bincount(near, slope**2, n)
         change = np.divide(np.bincount(near, off, n), info, out=np.zeros(n), where=info > 0)

@@ -139,7 +139,7 @@ def _what_to_do(
 
 
 @dataclass(frozen=True)
-class Layout:
+class TextLayout:
     """The columns of a text log and the channels that they hold, each with the index of its column."""
 
     path: str
@@ -196,7 +196,7 @@ class Fault:
     parted_before: int = 0
 
 
-def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> IngestError:
+def refusal(layout: TextLayout, faults: Sequence[Fault], *, more: bool = False) -> IngestError:
     """Return the error with the first bad line of a log, the number of bad lines, and advice for each kind of fault.
 
     ``more``: there may be further bad lines.
@@ -216,7 +216,7 @@ def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> I
     return IngestError(worst.message + others_text, f"{layout.path}:{worst.line}", code=worst.kind, hint=hint)
 
 
-def find_faults(layout: Layout, body: bytes, lines: Integers, before: tuple[int, str] | None) -> Iterator[Fault]:
+def find_faults(layout: TextLayout, body: bytes, lines: Integers, before: tuple[int, str] | None) -> Iterator[Fault]:
     """Yield the faults of a block of rows; ``before``: number and text of the preceding valid row."""
     for number, raw in zip(lines.tolist(), body.split(b"\n"), strict=False):
         text = raw.decode("utf-8", "replace")
@@ -232,7 +232,7 @@ def find_faults(layout: Layout, body: bytes, lines: Integers, before: tuple[int,
         yield fault
 
 
-def _fault(layout: Layout, line: int, text: str) -> Fault | None:
+def _fault(layout: TextLayout, line: int, text: str) -> Fault | None:
     """Return the fault of a line, None for a row of numbers."""
     if "\0" in text:
         nul = text.count("\0")
@@ -263,7 +263,7 @@ def _quoted(line: str, delimiter: str) -> list[int]:
 
 
 def _fault_of_cell(
-    layout: Layout, where: tuple[Column, int], cells: list[str], quoted: Sequence[int]
+    layout: TextLayout, where: tuple[Column, int], cells: list[str], quoted: Sequence[int]
 ) -> tuple[str, str]:
     """Return the kind and the message of a cell's fault; both empty for a finite number."""
     column, index = where

@@ -30,10 +30,10 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable, in_house_unit, joined
-from pipeline.io.csv_layout import Fault, Layout, column_notes, find_columns, find_faults, refusal
+from pipeline.io.csv_layout import Fault, TextLayout, column_notes, find_columns, find_faults, refusal
 from pipeline.io.csv_times import (
     EXACT_BELOW_S,
-    LONGEST_S,
+    MAX_TIME_S,
     exact_times,
     in_order,
     over_budget,
@@ -88,7 +88,7 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
 def read_stream(stream: BinaryIO, name: str, settings: CsvFormat, checks: Checks) -> ChannelTable:
     """Read the channels of an open text log; ``name`` stands for it in errors and notes."""
     log = TextLog(stream, name, settings)
-    rows = Rows(log)
+    rows = TextRows(log)
     for body, lines in log:
         rows.add(body, lines)
     rows.finish(checks)
@@ -125,7 +125,7 @@ def also(first: IngestError, second: IngestError) -> IngestError:
     return both
 
 
-class Rows:
+class TextRows:
     """The rows of a text log as numbers, gathered block by block."""
 
     def __init__(self, log: TextLog) -> None:
@@ -142,7 +142,7 @@ class Rows:
             self._allowed |= {"bad_row", "nul", "not_a_number", "decimal_comma"}
         if self.settings.session is not None:
             self._allowed.add("restarted")
-        self._layout: Layout | None = None
+        self._layout: TextLayout | None = None
         self._row_count = 0  # bad ones as well
         self._blocks: list[dict[int, NDArray[Any]]] = []  # columns of the valid rows
         self._faults: list[Fault] = []
@@ -150,7 +150,7 @@ class Rows:
         self._last_row: tuple[int, str] | None = None
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> TextLayout:
         """The columns of the channels; raises ``IngestError`` for a log without rows."""
         if self._layout is None:
             raise self.log.no_rows()
@@ -190,7 +190,7 @@ class Rows:
         if self._faults:
             self._drop_faults(layout, checks)
 
-    def _find_layout(self, body: bytes, lines: Integers) -> Layout:
+    def _find_layout(self, body: bytes, lines: Integers) -> TextLayout:
         """Find the columns of the channels, by the head and the first rows."""
         head, settings = self.log.head, self.settings
         assert head is not None  # noqa: S101  (rows follow it)
@@ -200,9 +200,11 @@ class Rows:
         if settings.delimiter == AUTO:
             self.notes.append(Note("N-DELIM", 1, 0, 0, f"the separator is {head.delimiter!r}, by the header"))
         self.notes += column_notes(head.names, columns, head.line if settings.header is True else 0)
-        return Layout(self.path, head.names, columns, head.delimiter, settings.decimal)
+        return TextLayout(self.path, head.names, columns, head.delimiter, settings.decimal)
 
-    def _valid_rows(self, layout: Layout, body: bytes, lines: Integers) -> tuple[bytes, Integers, dict[int, Values]]:
+    def _valid_rows(
+        self, layout: TextLayout, body: bytes, lines: Integers
+    ) -> tuple[bytes, Integers, dict[int, Values]]:
         """Return the valid rows of a block, and store the faults of the others."""
         found = []
         for fault in find_faults(layout, body, lines, self._last_row):
@@ -222,7 +224,7 @@ class Rows:
             raise IngestError("cannot be read as numbers: its rows cannot be separated", place, code="not_a_number")
         return body, lines, numbers
 
-    def _exact_times(self, layout: Layout, body: bytes, numbers: dict[int, Values]) -> dict[int, Integers]:
+    def _exact_times(self, layout: TextLayout, body: bytes, numbers: dict[int, Values]) -> dict[int, Integers]:
         """Return the times from their digits, once a double does not resolve half a nanosecond."""
         if self.settings.rate_hz is not None or self.settings.tick_ns is not None:
             return {}
@@ -233,10 +235,10 @@ class Rows:
                 return {}
             for block in self._blocks:
                 block[EXACT] = whole_times(block[index], column.unit)
-        out_of_range = largest >= LONGEST_S  # refused later
+        out_of_range = largest >= MAX_TIME_S  # refused later
         return {EXACT: np.zeros(len(numbers[index]), np.int64) if out_of_range else exact_times(layout, body)}
 
-    def _drop_faults(self, layout: Layout, checks: Checks) -> None:
+    def _drop_faults(self, layout: TextLayout, checks: Checks) -> None:
         """Note the dropped lines and count the repaired ones, or store the refusal."""
         final = self._faults[-1]
         end = max(final.line, int(self.lines[-1]))

@@ -31,23 +31,23 @@ if TYPE_CHECKING:
     from fractions import Fraction
 
     from pipeline.io.channel_table import ChannelTable
-    from pipeline.io.csv_layout import Layout
-    from pipeline.io.csv_read import Rows
+    from pipeline.io.csv_layout import TextLayout
+    from pipeline.io.csv_read import TextRows
     from pipeline.io.ingest_settings import Checks, Column
     from pipeline.records import Index, Integers, Values
 
 EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
-LONGEST_S = 9.2e9  # int64 nanoseconds end at 292 years
+MAX_TIME_S = 9.2e9  # int64 nanoseconds end at 292 years
 DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # of whole nanoseconds
-COARSEST = 0.01  # of the median interval
-NEAR = 2.5  # intervals
+MAX_TIME_RESOLUTION = 0.01  # of the median interval
+NEAR_INTERVALS = 2.5  # intervals
 LARGEST_DISPLACEMENT = 5  # rows
 MOST_LISTED = 5  # parts of a log, in a refusal
 SHORTEST_PART = 10  # rows; a shorter part is rows with a wrong time
 RESET_INTERVALS = 5  # a time that goes back by more begins another session
 
 
-def time_column(layout: Layout) -> tuple[Column, int]:
+def time_column(layout: TextLayout) -> tuple[Column, int]:
     """Return the column of the time and its index; the log must have one."""
     return next((c, i) for c, i in layout.columns if c.channel == "time")
 
@@ -57,7 +57,7 @@ def seconds_per_unit(unit: str) -> float:
     return UNITS["time"][unit][0] / 1e9
 
 
-def exact_times(layout: Layout, body: bytes) -> Integers:
+def exact_times(layout: TextLayout, body: bytes) -> Integers:
     """Return the times of rows in ns from their decimal digits."""
     column, index = time_column(layout)
     digits = DECIMAL_DIGITS[column.unit]
@@ -80,7 +80,7 @@ def whole_times(values: Values, unit: str, tick_ns: Fraction | None = None) -> I
     return np.asarray(np.rint(values * scale).astype(np.int64))
 
 
-def times_of(rows: Rows) -> Integers:
+def times_of(rows: TextRows) -> Integers:
     """Return the time of each row, ns; raise ``IngestError`` for times out of range or too coarse."""
     settings = rows.settings
     if settings.rate_hz is not None:
@@ -89,7 +89,7 @@ def times_of(rows: Rows) -> Integers:
     values, name, tick_ns = rows.numbers[index], rows.layout.names[index], settings.tick_ns
     unit_s = float(tick_ns) / 1e9 if tick_ns is not None else seconds_per_unit(column.unit)
     row = int(np.argmax(np.abs(values)))
-    if abs(values[row]) * unit_s >= LONGEST_S:
+    if abs(values[row]) * unit_s >= MAX_TIME_S:
         message = f"time {values[row] * unit_s:g} s is out of range; is {column.unit} the unit of column {name}?"
         raise IngestError(message, f"{rows.layout.path}:{rows.lines[row]}", code="wrong_rate")
     if rows.exact_ns is None:
@@ -110,15 +110,15 @@ def _refuse_coarse(values: Values, exact_ns: Integers, unit: str, name: str, pat
         return
     zeros = next(z for z in range(18, -1, -1) if not np.any(exact_ns % 10**z))
     resolution = spacing if np.array_equal(exact_ns, values.astype(np.int64) * scale) else 10.0**zeros
-    if resolution >= spacing / 10 and resolution > COARSEST * step:
+    if resolution >= spacing / 10 and resolution > MAX_TIME_RESOLUTION * step:
         message = (
             f"the times in column {name} have passed through floating-point numbers, which are {spacing:g} ns apart "
-            f"at {values[0]:.3g} {unit}: more than {COARSEST:.0%} of the median interval of {step:g} ns"
+            f"at {values[0]:.3g} {unit}: more than {MAX_TIME_RESOLUTION:.0%} of the median interval of {step:g} ns"
         )
         raise IngestError(message, path, code="coarse_time", hint="log them as integers")
 
 
-def in_order(table: ChannelTable, rows: Rows, checks: Checks) -> ChannelTable:
+def in_order(table: ChannelTable, rows: TextRows, checks: Checks) -> ChannelTable:
     """Sort a log by its times, with each time once.
 
     Raises ``IngestError`` for a time that goes back for another reason than an overflow or displaced rows, for two
@@ -267,7 +267,7 @@ def _unwrap(time_ns: Integers, tick_ns: float) -> tuple[Integers, list[tuple[int
     forward = steps[steps > 0]
     if back.size == 0 or forward.size == 0 or time_ns.min() < 0:
         return time_ns, []
-    near = NEAR * float(np.median(forward))
+    near = NEAR_INTERVALS * float(np.median(forward))
     moduli = sorted({2**32 * 1000, 2**32 * 1_000_000} | {round(2**bits * tick_ns) for bits in (16, 24, 32)})
     largest = int(time_ns.max())
     for modulus in (m for m in moduli if m > largest >= m - near):
@@ -289,12 +289,12 @@ def _starts(time_ns: Integers, restarts: list[int], tick_ns: float) -> list[int]
     return sorted({0, *resets, *restarts} - {len(time_ns)})
 
 
-def _tick_ns(rows: Rows) -> float:
+def _tick_ns(rows: TextRows) -> float:
     unit = "s" if rows.settings.rate_hz is not None else time_column(rows.layout)[0].unit
     return float(rows.settings.tick_ns or UNITS["time"][unit][0])
 
 
-def rows_of_session(rows: Rows, time_ns: Integers) -> Index:
+def rows_of_session(rows: TextRows, time_ns: Integers) -> Index:
     """Return the rows of the selected session of a log that was restarted."""
     starts, session = _starts(time_ns, rows.restarts, _tick_ns(rows)), rows.settings.session or 1
     if session > len(starts):

@@ -50,9 +50,9 @@ if TYPE_CHECKING:
 
 
 # 10 and 7 standard deviations: below 3e-12 by chance for normal noise; half of L as a margin.
-BEYOND, ALLOWED, JUMP = 10.0, 1.5, 7.0
+MAX_DEVIATIONS, ALLOWED, JUMP = 10.0, 1.5, 7.0
 AROUND_S, FEWEST_AROUND = 0.5, 6  # on either side
-REST_S, FEWEST_OF_REST = 2.0, 40  # where the unit rests, more samples make the median more precise
+REST_S, MIN_REST_MEDIAN_SAMPLES = 2.0, 40  # where the unit rests, more samples make the median more precise
 LATE_S = 0.1  # a delay of a low-cost filter or of the log
 WINDOWS = 40  # of a recording, to find the usual scatter of its rests
 LEVER_M = 0.1  # of the accelerometer from the turn axis, a usual fixture
@@ -62,10 +62,13 @@ SAME_EVENT = 5  # samples between two that belong to one event; an event of seve
 
 PIECE_S, SETTLING_S = 2.0, 0.3  # as the module's description states
 AT_REST_DPS = 0.02  # assumed noise of the rates of table encoders at rest
-FEWEST = 4  # samples of a piece
+MIN_PIECE_SAMPLES = 4  # samples of a piece
 FEWEST_PIECES = 8  # by which the usual scatter is known
 RATIO = 4.0  # a scatter twice the usual one
-SIGNIFICANT, TAIL = 6.0, 18.0  # P(chi^2 > nu + 6 sqrt(2 nu) + 18) < exp(-9) (Laurent and Massart 2000, lemma 1)
+SIGNIFICANT_DEVIATIONS, CHI_SQUARE_TAIL = (
+    6.0,
+    18.0,
+)  # P(chi^2 > nu + 6 sqrt(2 nu) + 18) < exp(-9) (Laurent and Massart 2000, lemma 1)
 LARGEST_SHARE = 0.1  # of the pieces
 
 
@@ -144,7 +147,7 @@ def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
             middle = float(median(around))
             scatter = usual if resting and usual is not None else _scatter(around)
             scatter = max(float(noise[column]), scatter)
-            off = abs(float(values[n, column]) - middle) - BEYOND * scatter - ALLOWED * float(allowed[n])
+            off = abs(float(values[n, column]) - middle) - MAX_DEVIATIONS * scatter - ALLOWED * float(allowed[n])
             excess[n, column] = max(off, 0.0)
     return _widened(excess), where
 
@@ -176,7 +179,7 @@ class _Motion:
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self.half = max(FEWEST_AROUND, int(np.ceil(AROUND_S / recording.interval)))
-        self.long = max(FEWEST_OF_REST, int(np.ceil(REST_S / recording.interval)))
+        self.long = max(MIN_REST_MEDIAN_SAMPLES, int(np.ceil(REST_S / recording.interval)))
         rate = self._rate()
         self.unknown = rate is None
         by_table = [recording.table_rate, recording.table_angle, recording.table_attitude]
@@ -286,7 +289,7 @@ def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str
 def _pieces(recording: Recording) -> Index:
     """Return start and stop of each piece of a rest, and of the samples to remove with it: (p, 4) array."""
     none = np.zeros((0, 4), np.intp)
-    if recording.samples < FEWEST * FEWEST_PIECES or recording.role in ("rests", "static"):
+    if recording.samples < MIN_PIECE_SAMPLES * FEWEST_PIECES or recording.role in ("rests", "static"):
         return none
     if recording.table_rate is not None:
         still = np.abs(recording.table_rate) < AT_REST_DPS
@@ -296,18 +299,18 @@ def _pieces(recording: Recording) -> Index:
     else:
         return none
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
-    size = max(FEWEST, round(PIECE_S / recording.interval))
+    size = max(MIN_PIECE_SAMPLES, round(PIECE_S / recording.interval))
     out = []
     settling = int(np.ceil(SETTLING_S / recording.interval))
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         start, stop = begin + settling, end - settling
-        if stop - start < FEWEST:
+        if stop - start < MIN_PIECE_SAMPLES:
             continue
         parts = -(-(stop - start) // size)
         cuts = [start + (stop - start) * k // parts for k in range(parts + 1)]
         whole = [begin, *cuts[1:-1], end]
         spans = zip(itertools.pairwise(cuts), itertools.pairwise(whole), strict=True)
-        out += [(*inner, *outer) for inner, outer in spans if inner[1] - inner[0] >= FEWEST]
+        out += [(*inner, *outer) for inner, outer in spans if inner[1] - inner[0] >= MIN_PIECE_SAMPLES]
     return np.array(out, np.intp).reshape(-1, 4)
 
 
@@ -323,7 +326,7 @@ def _excess(reading: Values, pieces: Index) -> tuple[Values, Values]:
     usual = np.maximum(median(about_mean / (count - 1.0)[:, None]), rounding)
     chi = np.sum(about_mean / usual, axis=1)
     freedom = 3.0 * (count - 1.0)
-    most = np.maximum(RATIO * freedom, freedom + SIGNIFICANT * np.sqrt(2.0 * freedom) + TAIL)
+    most = np.maximum(RATIO * freedom, freedom + SIGNIFICANT_DEVIATIONS * np.sqrt(2.0 * freedom) + CHI_SQUARE_TAIL)
     for piece in np.flatnonzero(chi > most):
         start, stop = pieces[piece]
         own = reading[start:stop]

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Values
 
 
-FEWEST_ROWS = 6  # for the quintic spline
-FINEST_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
+MIN_SPLINE_ROWS = 6  # for the quintic spline
+ENCODER_STEP_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
 MOST_POINTS = 1 << 18  # bounds memory and the cost of correlation; a power of 2 for the transform
-BENT = 8.0  # times the median change of slope
+BENT_SLOPE_RATIO = 8.0  # times the median change of slope
 RESTING_DPS = 0.5  # smallest range of the rate that is called a motion
 SAME_SIGN = 0.9  # correlation of the logged rate with the slope of the angle
 
@@ -104,8 +104,8 @@ def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
 
     log = unwrapped(log)
     t, log_time = seconds_of(sensor), seconds_of(log)
-    if len(log_time) < FEWEST_ROWS:
-        message = f"the table's log has {len(log_time)} rows; at least {FEWEST_ROWS} are needed"
+    if len(log_time) < MIN_SPLINE_ROWS:
+        message = f"the table's log has {len(log_time)} rows; at least {MIN_SPLINE_ROWS} are needed"
         raise IngestError(message, log.path, code="no_sync")
     if signals_of(log).resting:
         tau = np.clip(t, 0.0, log_time[-1])
@@ -164,7 +164,7 @@ def signals_of(log: ChannelTable) -> Signals:
     """Return the signals of a table's motion; raise ``IngestError`` for a log without rate, angle and attitude."""
     log_time = seconds_of(log)
     found = interpolators(log)
-    step = max(FINEST_OF_ATTITUDE_S if ATTITUDE[0] in found else FINEST_S, log_time[-1] / MOST_POINTS)
+    step = max(FINEST_OF_ATTITUDE_S if ATTITUDE[0] in found else ENCODER_STEP_S, log_time[-1] / MOST_POINTS)
     grid = step * np.arange(int(log_time[-1] / step) + 1)
     interval = float(np.median(np.diff(log_time)))
     if ATTITUDE[0] in found:
@@ -233,5 +233,5 @@ def _bent_line(log_time: Values, value: Values, tau: Values) -> Values:
     right = value[k + 1] + after * (tau - log_time[k + 1])
     ahead, h = value[k + 1] - value[k], log_time[k + 1] - log_time[k]
     meet = (before * h - ahead) * (after * h - ahead) <= 0  # the slope lies between the slopes on either side
-    bent = meet & (change[k - 1] > BENT * np.median(change)) & (tau >= log_time[1]) & (tau <= log_time[-2])
+    bent = meet & (change[k - 1] > BENT_SLOPE_RATIO * np.median(change)) & (tau >= log_time[1]) & (tau <= log_time[-2])
     return np.where(bent, np.where(before > after, np.minimum(left, right), np.maximum(left, right)), plain)

@@ -26,24 +26,24 @@ if TYPE_CHECKING:
     from pipeline.io.channel_table import ChannelTable
     from pipeline.records import Values
 
-BLOCK_S = 0.25  # two blocks make the shortest rest, half a second
-SHORTEST_BLOCK = 5  # samples, for a variance
-STILL = 9.0  # times the 10th percentile of the variance
-SMALLEST_VARIANCE = 1e-7  # relative to the square of the specific force
+ROTATION_BLOCK_S = 0.25  # two blocks make the shortest rest, half a second
+MIN_VARIANCE_SAMPLES = 5  # samples, for a variance
+STILL_VARIANCE_RATIO = 9.0  # times the 10th percentile of the variance
+MIN_RELATIVE_VARIANCE = 1e-7  # relative to the square of the specific force
 LARGEST_DRIFT_DEG = 2.0  # between any two parts of a rest; more is slow motion
 LARGEST_STEP_DEG = 0.5  # from block to block of a rest; a turn at 2 deg/s
 BLOCK_NOISE = 5.0  # standard deviations between the means of two blocks; in 10^5 blocks noise exceeds it less than once
-BINS = 64  # a half turn rotates by less than 3 deg in each
+ROTATION_BINS = 64  # a half turn rotates by less than 3 deg in each
 LONGEST_MOVE_S = 30.0  # a bias of 0.5 deg/s then adds 15 deg, the limit FITS_DEG
 SMALLEST_TURN_DEG = 20.0  # above FITS_DEG, so that a prediction without rotation does not fit
-FEWEST_MOVES = 3  # for a median
+MIN_MEDIAN_MOVES = 3  # for a median
 MOST_MOVES = 40  # bounds the cost
-MOST_SAMPLES = 200_000  # bounds the cost
+MAX_ROTATION_SAMPLES = 200_000  # bounds the cost
 FITS_DEG, FAILS_DEG = 15.0, 30.0  # the error of any other possible unit is tens of degrees
 
 
 @dataclass(frozen=True)
-class Move:
+class MoveByHand:
     """A move between two rests."""
 
     turns: Values  # integral of the angular rate over parts of the move, (64, 3), unit of the gyroscope times s
@@ -69,7 +69,7 @@ def interval_of(steps: Values) -> float:
 
 def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
     """Return start and stop of stretches of at least half a second at rest, from (n, 3) forces in any unit."""
-    width = max(SHORTEST_BLOCK, round(BLOCK_S / interval_s))
+    width = max(MIN_VARIANCE_SAMPLES, round(ROTATION_BLOCK_S / interval_s))
     count = len(force) // width
     if count < 4:
         return []
@@ -77,7 +77,7 @@ def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
     means = blocks.mean(axis=1)
     scatter = blocks.var(axis=1).sum(axis=1)
     size = float(np.median(np.linalg.norm(means, axis=1)))
-    still = scatter < max(STILL * float(np.quantile(scatter, 0.1)), SMALLEST_VARIANCE * size**2)
+    still = scatter < max(STILL_VARIANCE_RATIO * float(np.quantile(scatter, 0.1)), MIN_RELATIVE_VARIANCE * size**2)
     noise = BLOCK_NOISE * float(np.sqrt(2.0 * np.quantile(scatter, 0.1) / width))
     slow = np.linalg.norm(np.diff(means, axis=0), axis=1) <= max(np.radians(LARGEST_STEP_DEG) * size, noise)
     still &= np.append(slow, False) | np.append(False, slow)
@@ -87,11 +87,11 @@ def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
     return [(a * width, b * width) for a, b in found if np.linalg.norm(means[a:b] - means[a], axis=1).max() <= drift]
 
 
-def moves_of(force: Values, rate: Values, time_s: Values) -> list[Move]:
+def moves_of(force: Values, rate: Values, time_s: Values) -> list[MoveByHand]:
     """Return the moves between rests in which gravity rotated by more than 20 degrees; (n, 3) readings in any unit."""
     steps = np.diff(time_s, append=2 * time_s[-1] - time_s[-2])
     rests = rests_of(force, interval_of(steps))
-    found: list[Move] = []
+    found: list[MoveByHand] = []
     for (a, b), (c, d) in itertools.pairwise(rests):
         if len(found) == MOST_MOVES or time_s[c] - time_s[b - 1] > LONGEST_MOVE_S:
             continue
@@ -100,20 +100,20 @@ def moves_of(force: Values, rate: Values, time_s: Values) -> list[Move]:
         start = max(a, b - 1)
         bias = (rate[a:b].mean(axis=0) + rate[c:d].mean(axis=0)) / 2
         turned = (rate[start : c + 1] - bias) * steps[start : c + 1, None]
-        edges = np.linspace(0, len(turned), BINS + 1).astype(int)
+        edges = np.linspace(0, len(turned), ROTATION_BINS + 1).astype(int)
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(turned, axis=0)])
-        move = Move(np.diff(sums[edges], axis=0), before, after)
+        move = MoveByHand(np.diff(sums[edges], axis=0), before, after)
         if move.angle_deg > SMALLEST_TURN_DEG:
             found.append(move)
     return found
 
 
-def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> Values:
+def misfit_deg(moves: Sequence[MoveByHand], scales: Sequence[float]) -> Values:
     """Return the median over moves of ``misfits_deg``: (len(scales),) array, deg."""
     return np.asarray(np.median(misfits_deg(moves, scales), axis=0))
 
 
-def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> Values:
+def misfits_deg(moves: Sequence[MoveByHand], scales: Sequence[float]) -> Values:
     """Return the angle between predicted and measured gravity after each move, for each scale: (moves, scales) array.
 
     ``scales``: candidates of ``s``, deg/s per unit of the gyroscope.
@@ -136,11 +136,11 @@ def declared_scale(table: ChannelTable) -> tuple[float, str] | None:
     """Return the factor by which the angular rates are wrong, and the evidence; None if they are right or undecided."""
     if not {"accel_x", "gyro_x"} <= table.values.keys():
         return None
-    part = slice(0, MOST_SAMPLES)
+    part = slice(0, MAX_ROTATION_SAMPLES)
     force, rate = (np.column_stack([table.values[c][part] for c in TRIADS[s]]) for s in ("accelerometer", "gyroscope"))
     time_s = (table.time_ns[part] - table.time_ns[0]) / 1e9
     moves = moves_of(force, rate, time_s)
-    if len(moves) < FEWEST_MOVES:
+    if len(moves) < MIN_MEDIAN_MOVES:
         return None
     scales = (1.0, DEGREES, 1 / DEGREES)
     misfits = misfit_deg(moves, scales)

@@ -37,13 +37,13 @@ Name = Annotated[str | None, Field(description=ONLY_ONE)]
 Duration = Annotated[float, Field(ge=0)]
 
 
-class Section(BaseModel):
+class ProfileSection(BaseModel):
     """A section of an ingest profile. The description of a field states the expected value in an error message."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-class Checks(Section):
+class Checks(ProfileSection):
     """Limits of repairs and faults (``ingest.checks``).
 
     ``repaired_rows``: share of a file's rows that may be dropped or sorted. ``missing_time``: share of the duration in
@@ -57,7 +57,7 @@ class Checks(Section):
     rate_hz: Rate | None = Field(default=None, description="a positive number in Hz, or null")
 
 
-class ChannelSource(Section):
+class ChannelSource(ProfileSection):
     """The source of a channel: its unit, and the scale of counts."""
 
     channel: str
@@ -122,7 +122,7 @@ class Column(ChannelSource):
         raise ValueError(f"it is {'a name of the header' if header else 'an index from 0, for header is false'}")
 
 
-class CsvFormat(Section):
+class CsvFormat(ProfileSection):
     """The layout of one text file (``ingest.csv``).
 
     ``comment``: start of lines that are no data. ``header``: ``commented`` if the last comment names the columns.
@@ -171,7 +171,7 @@ class CsvFormat(Section):
         return None if time is None else 1_000_000_000 / Fraction(repr(time.counts_per_unit))
 
 
-class _Part(Section):
+class _Part(ProfileSection):
     """One of several files of a recording."""
 
     file: str = Field(min_length=1, description="the name of a file")
@@ -179,7 +179,7 @@ class _Part(Section):
     columns: Any = None
 
 
-S = TypeVar("S", bound=Section)
+S = TypeVar("S", bound=ProfileSection)
 C = TypeVar("C", bound=ChannelSource)
 
 
@@ -304,14 +304,14 @@ class MappedField(ChannelSource):
         return value if isinstance(value, FieldPath) else FieldPath.parse(value if isinstance(value, str) else "")
 
 
-class _LogPart(Section):
+class _LogPart(ProfileSection):
     """One of several message logs of a recording."""
 
     file: str = Field(min_length=1, description="the name of a file")
     topics: Any = None
 
 
-class McapFormat(Section):
+class McapFormat(ProfileSection):
     """How an MCAP file is read (``ingest.mcap``).
 
     ``topics``: topic to channel (or ``time``) to field. ``time_source``: the stamps in the messages, or the recorder's

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.ingest_settings import McapFormat
-    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_chunk import ChannelMessages
     from pipeline.io.mcap_reader import MessageReader
     from pipeline.records import Integers
     from pipeline.settings import Ingest
@@ -73,7 +73,7 @@ class _Topic:
     recorded: list[Integers] = field(default_factory=list)
     values: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
 
-    def read(self, rows: Rows, reader: MessageReader) -> None:
+    def read(self, rows: ChannelMessages, reader: MessageReader) -> None:
         """Decode the messages of a run."""
         if self.error is not None:
             return

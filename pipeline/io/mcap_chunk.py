@@ -50,7 +50,7 @@ _RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH")
 
 
 @dataclass
-class Rows:
+class ChannelMessages:
     """The messages of one channel in one run."""
 
     channel: int
@@ -67,7 +67,7 @@ class Rows:
         start = int(self.starts[row])
         return self.data[start : start + int(self.sizes[row])].tobytes()
 
-    def select(self, rows: Index) -> Rows:
+    def select(self, rows: Index) -> ChannelMessages:
         """Select messages by their indices, in increasing order."""
         if len(rows) == len(self.starts):
             return self
@@ -95,7 +95,7 @@ class Run:
     loose: bool = False  # whether the messages lie outside chunks
     index: dict[int, Integers] = field(default_factory=dict)
     records: list[tuple[bytes, bytes]] = field(default_factory=list)
-    rows: list[Rows] = field(default_factory=list)  # the messages of each channel
+    rows: list[ChannelMessages] = field(default_factory=list)  # the messages of each channel
 
 
 def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryview:
@@ -127,7 +127,7 @@ def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryvie
     return data
 
 
-def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
+def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[ChannelMessages]]:
     """Split a run into its messages; return the other records (opcode, content), and the messages by channel.
 
     Raises ``ValueError`` if the records do not fill the run exactly.
@@ -149,7 +149,9 @@ def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
     for channel in np.unique(heads["channel"]).tolist():
         mask = heads["channel"] == channel
         sizes = heads["length"][mask].astype(np.int64) - MESSAGE_HEAD
-        rows.append(Rows(channel, data, heads[mask], starts[mask] + HEAD.itemsize, sizes, 0, run.name, run.offset))
+        rows.append(
+            ChannelMessages(channel, data, heads[mask], starts[mask] + HEAD.itemsize, sizes, 0, run.name, run.offset)
+        )
     return others, rows
 
 
@@ -175,7 +177,7 @@ def _followed(
     return np.array(starts, np.int64), others
 
 
-def _alike(run: Run, data: NDArray[np.uint8], first: int) -> Rows | None:
+def _alike(run: Run, data: NDArray[np.uint8], first: int) -> ChannelMessages | None:
     """Return the messages if all records from the first message on have one channel and one length, else None."""
     _, length, channel = _HEAD.unpack_from(run.data, first)
     stride = RECORD_HEAD + length
@@ -186,7 +188,9 @@ def _alike(run: Run, data: NDArray[np.uint8], first: int) -> Rows | None:
     if not ((heads["opcode"] == Opcode.MESSAGE) & (heads["length"] == length) & (heads["channel"] == channel)).all():
         return None
     starts = first + HEAD.itemsize + stride * np.arange(count, dtype=np.int64)
-    return Rows(channel, data, heads, starts, np.full(count, length - MESSAGE_HEAD), stride, run.name, run.offset)
+    return ChannelMessages(
+        channel, data, heads, starts, np.full(count, length - MESSAGE_HEAD), stride, run.name, run.offset
+    )
 
 
 def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> Integers | None:

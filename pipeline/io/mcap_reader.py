@@ -28,7 +28,7 @@ from pipeline.io.mcap_chunk import MAGIC, RECORD_HEAD, Run, attachment, message_
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_chunk import ChannelMessages
     from pipeline.records import Note
 
 DEFINITIONS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
@@ -74,7 +74,7 @@ class MessageReader:
         """Whether a checksum covers every message; a file may have no checksums."""
         return False
 
-    def rows(self) -> Iterator[Rows]:
+    def rows(self) -> Iterator[ChannelMessages]:
         """Yield the messages, run by run and channel by channel; damage raises ``IngestError``."""
         raise NotImplementedError
 
@@ -109,7 +109,7 @@ class McapReader(MessageReader):
         """Whether a checksum covers every message."""
         return self._data_checked or (self._chunks_checked and not self._outside_chunks)
 
-    def rows(self) -> Iterator[Rows]:
+    def rows(self) -> Iterator[ChannelMessages]:
         """Yield the messages, run by run and channel by channel; errors as of ``runs``."""
         for run in self.runs():
             yield from run.rows

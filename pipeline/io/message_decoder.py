@@ -39,7 +39,7 @@ from pipeline.io.message_layout import (
     short_name,
 )
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE, VECTORS
-from pipeline.io.timestamps import LARGEST, nanoseconds, of_number, of_pair
+from pipeline.io.timestamps import MAX_NANOSECONDS, nanoseconds, of_number, of_pair
 from pipeline.io.units import ATTITUDE, COUNTS, TRIADS, UNITS, unit_spelt
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
     from pipeline.io.ingest_settings import McapFormat
-    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_chunk import ChannelMessages
     from pipeline.io.mcap_reader import MessageReader
     from pipeline.records import Index, Integers, Mask, Values
 
@@ -120,25 +120,25 @@ def listed_topics(reader: MessageReader) -> list[tuple[str, str]]:
     return sorted(found)
 
 
-class Batch(NamedTuple):
+class MessageBatch(NamedTuple):
     """Messages of a topic: their times, ns (None: the recorder's times are used), and values by channel."""
 
     time_ns: Integers | None
     values: dict[str, Values]
 
-    def times(self, rows: Rows) -> Integers:
+    def times(self, rows: ChannelMessages) -> Integers:
         """Return the times of the messages, or the recorder's times if none are read, ns."""
         return rows.heads["log_time"].astype(np.int64) if self.time_ns is None else self.time_ns
 
 
-def _together(parts: Sequence[Batch], groups: Sequence[tuple[Index, MessageLayout]]) -> Batch:
+def _together(parts: Sequence[MessageBatch], groups: Sequence[tuple[Index, MessageLayout]]) -> MessageBatch:
     """Join the messages of all layouts in the order of the file."""
     if len(parts) == 1:
         return parts[0]
     order = np.argsort(np.concatenate([own for own, _ in groups]))
     times = [part.time_ns for part in parts if part.time_ns is not None]
     values = {name: np.concatenate([part.values[name] for part in parts])[order] for name in parts[0].values}
-    return Batch(np.concatenate(times)[order] if times else None, values)
+    return MessageBatch(np.concatenate(times)[order] if times else None, values)
 
 
 class TopicDecoder:
@@ -166,14 +166,14 @@ class TopicDecoder:
         self._layouts: dict[int, MessageLayout] = {}  # the last one of each channel
         self._absent: dict[str, bool] = {}  # columns, by the first message
 
-    def read(self, rows: Rows, reader: MessageReader) -> Batch:
+    def read(self, rows: ChannelMessages, reader: MessageReader) -> MessageBatch:
         """Return times and channels of messages, without absent channels.
 
         An ``IngestError`` names the first message that contradicts its definition.
         """
         recorded = rows.heads["log_time"]
-        if (recorded > LARGEST).any():
-            number = self.count + int(np.argmax(recorded > LARGEST)) + 1
+        if (recorded > MAX_NANOSECONDS).any():
+            number = self.count + int(np.argmax(recorded > MAX_NANOSECONDS)) + 1
             message = f"message {number} on {self.topic}: the recorder's time of {recorded.max()} ns is out of range"
             raise IngestError(message, self.path, code="bad_time")
         if rows.channel not in self._channels:
@@ -213,7 +213,7 @@ class TopicDecoder:
             raise IngestError(message, self.path, code="unsupported", hint=SUPPORTED)
         return schema.name if schema else "json", find, decode
 
-    def _by_layout(self, rows: Rows, find: FindLayout) -> Iterator[tuple[Index, MessageLayout]]:
+    def _by_layout(self, rows: ChannelMessages, find: FindLayout) -> Iterator[tuple[Index, MessageLayout]]:
         """Yield the indices of the messages of each layout, and the layout."""
         remaining = np.arange(len(rows.starts))
         layout = self._layouts.get(rows.channel)
@@ -231,7 +231,7 @@ class TopicDecoder:
         for row in remaining.tolist():
             yield np.array([row]), self._in_message(row, rows, find)
 
-    def _columns(self, rows: Rows, indices: Index, layout: MessageLayout) -> Batch:
+    def _columns(self, rows: ChannelMessages, indices: Index, layout: MessageLayout) -> MessageBatch:
         """Return times and columns of the messages of one layout; a column is NaN where the list is empty."""
 
         def find(_: bytes) -> dict[str, tuple[int, str] | None]:
@@ -252,9 +252,9 @@ class TopicDecoder:
             columns[name] = found[name].astype(np.float64) if name in found else empty
             absent = columns[name] == -1.0 if name in VECTORS else np.array([name not in found])  # the same in all
             self._note_absent(name, absent, indices)
-        return Batch(time_ns, columns)
+        return MessageBatch(time_ns, columns)
 
-    def _decoded(self, rows: Rows, decode: Decode) -> Batch:
+    def _decoded(self, rows: ChannelMessages, decode: Decode) -> MessageBatch:
         """Return times and columns of messages, decoded one by one."""
         numbers: dict[str, list[float | None]] = {name: [] for name in self._paths}
         moments: list[int] = []
@@ -273,9 +273,9 @@ class TopicDecoder:
         for name, values in numbers.items():
             self._note_absent(name, np.array([v is None for v in values]), np.arange(len(values)))
         columns = {name: np.array(values, np.float64) for name, values in numbers.items()}
-        return Batch(None if self._time is None else np.array(moments, np.int64), columns)
+        return MessageBatch(None if self._time is None else np.array(moments, np.int64), columns)
 
-    def _in_message(self, row: int, rows: Rows, work: Callable[[bytes], T]) -> T:
+    def _in_message(self, row: int, rows: ChannelMessages, work: Callable[[bytes], T]) -> T:
         """Call a function on a message; any error becomes an ``IngestError`` that names the message."""
         payload = rows.payload(row)
         try:
@@ -317,7 +317,7 @@ class Topics:
         self.settings, self.path = settings, path
         self.decoders: dict[str, TopicDecoder] = {}
 
-    def decoder_of(self, rows: Rows, reader: MessageReader) -> TopicDecoder | None:
+    def decoder_of(self, rows: ChannelMessages, reader: MessageReader) -> TopicDecoder | None:
         """Return the decoder for messages; None if their topic is not read."""
         channel = reader.channels[rows.channel]
         name, schema = channel.topic, reader.schemas.get(channel.schema_id)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_chunk import ChannelMessages
     from pipeline.records import Index
 
 NUMBERS = {
@@ -41,7 +41,7 @@ _SEQUENCE = -1
 ENCAPSULATION = 4  # bytes before the content: its representation and options
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 BIG_ENDIAN = b"\x00\x00"
-DEEPEST = 32  # types within types
+MAX_NESTED_TYPES = 32  # types within types
 MOST_FIELDS = 100_000  # of one message; nested arrays of empty messages would not end
 
 
@@ -144,7 +144,7 @@ class MessageLayout:
     texts: dict[str, str | list[str]] = field(default_factory=dict)
     fixed: list[tuple[int, int]] = field(default_factory=list)
 
-    def matching(self, rows: Rows) -> Index:
+    def matching(self, rows: ChannelMessages) -> Index:
         """Return the indices of the messages with this layout."""
         same_size = np.flatnonzero(rows.sizes == len(self.sample))
         if not same_size.size:
@@ -156,7 +156,7 @@ class MessageLayout:
             same &= table[f"{at}"] == int.from_bytes(self.sample[at : at + width], "little")
         return same_size[same]
 
-    def columns(self, rows: Rows, wanted: dict[str, tuple[int, str]]) -> dict[str, NDArray[np.generic]]:
+    def columns(self, rows: ChannelMessages, wanted: dict[str, tuple[int, str]]) -> dict[str, NDArray[np.generic]]:
         """Return columns of all messages as copies; ``wanted``: name to (offset, type)."""
         table = rows.table(self._items(wanted))
         return {name: table[name].copy() for name in wanted}
@@ -249,7 +249,7 @@ class _LayoutFinder:
             raise ValueError(f"it has more than {MOST_FIELDS} fields")
 
     def message(self, key: str, prefix: str, depth: int) -> None:
-        if depth > DEEPEST:
+        if depth > MAX_NESTED_TYPES:
             raise ValueError(f"{key} contains itself")
         self.count()
         fields = self.definitions[key]

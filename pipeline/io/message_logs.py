@@ -31,7 +31,7 @@ from mcap.records import Channel, Schema
 
 from pipeline.errors import IngestError
 from pipeline.io.files import MESSAGE_FORMATS, is_mat_5
-from pipeline.io.mcap_chunk import HEAD, Rows
+from pipeline.io.mcap_chunk import HEAD, ChannelMessages
 from pipeline.io.mcap_reader import COPY_AGAIN, McapReader, MessageReader
 from pipeline.io.message_decoder import ARRAYS, STATED
 from pipeline.records import Note
@@ -47,15 +47,15 @@ if TYPE_CHECKING:
 
     Columns = Mapping[str, NDArray[Any]]
 
-RUN_SIZE = 4096  # messages of one topic of a bag that are decoded together
+MESSAGES_OF_A_RUN = 4096  # messages of one topic of a bag that are decoded together
 ELEMENT = re.compile(r"(.+)\[(\d+)\]")
 MARKED = 3  # bytes of a DataFlash message before its fields: two marks and its type
 MARKS, FORMAT, LENGTH_OF_FORMAT = b"\xa3\x95", 0x80, 89  # libraries/AP_Logger/LogStructure.h of ArduPilot
 MOST_GARBAGE = 528  # bytes at the end of a log that was written in blocks, as pymavlink allows
 TIME = "TimeUS"
-FEWEST_ROWS = 2  # shorter arrays are settings, not samples
-DEEPEST = 3  # dimensions: images, not read
-WIDEST = 64  # columns; a wider array is an image or a matrix
+MIN_SAMPLE_ROWS = 2  # shorter arrays are settings, not samples
+MAX_DIMENSIONS = 3  # dimensions: images, not read
+MAX_COLUMNS = 64  # columns; a wider array is an image or a matrix
 BYTES_OF_A_DOUBLE = 8  # longer numbers are no reading of a converter
 
 
@@ -69,7 +69,7 @@ class LogReader(MessageReader):
         with path.open("rb") as stream:
             self.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
 
-    def rows(self) -> Iterator[Rows]:
+    def rows(self) -> Iterator[ChannelMessages]:
         """Yield the messages; any error of the format's library is raised as ``IngestError``."""
         try:
             for rows in self.messages(self):
@@ -92,7 +92,7 @@ class LogReader(MessageReader):
 
 def _of_columns(
     log: LogReader, name: str, columns: Columns, units: Mapping[str, str], recorded_ns: Integers | None = None
-) -> Rows:
+) -> ChannelMessages:
     """Convert the arrays of a topic, (n,) or (n, k) numbers by field, to messages.
 
     ``units``: stated in the file, by field; ``recorded_ns``: times of the logger.
@@ -111,7 +111,7 @@ def _of_columns(
     return _rows(channel, table.tobytes(), np.full(count, kind.itemsize, np.int64), times)
 
 
-def _of_bag(log: LogReader) -> Iterator[Rows]:
+def _of_bag(log: LogReader) -> Iterator[ChannelMessages]:
     """Yield the messages of a ROS 1 bag, or of the SQLite file of a ROS 2 bag, in runs by connection."""
     version = 1 if log.file.suffix.lower() == ".bag" else 2
     with import_module(f"rosbags.rosbag{version}").Reader(log.file) as bag:
@@ -124,13 +124,13 @@ def _of_bag(log: LogReader) -> Iterator[Rows]:
         for connection, time, data in bag.messages(bag.connections):
             run = waiting[connection.id]
             run.append((time, data))
-            if len(run) == RUN_SIZE:
+            if len(run) == MESSAGES_OF_A_RUN:
                 yield _run_of(numbers[connection.id], run)
                 run.clear()
         yield from (_run_of(numbers[key], run) for key, run in waiting.items() if run)
 
 
-def _run_of(channel: int, run: list[tuple[int, bytes]]) -> Rows:
+def _run_of(channel: int, run: list[tuple[int, bytes]]) -> ChannelMessages:
     times, messages = zip(*run, strict=True)
     sizes = np.array([*map(len, messages)], np.int64)
     return _rows(channel, b"".join(messages), sizes, np.array(times, np.int64))
@@ -146,13 +146,13 @@ def _definition(connection: Any, version: int) -> str:  # noqa: ANN401  (rosbags
     return store.generate_msgdef(name, ros_version=2)[0] if name in store.fielddefs else ""
 
 
-def _rows(channel: int, data: bytes | memoryview, sizes: Integers, times: NDArray[Any]) -> Rows:
+def _rows(channel: int, data: bytes | memoryview, sizes: Integers, times: NDArray[Any]) -> ChannelMessages:
     """Return messages that follow each other in ``data``; ``times``: of the recorder, ns."""
     heads = np.zeros(len(sizes), HEAD)
     heads["channel"], heads["log_time"] = channel, times
     stride = int(sizes[0]) if len(sizes) and bool((sizes == sizes[0]).all()) else 0
     starts = np.cumsum(sizes) - sizes
-    return Rows(channel, np.frombuffer(data, np.uint8), heads, starts, sizes, stride, "the log", 0)
+    return ChannelMessages(channel, np.frombuffer(data, np.uint8), heads, starts, sizes, stride, "the log", 0)
 
 
 @contextlib.contextmanager
@@ -176,7 +176,7 @@ def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[Messag
     yield LogReader(path, known)
 
 
-def _of_ulog(log: LogReader) -> Iterator[Rows]:
+def _of_ulog(log: LogReader) -> Iterator[ChannelMessages]:
     from pyulog import ULog  # noqa: PLC0415  (an extra)
 
     with log.file.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()) as output:
@@ -224,7 +224,7 @@ def _check_chain(content: bytes, log: LogReader) -> None:
         log.notes.append(Note("N-TRUNCATED", 1, 0, 0, f"{what}; the complete messages were used"))
 
 
-def _of_dataflash(log: LogReader) -> Iterator[Rows]:
+def _of_dataflash(log: LogReader) -> Iterator[ChannelMessages]:
     """Yield the topics of a log; raise ``IngestError`` if it has other bytes between messages."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT, DFReader_binary  # noqa: PLC0415  (an extra)
 
@@ -257,7 +257,7 @@ def _of_dataflash(log: LogReader) -> Iterator[Rows]:
             yield _of_columns(log, _instance(known.name, sensor), part, units, times)
 
 
-def _of_arrays(log: LogReader) -> Iterator[Rows]:
+def _of_arrays(log: LogReader) -> Iterator[ChannelMessages]:
     if is_mat_5(log.file):
         from scipy.io import loadmat  # noqa: PLC0415  (few logs need it)
 
@@ -276,13 +276,13 @@ def _tree(group: Any) -> dict[str, Any]:  # noqa: ANN401  (h5py.Group)
     for name, item in group.items():
         if hasattr(item, "items"):
             found[name] = _tree(item) if name != "#refs#" else {}
-        elif getattr(item, "ndim", DEEPEST) < DEEPEST:
+        elif getattr(item, "ndim", MAX_DIMENSIONS) < MAX_DIMENSIONS:
             unit = next((item.attrs[k] for k in ("units", "unit") if k in item.attrs), "")
             found[name] = (item[()], unit.decode() if isinstance(unit, bytes) else str(unit))
     return found
 
 
-def _of_group(log: LogReader, place: str, tree: Mapping[str, object]) -> Iterator[Rows]:
+def _of_group(log: LogReader, place: str, tree: Mapping[str, object]) -> Iterator[ChannelMessages]:
     """Yield the topics of a group and of the groups in it."""
     arrays: dict[str, NDArray[Any]] = {}
     units: dict[str, str] = {}
@@ -300,7 +300,7 @@ def _of_group(log: LogReader, place: str, tree: Mapping[str, object]) -> Iterato
     yield from _by_length(log, place, arrays, units)
 
 
-def _by_length(log: LogReader, place: str, arrays: Columns, units: Mapping[str, str]) -> Iterator[Rows]:
+def _by_length(log: LogReader, place: str, arrays: Columns, units: Mapping[str, str]) -> Iterator[ChannelMessages]:
     """Yield the arrays of a group as topics, one for each length."""
     lengths = sorted({len(a) for a in arrays.values()})
     for length in lengths:
@@ -316,6 +316,6 @@ def _samples(array: NDArray[Any]) -> NDArray[Any] | None:
     array = np.squeeze(array)
     if array.ndim == 2 and array.shape[0] < array.shape[1]:
         array = array.T
-    if array.ndim not in (1, 2) or len(array) < FEWEST_ROWS or (array.ndim == 2 and array.shape[1] > WIDEST):
+    if array.ndim not in (1, 2) or len(array) < MIN_SAMPLE_ROWS or (array.ndim == 2 and array.shape[1] > MAX_COLUMNS):
         return None
     return array.astype("u1") if array.dtype.kind == "b" else array

@@ -36,21 +36,21 @@ GAP_INTERVALS = 1.5  # half way to one missing sample
 JITTER_NOTED, JITTER_TOO_LARGE = 0.2, 0.5  # rms, relative to the median interval; spectra need regular samples
 FULL_SCALE_MARGIN = 1.2  # sensors read up to a fifth beyond their nominal range
 RAIL = 1e-4  # relative; the largest code of 16 bits is 3e-5 below full scale
-BEYOND = 1e-3  # relative; with nominal counts per unit the largest code may be above full scale by this
-WINDOW = 64  # samples in which the share of equal neighbours is counted
-BY_CHANCE = 1e-6  # expected number of such runs in the recording
+FULL_SCALE_TOLERANCE = 1e-3  # relative; with nominal counts per unit the largest code may be above full scale by this
+NEIGHBOUR_WINDOW = 64  # samples in which the share of equal neighbours is counted
+EXPECTED_CHANCE_RUNS = 1e-6  # expected number of such runs in the recording
 SHORTEST_RUN = 20  # samples; the estimate of p from windows of 64 is too coarse for less
 FEWEST_STEPS = 64  # of the resolution: a channel with a smaller span shows noise alone
-QUIET = 0.5  # share of equal neighbours at which noise is below the resolution
-MOST_STRETCHES = 10  # of stuck rows that have a note each; more are one note: ``check`` lists 20 notes of a file
+EQUAL_NEIGHBOUR_SHARE = 0.5  # share of equal neighbours at which noise is below the resolution
+MAX_NOTED_STRETCHES = 10  # of stuck rows that have a note each; more are one note: ``check`` lists 20 notes of a file
 DEAD_ROWS = 1000  # shorter recordings may be constant by their resolution
 FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is wrong by a factor of 9.8 or 1000
 QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
 RATE_TOLERANCE = 0.2  # another unit of time is wrong by a factor of 1000
-ENOUGH = 200_000  # samples that a median is taken of
+MEDIAN_SAMPLES = 200_000  # samples that a median is taken of
 # Largest readings of a sensor at rest: gravity with a bias of a fifth, zero-rate output of consumer MEMS (MPU-6050
 # product specification 3.1). Where a log is coarse, a rest repeats such a reading although it is not clipped.
-AT_REST = {"accelerometer": 1.2, "gyroscope": 20.0}
+REST_LIMITS = {"accelerometer": 1.2, "gyroscope": 20.0}
 TURNING_DPS = 5.0  # a smaller rate is of the size of a low-cost gyroscope's bias
 # Factors by which intervals are wrong, and the kind of times that this indicates.
 _OTHER_FACTORS = {
@@ -116,7 +116,9 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
             raise IngestError(message, table.place(row), code="beyond_full_scale")
         # Many sensors read beyond their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth: a
         # largest value beyond the range that occurs more than once is clipped, too.
-        clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (size <= (1.0 + BEYOND) * full_scale)
+        clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (
+            size <= (1.0 + FULL_SCALE_TOLERANCE) * full_scale
+        )
         at_largest = size >= size.max() - 1.5 * count
         if size.max() > full_scale and at_largest.sum() > 1:
             clipped |= at_largest
@@ -146,12 +148,12 @@ def flag_flat_tops(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) 
         same = steps == 0.0
         if ends[1] - ends[0] < FEWEST_STEPS * np.min(steps, where=~same, initial=np.inf):
             continue
-        share = max(equal_share(same & (values[1:] != ends[0]) & (values[1:] != ends[1])), 1.0 / WINDOW)
-        for end in (e for e in ends if abs(e) > AT_REST[sensor]):
+        share = max(equal_share(same & (values[1:] != ends[0]) & (values[1:] != ends[1])), 1.0 / NEIGHBOUR_WINDOW)
+        for end in (e for e in ends if abs(e) > REST_LIMITS[sensor]):
             at_end = values == end
             rows = np.flatnonzero(at_end & ((flags & CLIPPED) == 0))
             by_chance = len(values) * share ** np.count_nonzero(same & at_end[1:])
-            if not rows.size or share > QUIET or by_chance > BY_CHANCE:
+            if not rows.size or share > EQUAL_NEIGHBOUR_SHARE or by_chance > EXPECTED_CHANCE_RUNS:
                 continue
             flags[rows] |= CLIPPED
             detail = (
@@ -173,7 +175,7 @@ def find_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> d
     for channel, same in neighbours.items():
         if not _in_a_row(same, SHORTEST_RUN - 1):
             continue
-        others = [not s.any() or equal_share(s) <= QUIET for c, s in neighbours.items() if c != channel]
+        others = [not s.any() or equal_share(s) <= EQUAL_NEIGHBOUR_SHARE for c, s in neighbours.items() if c != channel]
         dead = bool(same.all()) and len(same) >= DEAD_ROWS
         rows = _stuck_rows(same, equal_share(same))
         rows = np.arange(len(same)) if dead else rows[(flags[rows] & CLIPPED) == 0]
@@ -213,7 +215,7 @@ def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[n
     same = None if temperature is None else temperature[1:] == temperature[:-1]
     every = np.unique(np.concatenate([*found.values()]))
     stretches = np.split(every, np.flatnonzero(np.diff(every) > 1) + 1)
-    where = f" in {len(stretches)} places" if len(stretches) > MOST_STRETCHES else ""
+    where = f" in {len(stretches)} places" if len(stretches) > MAX_NOTED_STRETCHES else ""
     notes = []
     flags[every] |= STUCK
     for rows in [every] if where else stretches:
@@ -230,7 +232,7 @@ def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[n
             detail += (
                 f" while the table turns by {abs(np.subtract(*table.values['table_angle'][[last, first]])):.3g} deg"
             )
-        if not where and same is not None and same[first:last].all() and equal_share(same) <= QUIET:
+        if not where and same is not None and same[first:last].all() and equal_share(same) <= EQUAL_NEIGHBOUR_SHARE:
             detail += ", and the temperature with them"
         notes.append(table.note("N-STUCK", rows, f"{detail}: stuck, and left out of every fit"))
     return notes
@@ -238,10 +240,13 @@ def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[n
 
 def equal_share(same: Mask) -> float:
     """Return the 95th percentile of the share of equal neighbours, over windows that are not entirely equal."""
-    whole = len(same) // WINDOW * WINDOW
+    whole = len(same) // NEIGHBOUR_WINDOW * NEIGHBOUR_WINDOW
     if whole == 0:
         return 1.0
-    shares = np.bincount(np.flatnonzero(same[:whole]) // WINDOW, minlength=whole // WINDOW) / WINDOW
+    shares = (
+        np.bincount(np.flatnonzero(same[:whole]) // NEIGHBOUR_WINDOW, minlength=whole // NEIGHBOUR_WINDOW)
+        / NEIGHBOUR_WINDOW
+    )
     partial = shares[shares < 1.0]
     if not partial.size:
         return 1.0
@@ -251,10 +256,10 @@ def equal_share(same: Mask) -> float:
 
 def _stuck_rows(same: Mask, share: float) -> Index:
     """Return the rows in runs of equal values that are too long for chance."""
-    if share > QUIET:
+    if share > EQUAL_NEIGHBOUR_SHARE:
         return np.zeros(0, np.intp)
-    p = max(share, 1.0 / WINDOW)
-    longest = max(SHORTEST_RUN, int(np.ceil(np.log(BY_CHANCE / len(same)) / np.log(p))) + 1)
+    p = max(share, 1.0 / NEIGHBOUR_WINDOW)
+    longest = max(SHORTEST_RUN, int(np.ceil(np.log(EXPECTED_CHANCE_RUNS / len(same)) / np.log(p))) + 1)
     if not _in_a_row(same, longest - 1):
         return np.zeros(0, np.intp)
     edges = np.flatnonzero(np.diff(same, prepend=False, append=False))
@@ -319,7 +324,7 @@ def _check_rate(table: ChannelTable, checks: Checks) -> None:
 def _check_force(table: ChannelTable) -> None:
     if "accel_x" not in table.values:
         return
-    stride = -(-len(table.time_ns) // ENOUGH)
+    stride = -(-len(table.time_ns) // MEDIAN_SAMPLES)
     squares = np.asarray(sum(table.values[c][::stride] ** 2 for c in TRIADS["accelerometer"]))
     usual = float(np.sqrt(np.median(squares)))
     low, high = FORCE_RANGE_G
@@ -356,7 +361,7 @@ def _check_turn_rate(table: ChannelTable) -> None:
     """Raise ``IngestError`` if rates differ by a factor of 180/pi from the table's, or from gravity's rotation."""
     if "gyro_x" not in table.values:
         return
-    stride = -(-len(table.time_ns) // ENOUGH)
+    stride = -(-len(table.time_ns) // MEDIAN_SAMPLES)
     if "table_rate" in table.values:
         rate = np.abs(table.values["table_rate"][::stride])
         turning = rate > max(TURNING_DPS, 0.3 * float(rate.max()))

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from pipeline.settings import Procedure, RecordingFile, Sensor
 
 
-MOST_NAMED = 5  # further files that an error lists
+MAX_NAMED_FILES = 5  # further files that an error lists
 IN_MEMORY = "(DataFrame)"  # after the name of a recording that has no file
 
 
@@ -92,8 +92,8 @@ def read_recordings(
         first, *others = refused
         if others:
             listed = [f"{error.file} ({error.code})" for error in others]
-            first.message += f". Also refused: {'; '.join(listed[:MOST_NAMED])}"
-            first.message += f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
+            first.message += f". Also refused: {'; '.join(listed[:MAX_NAMED_FILES])}"
+            first.message += f" and {len(others) - MAX_NAMED_FILES} more" if len(others) > MAX_NAMED_FILES else ""
         raise first
     _check_different(recordings)
     return _compare_clocks(recordings)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_chunk import ChannelMessages
     from pipeline.io.message_layout import MessageLayout
     from pipeline.records import Index, Integers, Recording, Values
 
@@ -183,7 +183,11 @@ def imu_table(time_ns: Integers, readings: Readings, covariances: Readings | Non
 
 
 def replaced(
-    rows: Rows, groups: Sequence[tuple[Index, MessageLayout]], truths: Readings, channel: int, covariances: Readings
+    rows: ChannelMessages,
+    groups: Sequence[tuple[Index, MessageLayout]],
+    truths: Readings,
+    channel: int,
+    covariances: Readings,
 ) -> NDArray[np.uint8] | list[bytes]:
     """Return copies of Imu messages, as whole records, with calibrated readings.
 
@@ -213,7 +217,9 @@ def _in_ros_units(readings: Readings, covariances: Readings) -> dict[str, Values
     return found
 
 
-def _all_at_once(rows: Rows, layout: MessageLayout, numbers: dict[str, Values], channel: int) -> NDArray[np.uint8]:
+def _all_at_once(
+    rows: ChannelMessages, layout: MessageLayout, numbers: dict[str, Values], channel: int
+) -> NDArray[np.uint8]:
     """Copy all records of one layout, and replace their numbers."""
     size = HEAD.itemsize + len(layout.sample)
     places = {path: layout.places[path] for path in numbers}
@@ -237,7 +243,9 @@ def _all_at_once(rows: Rows, layout: MessageLayout, numbers: dict[str, Values], 
     return whole.view(np.uint8).reshape(len(starts), size)
 
 
-def new_imu(rows: Rows, truths: Readings, channel: int, time_ns: Integers, covariances: Readings) -> NDArray[np.uint8]:
+def new_imu(
+    rows: ChannelMessages, truths: Readings, channel: int, time_ns: Integers, covariances: Readings
+) -> NDArray[np.uint8]:
     """Return records of new ROS 2 Imu messages, with the log times and sequence numbers of the original records."""
     messages = imu_table(time_ns, truths, covariances)
     count, size = messages.shape

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pipeline.records import Integers
 
 BLOCK_BYTES = 1 << 20  # fits in the cache of the processor
-LONGEST = 1 << 24  # bytes of a line (one of 16 MB is no row of a table), and of the lines before the first row
+MAX_LINE_BYTES = 1 << 24  # bytes of a line (one of 16 MB is no row of a table), and of the lines before the first row
 NEWLINE = ord("\n")
 BOM = b"\xef\xbb\xbf"
 # A line, a carriage return without a newline, and (only as look-ahead) the line after it.
@@ -107,7 +107,7 @@ class TextLog:
             if self.head is None:
                 before += block
                 start = self._find_head(before)
-                if self.head is None and len(before) > LONGEST:
+                if self.head is None and len(before) > MAX_LINE_BYTES:
                     raise self.no_rows()
                 data = before[start:]
                 numbers = range(numbers.stop - data.count(b"\n"), numbers.stop)  # noqa: PLW2901
@@ -188,8 +188,8 @@ class TextLog:
                 end = chunk.rfind(b"\r", 0, len(chunk) - 1) + 1
             block = b"".join((rest, memoryview(chunk)[:end])) if end else b""
             rest = chunk[end:]
-            if len(rest) > LONGEST:
-                message = f"not a text log: no line ends within {LONGEST} bytes"
+            if len(rest) > MAX_LINE_BYTES:
+                message = f"not a text log: no line ends within {MAX_LINE_BYTES} bytes"
                 raise IngestError(message, f"{self.path}:{self.line}", code="foreign")
             if block:
                 yield self._lines(block)

@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Integers, Mask, Values
 
 
-LARGEST = np.iinfo(np.int64).max
+MAX_NANOSECONDS = np.iinfo(np.int64).max
 
 YEAR_2000, YEAR_2100 = 946_684_800 * SECOND_NS, 4_102_444_800 * SECOND_NS
-FEWEST = 3  # messages of a sensor: a row has a neighbour on both sides
-LONGEST_GAP = 1.5  # times the median interval, as of a recording's rows
-COARSEST = 0.01  # of the median interval: coarsest resolution of a time in floating-point numbers
+MIN_MESSAGES = 3  # messages of a sensor: a row has a neighbour on both sides
+MAX_GAP_INTERVALS = 1.5  # times the median interval, as of a recording's rows
+MAX_FLOAT_RESOLUTION = 0.01  # of the median interval: coarsest resolution of a time in floating-point numbers
 
 
 def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
@@ -47,7 +47,7 @@ def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
         found = moment[0] * SECOND_NS + moment[1]
     else:
         found = int((Decimal(moment) * int(UNITS["time"][unit][0])).to_integral_value())
-    if abs(found) > LARGEST:
+    if abs(found) > MAX_NANOSECONDS:
         raise ValueError(f"its stamp of {found} ns is out of range")
     return found
 
@@ -67,12 +67,12 @@ def of_number(values: NDArray[Any], unit: str) -> Integers:
     """Convert times in a unit to ns."""
     scale = int(UNITS["time"][unit][0])
     if values.dtype.kind in "iu":
-        if values.size and int(max(values.max(), -int(values.min()))) > LARGEST // scale:
+        if values.size and int(max(values.max(), -int(values.min()))) > MAX_NANOSECONDS // scale:
             raise ValueError(f"a stamp of {values.max()} {unit} is out of range")
         counted: Integers = values.astype(np.int64) * scale
         return counted
     numbers = values.astype(np.float64)
-    if not (np.abs(numbers) < LARGEST / scale).all():
+    if not (np.abs(numbers) < MAX_NANOSECONDS / scale).all():
         raise ValueError("a stamp is not finite, or out of range")
     whole = np.floor(numbers)
     parts: Integers = whole.astype(np.int64) * scale + np.rint((numbers - whole) * scale).astype(np.int64)
@@ -178,10 +178,10 @@ def check_fine(topic: str, time: Integers, path: str) -> None:
         return
     resolution = float(np.spacing(np.abs(time).max() / 1e9)) * 1e9
     interval = float(np.median(np.diff(time)))
-    if resolution > COARSEST * interval:
+    if resolution > MAX_FLOAT_RESOLUTION * interval:
         message = (
-            f"times on {topic} are floating-point numbers that hold {resolution:.3g} ns, more than {COARSEST:.0%} of "
-            f"the interval of {interval:.3g} ns"
+            f"times on {topic} are floating-point numbers that hold {resolution:.3g} ns, more than "
+            f"{MAX_FLOAT_RESOLUTION:.0%} of the interval of {interval:.3g} ns"
         )
         raise IngestError(message, path, code="bad_time", hint="log integer times")
 
@@ -192,14 +192,14 @@ def rows_covered(slow: Integers, fast: Integers, topic: str, path: str) -> Index
     Raises ``IngestError`` if there are none.
     """
     found = np.zeros(0, np.intp)
-    if len(slow) >= FEWEST and len(fast) >= FEWEST:
+    if len(slow) >= MIN_MESSAGES and len(fast) >= MIN_MESSAGES:
         edges, steps = _edges(slow), np.diff(fast)
         inside = (edges[:-1] >= fast[0]) & (edges[1:] <= fast[-1])
-        gaps = np.flatnonzero(steps > LONGEST_GAP * np.median(steps))
+        gaps = np.flatnonzero(steps > MAX_GAP_INTERVALS * np.median(steps))
         begun = np.searchsorted(fast[gaps], edges[1:], side="left")  # gaps that begin before the end of a row
         ended = np.searchsorted(fast[gaps + 1], edges[:-1], side="right")  # and that end before its beginning
         found = np.flatnonzero(inside & (begun == ended)) + 1
-    if len(found) < FEWEST:
+    if len(found) < MIN_MESSAGES:
         message = f"the messages on {topic} do not cover those of the other sensor in time"
         raise IngestError(message, path, code="bad_time", hint="both topics need stamps of one clock")
     return found

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 # A simulation.yaml with 10,000 units of 30 values each, which the largest fleet needs, stays below.
-LARGEST_BYTES, LARGEST_SIZE, DEEPEST = 10_000_000, 400_000, 50
+MAX_YAML_BYTES, MAX_YAML_VALUES, MAX_DEPTH = 10_000_000, 400_000, 50
 FLOAT = re.compile(  # that of OmegaConf, which reads 1e3 as a number where YAML 1.1 has a text
     r"""^(?:
      [-+]?[0-9]+(?:_[0-9]+)*\.[0-9_]*(?:[eE][-+]?[0-9]+)?
@@ -61,15 +61,15 @@ class _Loader(_Base):  # type: ignore[misc]
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+0123456789."))
 
 
-def read_yaml(path: Path, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401  (whatever the file holds)
+def read_yaml(path: Path, largest: int = MAX_YAML_VALUES) -> Any:  # noqa: ANN401  (whatever the file holds)
     """Read a YAML file of plain values, of at most the size ``largest``.
 
     Raises ``ConfigurationError`` if it is no regular file, cannot be read, is no YAML, or exceeds the limits.
     """
-    return load_yaml(read_text(path, LARGEST_BYTES, "settings"), str(path), largest)
+    return load_yaml(read_text(path, MAX_YAML_BYTES, "settings"), str(path), largest)
 
 
-def load_yaml(text: str, where: str, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401
+def load_yaml(text: str, where: str, largest: int = MAX_YAML_VALUES) -> Any:  # noqa: ANN401
     """Parse a YAML text; errors as of ``read_yaml``."""
     try:
         _check_size(yaml.parse(text, Loader=_Loader), where, largest)
@@ -118,5 +118,5 @@ def _check_limits(size: int, largest: int, depth: int, place: str) -> None:
             f"holds more than {largest} values, each alias (*) counted with all that it stands for; use fewer aliases",
             place,
         )
-    if depth > DEEPEST:
-        raise ConfigurationError(f"is nested more than {DEEPEST} deep", place)
+    if depth > MAX_DEPTH:
+        raise ConfigurationError(f"is nested more than {MAX_DEPTH} deep", place)

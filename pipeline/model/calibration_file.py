@@ -64,9 +64,11 @@ LARGEST_FACTOR = 1000.0
 # Two axes 1 deg apart have a condition of 2 / sin(1 deg) = 115; a sensor's axes are 90 deg apart within some degrees.
 LARGEST_CONDITION = 100.0
 
-FAST_S = 0.1  # estimators average over longer times, between two images or scans: a faster process counts as white
+MIN_EXPORTED_TIME_S = (
+    0.1  # estimators average over longer times, between two images or scans: a faster process counts as white
+)
 WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
-LEFT_OUT = {
+LEFT_OUT_REASONS = {
     "N-STUCK": "stuck",
     "N-CLIP": "clipped",
     "N-DISTURBED": "glitches or knocks",
@@ -189,8 +191,9 @@ def sample_covariance(document: Mapping[str, Any], sensor: str) -> Values | None
         cov = M diag(N^2 / dt + 2 Q^2 / dt^2 + sum_i G_i^2) M^T
 
     with the white and quantisation noise N and Q of an axis at rest, identified at the sampling interval dt, and the
-    standard deviation G_i of its Gauss-Markov processes with a correlation time of less than ``FAST_S``. A slower bias
-    wander is not noise of a single sample. None where the sensor is not calibrated, or the noise of an axis is unknown.
+    standard deviation G_i of its Gauss-Markov processes with a correlation time of less than ``MIN_EXPORTED_TIME_S``. A
+    slower bias wander is not noise of a single sample. None where the sensor is not calibrated, or the noise of an axis
+    is unknown.
     """
     noise, part = (document.get("noise") or {}).get(sensor) or {}, document.get(sensor)
     axes = noise.get("axes") or {}
@@ -200,7 +203,7 @@ def sample_covariance(document: Mapping[str, Any], sensor: str) -> Values | None
     for axis in AXES:
         terms = axes[axis]["terms"]
         white, quantisation = (terms[name]["value"] or 0.0 for name in ("white", "quantisation"))
-        fast = [g["value"] for g in terms["gauss_markov"] if g["correlation_time_s"]["value"] < FAST_S]
+        fast = [g["value"] for g in terms["gauss_markov"] if g["correlation_time_s"]["value"] < MIN_EXPORTED_TIME_S]
         variances.append(white**2 / dt + 2.0 * quantisation**2 / dt**2 + sum(g**2 for g in fast))
     spread = np.array(part["matrix"], np.float64) * np.sqrt(variances)
     return np.asarray(spread @ spread.T)
@@ -256,7 +259,7 @@ MULTIPLE = 4.0  # see above
 LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # share of the range, see above
 LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02  # see above
 EQUAL_SPREAD = 0.1  # relative spread of the three scale factors that have one cause
-NEAR = 0.03  # relative distance from a factor by which it is recognised, as a low-cost scale factor's limit
+FACTOR_DISTANCE = 0.03  # relative distance from a factor by which it is recognised, as a low-cost scale factor's limit
 FACTORS = {
     "accelerometer": {
         9.80665: "in m/s^2, and read as g",
@@ -270,8 +273,8 @@ FACTORS = {
         1.0 / 6.0: "in revolutions a minute, and read as deg/s",
     },
 }
-NAMED = 5  # parameters beyond the limits that a line names
-RANGES = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
+NAMED_PARAMETERS = 5  # parameters beyond the limits that a line names
+RANGE_RATIOS = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
 OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
 OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
 OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
@@ -307,7 +310,7 @@ def beyond_limits(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -
 def beyond_words(part: Mapping[str, Any] | None) -> str:
     """Return the entries of ``beyond_limits`` in a calibration in words: ``bias y (250 %), ...``; empty for none."""
     entries = (part or {}).get("beyond_limits") or []
-    return ", ".join(first([f"{_plain(e)} ({100.0 * e['ratio']:.3g} %)" for e in entries], NAMED))
+    return ", ".join(first([f"{_plain(e)} ({100.0 * e['ratio']:.3g} %)" for e in entries], NAMED_PARAMETERS))
 
 
 def _entry(row: Row) -> Entry:
@@ -364,11 +367,11 @@ def _scale_cause(sensor: str, factors: np.ndarray) -> str:
     mean = float(np.mean(factors))
     if np.ptp(factors) > EQUAL_SPREAD * mean:
         return "another column, counts per unit or axis map of this axis, or a damaged axis"
-    unit = next((u for f, u in FACTORS[sensor].items() if abs(mean / f - 1.0) < NEAR), None)
+    unit = next((u for f, u in FACTORS[sensor].items() if abs(mean / f - 1.0) < FACTOR_DISTANCE), None)
     if unit is not None:
         return f"readings {mean:.4g} times the truth: they are {unit}; set the unit of their columns in ingest"
     setting = f"set sensor.{sensor}.full_scale and counts_per_unit"
-    if any(abs(mean / f - 1.0) < NEAR for f in RANGES):
+    if any(abs(mean / f - 1.0) < FACTOR_DISTANCE for f in RANGE_RATIOS):
         return f"readings {mean:.4g} times the truth: the sensor was set to another range; {setting}"
     return f"readings {mean:.4g} times the truth: the sensor was probably set to another range or unit; {setting}"
 
@@ -435,11 +438,11 @@ def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:
         if missing := entry.get("missing_s"):
             found.append(f"{name}: {missing / entry['duration_s']:.3%} of the time is missing")
         for note in entry.get("notes") or []:
-            if note["code"] in LEFT_OUT:
+            if note["code"] in LEFT_OUT_REASONS:
                 counts.setdefault(note["code"], []).append(note["count"])
         for code, each_note in counts.items():
             several = code == "N-CLIP" and len(each_note) > 1  # a note for each channel, some for the same rows
             count = max(each_note) if several else sum(each_note)
             share = f"{'at least ' * several}{count:,}{f' of {rows:,}' if rows else ''} rows of {name}"
-            found.append(f"{share} ({f'{count / rate:.2g} s ' if rate else ''}{LEFT_OUT[code]})")
+            found.append(f"{share} ({f'{count / rate:.2g} s ' if rate else ''}{LEFT_OUT_REASONS[code]})")
     return found

@@ -25,7 +25,7 @@ from pipeline.model.calibration_file import read_calibration, sample_covariance,
 from pipeline.model.effects import load_python_effect, register
 from pipeline.model.effects.base import OF_THE_ROOM
 from pipeline.model.log_motion import SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
-from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
+from pipeline.model.measurement import SensorEffects, sensor_effects, solve, without_effects
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration, Values
 
 if TYPE_CHECKING:
@@ -92,9 +92,9 @@ class CompensationStream:
     def __init__(self, unit: str, calibrations: dict[str, SensorCalibration], smoothing: float) -> None:
         self.unit, self.smoothing = unit, smoothing
         self.steps = {s: Steps.of(s, sensor_effects(c)) for s, c in calibrations.items()}
-        self._steady = {s: Part.of(c, self.steps[s].steady) for s, c in calibrations.items()}
-        self._moving = {s: Part.of(c, self.steps[s].moving) for s, c in calibrations.items()}
-        self._linear = {s: Part.of(c, ()) for s, c in calibrations.items()}
+        self._steady = {s: SensorEffects.of(c, self.steps[s].steady) for s, c in calibrations.items()}
+        self._moving = {s: SensorEffects.of(c, self.steps[s].moving) for s, c in calibrations.items()}
+        self._linear = {s: SensorEffects.of(c, ()) for s, c in calibrations.items()}
         self._line = ExponentialRegression(smoothing or 1.0)
         self._ends = [LogEnd()]  # of the last block, one for each iteration
 

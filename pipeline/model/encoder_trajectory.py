@@ -25,8 +25,8 @@ GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for
 MOVING_DPS = 0.02  # exceeds the rate noise of a resting table
 SAME_SHARE, SAME_DPS2 = 0.01, 0.1  # how nearly two neighbouring intervals must agree on an acceleration
 LAG_ROUNDING_DPS = 1e-11  # some hundred roundings of a rate of 400 deg/s
-ROUNDING = 1e-9  # relative: some roundings of a printed number
-MULTIPLES = 10  # of a step: as many different changes are not those of equal moves
+PRINTED_ROUNDING = 1e-9  # relative: some roundings of a printed number
+MAX_DIFFERENT_MOVES = 10  # of a step: as many different changes are not those of equal moves
 CLEARLY_ABOVE = 4.0  # times the step of an exact log: its angles may all be even multiples
 MEMORY_S = 0.3  # fifteen time constants of the slowest filter of 20 ms
 CORNER_DPS2 = 3.0  # over a filter of 20 ms: 0.06 deg/s
@@ -127,11 +127,11 @@ class EncoderTrajectory:
         (2, n - 1) array: of the excess, deg, and of the acceleration, deg/s^2; zeros for a log that is not rounded.
         """
         changes, rates = np.abs(np.diff(self.angle)), np.abs(self.rate)
-        angle = step_of(changes, ROUNDING * max(float(np.abs(self.angle).max()), 1.0))
-        rate = step_of(rates, ROUNDING * max(float(rates.max()), 1.0))
+        angle = step_of(changes, PRINTED_ROUNDING * max(float(np.abs(self.angle).max()), 1.0))
+        rate = step_of(rates, PRINTED_ROUNDING * max(float(rates.max()), 1.0))
         distinct = len(np.unique(np.rint(changes / angle))) if angle else 0
         exact = 0.5 * rate**2 / max(float(np.abs(self._mean).max()), MOVING_DPS)
-        if distinct <= MULTIPLES or angle <= CLEARLY_ABOVE * exact:
+        if distinct <= MAX_DIFFERENT_MOVES or angle <= CLEARLY_ABOVE * exact:
             return np.zeros((2, len(self._step)))
         return np.array([angle + np.minimum(0.5 * rate * self._step, angle), rate / self._step])
 

@@ -29,7 +29,12 @@ if TYPE_CHECKING:
     Signals = Mapping[str, Values]
     Evaluate = Callable[[Signals], Any]
 
-LONGEST, DEEPEST, MOST_NODES, LARGEST_POWER = 500, 40, 200, 20.0  # above every shipped formula; they bound the cost
+MAX_FORMULA_LENGTH, MAX_FORMULA_DEPTH, MAX_FORMULA_NODES, LARGEST_POWER = (
+    500,
+    40,
+    200,
+    20.0,
+)  # above every shipped formula; they bound the cost
 
 
 class Signal(NamedTuple):
@@ -148,15 +153,15 @@ def parse(text: str) -> Formula:
     line = " ".join(text.split())
     if not line:
         raise _refusal(line, 0, "it is empty")
-    if len(line) > LONGEST:
-        raise ConfigurationError(f"a formula of {len(line)} characters; at most {LONGEST} are read")
+    if len(line) > MAX_FORMULA_LENGTH:
+        raise ConfigurationError(f"a formula of {len(line)} characters; at most {MAX_FORMULA_LENGTH} are read")
     strange = STRANGE.search(line)
     if strange:
         found = strange.group()
         raise _refusal(line, strange.start(), f"{found!r} is not allowed in a formula{HINTS.get(found, '')}")
     depth = accumulate((character == "(") - (character == ")") for character in line)
-    if max(depth) > DEEPEST:
-        raise ConfigurationError(f"a formula with brackets {DEEPEST} deep; use several terms")
+    if max(depth) > MAX_FORMULA_DEPTH:
+        raise ConfigurationError(f"a formula with brackets {MAX_FORMULA_DEPTH} deep; use several terms")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -180,7 +185,7 @@ class _Reader:
 
     def read(self, node: ast.expr, depth: int) -> tuple[Evaluate, str]:
         self.nodes += 1
-        if depth > DEEPEST or self.nodes > MOST_NODES:
+        if depth > MAX_FORMULA_DEPTH or self.nodes > MAX_FORMULA_NODES:
             raise self._refused(node, "the formula is nested too deeply or has too many parts; use several terms")
         if isinstance(node, ast.Constant):
             return _number(self._value(node))

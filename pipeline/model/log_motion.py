@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     Known = tuple[float, Values]  # the last sample that is not missing: time in s, value
 
 STRETCH = 4.0  # memories: exp(4) costs two digits of the sums; shorter stretches cost time
-FARTHEST = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
+MAX_MEMORIES_BACK = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
 DEGENERATE = 1e-15  # determinant over its scale, below which doubles do not resolve a slope
 SIGNALS = {
     "time": {"time"},
@@ -155,7 +155,7 @@ class ExponentialRegression:
     def apply(self, time: Values, temperature: Values) -> Values:
         """Return the line at each sample: (n,) array, degC; also where the temperature is missing (NaN).
 
-        Raises ``InputError`` if time goes back by more than ``FARTHEST`` memories.
+        Raises ``InputError`` if time goes back by more than ``MAX_MEMORIES_BACK`` memories.
         """
         stretch = np.floor(time / (STRETCH * self.memory))
         cuts = np.flatnonzero(stretch[1:] != stretch[:-1]) + 1
@@ -171,7 +171,7 @@ class ExponentialRegression:
         self._stretch = stretch
         if not abs(step) > 0.0 or not self._sums[0]:  # NaN: no stretch yet
             return
-        if step < -FARTHEST * self.memory:
+        if step < -MAX_MEMORIES_BACK * self.memory:
             raise InputError(f"time goes back by about {-step:.6g} s to {time:.6f} s; sort the log, or cut it there")
         s0, s1, s2, r0, r1 = self._sums
         moved = (s0, s1 - step * s0, s2 - 2.0 * step * s1 + step * step * s0, r0, r1 - step * r0)

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
     Truths = dict[str, Values]
 
-ROUNDS = 60  # two digits a round: far more than 1e-13 needs
-TOLERANCE = 1e-13  # relative: some hundred roundings of a double
+MAX_INVERSION_ITERATIONS = 60  # two digits a round: far more than 1e-13 needs
+INVERSION_TOLERANCE = 1e-13  # relative: some hundred roundings of a double
 OUT_OF_REACH = 1e12  # g or deg/s: far beyond any reading, the fixed point diverges
 
 
 @dataclass(frozen=True)
-class Part:
+class SensorEffects:
     """The effects, with their values, to subtract from the readings of a sensor; K is the inverse of its matrix."""
 
     calibration: SensorCalibration
@@ -81,7 +81,7 @@ def compensate(
     def motion_at(truths: Truths, _number: int) -> Motion:
         return replace(motion, **{field: truths[sensor]})  # type: ignore[arg-type]
 
-    part = Part.of(calibration, sensor_effects(calibration) if effects is None else effects)
+    part = SensorEffects.of(calibration, sensor_effects(calibration) if effects is None else effects)
     return solve({sensor: part}, {sensor: reading}, motion_at)[sensor]
 
 
@@ -90,7 +90,7 @@ def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
     return [fitted for fitted in calibration.effects if owner_of(fitted) == Owner.SENSOR]
 
 
-def solve(parts: Mapping[str, Part], readings: Truths, motion_at: Callable[[Truths, int], Motion]) -> Truths:
+def solve(parts: Mapping[str, SensorEffects], readings: Truths, motion_at: Callable[[Truths, int], Motion]) -> Truths:
     """Solve the measurement equation of one or both sensors.
 
     ``parts``: by sensor; the readings of a sensor without a part are its truth. ``readings`` and result: by sensor,
@@ -102,7 +102,7 @@ def solve(parts: Mapping[str, Part], readings: Truths, motion_at: Callable[[Trut
     if not busy:
         return truths
     settled = np.zeros(len(next(iter(truths.values()))), bool)
-    for number in range(ROUNDS):
+    for number in range(MAX_INVERSION_ITERATIONS):
         moved = without_effects(busy, readings, motion_at(truths, number))
         if any(np.any(np.abs(moved[s]) > OUT_OF_REACH) for s in busy):
             break
@@ -121,7 +121,7 @@ def solve(parts: Mapping[str, Part], readings: Truths, motion_at: Callable[[Trut
     )
 
 
-def without_effects(parts: Mapping[str, Part], readings: Truths, motion: Motion) -> Truths:
+def without_effects(parts: Mapping[str, SensorEffects], readings: Truths, motion: Motion) -> Truths:
     """Return ``matrix @ (reading - bias - effects(motion))`` for each sensor in ``parts``."""
     return {s: linear_truth(part.calibration, part.take_off(readings[s], motion)) for s, part in parts.items()}
 
@@ -146,5 +146,5 @@ def inverse_of(calibration: SensorCalibration) -> Values:
 
 def _near(new: Values, old: Values) -> Mask:
     """Return which samples have converged, relative to their size; missing ones (NaN) count as such: (n,) array."""
-    far = np.abs(new - old) > TOLERANCE * np.maximum(np.abs(new), 1.0)
+    far = np.abs(new - old) > INVERSION_TOLERANCE * np.maximum(np.abs(new), 1.0)
     return np.logical_not(far[:, 0] | far[:, 1] | far[:, 2])

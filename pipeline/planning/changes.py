@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 FASTER_DPS = (100.0, 200.0)  # proposed rates, within a low-cost range of 250 deg/s
 CLEARLY_FASTER = 1.3  # least proposed rate over the procedure's fastest rate
-WITHIN = 0.9  # of the gyroscope's full scale: its bias needs the remainder
+USABLE_RANGE_SHARE = 0.9  # of the gyroscope's full scale: its bias needs the remainder
 MOTION_S, MOTION_DPS = 120.0, 100.0  # of the proposed random motion
 UPRIGHT_DPS = 60.0  # one turn about an upright z in 6 s
 LONG_REST_S = 600.0  # six correlation times of a typical wander (configs/sensor)
 POSITIONS = 2  # proposed number of rests over that of the procedure
 CLEARLY_SMALLER = 99.5  # per cent
-TOP = 3  # changes that are printed
+PRINTED_CHANGES = 3  # changes that are printed
 
 
 @dataclass(frozen=True)
-class Change:
+class ProcedureChange:
     """A change of the procedure or an additional recording."""
 
     what: str  # as advice to the reader
@@ -50,19 +50,19 @@ class Change:
     extra: tuple[Planned, ...] = ()
 
 
-def changes(unit: UnitDescription) -> list[Change]:
+def changes(unit: UnitDescription) -> list[ProcedureChange]:
     """Return the proposed changes of a unit's procedure."""
     course, on_table = course_of(unit), unit.procedure in TABLE_PROCEDURES
     full = shipped_settings(sensor=unit.sensor).sensor.gyroscope.full_scale
     fixed = replace(unit, samples=None, course=asdict(course))
-    found: list[Change] = []
+    found: list[ProcedureChange] = []
 
     def propose(what: str, options: str, **values: Any) -> None:  # noqa: ANN401  (any attribute of the course)
-        found.append(Change(what, options, replace(fixed, course={**fixed.course, **values})))
+        found.append(ProcedureChange(what, options, replace(fixed, course={**fixed.course, **values})))
 
     if on_table and not course.both_directions:
         propose("make every turn in the other direction too", "--both-directions", both_directions=True)
-    faster = [r for r in FASTER_DPS if CLEARLY_FASTER * max(course.rates_dps) < r <= WITHIN * full]
+    faster = [r for r in FASTER_DPS if CLEARLY_FASTER * max(course.rates_dps) < r <= USABLE_RANGE_SHARE * full]
     if on_table and faster:
         rates = (*course.rates_dps, *faster)
         what = f"turn at {' and '.join(f'{r:g}' for r in faster)} deg/s too, both sensors recorded"
@@ -74,7 +74,7 @@ def changes(unit: UnitDescription) -> list[Change]:
         propose("rest twice as long at each stop", f"--dwell {dwell:g}", dwell_s=dwell)
     if unit.procedure == "three_axis_turns":
         what = f"heat and cool the unit by {course.thermal_ramp_degc:g} degC meanwhile, in a thermal chamber"
-        found.append(Change(what, "--procedure thermal_ramp", replace(fixed, procedure="thermal_ramp")))
+        found.append(ProcedureChange(what, "--procedure thermal_ramp", replace(fixed, procedure="thermal_ramp")))
     if on_table:
         found += _further(fixed, course, full)
     elif unit.procedure == "multi_position":
@@ -82,42 +82,42 @@ def changes(unit: UnitDescription) -> list[Change]:
         propose(f"rest in {more} positions", f"--positions {more}", positions=more)
     else:
         what = f"instead of these, rest in {course.positions} positions, each with another inclination"
-        found.append(Change(what, "--procedure multi_position", replace(fixed, procedure="multi_position")))
+        found.append(ProcedureChange(what, "--procedure multi_position", replace(fixed, procedure="multi_position")))
     if course.static_s < LONG_REST_S:
         what = f"a long rest of {LONG_REST_S / 60.0:g} min, to determine the noise"
         propose(what, f"--static {LONG_REST_S:g}", static_s=LONG_REST_S)
     return found
 
 
-def _further(unit: UnitDescription, course: Course, full: float) -> Iterator[Change]:
+def _further(unit: UnitDescription, course: Course, full: float) -> Iterator[ProcedureChange]:
     """Yield recordings for which the procedure has no option."""
     planned = plan(unit.procedure, replace(course, validation_s=0.0, static_s=0.0), np.random.default_rng(0))
     repeated = tuple(replace(p, name=f"{p.name}_again") for p in planned)
-    yield Change("run the whole procedure a second time, once the unit is warm", "", unit, repeated)
+    yield ProcedureChange("run the whole procedure a second time, once the unit is warm", "", unit, repeated)
     if unit.table == "single_axis":
         return
-    rate = min(MOTION_DPS, WITHIN * full)
+    rate = min(MOTION_DPS, USABLE_RANGE_SHARE * full)
     motion = random_gimbals(MOTION_S, rate, np.random.default_rng(0))
     what = f"random motion about all axes up to {rate:g} deg/s for {MOTION_S / 60.0:g} min, attitude logged, in the fit"
-    yield Change(what, "", unit, (Planned("motion", "gyroscope", None, motion),))
+    yield ProcedureChange(what, "", unit, (Planned("motion", "gyroscope", None, motion),))
     still = np.zeros((3, 1))
     turn = Gimbals(np.array([0.0, 0.0, UPRIGHT_DPS]), still, still, still, 360.0 / UPRIGHT_DPS)
     what = "turn about z with z upright, attitude logged, in the fit"
-    yield Change(what, "", unit, (Planned("upright_z", "gyroscope", None, turn),))
+    yield ProcedureChange(what, "", unit, (Planned("upright_z", "gyroscope", None, turn),))
 
 
 @dataclass(frozen=True)
-class Gain:
+class PlanGain:
     """The improvement of a plan by a change."""
 
-    change: Change
+    change: ProcedureChange
     minutes: float  # additional time
     shown: tuple[str, ...]  # ``sensor.effect`` that become observable; of the table only if neither sensor showed it
     distinguished: tuple[str, ...]  # those that are no longer taken for a look-alike
     factor: float  # geometric mean of new over old smallest size, of effects that are observable in both
 
 
-def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
+def best_changes(unit: UnitDescription, before: Document) -> list[PlanGain]:
     """Return the gain of each change, the most helpful first; ``before`` is the plan of the unit's procedure.
 
     The order is by the number of effects that become observable for each additional minute (at least one, to set up),
@@ -127,14 +127,14 @@ def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
         return []
     gains = [_gain(change, before, plan_of(change.unit, change.extra, half_only=True)) for change in changes(unit)]
 
-    def order(gain: Gain) -> tuple[float, float]:
+    def order(gain: PlanGain) -> tuple[float, float]:
         minutes = max(gain.minutes, 1.0)
         return -len(gain.shown) / minutes, float(np.log(gain.factor)) / minutes
 
     return sorted(gains, key=order)
 
 
-def _gain(change: Change, before: Document, after: Document) -> Gain:
+def _gain(change: ProcedureChange, before: Document, after: Document) -> PlanGain:
     old, new = (  # observable effects by ``sensor.effect``
         {f"{s}.{entry['effect']}": entry for s in SENSORS for entry in document[s]["effects"]}
         for document in (before, after)
@@ -142,7 +142,7 @@ def _gain(change: Change, before: Document, after: Document) -> Gain:
     of_table = {entry["effect"] for entry in old.values() if effect(entry["effect"]).owner == Owner.TABLE}
     both = [key for key in new if key in old]
     ratios = [np.log(new[key]["smallest"] / old[key]["smallest"]) for key in both]
-    return Gain(
+    return PlanGain(
         change,
         after["minutes"] - before["minutes"],
         tuple(key for key, entry in new.items() if key not in old and entry["effect"] not in of_table),
@@ -151,13 +151,13 @@ def _gain(change: Change, before: Document, after: Document) -> Gain:
     )
 
 
-def helps_most(gains: Sequence[Gain]) -> list[str]:
+def helps_most(gains: Sequence[PlanGain]) -> list[str]:
     """Return the first changes that help as lines."""
     useful = [gain for gain in gains if gain.shown or gain.distinguished or 100.0 * gain.factor < CLEARLY_SMALLER]
     if not useful:
         return ["additional recordings: none of those examined shows more"] if gains else []
     lines = ["additional recordings, the most helpful first:"]
-    for number, gain in enumerate(useful[:TOP], start=1):
+    for number, gain in enumerate(useful[:PRINTED_CHANGES], start=1):
         options = f" ({gain.change.options})" if gain.change.options else ""
         lines.append(f"  {number}. {gain.change.what}{options}: {gain.minutes:+.1f} min")
         parts = [f"shows {_listed(gain.shown)}"] if gain.shown else []

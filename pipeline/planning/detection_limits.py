@@ -31,12 +31,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.estimation.design import Term
+from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gates import min_gain
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
 from pipeline.estimation.multi_position.model import NoiseHypothesis, log_likelihood, project_out
-from pipeline.estimation.ranking import RIDGE
-from pipeline.estimation.selection import ALIKE, DELAYS, Selection
+from pipeline.estimation.ranking import UNIT_COLUMN_RIDGE
+from pipeline.estimation.selection import DELAYS, LOOK_ALIKE_SHARE, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -44,13 +44,13 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.records import Mask, Noise, Values
 
-STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %
-LEAST, LARGEST = 1e-8, 1e3  # share of the limits
+BISECTION_STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %
+MIN_LIMIT_SHARE, MAX_LIMIT_SHARE = 1e-8, 1e3  # share of the limits
 ALMOST_SURE = 0.95  # share of the cases in which the size ``sure`` is found
 PARTLY = 0.3  # least share of a signal that a look-alike reproduces to be preferred for having fewer parameters
 MOST_SIGNS = 32  # patterns of signs; the mean over them is then within 0.1 of that over all (standard error of a share)
-DRAWS = 64  # of the noise of rests: the standard error of a share of one half is 0.06
-ROUNDING = 1e-6  # share of a signal: a smaller remainder of it is rounding
+NOISE_DRAWS = 64  # of the noise of rests: the standard error of a share of one half is 0.06
+SIGNAL_ROUNDING = 1e-6  # share of a signal: a smaller remainder of it is rounding
 TIED = 1e-3  # deviation of a difference in 2 log L: with a smaller one two effects are equal to the selection
 
 
@@ -79,7 +79,7 @@ class _Signal:
 class DetectionLimits(abc.ABC):
     """The detection limits of a selection's candidates; one effect may have candidates with several time constants."""
 
-    def __init__(self, sensor: str, candidates: Sequence[Term], limits: Mapping[str, Values]) -> None:
+    def __init__(self, sensor: str, candidates: Sequence[EffectColumns], limits: Mapping[str, Values]) -> None:
         self.sensor, self.candidates = sensor, candidates
         unlimited = {t.effect.name: np.full(len(t.values), np.inf) for t in candidates}
         self.limits: dict[str, Values] = {name: limits.get(name, none) for name, none in unlimited.items()}
@@ -124,7 +124,7 @@ class DetectionLimits(abc.ABC):
             np.inf if half_only else _smallest(signal.found, ALMOST_SURE),
             np.inf if half_only else _smallest(named, 0.5),
             rivals[int(np.argmin(ahead))] if np.any(ahead < 0.5) else None,
-            {r: share for r, share in sorted(largest.items(), key=lambda item: -item[1]) if share > ALIKE},
+            {r: share for r, share in sorted(largest.items(), key=lambda item: -item[1]) if share > LOOK_ALIKE_SHARE},
         )
 
     def _fixed(self, j: int) -> Mask:
@@ -144,10 +144,10 @@ class DetectionLimits(abc.ABC):
 
 def _smallest(probability: Callable[[float], Values], wanted: float) -> float:
     """Return the smallest share at which the mean probability over the signs is reached; infinite if none."""
-    low, high = np.log(LEAST), np.log(LARGEST)
-    if np.mean(probability(LARGEST)) < wanted:
+    low, high = np.log(MIN_LIMIT_SHARE), np.log(MAX_LIMIT_SHARE)
+    if np.mean(probability(MAX_LIMIT_SHARE)) < wanted:
         return float("inf")
-    for _ in range(STEPS):
+    for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if np.mean(probability(float(np.exp(middle)))) >= wanted else (middle, high)
     return float(np.exp(high))
@@ -192,7 +192,7 @@ class TurntableLimits(DetectionLimits):
             explained = self._explained(i, j, q)
             if explained[self.setting].sum() > PARTLY * whole:
                 remainder = signal - explained
-                remainders.append(np.where(remainder > ROUNDING * signal, remainder, 0.0)[:, None])
+                remainders.append(np.where(remainder > SIGNAL_ROUNDING * signal, remainder, 0.0)[:, None])
                 shares[i] = 1.0 - float(np.sum(remainders[-1][self.setting])) / whole
         remaining = np.concatenate(remainders, axis=1)
         more = k - np.array([self._parameters(i) for i in shares], float)[:, None]
@@ -228,7 +228,7 @@ class TurntableLimits(DetectionLimits):
         rival, place, products = self.ranking.places[i], self.ranking.places[j], self.ranking.products
         if i not in self._solved:
             inner = products[:, rival[:, None], rival]
-            inner = inner + RIDGE * np.einsum("tii->ti", inner)[:, :, None] * np.eye(len(rival))
+            inner = inner + UNIT_COLUMN_RIDGE * np.einsum("tii->ti", inner)[:, :, None] * np.eye(len(rival))
             self._solved[i] = np.linalg.solve(inner, products[:, rival, :])
         cross = products[:, rival[:, None], place] @ q.T
         return np.asarray(np.sum(cross * (self._solved[i][:, :, place] @ q.T), axis=1))
@@ -247,14 +247,14 @@ def noise_sums(blocks: Blocks, samples: float, settings: Sequence[Setting], true
 class RestLimits(DetectionLimits):
     """The detection limits of a selection by hand in a simulated recording, for readings of some noise."""
 
-    def __init__(self, selection: by_hand.Selection, noise: Noise) -> None:
+    def __init__(self, selection: by_hand.SelectionByHand, noise: Noise) -> None:
         model = selection.model
-        terms = [Term(this, v) for this in selection.candidates for v in this.starts(model.sensor)]
+        terms = [EffectColumns(this, v) for this in selection.candidates for v in this.starts(model.sensor)]
         super().__init__(model.sensor, terms, selection.limits)
         equations = model.equations(replace(selection.fits[0].state, terms=()), terms)
         ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
         C = equations.covariance(NoiseHypothesis(Setting(ratio, noise.correlation_time), (0.0,) * model.kinds))
-        drawn = np.linalg.cholesky(C) @ np.random.default_rng(0).standard_normal((len(C), DRAWS))
+        drawn = np.linalg.cholesky(C) @ np.random.default_rng(0).standard_normal((len(C), NOISE_DRAWS))
         together = replace(equations, candidates=[*equations.candidates, drawn])
         self.projected = project_out(together, selection.hypotheses)
         self.drawn, self.equations = self.projected.raw[-1], len(C)
@@ -276,7 +276,7 @@ class RestLimits(DetectionLimits):
         return log_likelihood(rss, self.drawn.shape[1], self.projected.log_determinant[:, None])
 
     def _signal(self, j: int, sizes: Values) -> _Signal:
-        signs = np.random.default_rng(1).choice([-1.0, 1.0], (DRAWS, len(sizes)))
+        signs = np.random.default_rng(1).choice([-1.0, 1.0], (NOISE_DRAWS, len(sizes)))
         signal = self.projected.raw[j] @ (signs * sizes).T
         total = _squares(self.drawn, signal)
         explained = {i: _squares(self._of_draws[i], self._along(i, signal)) for i in (j, *self._rivals(j))}
@@ -296,7 +296,7 @@ class RestLimits(DetectionLimits):
 
         def ahead(share: float) -> Values:
             delta = bic(share, j)
-            return np.array([delta >= bic(share, i) for i in shares], float).reshape(-1, DRAWS)
+            return np.array([delta >= bic(share, i) for i in shares], float).reshape(-1, NOISE_DRAWS)
 
         return _Signal(found, ahead, shares)
 

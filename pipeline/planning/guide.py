@@ -70,9 +70,11 @@ if TYPE_CHECKING:
 
 SHARPNESS = 8  # exponent of a smooth norm for the largest U, within 32 % of it for nine parameters
 SWEEPS = 10  # of the exchange, which usually ends after two or three
-MOST = 60  # planned rests: some 7 min
-FEWEST = 9  # rests of the fit, one for each parameter
-SAME = 0.08  # difference of components of the vertical, 5 deg from an edge: within it, the name does not change
+MAX_PLANNED_RESTS = 60  # planned rests: some 7 min
+MIN_RESTS = 9  # rests of the fit, one for each parameter
+SAME_DIRECTION = (
+    0.08  # difference of components of the vertical, 5 deg from an edge: within it, the name does not change
+)
 LEVEL_DEG = 3.0  # largest tilt that is not mentioned: units are set down by hand to about 1 deg
 BETWEEN_SIDES = np.tan(np.radians(22.5))  # ratio of two components above which a corner is raised, not a side
 
@@ -93,7 +95,7 @@ def in_words(up: Sequence[float] | Values) -> str:
     '+z up, then the +x side raised by 27 deg'
     """
     n = np.asarray(up, float) / float(np.linalg.norm(up))
-    first = next(i for i in (2, 1, 0) if abs(n[i]) > np.max(np.abs(n)) - SAME)
+    first = next(i for i in (2, 1, 0) if abs(n[i]) > np.max(np.abs(n)) - SAME_DIRECTION)
     tilt = float(np.degrees(np.arccos(min(abs(n[first]), 1.0))))
     if tilt < LEVEL_DEG:
         return f"{_axis(n, first)} up"
@@ -109,7 +111,7 @@ def _axis(n: Values, i: int) -> str:
 
 
 @dataclass(frozen=True)
-class Progress:
+class GuideProgress:
     """The state of the accelerometer's calibration by the rests so far."""
 
     rests: tuple[tuple[Recording, Rest], ...]  # in order of time in each recording
@@ -142,7 +144,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Proposal:
+class ProposedRest:
     """The next rest."""
 
     up: Values  # (3,)
@@ -167,7 +169,7 @@ def fitted_by_hand(recordings: Sequence[Recording], settings: Settings, *, gyros
     return unit
 
 
-def progress_of(unit: UnitState, settings: Settings, dwell: float) -> Progress:
+def progress_of(unit: UnitState, settings: Settings, dwell: float) -> GuideProgress:
     """Return the state of the accelerometer's calibration.
 
     ``unit``: with the fit of the accelerometer (``fitted_by_hand``). ``dwell``: s, of a future rest. Raises
@@ -204,7 +206,7 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> Progress:
     pairs = [pair for pair, _ in of_both]
     last = sum(pair[0] is pairs[-1][0] for pair in pairs) if pairs else 0
     every = holdout_interval(recordings, settings.procedure)
-    return Progress(
+    return GuideProgress(
         rests=tuple(pairs),
         held_out=tuple(held for _, held in of_both),
         up=_directions(pairs, values),
@@ -251,7 +253,7 @@ def _undetermined(fitted: SensorCalibration) -> str:
     count = fitted.stages[-1].details["orientations_used"]
     if by_limit:
         return f"{count} orientations leave {', '.join(by_limit)} open"
-    return f"{count} orientations determine nine parameters without a check" if count <= FEWEST else ""
+    return f"{count} orientations determine nine parameters without a check" if count <= MIN_RESTS else ""
 
 
 def _white_of_rest(orientations: Orientations, data_sheet: DataSheet, dwell: float) -> float:
@@ -271,8 +273,8 @@ def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Valu
     return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
 
 
-def propose(progress: Progress, goal: float) -> Proposal:
-    """Return the next rest, with the number of rests up to the goal, g; at most ``MOST``."""
+def propose(progress: GuideProgress, goal: float) -> ProposedRest:
+    """Return the next rest, with the number of rests up to the goal, g; at most ``MAX_PLANNED_RESTS``."""
     up = attitudes()
     readings = progress.values[BIAS] + up @ np.linalg.inv(triangle(progress.values)).T
     X = derivative_of(readings, progress.values) / progress.error
@@ -281,13 +283,13 @@ def propose(progress: Progress, goal: float) -> Proposal:
     if progress.next_is_held_out:  # as far as possible from all rests, to judge the fit between them
         free = np.setdiff1d(np.arange(len(up)), planned) if len(set(planned)) < len(up) else np.arange(len(up))
         near = np.max(up[free] @ progress.up.T, axis=1, initial=-1.0)
-        return Proposal(up[free[int(np.argmin(near))]], len(planned), expected)
+        return ProposedRest(up[free[int(np.argmin(near))]], len(planned), expected)
     rows = planned or range(len(up))
     gain = np.einsum("ni,ij,nj->n", X[rows], np.linalg.inv(progress.information), X[rows])
-    return Proposal(up[rows[int(np.argmax(gain))]], len(planned), expected)
+    return ProposedRest(up[rows[int(np.argmax(gain))]], len(planned), expected)
 
 
-def _planned(progress: Progress, X: Values, goal: float) -> tuple[list[int], Values]:
+def _planned(progress: GuideProgress, X: Values, goal: float) -> tuple[list[int], Values]:
     """Return the attitudes of the fewest further rests that reach the goal, and F with them."""
     planned: list[int] = []
     F = progress.information
@@ -301,7 +303,7 @@ def _planned(progress: Progress, X: Values, goal: float) -> tuple[list[int], Val
         variance = progress.inflation * (np.diag(inverse) - V**2 / (1.0 + np.sum(V * X, axis=1))[:, None])
         return np.asarray(np.sum((variance / variance.max()) ** SHARPNESS, axis=1))
 
-    while len(planned) < MOST:
+    while len(planned) < MAX_PLANNED_RESTS:
         planned.append(int(np.argmin(scores(F))))
         F = F + np.outer(X[planned[-1]], X[planned[-1]])
         for _ in range(SWEEPS):
@@ -314,17 +316,17 @@ def _planned(progress: Progress, X: Values, goal: float) -> tuple[list[int], Val
                     planned[i], F = new, without + np.outer(X[new], X[new])
             if planned == before:
                 break
-        if progress.used + len(planned) > FEWEST and progress.largest(F, len(planned)) <= goal:
+        if progress.used + len(planned) > MIN_RESTS and progress.largest(F, len(planned)) <= goal:
             break
     return planned, F
 
 
 TURNS_DEG = (90.0, 180.0, 270.0, 360.0)  # angles that need no scale
-STEP = 1e-5  # relative, of a difference quotient: its error is 1e-10
+RELATIVE_STEP = 1e-5  # relative, of a difference quotient: its error is 1e-10
 
 
 @dataclass(frozen=True)
-class Turn:
+class ProposedTurn:
     """A turn about a body axis that stays level."""
 
     axis: int
@@ -343,11 +345,11 @@ class Turn:
         def vertical(m: Values) -> Values:
             return np.asarray(rotation_by(-(turned + self.angle * m)) @ np.eye(3)[self.up])
 
-        steps = STEP * np.eye(3)
-        return np.column_stack([(vertical(m) - vertical(-m)) / (2.0 * STEP) for m in steps])
+        steps = RELATIVE_STEP * np.eye(3)
+        return np.column_stack([(vertical(m) - vertical(-m)) / (2.0 * RELATIVE_STEP) for m in steps])
 
 
-def most_informative_turn(gyroscope: SensorCalibration, direction: float) -> Turn:
+def most_informative_turn(gyroscope: SensorCalibration, direction: float) -> ProposedTurn:
     """Return the turn that improves the gyroscope's matrix most.
 
     ``gyroscope``: its calibration so far, with a covariance. ``direction``: s, rad.
@@ -355,12 +357,12 @@ def most_informative_turn(gyroscope: SensorCalibration, direction: float) -> Tur
     assert gyroscope.covariance is not None  # noqa: S101
     S = gyroscope.covariance
 
-    def gain(turn: Turn) -> float:
+    def gain(turn: ProposedTurn) -> float:
         column = 3 + 3 * np.arange(3) + turn.axis
         H = turn.sensitivity() / direction
         return float(np.linalg.slogdet(np.eye(3) + H @ S[np.ix_(column, column)] @ H.T)[1])
 
-    turns = (Turn(axis, up, angle) for axis, up in permutations(range(3), 2) for angle in TURNS_DEG)
+    turns = (ProposedTurn(axis, up, angle) for axis, up in permutations(range(3), 2) for angle in TURNS_DEG)
     return max(turns, key=gain)
 
 

@@ -132,7 +132,7 @@ def of_sensor(
     return document
 
 
-def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Selection:
+def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.SelectionByHand:
     """Return the selection in a simulated procedure by hand.
 
     Raises ``NotObservableError`` if bias and matrix cannot be determined, or if there are no rests.
@@ -143,7 +143,7 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Select
     if sensor == "gyroscope":
         start, other = SensorCalibration(sensor), start
     model = require_model(simulated.recordings, start, simulated.noise[sensor], simulated.settings, other)
-    return by_hand.Selection(model, start, [], simulated.noise[sensor], simulated.settings.sensor.of(sensor))
+    return by_hand.SelectionByHand(model, start, [], simulated.noise[sensor], simulated.settings.sensor.of(sensor))
 
 
 def _entry(sensor: str, detection: Detection, *, limited: bool) -> Document:

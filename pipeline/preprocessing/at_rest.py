@@ -48,22 +48,29 @@ if TYPE_CHECKING:
     from pipeline.settings import DataSheet, Sensor, Settings
 
 
-BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
-FEWEST_OF_REST, RESTS = 8, 3  # samples of a rest, and rests of a recording, that determine the usual scatter
+REST_BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
+MIN_SAMPLES_OF_REST, MIN_RESTS_OF_SCATTER = (
+    8,
+    3,
+)  # samples of a rest, and rests of a recording, that determine the usual scatter
 LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer than 1 of 10^9 blocks
-QUARTER_SIZE, UNUSUAL, WIDEST = 0.6745, 5.0, 0.4  # quartile of a normal distribution; factor and limit of s
+QUARTER_SIZE, UNUSUAL, MAX_SCATTER_DEVIATION = (
+    0.6745,
+    5.0,
+    0.4,
+)  # quartile of a normal distribution; factor and limit of s
 OF_RESTS, OF_SHEET = 2.0, 4.0  # a running bench adds noise to that on a desk; data sheets state typical noise
 STEPPED_DEG = 0.1  # between two samples of a rest: five times what RATE_AT_REST_DPS turns in a second
-SIGNIFICANT = 6.0  # standard deviations, as in pipeline.signal.rests
-FEWEST_SAMPLES = 60  # fewest that determine the noise in pipeline.estimation.noise
-SHORTEST_S = 10.0  # in which a wander of 100 s changes by a third of its size
+SIGNIFICANT_DEVIATIONS_AT_REST = 6.0  # standard deviations, as in pipeline.signal.rests
+MIN_NOISE_SAMPLES_AT_REST = 60  # fewest that determine the noise in pipeline.estimation.noise
+MIN_DRIFT_REST_S = 10.0  # in which a wander of 100 s changes by a third of its size
 UNKNOWN_DEGC = 5.0  # change of temperature in some minutes of a room, where none is logged
 HALF_TURN_DEG = 180.0  # in which both axes across a level turn vary by 1 g at least
 SPANNED = 0.2  # of what the motion requires
 INNER = (0.05, 0.95)  # shares of the samples
 COPIED = 0.5  # share of the changes of an axis that another makes at the same row, to the last digit
 LEVEL_G = 0.5  # of the axes across a turn together, from which gravity turns in the body
-FEWEST = 32  # samples, of which an axis is copied or stays
+MIN_AXIS_SAMPLES = 32  # samples, of which an axis is copied or stays
 
 
 def check_static(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:
@@ -88,7 +95,7 @@ def _doubted(
 ) -> Recording:
     """Return a static recording, with the note ``N-REFERENCE`` if it contradicts the rests of the others."""
     others = [r for r in recordings if r.role != "static" and r.samples > 1]
-    if recording.samples < FEWEST_SAMPLES or not others:
+    if recording.samples < MIN_NOISE_SAMPLES_AT_REST or not others:
         return recording
     intervals = np.array([r.interval for r in others]) / recording.interval
     faster, slower = np.sqrt(max(1.0, intervals.max())), np.sqrt(max(1.0, 1.0 / intervals.min()))
@@ -116,7 +123,7 @@ def _doubted(
         if sensor == "gyroscope":
             means = rests[:, 2]
             away = float(np.max([means.min(axis=0) - static[2], static[2] - means.max(axis=0)]))
-            noise = SIGNIFICANT * float(usual[0].max()) / np.sqrt(FEWEST_OF_REST)
+            noise = SIGNIFICANT_DEVIATIONS_AT_REST * float(usual[0].max()) / np.sqrt(MIN_SAMPLES_OF_REST)
             most = noise + _bias_change([recording, *others], sensor_model.gyroscope)
             if away > most:
                 details.append(
@@ -146,7 +153,7 @@ def _bias_change(recordings: Sequence[Recording], data_sheet: DataSheet) -> floa
 
 def _blocks(recording: Recording, values: Values) -> Values:
     """Return the samples in blocks of a second: (n, 3) array to (k, size, 3), (n,) array to (k, size)."""
-    size = max(FEWEST_OF_BLOCK, round(BLOCK_S / recording.interval))
+    size = max(FEWEST_OF_BLOCK, round(REST_BLOCK_S / recording.interval))
     count = len(values) // size
     return values[: count * size].reshape(count, size, *values.shape[1:])
 
@@ -177,11 +184,11 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_model:
     start, stop = max(parts, key=lambda part: part[1] - part[0], default=(0, 0))
     start, stop = start + (size if start else 0), stop - (size if stop < recording.samples else 0)
     left_out = recording.samples - (stop - start)
-    if stop - start < FEWEST_SAMPLES or (stop - start) * recording.interval < SHORTEST_S:
+    if stop - start < MIN_NOISE_SAMPLES_AT_REST or (stop - start) * recording.interval < MIN_DRIFT_REST_S:
         raise refusal(
             recording,
             "not_at_rest",
-            f"it is for the noise at rest, and no {SHORTEST_S:g} s of it are at rest: {why} "
+            f"it is for the noise at rest, and no {MIN_DRIFT_REST_S:g} s of it are at rest: {why} "
             f"({int(moving.sum())} of {count} stretches of {size * recording.interval:.3g} s move)",
             "remove it, the noise is then taken from the rests of the other recordings, or record it again",
         )
@@ -201,7 +208,9 @@ def _moving(
     means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
     usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
     tiny = np.finfo(float).tiny
-    spread = np.minimum(np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE, WIDEST)
+    spread = np.minimum(
+        np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE, MAX_SCATTER_DEVIATION
+    )
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
     white = data_sheet.noise_density * np.sqrt(0.5 / recording.interval)
     if len(rests):
@@ -212,7 +221,10 @@ def _moving(
     loud = scatter / usual
     away = np.abs(means - median(means))
     change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
-    allowed = _slow(data_sheet, change, float(recording.time[-1] - recording.time[0])) + SIGNIFICANT * usual
+    allowed = (
+        _slow(data_sheet, change, float(recording.time[-1] - recording.time[0]))
+        + SIGNIFICANT_DEVIATIONS_AT_REST * usual
+    )
     moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)
     if np.any(loud > louder):
         return moving, f"the {sensor} scatters {loud.max():.3g} times as usual"
@@ -224,7 +236,7 @@ def _slow(data_sheet: DataSheet, change: float, duration: float) -> float:
     """Return the largest plausible change of a bias at rest, for a change of temperature (degC) and a duration (s)."""
     effects = data_sheet.effects
     return (
-        SIGNIFICANT * data_sheet.bias_wander
+        SIGNIFICANT_DEVIATIONS_AT_REST * data_sheet.bias_wander
         + effects.get("bias_drift", 0.0) * duration
         + effects.get("bias_temperature", 0.0) * change
         + effects.get("warm_up", 0.0)
@@ -241,11 +253,13 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
         angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
         stepped = np.abs(np.diff(angle)) > STEPPED_DEG  # the table moved between two samples
         pieces = np.split(rows, np.flatnonzero((np.diff(rows) > 1) | stepped) + 1)
-        rests = [piece for piece in pieces if len(piece) >= FEWEST_OF_REST]
+        rests = [piece for piece in pieces if len(piece) >= MIN_SAMPLES_OF_REST]
         for sensor in SENSORS:
             reading = recording.reading(sensor)
             if reading is not None:
-                moments[sensor] += [_moments(reading[None, rest]) for rest in rests[:: len(rests) // RESTS + 1]]
+                moments[sensor] += [
+                    _moments(reading[None, rest]) for rest in rests[:: len(rests) // MIN_RESTS_OF_SCATTER + 1]
+                ]
     return {sensor: np.concatenate(parts) for sensor, parts in moments.items()}
 
 
@@ -274,7 +288,7 @@ def _moments(blocks: Values) -> Values:
 def check_axes(recordings: Sequence[Recording]) -> None:
     """Refuse an axis that is constant while the table turns, or that is a copy of another."""
     for recording in recordings:
-        if recording.samples >= FEWEST:
+        if recording.samples >= MIN_AXIS_SAMPLES:
             _check_copies(recording)
             if recording.axis is not None:
                 _check_spans(recording)
@@ -292,12 +306,12 @@ def _check_copies(recording: Recording) -> None:
         if reading is None:
             continue
         a, b = reading[:, one], reading[:, two]
-        if np.count_nonzero(np.abs(a) == np.abs(b)) <= COPIED * FEWEST:  # in any rows: too few for a refusal
+        if np.count_nonzero(np.abs(a) == np.abs(b)) <= COPIED * MIN_AXIS_SAMPLES:  # in any rows: too few for a refusal
             continue
         changing = a[1:] != a[:-1]
-        if changing.sum() < FEWEST:
+        if changing.sum() < MIN_AXIS_SAMPLES:
             continue
-        least = max(COPIED, SIGNIFICANT * float(np.sqrt(0.5 / changing.sum())))
+        least = max(COPIED, SIGNIFICANT_DEVIATIONS_AT_REST * float(np.sqrt(0.5 / changing.sum())))
         for sign, what in ((1.0, "a copy"), (-1.0, "the negative")):
             same, by_chance = ((a[1:] == sign * other)[changing] for other in (b[1:], b[:-1]))
             if same.mean() - by_chance.mean() > least:
@@ -325,7 +339,7 @@ def _check_spans(recording: Recording) -> None:
         angle = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))
     if recording.accelerometer is not None and np.ptp(angle) >= HALF_TURN_DEG:
         turns = np.abs(np.diff(angle, prepend=angle[0])) > RATE_AT_REST_DPS * recording.interval
-        rows = turns if turns.sum() >= FEWEST else np.ones(len(angle), bool)  # rests may be most of the time
+        rows = turns if turns.sum() >= MIN_AXIS_SAMPLES else np.ones(len(angle), bool)  # rests may be most of the time
         spans = [_span(f) for f in recording.accelerometer[-len(angle) :][rows].T]
         across = [(axis + 1) % 3, (axis + 2) % 3]
         # Not in a turn about the vertical or about another axis: see check_mounting.

@@ -54,7 +54,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import axis_matrix
-from pipeline.io.gravity_rotation import FAILS_DEG, FEWEST_MOVES, MOST_SAMPLES, misfits_deg, moves_of
+from pipeline.io.gravity_rotation import FAILS_DEG, MAX_ROTATION_SAMPLES, MIN_MEDIAN_MOVES, misfits_deg, moves_of
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.records import AXES
 from pipeline.signal.rests import still_samples
@@ -62,28 +62,28 @@ from pipeline.signal.rests import still_samples
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.io.gravity_rotation import Move
+    from pipeline.io.gravity_rotation import MoveByHand
     from pipeline.records import Recording, Values
     from pipeline.settings import RecordingFile, Table
 
-FEWEST = 10  # samples, five times the unknowns of an angle
-ACROSS = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
+MIN_ANGLE_SAMPLES = 10  # samples, five times the unknowns of an angle
+UP_AT_QUARTER_TURN = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
 # Smallest eigenvalue of the covariance of (cos A, sin A): that of an arc of 110 deg. For a shorter arc, a nonlinearity
 # of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
 LEAST_COVERAGE = 0.017
 SMALLEST_SHARE = 1e-6  # of the largest eigenvalue, below which a function of the rate is one of the others
-LARGEST_UNCERTAINTY = 0.02  # g, of p and q: 1 deg
+MAX_DIRECTION_UNCERTAINTY_G = 0.02  # g, of p and q: 1 deg
 CHANGING = 0.1  # standard deviation over largest rate, from which a rate changes enough to be followed
-SLOWEST_DPS = 0.1  # standard deviation of a rate that can be followed
+MIN_FOLLOWED_RATE_DPS = 0.1  # standard deviation of a rate that can be followed
 LARGEST_BIAS_DPS = 20.0  # zero-rate output of consumer MEMS (MPU-6050 product specification)
-ALIKE = 0.9  # correlation of a gyroscope axis with the rate from which its gain is evidence
+MIN_GAIN_CORRELATION = 0.9  # correlation of a gyroscope axis with the rate from which its gain is evidence
 # From the nearest axis: beyond cross-axis sensitivity and seats, below the 45 deg between two axes.
 CLEAR_DEG = 30.0
 FEWEST_MISSED, CLEARLY_FEWER = 2, 4  # moves that gravity does not follow: one may be a knock
 
 
 @dataclass(frozen=True)
-class Bench:
+class TurnMounting:
     """Mounting of the unit in one turn, and how the table counts the angle."""
 
     axis: str  # body axis turned about
@@ -105,20 +105,20 @@ class Bench:
     def offset(self) -> float:
         """Convention's angle minus ``sense * A``, deg."""
         a, up = AXES.index(self.axis), signed_axis(self.up)
-        face = 0.0 if self.vertical else float(np.degrees(np.arctan2(up @ ACROSS[a], up @ UP_AT_ZERO[a])))
+        face = 0.0 if self.vertical else float(np.degrees(np.arctan2(up @ UP_AT_QUARTER_TURN[a], up @ UP_AT_ZERO[a])))
         return face - self.sense * self.zero_deg
 
 
-def stated_bench(entry: RecordingFile | None, table: Table, axis: str) -> Bench:
+def stated_bench(entry: RecordingFile | None, table: Table, axis: str) -> TurnMounting:
     """Return the mounting that a recording's entry in the procedure states; the table states sense and zero else."""
     if entry is None:
-        return Bench(axis, usual_up(axis), table.sense, table.zero_deg)
+        return TurnMounting(axis, usual_up(axis), table.sense, table.zero_deg)
     sense = table.sense if entry.sense is None else entry.sense
     zero_deg = table.zero_deg if entry.zero_deg is None else entry.zero_deg
-    return Bench(axis, entry.up or usual_up(axis), sense, zero_deg)
+    return TurnMounting(axis, entry.up or usual_up(axis), sense, zero_deg)
 
 
-def found_bench(fit: TurnFit, axis: str) -> Bench | None:
+def found_bench(fit: TurnFit, axis: str) -> TurnMounting | None:
     """Return the mounting by gravity in a turn about a known level axis; None where gravity does not determine it."""
     if fit.gravity is None or fit.turn_axis is None:
         return None
@@ -129,18 +129,18 @@ def found_bench(fit: TurnFit, axis: str) -> Bench | None:
 
 def angle_ahead(axis: int, p: Values, q: Values) -> float:
     """Return the angle of the rotation that turns u and u x a onto p and q with least squares, deg."""
-    up, across = UP_AT_ZERO[axis], ACROSS[axis]
+    up, across = UP_AT_ZERO[axis], UP_AT_QUARTER_TURN[axis]
     return float(np.degrees(np.arctan2(p @ across - q @ up, p @ up + q @ across)))
 
 
-def bench_of(axis: str, sense: int, at_zero: float) -> Bench:
+def bench_of(axis: str, sense: int, at_zero: float) -> TurnMounting:
     """Return the mounting with the smallest zero; ``at_zero``: the convention's angle at logged angle 0, deg."""
     a, face = AXES.index(axis), 90.0 * round(at_zero / 90.0)
-    up = nearest_axis(np.cos(np.radians(face)) * UP_AT_ZERO[a] + np.sin(np.radians(face)) * ACROSS[a])
-    return Bench(axis, up, sense, sense * (face - at_zero))
+    up = nearest_axis(np.cos(np.radians(face)) * UP_AT_ZERO[a] + np.sin(np.radians(face)) * UP_AT_QUARTER_TURN[a])
+    return TurnMounting(axis, up, sense, sense * (face - at_zero))
 
 
-def off_at_rest(recording: Recording, bench: Bench) -> float:
+def off_at_rest(recording: Recording, bench: TurnMounting) -> float:
     """Return by how much gravity at rest is ahead of the stated mounting, deg; 0 where the table never rests.
 
     Where all rests are at one angle, a bias of 0.1 g changes it by 6 deg.
@@ -149,19 +149,19 @@ def off_at_rest(recording: Recording, bench: Bench) -> float:
     if angle is None or force is None:
         return 0.0
     still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.valid
-    if np.sum(still) < FEWEST:
+    if np.sum(still) < MIN_ANGLE_SAMPLES:
         return 0.0
     A = np.radians(bench.sense * angle[still] + bench.offset)
     return angle_ahead(AXES.index(bench.axis), np.cos(A) @ force[still], np.sin(A) @ force[still])
 
 
-def by_convention(fit: TurnFit, bench: Bench) -> Gravity | None:
+def by_convention(fit: TurnFit, bench: TurnMounting) -> FittedGravity | None:
     """Return c, p and q against the convention's angle; None where gravity does not turn or was not fitted."""
     if fit.gravity is None or bench.vertical or fit.vertical is not None:
         return None
     c, s = np.cos(np.radians(bench.offset)), np.sin(np.radians(bench.offset))
     constant, cosine, sine = fit.gravity
-    return Gravity(constant, c * cosine - bench.sense * s * sine, s * cosine + bench.sense * c * sine)
+    return FittedGravity(constant, c * cosine - bench.sense * s * sine, s * cosine + bench.sense * c * sine)
 
 
 def usual_up(axis: str) -> str:
@@ -190,7 +190,7 @@ def unit(vector: Values) -> Values:
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))
 
 
-class Gravity(NamedTuple):
+class FittedGravity(NamedTuple):
     """The fitted c, p and q: (3,) arrays, g."""
 
     constant: Values
@@ -202,7 +202,7 @@ class Gravity(NamedTuple):
 class TurnFit:
     """What gravity and gyroscope show of the mounting in one turn."""
 
-    gravity: Gravity | None  # None where the angle covers too little
+    gravity: FittedGravity | None  # None where the angle covers too little
     gain: Values | None  # k, (3,) array; None where no axis follows the rate
     mean_rate: float = 0.0  # deg/s, of the angle over the samples; times a time offset it adds to the zero
     arc: float = 0.0  # deg
@@ -250,15 +250,15 @@ def fit_turn(recording: Recording) -> TurnFit:
     inverse = np.linalg.pinv(products[:m, :m], rcond=SMALLEST_SHARE, hermitian=True)
     reduced = products[m:, m:] - products[m:, :m] @ inverse @ products[:m, m:]
     normal = reduced[:2, :2]
-    if len(A) < FEWEST or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
+    if len(A) < MIN_ANGLE_SAMPLES or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
         return TurnFit(None, gain, mean_rate, arc, f"the table angle covers {arc:.3g} deg only")
     p_and_q = np.linalg.solve(normal, reduced[:2, 2:])
     variance = np.diag(reduced[2:, 2:] - reduced[2:, :2] @ p_and_q) / len(A)
     scatter = float(np.sqrt(np.max(variance.clip(0.0)) * np.max(np.diag(np.linalg.inv(normal)))))
-    if scatter > LARGEST_UNCERTAINTY:
+    if scatter > MAX_DIRECTION_UNCERTAINTY_G:
         return TurnFit(None, gain, mean_rate, arc, "the accelerometer does not follow the table angle")
     constant = np.mean(reading, axis=0) - np.mean(columns[:, m : m + 2], axis=0) @ p_and_q
-    return TurnFit(Gravity(constant, *p_and_q), gain, mean_rate, arc)
+    return TurnFit(FittedGravity(constant, *p_and_q), gain, mean_rate, arc)
 
 
 def _gain(recording: Recording, rate: Values | None) -> Values | None:
@@ -271,12 +271,12 @@ def _gain(recording: Recording, rate: Values | None) -> Values | None:
     if changing:
         rate, gyro = rate - np.mean(rate), gyro - np.mean(gyro, axis=0)
     power = float(rate @ rate)
-    if power <= len(rate) * (SLOWEST_DPS if changing else LARGEST_BIAS_DPS) ** 2:
+    if power <= len(rate) * (MIN_FOLLOWED_RATE_DPS if changing else LARGEST_BIAS_DPS) ** 2:
         return None
     gain = rate @ gyro / power
     largest = int(np.argmax(np.abs(gain)))
     alike = abs(gain[largest]) * np.sqrt(power / max(float(gyro[:, largest] @ gyro[:, largest]), 1e-30))
-    return np.asarray(gain) if alike >= ALIKE else None
+    return np.asarray(gain) if alike >= MIN_GAIN_CORRELATION else None
 
 
 def check_frames(
@@ -313,7 +313,7 @@ def check_frames_by_hand(recording: Recording, maps: Mapping[str, Sequence[str]]
     """Refuse rests and moves by hand in which the gyroscope's rates rotate gravity only with other axes."""
     if recording.accelerometer is None or recording.gyroscope is None:
         return
-    part = slice(0, MOST_SAMPLES)
+    part = slice(0, MAX_ROTATION_SAMPLES)
     moves = moves_of(recording.accelerometer[part], recording.gyroscope[part], recording.time[part])
     contradiction = other_axes(moves)
     if contradiction is None:
@@ -327,13 +327,13 @@ def check_frames_by_hand(recording: Recording, maps: Mapping[str, Sequence[str]]
     )
 
 
-def other_axes(moves: Sequence[Move]) -> tuple[str, Values | None] | None:
+def other_axes(moves: Sequence[MoveByHand]) -> tuple[str, Values | None] | None:
     """Return the evidence that only other axes rotate gravity rightly, and D if one alone does; None without it."""
 
     def missed(D: Values) -> int:
         return int(np.sum(misfits_deg([replace(m, turns=m.turns @ D.T) for m in moves], [1.0]) > FAILS_DEG))
 
-    as_read = missed(np.eye(3)) if len(moves) >= FEWEST_MOVES else 0
+    as_read = missed(np.eye(3)) if len(moves) >= MIN_MEDIAN_MOVES else 0
     if as_read < FEWEST_MISSED:
         return None
     permutations = signed_permutations()

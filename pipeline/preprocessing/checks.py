@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.quality_flags import BY_CHANCE
+from pipeline.io.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.io.units import TRIADS
 from pipeline.model.kinematics import normal_gravity_g
 from pipeline.preprocessing.at_rest import check_axes, check_static
@@ -39,10 +39,10 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Recording
     from pipeline.settings import Settings, Table
 
-FEWEST, APART = 20, 8  # rows, see above
-STEPS = "N-RESOLUTION"
+MIN_STEP_ROWS, APART = 20, 8  # rows, see above
+RESOLUTION_NOTE = "N-RESOLUTION"
 SAME_STEP = 1e-6  # relative: rounding of a difference of decimals
-DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
+MAX_SIGNIFICANT_DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
 SAME_GRAVITY_G = 1e-4  # gravity changes by as much over 0.3 km of height
 OF_DECIMALS = 200  # samples that determine the decimals: a finer reading ends in a zero in a tenth of them
 MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
@@ -79,14 +79,17 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
         steps = coarse_steps([np.asarray(recordings[k].reading(sensor)) for k in own])
         for step in np.unique(steps[steps > 0.0]):
             axes = ", ".join(name for name, s in zip(TRIADS[sensor], steps, strict=True) if s == step)
-            digits = next((f", {d} decimal{'s' * (d != 1)}," for d in range(DIGITS) if _is_whole(step * 10.0**d)), "")
+            digits = next(
+                (f", {d} decimal{'s' * (d != 1)}," for d in range(MAX_SIGNIFICANT_DIGITS) if _is_whole(step * 10.0**d)),
+                "",
+            )
             detail = (
                 f"{axes}: steps of {step:.3g} {SENSOR_UNITS[sensor]}{digits} and noise of less than half a step: "
                 f"means are off by up to {0.5 * step:.3g} {SENSOR_UNITS[sensor]}, however long the recording, and "
                 "effects of this size cannot be distinguished from rounding. Log more digits, or set a smaller range"
             )
             first = noted[own[0]]
-            noted[own[0]] = replace(first, notes=(*first.notes, Note(STEPS, first.samples, 0, 0, detail)))
+            noted[own[0]] = replace(first, notes=(*first.notes, Note(RESOLUTION_NOTE, first.samples, 0, 0, detail)))
     return noted
 
 
@@ -129,13 +132,17 @@ def _check_shared_rows(recordings: Sequence[Recording]) -> None:
 
 
 def _decimals(recording: Recording) -> tuple[int, ...]:
-    """Return the decimals of each sensor's readings, by its first samples; ``DIGITS`` for an absent sensor."""
+    """Return the decimals of each sensor's readings; ``MAX_SIGNIFICANT_DIGITS`` for an absent sensor."""
     decimals = []
     for sensor in SENSORS:
         reading = recording.reading(sensor)
         part = np.zeros(0) if reading is None else reading[:OF_DECIMALS][np.isfinite(reading[:OF_DECIMALS]).all(axis=1)]
-        exact = (d for d in range(1, DIGITS) if part.size and np.all(np.abs(part - np.round(part, d)) < 10.0**-DIGITS))
-        decimals.append(next(exact, DIGITS))
+        exact = (
+            d
+            for d in range(1, MAX_SIGNIFICANT_DIGITS)
+            if part.size and np.all(np.abs(part - np.round(part, d)) < 10.0**-MAX_SIGNIFICANT_DIGITS)
+        )
+        decimals.append(next(exact, MAX_SIGNIFICANT_DIGITS))
     return tuple(decimals)
 
 
@@ -148,14 +155,14 @@ def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:
     order = np.argsort(value, kind="stable")  # equal rows next to each other, in the order of recordings
     value, owner, row = value[order], owner[order], row[order]
     same = value[1:] == value[:-1]
-    if np.count_nonzero(same) < FEWEST - 1:
+    if np.count_nonzero(same) < MIN_STEP_ROWS - 1:
         return
     within = same & (owner[1:] == owner[:-1])
     single = ~(np.append(within, False) | np.append(False, within))  # rows that occur once in their recording
     value, owner, row = value[single], owner[single], row[single]
     for step in range(1, len(keys)):  # a row may be in several recordings: a pair of it is up to n - 1 places apart
         twin = np.flatnonzero(value[step:] == value[:-step])
-        if twin.size < FEWEST:
+        if twin.size < MIN_STEP_ROWS:
             break
         pairs = owner[twin] * len(keys) + owner[twin + step]
         for pair in np.unique(pairs):
@@ -188,7 +195,7 @@ def _check_pair(one: Recording, two: Recording, first: Index, second: Index) -> 
     best = int(np.argmax(lengths))
     count = int(lengths[best])
     chance = APART * common / longest
-    if count < FEWEST or (count < common / 2 and chance < 1.0 and chance ** (count - 1) > BY_CHANCE):
+    if count < MIN_STEP_ROWS or (count < common / 2 and chance < 1.0 and chance ** (count - 1) > EXPECTED_CHANCE_RUNS):
         return
     a, b = int(edges[2 * best]), int(edges[2 * best + 1])
     late, early = (two, one) if two.role == "validation" or one.role != "validation" else (one, two)

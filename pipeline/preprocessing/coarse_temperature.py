@@ -25,16 +25,20 @@ if TYPE_CHECKING:
     from pipeline.records import Recording, Values
 
 CELL_S = 10.0  # between the nodes of T, a line between them: of 5 degC with theta = 300 s it misses 1e-3 degC
-QUARTERS = 4  # parts of a cell; equal readings in a part become one
-MOST_NODES = 4000  # 11 h; a longer log is left as it is
+CELL_PARTS = 4  # parts of a cell; equal readings in a part become one
+MAX_TEMPERATURE_NODES = 4000  # 11 h; a longer log is left as it is
 ONE_STEP = 0.99  # least share of the changes that are of one step: larger noise dithers the steps, and averages out
-NOISES = (0.02, 0.04, 0.07, 0.12, 0.2)  # s over h
-DENSITIES = tuple(10.0 ** np.arange(-12.0, -3.0))  # lambda, degC^2 / s^3: 0.03 to 30 degC in an hour
-SETTLING_S = (None, *np.geomspace(50.0, 1600.0, 21))  # theta: of packages on boards to that of housings
+NOISE_GRID = (0.02, 0.04, 0.07, 0.12, 0.2)  # s over h
+DRIFT_DENSITIES = tuple(10.0 ** np.arange(-12.0, -3.0))  # lambda, degC^2 / s^3: 0.03 to 30 degC in an hour
+THERMAL_TIME_CONSTANTS_S = (None, *np.geomspace(50.0, 1600.0, 21))  # theta: of packages on boards to that of housings
 AMPLITUDE_DEGC = 10.0  # standard deviation of c and of the level, about the mean
 FEWEST_CHANGES = 2  # of the reading: without them nothing is known between the steps
-ROUNDS, SETTLED, LEAST_SHARE = 40, 1e-3, 1e-3  # of Newton's method; change of the log posterior; share of a step
-ROUNDING = 1e-12  # relative: some thousand roundings of a double
+MAX_NEWTON_ITERATIONS, SETTLED_LOG_POSTERIOR, MIN_STEP_SHARE = (
+    40,
+    1e-3,
+    1e-3,
+)  # of Newton's method; change of the log posterior; share of a step
+DOUBLE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
 
 
 def refined(recordings: Sequence[Recording]) -> list[Recording]:
@@ -44,7 +48,7 @@ def refined(recordings: Sequence[Recording]) -> list[Recording]:
     if step == 0.0 or len(known) < len(recordings) or not all(r.clock_shared for r in known):
         return list(recordings)
     first = min(float(r.time[0]) for r in known)
-    if max(float(r.time[-1]) for r in known) - first > MOST_NODES * CELL_S:
+    if max(float(r.time[-1]) for r in known) - first > MAX_TEMPERATURE_NODES * CELL_S:
         return list(recordings)
     time, reading = (np.concatenate([getattr(r, name) for r in known]) for name in ("time", "temperature"))
     curve = _Curve(time - first, reading, step).best()
@@ -74,7 +78,7 @@ class _Curve:
 
     def __init__(self, time: Values, reading: Values, step: float) -> None:
         place, self.mean, self.step = time / CELL_S, float(reading.mean()), step
-        keys = np.stack([np.floor(place * QUARTERS), np.rint(reading / step)], axis=1)
+        keys = np.stack([np.floor(place * CELL_PARTS), np.rint(reading / step)], axis=1)
         _, inverse, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
         place, value = (np.bincount(inverse.ravel(), v) / count for v in (place, reading - self.mean))
         self.value, self.count, self.k = value, count.astype(float), place.astype(int)
@@ -85,13 +89,13 @@ class _Curve:
 
     def best(self) -> Values:
         """Return T at the nodes with the most probable noise, density and time of settling, by cyclic search."""
-        noise, density, settling, before = NOISES[2], DENSITIES[4], SETTLING_S[12], None
+        noise, density, settling, before = NOISE_GRID[2], DRIFT_DENSITIES[4], THERMAL_TIME_CONSTANTS_S[12], None
         while (noise, density, settling) != before:
             before = noise, density, settling
-            pairs = [(d, s) for d in DENSITIES for s in dict.fromkeys([settling, *SETTLING_S[::4]])]
+            pairs = [(d, s) for d in DRIFT_DENSITIES for s in dict.fromkeys([settling, *THERMAL_TIME_CONSTANTS_S[::4]])]
             density, settling = max(pairs, key=lambda pair: self._evidence(noise, *pair))
-            settling = max(SETTLING_S, key=lambda each: self._evidence(noise, density, each))
-            noise = max(NOISES, key=lambda each: self._evidence(each, density, settling))
+            settling = max(THERMAL_TIME_CONSTANTS_S, key=lambda each: self._evidence(noise, density, each))
+            noise = max(NOISE_GRID, key=lambda each: self._evidence(each, density, settling))
         return self.mean + self.known[noise, density, settling][1]
 
     def _evidence(self, *key: Any) -> float:  # noqa: ANN401
@@ -118,7 +122,7 @@ class _Curve:
         m, c = self.last
         gained = float("inf")
         value, first, second = objective(m, c)
-        for _ in range(ROUNDS):
+        for _ in range(MAX_NEWTON_ITERATIONS):
             band, (left, right) = prior.copy(), self.shares
             band[0] += np.bincount(self.k, second * left**2, n) + np.bincount(self.k + 1, second * right**2, n)
             band[1] += np.bincount(self.k, second * left * right, n)
@@ -130,9 +134,9 @@ class _Curve:
             to_c = float(first @ at_decay - least * c - cross @ solved[:, 0]) / of_c
             to_m: Values = solved[:, 0] - to_c * solved[:, 1]
             share = 1.0
-            if gained < SETTLED:
+            if gained < SETTLED_LOG_POSTERIOR:
                 break
-            while (new := objective(m + share * to_m, c + share * to_c))[0] < value and share > LEAST_SHARE:
+            while (new := objective(m + share * to_m, c + share * to_c))[0] < value and share > MIN_STEP_SHARE:
                 share *= 0.5
             gained = new[0] - value
             if gained > 0.0:
@@ -158,7 +162,7 @@ class _Curve:
         above = a > 0.0  # there the other tail, in which the difference keeps its digits
         a, b = np.where(above, -b, a), np.where(above, -a, b)
         low, high = log_ndtr(a), log_ndtr(b)
-        log = high + np.log1p(-np.exp(np.minimum(low - high, -ROUNDING)))
+        log = high + np.log1p(-np.exp(np.minimum(low - high, -DOUBLE_ROUNDING)))
         at_a, at_b = (np.exp(-0.5 * x * x - 0.5 * np.log(2.0 * np.pi) - log) for x in (a, b))
         first = (at_a - at_b) / noise
         second = np.maximum((at_b * b - at_a * a) / noise**2 + first**2, 0.0)

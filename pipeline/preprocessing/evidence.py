@@ -34,7 +34,7 @@ LEAST_RATE_DPS = 1.0  # change of a rate from which it determines the gyroscope'
 
 
 @dataclass(frozen=True)
-class Limits:
+class ChannelLimits:
     """How much an effect of the catalogue may make channels differ, and the names of channels in the files."""
 
     late_s: float  # time_offset and low_pass_lag
@@ -48,7 +48,7 @@ class Limits:
     columns: Mapping[str, Any]  # ingest.csv.columns
 
     @classmethod
-    def of(cls, settings: Settings) -> Limits:
+    def of(cls, settings: Settings) -> ChannelLimits:
         """Return the limits by sensor model, table and ingest profile; those that are not stated are 0."""
         effects = [settings.sensor.of(s).effects for s in SENSORS]
         gyroscope = settings.sensor.gyroscope

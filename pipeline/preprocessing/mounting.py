@@ -18,7 +18,7 @@ from pipeline.errors import IngestError
 from pipeline.io.channel_table import STRAIGHT, axis_maps, axis_matrix
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.preprocessing.bench import (
-    ACROSS,
+    UP_AT_QUARTER_TURN,
     as_map,
     bench_of,
     by_convention,
@@ -40,7 +40,7 @@ from pipeline.records import AXES, Note, level_in_body
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.preprocessing.bench import Bench, TurnFit
+    from pipeline.preprocessing.bench import TurnFit, TurnMounting
     from pipeline.records import Recording, Values
     from pipeline.settings import Procedure, Sensor, Settings, Table
 
@@ -52,13 +52,13 @@ UNLIKE = 0.5  # gain of the stated axis over the largest one, below which the un
 
 
 @dataclass(frozen=True)
-class Turn:
+class TurnRecording:
     """A turn recording, its stated mounting and the one by gravity."""
 
     recording: Recording
-    stated: Bench
+    stated: TurnMounting
     fit: TurnFit
-    found: Bench | None  # None where gravity does not determine it
+    found: TurnMounting | None  # None where gravity does not determine it
     configurable: bool  # whether the procedure has an entry of the recording's name
     tolerance_deg: float  # of the zero
 
@@ -72,11 +72,11 @@ class Turn:
 class _Departure:
     """A difference between the mounting of a turn and the stated one."""
 
-    turn: Turn
+    turn: TurnRecording
     code: str  # of the refusal
     problem: str
     settings: dict[str, str]  # that describe the mounting, by the key below the recording's entry in the procedure
-    bench: Bench | None = None  # the mounting by gravity, which is applied; None: the turn is refused
+    bench: TurnMounting | None = None  # the mounting by gravity, which is applied; None: the turn is refused
 
 
 def check_mounting(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:
@@ -139,7 +139,7 @@ def _turns(
     table: Table,
     sensor: Sensor,
     tolerance: float,
-) -> list[Turn]:
+) -> list[TurnRecording]:
     # Largest plausible time offset, which adds to the zero of turns in one direction.
     offset_s = sensor.accelerometer.effects.get("time_offset", TIME_OFFSET_S)
     # Three relative standard deviations of what a table without encoders loses, over half of the arc.
@@ -149,11 +149,13 @@ def _turns(
         if r.axis is not None and not (r.table_angle is None and r.table_rate is None):
             stated, fit = stated_bench(procedure.recordings.get(r.name), table, r.axis), fit_turn(r)
             of_zero = tolerance + offset_s * abs(fit.mean_rate) + lost * fit.arc
-            turns.append(Turn(r, stated, fit, found_bench(fit, r.axis), r.name in procedure.recordings, of_zero))
+            turns.append(
+                TurnRecording(r, stated, fit, found_bench(fit, r.axis), r.name in procedure.recordings, of_zero)
+            )
     return turns
 
 
-def _accelerometer_axes(turns: Sequence[Turn]) -> Values | None:
+def _accelerometer_axes(turns: Sequence[TurnRecording]) -> Values | None:
     """Return M_a, the signed permutation from the stated faces to the accelerometer's readings; None without one."""
     total, count = np.zeros((3, 3)), np.zeros(3)
     pairs = []
@@ -162,7 +164,7 @@ def _accelerometer_axes(turns: Sequence[Turn]) -> Values | None:
         if gravity is None:
             continue
         a = AXES.index(turn.stated.axis)
-        for reading, true in ((gravity.cosine, UP_AT_ZERO[a]), (gravity.sine, ACROSS[a])):
+        for reading, true in ((gravity.cosine, UP_AT_ZERO[a]), (gravity.sine, UP_AT_QUARTER_TURN[a])):
             total += np.outer(reading, true)
             count += np.abs(true)
             pairs.append((reading, true))
@@ -235,7 +237,7 @@ def _turned_attitude(recording: Recording) -> Recording:
     return replace(recording, table_attitude=np.asarray(attitude, np.float64), notes=(*recording.notes, note))
 
 
-def _negated(turns: Sequence[Turn], tolerance: float) -> bool:
+def _negated(turns: Sequence[TurnRecording], tolerance: float) -> bool:
     """Return whether each turn shows the opposite face at the stated zero, as with a negated accelerometer.
 
     A unit that is turned over shows the opposite sense about one or two of the three axes; with a negated accelerometer
@@ -252,7 +254,9 @@ def _negated(turns: Sequence[Turn], tolerance: float) -> bool:
     return opposite and len({f.sense * s.sense for f, s in found if f is not None}) == 1
 
 
-def _applied(turn: Turn, doubt: Note | None, as_found: str, ways: tuple[tuple[str, ...], ...] = ()) -> Recording:
+def _applied(
+    turn: TurnRecording, doubt: Note | None, as_found: str, ways: tuple[tuple[str, ...], ...] = ()
+) -> Recording:
     """Return the recording with angle and rate by the convention, with notes on that and its doubt.
 
     ``as_found``: the difference from the stated mounting and the hint; empty where the stated one is applied. ``ways``:
@@ -285,7 +289,7 @@ def _applied(turn: Turn, doubt: Note | None, as_found: str, ways: tuple[tuple[st
     )
 
 
-def words(bench: Bench) -> str:
+def words(bench: TurnMounting) -> str:
     """Return a mounting in words."""
     hand = "right" if bench.sense > 0 else "left"
     return (
@@ -294,7 +298,7 @@ def words(bench: Bench) -> str:
     )
 
 
-def _departure(turn: Turn, tolerance: float) -> _Departure | None:
+def _departure(turn: TurnRecording, tolerance: float) -> _Departure | None:
     """Return the difference between the mounting of a turn and the stated one, or None."""
     if turn.fit.vertical is not None or turn.stated.vertical:
         return _vertical(turn) or _gyroscope_sense(turn)
@@ -303,7 +307,7 @@ def _departure(turn: Turn, tolerance: float) -> _Departure | None:
     )
 
 
-def _axis(turn: Turn, tolerance: float) -> _Departure | None:
+def _axis(turn: TurnRecording, tolerance: float) -> _Departure | None:
     """Return the difference of the turn axis."""
     axis, fit, name = turn.stated.axis, turn.fit, turn.name
     direction = fit.turn_axis if fit.turn_axis is not None else fit.gain
@@ -327,7 +331,7 @@ def _axis(turn: Turn, tolerance: float) -> _Departure | None:
     return None
 
 
-def _gyroscope_sense(turn: Turn) -> _Departure | None:
+def _gyroscope_sense(turn: TurnRecording) -> _Departure | None:
     axis, gain = turn.stated.axis, turn.fit.gain
     if gain is None or gain[AXES.index(axis)] * turn.stated.sense > 0.0:
         return None
@@ -335,7 +339,7 @@ def _gyroscope_sense(turn: Turn) -> _Departure | None:
     return _Departure(turn, "wrong_sense", problem, {"sense": str(-turn.stated.sense)})
 
 
-def _face(turn: Turn, found: Bench, tolerance: float) -> _Departure | None:
+def _face(turn: TurnRecording, found: TurnMounting, tolerance: float) -> _Departure | None:
     """Return the difference of sense, upward face or zero."""
     stated, allowed = turn.stated, turn.tolerance_deg
     off = (found.offset - stated.offset + 180.0) % 360.0 - 180.0
@@ -355,7 +359,7 @@ def _face(turn: Turn, found: Bench, tolerance: float) -> _Departure | None:
     return _Departure(turn, code, problem, _differing(found, stated, tolerance), found)
 
 
-def _differing(found: Bench, stated: Bench, tolerance: float) -> dict[str, str]:
+def _differing(found: TurnMounting, stated: TurnMounting, tolerance: float) -> dict[str, str]:
     """Return the settings by which the mounting by gravity differs from the stated one."""
     settings = {} if found.up == stated.up else {"up": found.up}
     settings |= {} if found.sense == stated.sense else {"sense": f"{found.sense}"}
@@ -364,7 +368,7 @@ def _differing(found: Bench, stated: Bench, tolerance: float) -> dict[str, str]:
     )
 
 
-def _vertical(turn: Turn) -> _Departure | None:
+def _vertical(turn: TurnRecording) -> _Departure | None:
     """Return the difference of a turn whose axis is vertical or stated to be vertical."""
     stated, fit, name = turn.stated, turn.fit, turn.name
     if fit.gravity is None:

@@ -30,7 +30,7 @@ import numpy as np
 from pipeline.preprocessing.evidence import (
     LEAST_RATE_DPS,
     OPPOSITE,
-    Limits,
+    ChannelLimits,
     alike,
     axis_index,
     gravity_turned,
@@ -43,7 +43,7 @@ from pipeline.preprocessing.evidence import (
     refusal,
     spin,
 )
-from pipeline.preprocessing.reference_rows import Comparison
+from pipeline.preprocessing.reference_rows import ChannelComparison
 from pipeline.preprocessing.reference_scale import (
     check_intervals,
     check_scale_of_motion,
@@ -61,17 +61,19 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
 
 
-FEWEST = 32  # samples, two short stretches
-HALF = 0.5  # of the usual gain, which the axis turned about reaches; of an interval, between its end and its mean
-SAME = 0.1  # relative difference between gains of one gyroscope in two turns
+MIN_REFERENCE_SAMPLES = 32  # samples, two short stretches
+MIN_SHARE_OF_USUAL_GAIN = (
+    0.5  # of the usual gain, which the axis turned about reaches; of an interval, between its end and its mean
+)
+SAME_GAIN = 0.1  # relative difference between gains of one gyroscope in two turns
 FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
-FINEST_S = 0.05  # step in which delays are tried; a parabola finds what lies between
+DELAY_STEP_S = 0.05  # step in which delays are tried; a parabola finds what lies between
 CLOCKS = 4001  # rates of the clock that are tried: 5 us in 1 s where it may be off by 1 %
 RESTING = 0.01  # of the fastest rate of a turn, below which the table rests
 QUARTER = 0.25  # of an interval, within which a delay between samples is known
 BETTER = 0.5  # share of the power of the difference of two signals below which they are alike
 NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
-SURE = 5.0  # standard deviations of the sum of squares that the ends of the window add
+SURE_END_DEVIATIONS = 5.0  # standard deviations of the sum of squares that the ends of the window add
 ALIGN = "align the table's log with the sensor's rows, or give it a separate time column (ingest=table_log)"
 
 
@@ -94,17 +96,17 @@ def check_turns(recordings: Sequence[Recording], settings: Settings) -> tuple[li
     Signs and directions are not compared: this check precedes that of the mounting, which wrong units would mislead.
     ``IngestError``: channels of a turn contradict each other by more than an effect of the catalogue explains.
     """
-    limits, turns = Limits.of(settings), _turns(recordings)
+    limits, turns = ChannelLimits.of(settings), _turns(recordings)
     for recording in turns:
         check_scale_of_turn(recording, limits)
-    check_intervals([r for r in recordings if r.samples >= FEWEST], limits)
+    check_intervals([r for r in recordings if r.samples >= MIN_REFERENCE_SAMPLES], limits)
     gyroscope = _Gyroscope(turns)
     found = {r.name: _check_turn(r, gyroscope, limits) for r in turns}
     return _with_notes(recordings, found), {name: delay for name, (_, delay) in found.items() if delay is not None}
 
 
 def _turns(recordings: Sequence[Recording]) -> list[Recording]:
-    logged = [r for r in recordings if r.samples >= FEWEST and r.role != "static"]
+    logged = [r for r in recordings if r.samples >= MIN_REFERENCE_SAMPLES and r.role != "static"]
     return [r for r in logged if r.axis is not None and not (r.table_rate is None and r.table_angle is None)]
 
 
@@ -114,8 +116,8 @@ def check_motion(recordings: Sequence[Recording], delays: Mapping[str, Delay], s
     ``recordings``: with their turns by the convention; ``delays``: of the sensor in them. ``IngestError``: channels of
     held-out motion contradict each other, or the delay of a recording contradicts those of the others.
     """
-    limits, gyroscope = Limits.of(settings), _Gyroscope(_turns(recordings))
-    logged = [r for r in recordings if r.samples >= FEWEST and r.role != "static"]
+    limits, gyroscope = ChannelLimits.of(settings), _Gyroscope(_turns(recordings))
+    logged = [r for r in recordings if r.samples >= MIN_REFERENCE_SAMPLES and r.role != "static"]
     moved = [r for r in logged if r.axis is None and not (r.table_rate is None and r.table_attitude is None)]
     for turn in (r for r in logged if r.axis is not None and r.table_angle is None and r.table_rate is None):
         _check_attitude_of_turn(turn, limits)
@@ -150,7 +152,7 @@ class _Gyroscope:
         self.usual = float(np.median(gains)) if len(gains) > 2 else 1.0
         self.matrix = self.usual * np.eye(3)
         for axis in range(3):
-            fitting = [f for f in found if f[0] == axis and abs(abs(f[2][axis]) / self.usual - 1.0) <= SAME]
+            fitting = [f for f in found if f[0] == axis and abs(abs(f[2][axis]) / self.usual - 1.0) <= SAME_GAIN]
             if fitting:
                 self.matrix[:, axis] = max(fitting, key=lambda f: f[1])[2]
         self.bias = np.median([bias for *_, bias in found], axis=0) if found else None
@@ -161,9 +163,9 @@ class _Gyroscope:
         if recording.gyroscope is None or rate is None or slopes is None:
             return None
         reading, gains = recording.gyroscope[:, axis], np.abs(slopes[0]) / self.usual
-        if abs(gains[axis] - 1.0) <= SAME:
+        if abs(gains[axis] - 1.0) <= SAME_GAIN:
             return np.asarray((reading - slopes[1, axis]) / slopes[0, axis])
-        if max(gains) > HALF > gains[axis]:
+        if max(gains) > MIN_SHARE_OF_USUAL_GAIN > gains[axis]:
             return None  # another axis turns: the check of the mounting decides
         gain = self.matrix[axis, axis]
         bias = np.median(reading - gain * rate) if self.bias is None else self.bias[axis]
@@ -189,7 +191,7 @@ def _slopes(recording: Recording) -> Values:
     return np.stack([gain, median(reading - gain * rate[:, None])])
 
 
-def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> tuple[list[Note], Delay | None]:
+def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: ChannelLimits) -> tuple[list[Note], Delay | None]:
     channels, axis = [*of_table(recording)], axis_index(recording)
     if any(alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels):
         rate, angle = (limits.column(recording, name) for name in ("table_rate", "table_angle"))
@@ -209,7 +211,9 @@ def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> 
     return notes, delay
 
 
-def _check_motion(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> tuple[list[Note], Delay | None]:
+def _check_motion(
+    recording: Recording, gyroscope: _Gyroscope, limits: ChannelLimits
+) -> tuple[list[Note], Delay | None]:
     vector = gyroscope.vector(recording)
     size = None if vector is None else np.linalg.norm(vector, axis=1)
     check_scale_of_motion(recording, size, limits)
@@ -222,7 +226,9 @@ def _check_motion(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -
     return found
 
 
-def _compare(recording: Recording, channels: Sequence[Channel], limits: Limits) -> tuple[list[Note], Delay | None]:
+def _compare(
+    recording: Recording, channels: Sequence[Channel], limits: ChannelLimits
+) -> tuple[list[Note], Delay | None]:
     """Compare each channel of the table's log with all others; return notes, and the delay of the sensor."""
     if len([c for c in channels if c.name != "gravity"]) < 2:
         return [], None
@@ -231,7 +237,7 @@ def _compare(recording: Recording, channels: Sequence[Channel], limits: Limits) 
     if late > limits.late_s:  # a clock that drifts: it adds nearly the same delay throughout the recording
         limits = replace(limits, late_s=late + limits.late_s)
     notes = []
-    for gross, note in filter(None, map(Comparison(recording, channels, limits).find, channels)):
+    for gross, note in filter(None, map(ChannelComparison(recording, channels, limits).find, channels)):
         if gross:
             hint = "correct or leave out these rows of the table's log, or record again"
             raise refusal(recording, "reference_contradiction", note.detail, hint)
@@ -239,20 +245,20 @@ def _compare(recording: Recording, channels: Sequence[Channel], limits: Limits) 
     return notes, delay
 
 
-def _check_attitude_of_turn(recording: Recording, limits: Limits) -> None:
+def _check_attitude_of_turn(recording: Recording, limits: ChannelLimits) -> None:
     """Compare the attitude of a turn without angle and rate with the gyroscope, whose bias is its median at rest."""
     if recording.table_attitude is None or recording.gyroscope is None:
         return
     speed = np.linalg.norm(spin(recording.table_attitude), axis=1) / np.diff(recording.time)
     fastest = float(quantiles(speed, 0.99)[0])
-    moving, resting = speed > HALF * fastest, speed < RESTING * fastest
-    if min(np.count_nonzero(moving), np.count_nonzero(resting)) >= FEWEST:
+    moving, resting = speed > MIN_SHARE_OF_USUAL_GAIN * fastest, speed < RESTING * fastest
+    if min(np.count_nonzero(moving), np.count_nonzero(resting)) >= MIN_REFERENCE_SAMPLES:
         vector = recording.gyroscope - median(recording.gyroscope[1:][resting])
         _check_directions(recording, recording.table_attitude, vector, limits, moving)
 
 
 def _check_directions(
-    recording: Recording, attitude: Values, vector: Values, limits: Limits, where: Mask | slice = slice(None)
+    recording: Recording, attitude: Values, vector: Values, limits: ChannelLimits, where: Mask | slice = slice(None)
 ) -> None:
     """Refuse an attitude whose rotation has another direction in the body than the gyroscope's."""
     logged = (spin(attitude) / np.diff(recording.time)[:, None])[where]
@@ -271,7 +277,7 @@ def _check_directions(
         )
 
 
-def _delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits) -> Delay | None:
+def _delay_of(recording: Recording, channels: Sequence[Channel], limits: ChannelLimits) -> Delay | None:
     """Return the delay of the sensor against the table's log; refuse a delay that no effect explains."""
     first, *others = (c for c in channels if c.name != "gravity")
     found = None
@@ -289,7 +295,7 @@ def _delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits)
             continue
         best, low, high = ((d - furthest) * step for d in interval)
         delay = Delay(best, low, high)
-        if abs(delay.nearest(0.0)) > max(allowed, HALF * step) + QUARTER * step:
+        if abs(delay.nearest(0.0)) > max(allowed, MIN_SHARE_OF_USUAL_GAIN * step) + QUARTER * step:
             raise refusal(
                 recording,
                 "reference_contradiction",
@@ -312,7 +318,7 @@ def _variances(fixed: Values, moved: Values) -> Values:
     return np.asarray(np.maximum(difference - (total[n:] - total[:-n]) ** 2 / n, rounding) / n)
 
 
-def _check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> None:
+def _check_delays(found: Sequence[tuple[Recording, Delay]], limits: ChannelLimits) -> None:
     """Refuse a recording whose delay contradicts the one offset and the one clock of a unit's recordings.
 
     For some tau and e with ``|tau| <= time_offset + low_pass_lag`` and ``|e| <= clock_rate``, ``tau + e t`` has to be
@@ -320,7 +326,7 @@ def _check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> N
     """
     if len(found) < 2 or not all(r.clock_shared for r, _ in found):
         return
-    known = QUARTER * np.array([max(r.interval, FINEST_S) for r, _ in found])
+    known = QUARTER * np.array([max(r.interval, DELAY_STEP_S) for r, _ in found])
     intervals = np.array([[r.time[0], r.time[-1], d.low, d.high] for r, d in found])
     intervals[:, 2:] += np.outer(known, [-1.0, 1.0])
     if _of_one_clock(intervals, limits):
@@ -339,7 +345,7 @@ def _check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> N
     )
 
 
-def _of_one_clock(intervals: Values, limits: Limits) -> bool:
+def _of_one_clock(intervals: Values, limits: ChannelLimits) -> bool:
     """Return whether one offset and one clock explain (r, 4) first and last times, least and largest delays, s."""
     start, end, low, high = intervals.T
     if max(low.max(), -limits.late_s) <= min(high.min(), limits.late_s):  # without any drift
@@ -355,7 +361,7 @@ def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[floa
     one, two = (c.low if c.of_intervals else 0.5 * (c.low[1:] + c.low[:-1]) for c in (first, other))
     known = np.isfinite(one) & np.isfinite(two)
     one, two = np.where(known, one, 0.0), np.where(known, two, 0.0)
-    size = max(1, int(FINEST_S / recording.interval))
+    size = max(1, int(DELAY_STEP_S / recording.interval))
     if size > 1:
         count = len(one) // size
         one, two = (v[: count * size].reshape(count, size).mean(axis=1) for v in (one, two))
@@ -370,7 +376,7 @@ def _interval(squares: Values, room: float, steps: int) -> tuple[float, float, f
     best = _nearest_minimum(squares, room)
     least = max(float(squares.min()), float(np.finfo(float).tiny))
     over = np.log(np.maximum(squares, least)) - np.log(least)  # their quotient may exceed the largest number
-    open_to = np.flatnonzero(steps * over <= SURE * np.sqrt(2.0 * len(squares)))
+    open_to = np.flatnonzero(steps * over <= SURE_END_DEVIATIONS * np.sqrt(2.0 * len(squares)))
     if open_to[0] == 0 and open_to[-1] == len(squares) - 1:
         return None
     return best, min(best, float(open_to[0])), max(best, float(open_to[-1]))

@@ -28,25 +28,25 @@ from pipeline.records import Note, median
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.preprocessing.evidence import Channel, Limits
+    from pipeline.preprocessing.evidence import Channel, ChannelLimits
     from pipeline.records import Index, Recording, Values
 
     Found = tuple[str, int, int, int]  # text with the places {name} and {names}; number of rows, first and last sample
 
 BY_NOISE = 10.0  # standard deviations, as of disturbances (pipeline.io.disturbances)
 BENDS = 3.0  # times the second difference: in a move as long as one interval, it is a quarter of the rate
-SHORT, LONG = 16, 12  # samples of a short stretch; long ones in a recording
-MANY = 20  # samples, more than a spike or a jump changes
+SHORT_STRETCH_SAMPLES, LONG_STRETCHES = 16, 12  # samples of a short stretch; long ones in a recording
+MANY_SAMPLES = 20  # samples, more than a spike or a jump changes
 RESOLVED_DEG = 1e-3  # of a logged angle: the tenth of a common encoder's 0.01 deg
 CURVED = 0.02  # relative error by nonlinearities of a gyroscope's gain that is fitted to the same turn
 OF_SENSOR = ("gyroscope", "gravity")
 PHASE = 0.2  # relative error of gravity's phase over some degrees: twice 0.1 g of bias
 
 
-class Comparison:
+class ChannelComparison:
     """The channels of one recording, compared with each other."""
 
-    def __init__(self, recording: Recording, channels: Sequence[Channel], limits: Limits) -> None:
+    def __init__(self, recording: Recording, channels: Sequence[Channel], limits: ChannelLimits) -> None:
         self.recording, self.channels, self.limits = recording, channels, limits
         self.dt = np.diff(recording.time)
         self.interval = float(median(self.dt))
@@ -101,11 +101,11 @@ class Comparison:
         if not rows.size:
             return None
         worst = int(np.argmax(least))
-        group = rows[np.abs(rows - worst) <= SHORT]
+        group = rows[np.abs(rows - worst) <= SHORT_STRETCH_SAMPLES]
         low = others[int(np.argmin([e[worst] for e in excess]))].low
         first, last = int(group[0]), int(group[-1]) + (1 if claim.of_intervals else 0)
         looks = "it looks like a spike or a jump"
-        if rows.size > MANY:
+        if rows.size > MANY_SAMPLES:
             looks = "does it follow this motion, or is it frozen, reversed in time, or of another recording?"
         text = (
             f"{{name}} {'turns at' if claim.of_intervals else 'is'} {claim.low[worst]:.4g} deg/s in "
@@ -116,7 +116,7 @@ class Comparison:
 
     def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Found | None:
         limits, n = self.limits, len(self.dt)
-        for size in sorted({SHORT, max(n // LONG, SHORT)}):
+        for size in sorted({SHORT_STRETCH_SAMPLES, max(n // LONG_STRETCHES, SHORT_STRETCH_SAMPLES)}):
             starts = np.arange(0, max(n - size // 2, 1), size)
             turned, total, bends, _ = self._sums(claim, size, starts)
             length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)

@@ -48,12 +48,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.errors import IngestError
-    from pipeline.preprocessing.evidence import Limits
+    from pipeline.preprocessing.evidence import ChannelLimits
     from pipeline.records import Mask, Recording, Values
 
     Units = Sequence[tuple[float, str]]
 
-BLOCKS = 96  # of a recording, so that each holds a part of a turn
+RATIO_BLOCKS = 96  # of a recording, so that each holds a part of a turn
 GRAVITY_TOLERANCE = 0.2  # of a ratio to the angle by gravity: two times 6 deg in 60
 WRONG_FACTORS = ((0.5, "is half of what it should be"), (2.0, "is twice what it should be"))
 UNITS = (
@@ -70,23 +70,34 @@ ANGLE_UNITS = (
     (1.0 / 360.0, "looks like turns declared as deg"),
     *WRONG_FACTORS,
 )
-TIMES = ((1e3, "ms declared as s"), (1e6, "us declared as s"), (1e9, "ns declared as s"), (1e-3, "s declared as ms"))
+TIME_UNIT_FACTORS = (
+    (1e3, "ms declared as s"),
+    (1e6, "us declared as s"),
+    (1e9, "ns declared as s"),
+    (1e-3, "s declared as ms"),
+)
 OTHER_AXIS = 0.5  # the axis that turns reads more than twice as much as one that leans by up to 26 deg
 LEAST_TOTAL_DEG = 1.0  # over a recording, for a ratio
-SPREAD = 0.2  # relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale
-EVEN = 1e-2  # relative change of a constant rate
-FEWEST = 10  # intervals at constant rate
+MAX_RATIO_SPREAD = (
+    0.2  # relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale
+)
+CONSTANT_RATE_CHANGE = 1e-2  # relative change of a constant rate
+MIN_STEADY_INTERVALS = 10  # intervals at constant rate
 MOSTLY_EVEN = 0.7  # of the angle that is turned
 WHOLE_TURN_DEG = 330.0  # of gravity's phase, from which its harmonics are distinguished from its slope
 ALIKE_SAMPLES = 64.0  # neighbours with correlated residuals, by which the variance of the slope is enlarged
-SIGNIFICANT = 6.0  # standard uncertainties, as in pipeline.signal.rests
+SIGNIFICANT_UNCERTAINTIES = 6.0  # standard uncertainties, as in pipeline.signal.rests
 QUARTZ = 2e-4  # relative: two quartz clocks of +-100 ppm each
 GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz, errors of its phase by lever arms
 SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, error of gravity's direction by an accelerometer's nonlinearities
-FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, ROUNDS = 200, 24, 4  # samples; blocks of a sandwich estimate; Gauss-Newton steps
+FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, GEAR_ITERATIONS = (
+    200,
+    24,
+    4,
+)  # samples; blocks of a sandwich estimate; Gauss-Newton steps
 CONVERGED = 1e-12  # relative step, far below the uncertainty of any ratio
 SHARES = np.arange(1, BLOCKS_OF_A_GEAR) / BLOCKS_OF_A_GEAR
-ALIKE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
+UNIT_FACTOR_TOLERANCE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
 
 
 class _Ratio(NamedTuple):
@@ -104,10 +115,10 @@ class _Ratio(NamedTuple):
     @property
     def of_time(self) -> bool:
         """Whether a wrong unit of the time explains it."""
-        return self.even and bool(_unit(self.value, TIMES))
+        return self.even and bool(_unit(self.value, TIME_UNIT_FACTORS))
 
 
-def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
+def check_scale_of_turn(recording: Recording, limits: ChannelLimits) -> None:
     """Refuse a turn in which angle, rate, gyroscope, gravity and time contradict each other in scale.
 
     A turn about another axis than the stated one is not compared: the check of the mounting follows.
@@ -159,7 +170,7 @@ def _turned(recording: Recording) -> tuple[Values | None, ...] | None:
     return tuple(map(_in_blocks, channels))
 
 
-def check_scale_of_motion(recording: Recording, size: Values | None, limits: Limits) -> None:
+def check_scale_of_motion(recording: Recording, size: Values | None, limits: ChannelLimits) -> None:
     """Refuse held-out motion whose rate, attitude and gyroscope (its calibrated ``size``) contradict each other."""
     found = {c.name: _in_blocks(c.turned) for c in of_table(recording)}
     rate, attitude = found.get("table_rate"), found.get("table_attitude")
@@ -184,7 +195,7 @@ def check_scale_of_motion(recording: Recording, size: Values | None, limits: Lim
     )
 
 
-def doubt_of_angle(recording: Recording, limits: Limits) -> str | None:
+def doubt_of_angle(recording: Recording, limits: ChannelLimits) -> str | None:
     """Return the doubt that a turn's angle differs from gravity's by a factor: an encoder's counts, a gear."""
     found = _gear(recording)
     if found is None:
@@ -192,7 +203,7 @@ def doubt_of_angle(recording: Recording, limits: Limits) -> str | None:
     ratio, spread = found
     assert recording.table_angle is not None  # noqa: S101
     allowed = limits.rate_stated + limits.angle_stated_deg / float(np.ptp(recording.table_angle)) + SAME_ANGLE
-    if abs(ratio - 1.0) <= allowed + SIGNIFICANT * spread:
+    if abs(ratio - 1.0) <= allowed + SIGNIFICANT_UNCERTAINTIES * spread:
         return None
     return (
         f"{limits.column(recording, 'table_angle')} turns {ratio:.6g} times as far as gravity does in the readings "
@@ -215,7 +226,7 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
     y = force[keep][:, [(axis + 1) % 3, (axis + 2) % 3]]
     a = logged = np.radians(angle[keep] - float(np.mean(angle[keep])))
     slope, late = np.gradient(w, t), (t - t[0]) / (t[-1] - t[0])
-    for _ in range(ROUNDS):
+    for _ in range(GEAR_ITERATIONS):
         c, s = np.cos(a), np.sin(a)
         columns = [np.ones_like(a), c, s, w * c, w * s, w * w, slope, late, late * late]
         columns += [f(k * a) for k in (2, 3) for f in (np.cos, np.sin)]
@@ -240,7 +251,7 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
     return float(logged @ logged / (a @ logged)), max(float(np.linalg.norm(scores)), white) / information
 
 
-def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
+def doubt_of_scale(recording: Recording, limits: ChannelLimits) -> str | None:
     """Return the doubt that a turn's rate differs from that of its angle, or of gravity, by a factor."""
     found = rate_against_angle(recording)
     if found is None:
@@ -248,7 +259,7 @@ def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
     ratio, spread, samples = found
     logged = recording.table_angle is not None
     against, least = (limits.column(recording, "table_angle"), QUARTZ) if logged else GRAVITY_TURNS
-    if abs(ratio - 1.0) <= limits.rate_stated + least + SIGNIFICANT * spread:
+    if abs(ratio - 1.0) <= limits.rate_stated + least + SIGNIFICANT_UNCERTAINTIES * spread:
         return None
     return (
         f"{limits.column(recording, 'table_rate')} is {ratio:.6g} times the rate at which {against} turns, over "
@@ -267,12 +278,12 @@ def rate_against_angle(recording: Recording) -> tuple[float, float, int] | None:
     if rate is None:
         return None
     dt = np.diff(recording.time)
-    even = np.abs(np.diff(rate)) <= EVEN * np.abs(rate[1:])
+    even = np.abs(np.diff(rate)) <= CONSTANT_RATE_CHANGE * np.abs(rate[1:])
     even &= (np.abs(rate[1:]) > LEAST_TOTAL_DEG) & ~gaps(recording)
     even[1:-1] &= even[2:] & even[:-2]  # two samples on either side of a short move's peak are equal by chance
     even[[0, -1]] = False
     samples = int(even.sum())
-    if samples < FEWEST:
+    if samples < MIN_STEADY_INTERVALS:
         return None
     if recording.table_angle is None:
         fit = _against_phase(recording, 0.5 * (rate[1:] + rate[:-1]) * dt, even)
@@ -297,13 +308,13 @@ def _against_phase(recording: Recording, steps: Values, even: Mask) -> tuple[flo
     return abs(float(x[0])), float(np.sqrt(variance * ALIKE_SAMPLES))
 
 
-def check_intervals(recordings: Sequence[Recording], limits: Limits) -> None:
+def check_intervals(recordings: Sequence[Recording], limits: ChannelLimits) -> None:
     """Refuse a recording whose interval differs from that of the unit's others as by a wrong unit of the time."""
     if len(recordings) < 3:
         return
     middle = float(np.median([r.interval for r in recordings]))
     for recording in recordings:
-        if what := _unit(recording.interval / middle, TIMES):
+        if what := _unit(recording.interval / middle, TIME_UNIT_FACTORS):
             raise refusal(
                 recording,
                 "reference_time",
@@ -317,7 +328,7 @@ def _in_blocks(turned: Values | None) -> Values | None:
     """Return the angle turned in each block of a recording: (96,) array, deg."""
     if turned is None:
         return None
-    starts = np.linspace(0, len(turned), min(BLOCKS, len(turned)), endpoint=False).astype(int)
+    starts = np.linspace(0, len(turned), min(RATIO_BLOCKS, len(turned)), endpoint=False).astype(int)
     return np.asarray(np.add.reduceat(turned, starts))
 
 
@@ -329,15 +340,15 @@ def _ratio(one: Values | None, other: Values | None) -> _Ratio | None:
     if not float(np.sum(np.minimum(size, largest_but(size, 10)))) > LEAST_TOTAL_DEG:
         return None
     low, middle, high = np.abs(ratio_quartiles(one, other, 10, 0.3))
-    return _Ratio(float(middle), bool(middle > 0.0 and abs(high - low) <= SPREAD * middle))
+    return _Ratio(float(middle), bool(middle > 0.0 and abs(high - low) <= MAX_RATIO_SPREAD * middle))
 
 
 def _unit(value: float, units: Units) -> str:
     """Return the wrong unit that explains a factor, in words; empty for none."""
-    return next((what for factor, what in units if abs(value / factor - 1.0) <= ALIKE), "")
+    return next((what for factor, what in units if abs(value / factor - 1.0) <= UNIT_FACTOR_TOLERANCE), "")
 
 
-def _wrong_angle(recording: Recording, limits: Limits, factor: float, against: str) -> IngestError:
+def _wrong_angle(recording: Recording, limits: ChannelLimits, factor: float, against: str) -> IngestError:
     what = _unit(factor, ANGLE_UNITS) or f"is {factor:.4g} times what it should be"
     message = (
         f"{limits.column(recording, 'table_angle')} {what}: over {place(recording, 0, recording.samples - 1)} it turns "
@@ -346,7 +357,9 @@ def _wrong_angle(recording: Recording, limits: Limits, factor: float, against: s
     return refusal(recording, "reference_scale", message, "correct ingest.csv.columns.table_angle.unit")
 
 
-def _wrong_rate(recording: Recording, limits: Limits, ratio: _Ratio, against: str, *, gyro_agrees: bool) -> IngestError:
+def _wrong_rate(
+    recording: Recording, limits: ChannelLimits, ratio: _Ratio, against: str, *, gyro_agrees: bool
+) -> IngestError:
     """Return the refusal of the table's rate, or of the time or both rates if the gyroscope agrees with it."""
     if gyro_agrees and ratio.of_time:
         return _wrong_time(recording, limits, ratio, "the table's rate sums up to")
@@ -360,8 +373,8 @@ def _wrong_rate(recording: Recording, limits: Limits, ratio: _Ratio, against: st
     return refusal(recording, "reference_scale", f"{name} {what}: over {whole} {seen}", f"correct {keys}")
 
 
-def _wrong_time(recording: Recording, limits: Limits, ratio: _Ratio, seen: str) -> IngestError:
-    name, what = limits.column(recording, "time"), _unit(ratio.value, TIMES)
+def _wrong_time(recording: Recording, limits: ChannelLimits, ratio: _Ratio, seen: str) -> IngestError:
+    name, what = limits.column(recording, "time"), _unit(ratio.value, TIME_UNIT_FACTORS)
     return refusal(
         recording,
         "reference_time",

@@ -30,14 +30,14 @@ import numpy as np
 
 from pipeline.model.effects import effect
 from pipeline.model.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
-from pipeline.preprocessing.bench import ACROSS, angle_ahead, by_convention, unit
+from pipeline.preprocessing.bench import UP_AT_QUARTER_TURN, angle_ahead, by_convention, unit
 from pipeline.records import AFTER_BASE, AXES, BASE_COUNT, MATRIX_NAMES, Note, motion_at_rest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.preprocessing.bench import Bench, Gravity
-    from pipeline.preprocessing.mounting import Turn
+    from pipeline.preprocessing.bench import FittedGravity, TurnMounting
+    from pipeline.preprocessing.mounting import TurnRecording
     from pipeline.records import Values
     from pipeline.settings import Sensor, Table
 
@@ -47,24 +47,27 @@ SMALLEST_DEG = 0.3
 TIMES_STATED = 3.0  # standard uncertainties of the table's orthogonality and angle
 NOISE_PQ_G = 5e-4  # by wander, drift and nonlinearity in p and q in the blind study: 0.03 deg
 NOISE_C_G = 4e-3  # likewise in c: half of a K2 of 6e-3 1/g (twice 0.3 %), or 8 degC at 5e-4 g/degC
-CLEARLY, OF_TWO_MORE = 1.0, 4.0  # chi-square by which leans have to be better than seats: 1 sigma; 2 sigma with tilt
-FITS = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
+CLEAR_CHI_SQUARE, OF_TWO_MORE = (
+    1.0,
+    4.0,
+)  # chi-square by which leans have to be better than seats: 1 sigma; 2 sigma with tilt
+MAX_SEAT_CHI_SQUARE = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
 GAUGE = 1e-6  # weight with which the seats have the smallest sum of squares
 # Columns of the design of ``_fit``: K comes before the bias.
 OF_K, OF_BIAS = slice(0, len(MATRIX_NAMES)), slice(len(MATRIX_NAMES), BASE_COUNT)
-QUARTERS = np.array([0.0, 90.0, 180.0, 270.0])
-TABLE = ("table_tilt", "table_axis_nonorthogonality")
+QUARTER_TURNS_DEG = np.array([0.0, 90.0, 180.0, 270.0])
+TABLE_EFFECTS = ("table_tilt", "table_axis_nonorthogonality")
 # Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
-LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 0.04}
+BENCH_LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 0.04}
 
 
 @dataclass(frozen=True)
 class _Conventional:
     """A turn by the convention of its mounting."""
 
-    turn: Turn
-    bench: Bench
-    gravity: Gravity
+    turn: TurnRecording
+    bench: TurnMounting
+    gravity: FittedGravity
 
     @property
     def axis(self) -> int:
@@ -74,7 +77,7 @@ class _Conventional:
     @property
     def ideal(self) -> tuple[Values, Values]:
         """Vectors p and q of an ideal sensor: u and u x a."""
-        return UP_AT_ZERO[self.axis], ACROSS[self.axis]
+        return UP_AT_ZERO[self.axis], UP_AT_QUARTER_TURN[self.axis]
 
     def normal(self, K: Values) -> Values:
         """Return the turn axis in the frame of K, ``K^T (q x p)`` with length 1: (3,) array."""
@@ -120,7 +123,7 @@ def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
 
 def _table_explains(turns: Sequence[_Conventional], K: Values, limits: Sequence[float]) -> bool:
     """Return whether tilt, leaning axes and a time offset within limits explain the turns, and seats do not better."""
-    tilt, lean = (np.stack([_columns_of(name, t) for t in turns]) for name in TABLE)
+    tilt, lean = (np.stack([_columns_of(name, t) for t in turns]) for name in TABLE_EFFECTS)
     late = np.stack([_offset_columns(t) for t in turns])
     seat = np.zeros((len(turns), 3, 3, 3 * len(turns)))
     for k, turn in enumerate(turns):
@@ -128,11 +131,11 @@ def _table_explains(turns: Sequence[_Conventional], K: Values, limits: Sequence[
     level_seats = _fit(turns, K, seat, [np.inf] * 3 * len(turns))
     of_tilt, of_lean = [limits[0]] * 2, [limits[1]] * 6
     tilted = _fit(turns, K, np.concatenate([tilt, late], axis=3), [*of_tilt, limits[2]])
-    if tilted < min(FITS, level_seats):
+    if tilted < min(MAX_SEAT_CHI_SQUARE, level_seats):
         return True
     leaning = _fit(turns, K, np.concatenate([lean, late], axis=3), [*of_lean, limits[2]])
     both = _fit(turns, K, np.concatenate([tilt, lean, late], axis=3), [*of_tilt, *of_lean, limits[2]])
-    return min(leaning, both + OF_TWO_MORE) < min(FITS, level_seats - CLEARLY)
+    return min(leaning, both + OF_TWO_MORE) < min(MAX_SEAT_CHI_SQUARE, level_seats - CLEAR_CHI_SQUARE)
 
 
 def _fit(turns: Sequence[_Conventional], K: Values, columns: Values, limits: Sequence[float]) -> float:
@@ -155,9 +158,11 @@ def _fit(turns: Sequence[_Conventional], K: Values, columns: Values, limits: Seq
 
 def _columns_of(name: str, turn: _Conventional) -> Values:
     """Return the derivative of c, p and q by the m parameters of a table effect, 1/deg: (3, 3, m) array."""
-    force, level = (turn_about_axis(v, turn.axis, -QUARTERS) for v in (turn.ideal[0], level_at_zero(turn.axis)))
-    rest = motion_at_rest(QUARTERS)
-    motion = replace(rest, specific_force=force, level=level, axis=turn.axis, angle=QUARTERS, rate=np.zeros(4))
+    force, level = (
+        turn_about_axis(v, turn.axis, -QUARTER_TURNS_DEG) for v in (turn.ideal[0], level_at_zero(turn.axis))
+    )
+    rest = motion_at_rest(QUARTER_TURNS_DEG)
+    motion = replace(rest, specific_force=force, level=level, axis=turn.axis, angle=QUARTER_TURNS_DEG, rate=np.zeros(4))
     of = effect(name)
     at_0, at_90, at_180, at_270 = of.regressors(
         "accelerometer", motion, np.eye(3), np.zeros(len(of.parameters("accelerometer")))
@@ -171,7 +176,7 @@ def _offset_columns(turn: _Conventional) -> Values:
     return np.asarray(np.radians(mean_rate) * np.stack([np.zeros(3), across, -up])[..., None])
 
 
-def seat_notes(turns: Sequence[Turn], table: Table, sensor: Sensor) -> dict[str, Note]:
+def seat_notes(turns: Sequence[TurnRecording], table: Table, sensor: Sensor) -> dict[str, Note]:
     """Return the note on each recording that the common mounting does not explain, by name.
 
     The turns of one setup are compared, or all together if no setup has turns about all three axes. With
@@ -181,7 +186,7 @@ def seat_notes(turns: Sequence[Turn], table: Table, sensor: Sensor) -> dict[str,
         return {}
     allowed = max(SMALLEST_DEG, TIMES_STATED * float(np.hypot(table.orthogonality_deg, table.angle_accuracy_deg)))
     effects = sensor.accelerometer.effects
-    limits = [effects.get(name, limit) for name, limit in LIMITS.items()]
+    limits = [effects.get(name, limit) for name, limit in BENCH_LIMITS.items()]
     details: dict[str, str] = {}
     setups = [
         _conventional([(t, t.stated) for t in turns if t.recording.setup == setup])
@@ -211,7 +216,7 @@ def seat_notes(turns: Sequence[Turn], table: Table, sensor: Sensor) -> dict[str,
     return {t.name: Note("N-SEATS", t.recording.samples, 0, 0, details[t.name]) for t in turns if t.name in details}
 
 
-def refined_zeros(turns: Sequence[Turn]) -> dict[str, float]:
+def refined_zeros(turns: Sequence[TurnRecording]) -> dict[str, float]:
     """Return the zero of each turn, deg, by all turns together; empty where one seat does not explain them.
 
     The zero by one turn alone is uncertain by the misalignment of the axes.
@@ -227,7 +232,9 @@ def refined_zeros(turns: Sequence[Turn]) -> dict[str, float]:
     return zeros
 
 
-def _conventional(turns: list[tuple[Turn, Bench | None]]) -> tuple[list[_Conventional], list[_Conventional]]:
+def _conventional(
+    turns: list[tuple[TurnRecording, TurnMounting | None]],
+) -> tuple[list[_Conventional], list[_Conventional]]:
     """Return the turns in which gravity turns, and those of them for the accelerometer."""
     known = [(t, bench, by_convention(t.fit, bench)) for t, bench in turns if bench is not None]
     every = [_Conventional(t, bench, gravity) for t, bench, gravity in known if gravity is not None]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 COUNTING = 0.98  # share of steps by exactly 1
 FEWEST_RISES = 4  # of a time, per fall; a noisy reading falls as often as it rises
-SCATTER = 0.2  # of intervals, relative to their median: above, times are of arrival, not of sampling
+MAX_INTERVAL_SCATTER = 0.2  # of intervals, relative to their median: above, times are of arrival, not of sampling
 TEMPERATURE_RANGE = (-60.0, 130.0)  # degC, of electronics and their tests
 
 OFFSETS = (32768.0, 8192.0, 2048.0)  # middle of unsigned 16, 14 and 12 bits
@@ -65,8 +65,8 @@ UNIT_ENDINGS = (
     ("us", ("us", "micros", "usec", "microseconds")), ("ns", ("ns", "nanos", "nsec", "nanoseconds")), ("deg", ("deg",)),
 )  # fmt: skip
 LINES_TRIED = 400  # with each separator
-MOST_ROWS = 200_000  # that are parsed; limits the time
-FEWEST_ROWS = FEWEST_COLUMNS = 3  # of the log of a three-axis sensor
+MAX_PARSED_ROWS = 200_000  # that are parsed; limits the time
+MIN_ROWS = MIN_COLUMNS = 3  # of the log of a three-axis sensor
 SEPARATORS = (",", ";", "\t", "|", " ")
 NUMBER = {
     ".": re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"),
@@ -224,7 +224,7 @@ def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
     candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
     steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
-    if gap_free and steps.sum() > 0 and np.std(steps) > SCATTER * abs(float(np.median(steps))):
+    if gap_free and steps.sum() > 0 and np.std(steps) > MAX_INTERVAL_SCATTER * abs(float(np.median(steps))):
         columns.arrival, columns.counter = candidates[0], gap_free[0]
     elif candidates:
         columns.time = candidates[0]
@@ -242,7 +242,7 @@ def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
 
 def _never_falls(values: Values) -> bool:
     """Return whether numbers rise, or repeat the one before, like the times of samples in bursts."""
-    return len(values) > FEWEST_ROWS and bool(np.all(np.diff(values) >= 0)) and bool(values[-1] > values[0])
+    return len(values) > MIN_ROWS and bool(np.all(np.diff(values) >= 0)) and bool(values[-1] > values[0])
 
 
 def _advances(values: Values) -> bool:
@@ -351,10 +351,10 @@ def find_layout(data: bytes, path: str) -> Log:
     tried = [_try(lines[:LINES_TRIED], separator, decimal) for separator in SEPARATORS for decimal in NUMBER]
     width, start, separator, decimal = max(tried, key=lambda t: (t[0], -t[1]))
     names, skip, comment = _names(lines, start, separator)
-    parsed = lines[start : start + MOST_ROWS]
+    parsed = lines[start : start + MAX_PARSED_ROWS]
     rows = [cells for cells in _cells(parsed, separator) if len(cells) == len(names)]
     numbers = _numbers(rows, decimal)
-    if width < FEWEST_COLUMNS or len(rows) < FEWEST_ROWS or not numbers:
+    if width < MIN_COLUMNS or len(rows) < MIN_ROWS or not numbers:
         first = " / ".join(lines[:3])[:150]
         raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
     stated = ((STATED_NUMBER.search(line), line.strip()) for line in lines[:start] if RATE_KEY.search(line))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.io.units import TABLE_CHANNELS, TRIADS
 from pipeline.profile_detection.proposal import UNITS_OF, fields_of
-from pipeline.profile_detection.unit_guesses import OF_SENSOR, UNKNOWN
+from pipeline.profile_detection.unit_guesses import OF_SENSOR, TO_DECIDE
 
 if TYPE_CHECKING:
     from pipeline.profile_detection.proposal import Proposal
@@ -79,7 +79,7 @@ def _entries(proposal: Proposal, part: int, indent: str) -> list[str]:
 
 def not_found(proposal: Proposal) -> list[str]:
     """Return sentences about the sensors and references without a column, and the lines to add."""
-    channels = {c for entries in proposal.columns for c, e in entries.items() if e["column"] != UNKNOWN}
+    channels = {c for entries in proposal.columns for c, e in entries.items() if e["column"] != TO_DECIDE}
     missing = [
         f"the {s}, which such a log cannot calibrate. If the log holds it, add {', '.join(triad)}, each with its "
         f"column and unit ({', '.join(UNITS_OF[s])}, or counts with counts_per_unit)."

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.io.bursts import find_bursts
 from pipeline.io.csv_times import SHORTEST_PART
-from pipeline.io.gravity_rotation import Move, interval_of, moves_of
+from pipeline.io.gravity_rotation import MoveByHand, interval_of, moves_of
 from pipeline.io.ingest_settings import AUTO
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
 from pipeline.profile_detection.columns import (
@@ -31,7 +31,7 @@ from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
     CENTIDEGREES,
     OF_SENSOR,
-    UNKNOWN,
+    TO_DECIDE,
     Guess,
     counts_of_sensor,
     even_steps,
@@ -87,8 +87,8 @@ class Proposal:
 
     def unknown(self) -> list[str]:
         """Return the keys and channels with a value to fill in."""
-        keys = [k for k, v in self.csv.items() if v == UNKNOWN]
-        return keys + [c for entries in self.columns for c, e in entries.items() if UNKNOWN in e.values()]
+        keys = [k for k, v in self.csv.items() if v == TO_DECIDE]
+        return keys + [c for entries in self.columns for c, e in entries.items() if TO_DECIDE in e.values()]
 
     def ingest(self, name: str, sensor: Sensor | None) -> dict[str, Any]:
         """Return the proposal as the section ``ingest`` of a configuration, with the counts of the sensor's file."""
@@ -169,7 +169,7 @@ def _fill_in(proposal: Proposal, other: Proposal) -> None:
     for channel, entry in proposal.columns[0].items():
         better = other.columns[0].get(channel, entry)
         by_turns = channel == "table_angle" and (better["unit"], entry["unit"]) == (COUNTS, "deg")
-        if (UNKNOWN in entry.values() and UNKNOWN not in better.values()) or by_turns:
+        if (TO_DECIDE in entry.values() and TO_DECIDE not in better.values()) or by_turns:
             proposal.columns[0][channel] = better
             key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
             proposal.evidence[key] = f"{other.evidence[key]} ({Path(other.files[0]).name})"
@@ -205,7 +205,7 @@ def _proposal(parts: list[Columns], sensor: Sensor | None) -> Proposal:
     proposal.remarks.append("no three columns have the names or values of an accelerometer or a gyroscope")
     if proposal.topic is None and "table_rate" not in proposal.columns[0]:  # lines of both sensors to fill in
         for name, triad in TRIADS.items():
-            proposal.columns[0] |= {c: {"column": UNKNOWN, "unit": UNKNOWN} for c in triad}
+            proposal.columns[0] |= {c: {"column": TO_DECIDE, "unit": TO_DECIDE} for c in triad}
             proposal.evidence[name] = (
                 f"the names of the {name}'s columns, and their unit: {', '.join(UNITS_OF[name])}, or counts with "
                 f'counts_per_unit: "{OF_SENSOR.format(name)}"; leave the three lines out if it is not in the log'
@@ -240,7 +240,7 @@ def _gyroscope(
     parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: Sensor | None
 ) -> Guess:
     """Return the unit of the rates from the table, from gravity, or, for counts, from the configuration."""
-    moves, why_none = list[Move](), "no accelerometer in the log that determines the unit"
+    moves, why_none = list[MoveByHand](), "no accelerometer in the log that determines the unit"
     if force is not None and not parts[0].steady:
         why_none = "the rows are not one series in time, so the turns of gravity do not determine the unit"
     elif force is not None:
@@ -248,7 +248,7 @@ def _gyroscope(
         why_none = "" if moves else "no move between rests rotates gravity, which would show the unit"
     by_table = unit_by_table(next(c for c in parts if "gyroscope" in c.triads), rate, time_s)
     guess = by_table or rate_unit(rate, moves, why_none, timed=time_s is not None)
-    if guess.entry["unit"] == COUNTS and guess.entry["counts_per_unit"] == UNKNOWN:
+    if guess.entry["unit"] == COUNTS and guess.entry["counts_per_unit"] == TO_DECIDE:
         return counts_of_sensor(guess, "gyroscope", sensor)
     return guess
 
@@ -263,7 +263,7 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
         guess = time_unit(values, *stated_unit(name, "time"))
         if "ticks" in words_of(name):
             text = f"{name}: counts_per_unit is the number of ticks per second"
-            guess = Guess({"unit": COUNTS, "counts_per_unit": UNKNOWN}, text)
+            guess = Guess({"unit": COUNTS, "counts_per_unit": TO_DECIDE}, text)
         proposal.csv["rate_hz"] = None
         proposal.evidence.pop("rate_hz", None)
         proposal.evidence["time"] = guess.evidence
@@ -275,7 +275,7 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
         return _counted(parts[0], parts[0].counter, proposal)
     if first.csv["rate_hz"] is not None:
         return np.arange(len(next(iter(first.numbers.values())))) / float(first.csv["rate_hz"])
-    proposal.csv["rate_hz"] = UNKNOWN
+    proposal.csv["rate_hz"] = TO_DECIDE
     proposal.evidence["rate_hz"] = "there is no time: the sampling rate in Hz"
     return None
 
@@ -305,7 +305,11 @@ def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | Non
         stated = "the sampling rate in Hz" if rate is None else f"{rate:g} Hz on average by {name}"
         evidence = f"{key} counts samples without a gap, and the intervals of {name} scatter; {stated}"
     proposal.csv["rate_hz"] = None
-    proposal.columns[0]["time"] = {"column": key, "unit": COUNTS, "counts_per_unit": UNKNOWN if rate is None else rate}
+    proposal.columns[0]["time"] = {
+        "column": key,
+        "unit": COUNTS,
+        "counts_per_unit": TO_DECIDE if rate is None else rate,
+    }
     proposal.evidence["time"] = evidence
     return None if rate is None else (count - count[0]) / rate
 
@@ -314,7 +318,7 @@ def _in_dps(rate: Values, proposal: Proposal) -> Values | None:
     """Return rates in deg/s, without correction of their offset; None if their unit is unknown."""
     entry = next(e[GYROSCOPE[0]] for e in proposal.columns if GYROSCOPE[0] in e)
     counts = entry.get("counts_per_unit", 1.0)
-    if entry["unit"] == UNKNOWN or isinstance(counts, str):
+    if entry["unit"] == TO_DECIDE or isinstance(counts, str):
         return None
     multiplier, divisor = UNITS[GYROSCOPE[0]][entry["unit"]]
     return np.asarray(rate * multiplier / divisor / counts, np.float64)
@@ -338,7 +342,7 @@ def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) ->
         proposal.columns[place][channel] = {"column": log.keys[index], **entry}
         if entry is not guess.entry:
             proposal.evidence[sensor] = f"{why}; {guess.evidence}"
-            if guess.entry["unit"] not in (stated, UNKNOWN):
+            if guess.entry["unit"] not in (stated, TO_DECIDE):
                 proposal.remarks.append(f"{log.names[index]}: {why}, and yet {guess.evidence}")
 
 

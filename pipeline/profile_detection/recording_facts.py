@@ -22,8 +22,8 @@ from pipeline.io.message_logs import open_reader
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
 from pipeline.io.units import DEGREES, TRIADS
 from pipeline.preprocessing.bench import other_axes
-from pipeline.profile_detection.columns import FEWEST_ROWS, MOST_ROWS, Log, find_columns
-from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
+from pipeline.profile_detection.columns import MAX_PARSED_ROWS, MIN_ROWS, Log, find_columns
+from pipeline.profile_detection.unit_guesses import BURST_INTERVAL_DIFFERENCE, FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.signal.rests import rests_from_table, runs
 
@@ -33,23 +33,23 @@ if TYPE_CHECKING:
 
     from mcap.records import Channel, Schema
 
-    from pipeline.io.gravity_rotation import Move
-    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.gravity_rotation import MoveByHand
+    from pipeline.io.mcap_chunk import ChannelMessages
     from pipeline.io.mcap_reader import MessageReader
     from pipeline.records import Note, Recording, Values
     from pipeline.settings import Sensor
 
-MOST_SAMPLES = 500_000  # searched for rests and moves
-FEWEST_SAMPLES = 3  # of a rest, for a variance
+MAX_SEARCHED_SAMPLES = 500_000  # searched for rests and moves
+MIN_VARIANCE_SAMPLES = 3  # of a rest, for a variance
 PLATEAU = 3  # samples at the largest value; noise repeats it less often
 DECISIVE_RATIO = 2.0  # of the misfits of two units of the rates, from which the moves determine the unit
-LABEL = 16  # width of the labels, characters
+LABEL_WIDTH = 16  # width of the labels, characters
 WIDTH = 118  # characters of a line
 LISTED_NOTES = 20  # fit one screen; the others are counted
 LONGEST_ARRAY = 16  # elements of a field that may be readings
 LONGEST_LIST = 4  # elements of an array that are listed
 OF_ARRAYS = ("HDF5", "MATLAB")  # formats whose arrays a user names
-MOST_FIELDS = 24  # of a message that are listed
+MAX_LISTED_FIELDS = 24  # of a message that are listed
 MOST_TOPICS = 20  # with a line each
 
 Line = tuple[str, str]
@@ -77,7 +77,7 @@ def as_text(lines: Sequence[Line]) -> str:
     """Return pairs of label and text as wrapped lines in two columns."""
     wrapped = []
     for label, text in lines:
-        first = f"  {label:<{LABEL}}"
+        first = f"  {label:<{LABEL_WIDTH}}"
         wrapped += textwrap.wrap(
             text,
             WIDTH,
@@ -95,7 +95,7 @@ def _time(recording: Recording) -> str:
     jitter = float(np.std(np.diff(time) / 1e9)) / interval
     mean = span / max(recording.samples - 1, 1)
     rate, median = f"{1 / interval:.6g} Hz", f"{_number(interval * 1e3)} ms"
-    bursty = abs(mean / interval - 1.0) > BURSTS
+    bursty = abs(mean / interval - 1.0) > BURST_INTERVAL_DIFFERENCE
     rate = f"{1 / mean:.6g} Hz on average ({rate} by the median interval of " if bursty else f"{rate} (median interval "
     rate += median
     text = f"{recording.samples:,} rows over {_number(span)} s at {rate}), from {_number(float(time[0]) / 1e9)} s"
@@ -109,11 +109,11 @@ def _rests(recording: Recording) -> list[tuple[int, int]]:
     turns = _turns(recording)
     by_table = rests_from_table(recording) if turns else []
     if by_table:
-        return [(r.start, r.stop) for r in by_table if r.stop - r.start >= FEWEST_SAMPLES]
+        return [(r.start, r.stop) for r in by_table if r.stop - r.start >= MIN_VARIANCE_SAMPLES]
     force = recording.accelerometer
     if force is None or recording.samples < 20 or (turns and recording.table_rate is not None):
         return []
-    return rests_of(force[:MOST_SAMPLES], recording.interval)
+    return rests_of(force[:MAX_SEARCHED_SAMPLES], recording.interval)
 
 
 def _turns(recording: Recording) -> bool:
@@ -215,7 +215,7 @@ def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]
     """State whether the integrated rates agree with the rotation of gravity between rests."""
     if recording.accelerometer is None or recording.gyroscope is None or recording.samples < 20:
         return []
-    part = slice(0, MOST_SAMPLES)
+    part = slice(0, MAX_SEARCHED_SAMPLES)
     force = recording.accelerometer[part]
     means = [force[a:b].mean(axis=0) for a, b in rests]
     centre = sphere(np.array(means))[0] if len(means) >= FEWEST_RESTS_FOR_A_SPHERE else np.zeros(3)
@@ -227,7 +227,7 @@ def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]
     return [("units", "no move between rests turns gravity, so the unit of the rates cannot be checked")]
 
 
-def _rates_and_gravity(moves: Sequence[Move]) -> str:
+def _rates_and_gravity(moves: Sequence[MoveByHand]) -> str:
     """State the misfit of the integrated rates to the rotation of gravity, also for other units and other axes."""
     scales = (1.0, DEGREES, 1 / DEGREES)
     declared, *others = misfit_deg(moves, scales)
@@ -286,19 +286,19 @@ def topics_of(path: Path) -> list[Log]:
     return best
 
 
-def _topic(reader: MessageReader, rows: Rows) -> Log | None:
+def _topic(reader: MessageReader, rows: ChannelMessages) -> Log | None:
     """Return the messages of a topic as columns; None if they are too few, vary in length or have no numbers."""
     channel = reader.channels[rows.channel]
     schema = reader.schemas.get(channel.schema_id)
     try:
         find = ros_layouts(channel, schema)
-        layout = find(rows.payload(0)) if find is not None and len(rows.starts) >= FEWEST_ROWS else None
+        layout = find(rows.payload(0)) if find is not None and len(rows.starts) >= MIN_ROWS else None
     except (ValueError, KeyError):  # an invalid definition, or a message that contradicts it
         return None
     if layout is None or not layout.places or len(layout.matching(rows)) < len(rows.starts):
         return None
     arrays = layout.columns(rows, layout.elements(LONGEST_ARRAY))
-    columns: dict[str, Any] = {n: c[:MOST_ROWS].astype(np.float64) for n, c in arrays.items()}
+    columns: dict[str, Any] = {n: c[:MAX_PARSED_ROWS].astype(np.float64) for n, c in arrays.items()}
     for seconds, nanos in STAMPS:
         for base in [n.removesuffix(f".{seconds}") for n in columns if n.endswith(f".{seconds}")]:
             if f"{base}.{nanos}" in columns:
@@ -357,11 +357,11 @@ def _fields(channel: Channel, schema: Schema | None, payload: bytes) -> str:
         find_layout, decode = ros_layouts(channel, schema), object_decoder(channel, schema)
         longest = LONGEST_ARRAY if schema is not None and schema.encoding == ARRAYS else LONGEST_LIST
         names = find_layout(payload).elements(longest) if find_layout else _numbers(decode and decode(payload), "")
-        paths = list(islice(names, MOST_FIELDS + 1))
+        paths = list(islice(names, MAX_LISTED_FIELDS + 1))
     except Exception:  # noqa: BLE001  (a decoder may raise anything for an unknown message: nothing is listed)
         return ""
-    more = " .." if len(paths) > MOST_FIELDS else ""
-    return f", with {', '.join(paths[:MOST_FIELDS])}{more}" if paths else ""
+    more = " .." if len(paths) > MAX_LISTED_FIELDS else ""
+    return f", with {', '.join(paths[:MAX_LISTED_FIELDS])}{more}" if paths else ""
 
 
 def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a message of any decoder)

@@ -22,15 +22,15 @@ from pipeline.profile_detection.columns import NO_SENSOR, OFFSETS, stated_unit, 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.io.gravity_rotation import Move
+    from pipeline.io.gravity_rotation import MoveByHand
     from pipeline.profile_detection.columns import Columns
     from pipeline.records import Values
     from pipeline.settings import Sensor
 
-UNKNOWN = "???"
+TO_DECIDE = "???"
 OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: a reference to the configuration of the sensor
 MPU60X0_TEMPERATURE = {"counts_per_unit": 340.0, "offset": -12420.2}  # MPU-6000/6050 register map 4.2, 4.18
-CLOSE = 0.12  # bias and scale factor of a low-cost sensor in one position
+LOW_COST_ERROR = 0.12  # bias and scale factor of a low-cost sensor in one position
 CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and misalignment on the table
 SLOWEST = 1.0  # deg/s rms of a table: below, noise and bias wander are larger
 LARGEST_RESIDUAL = 0.3  # rms of the rates after the fit of the table's rate, of before: misalignment and noise
@@ -38,12 +38,12 @@ CLOSE_BY_TURNS = 0.2  # bias and scale factor of both sensors, in few moves
 USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
-EVEN = 0.02  # largest departure from a straight line, of the span
-SCALES = np.geomspace(1.0, 1000.0, 481)  # grid of counts per deg/s, in steps of 1.4 %
+MAX_LINE_DEPARTURE = 0.02  # largest departure from a straight line, of the span
+COUNT_GRID = np.geomspace(1.0, 1000.0, 481)  # grid of counts per deg/s, in steps of 1.4 %
 ASSUMED_HZ = 100.0  # if the time is unknown
 CONVINCING_DEG = 12.0  # below half of the residual angle of the next usual scale in a quarter turn
 TOO_FAST_FOR_RADIANS = 40.0  # rad/s, 2300 deg/s: beyond the range of usual sensors
-BURSTS = 0.1  # relative difference of mean and median interval, from which both are stated
+BURST_INTERVAL_DIFFERENCE = 0.1  # relative difference of mean and median interval, from which both are stated
 RATES_HZ = (5.0, 20_000.0)  # sampling rates of inertial sensors
 SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
 FLATTEST = 0.1  # smallest over largest extent of rests in a plane: misalignment and scale factors are some percent
@@ -82,7 +82,7 @@ def time_unit(values: Values, stated: str | None, why: str) -> Guess:
     mean = float(np.mean(steps)) if len(steps) and np.all(steps >= 0) else step
 
     def on_average(second: float) -> str:
-        if not step or abs(mean / step - 1.0) < BURSTS:
+        if not step or abs(mean / step - 1.0) < BURST_INTERVAL_DIFFERENCE:
             return ""
         return f" by the median interval and {1 / (mean * second):.4g} Hz on average: rows in bursts, or gaps"
 
@@ -97,7 +97,7 @@ def time_unit(values: Values, stated: str | None, why: str) -> Guess:
         rate = f"{1 / (step * seconds[unit]):.4g} Hz{on_average(seconds[unit])}"
         evidence = f"{what}steps of {step:.6g}, so {unit} at {rate}{''.join(others)}"
         return Guess({"unit": unit}, evidence, seconds[unit])
-    return Guess({"unit": UNKNOWN}, f"steps of {step:g} suit no unit of time: s, ms, us or ns?")
+    return Guess({"unit": TO_DECIDE}, f"steps of {step:g} suit no unit of time: s, ms, us or ns?")
 
 
 def force_unit(force: Values, interval_s: float) -> Guess:
@@ -115,9 +115,9 @@ def force_unit(force: Values, interval_s: float) -> Guess:
     if whole(force):
         guess = _counts_per_g(len(rests), centre, radius, size, where)
     else:
-        guess = Guess({"unit": UNKNOWN}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg)")
+        guess = Guess({"unit": TO_DECIDE}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg)")
         for unit, gravity in FORCE_UNITS.items():
-            if abs(size / gravity - 1) < CLOSE:
+            if abs(size / gravity - 1) < LOW_COST_ERROR:
                 guess = Guess({"unit": unit}, f"{where}, so {unit}")
     return replace(guess, centre=centre)
 
@@ -133,10 +133,10 @@ def _counts_per_g(rests: int, centre: Values, radius: float, size: float, where:
         spread = f"{rests} rests lie on a sphere of radius {radius:.0f} about {middle:.0f}"
         return Guess(entry, f"whole numbers; {spread}, so counts with an offset of {offset:.0f}")
     usual = min(USUAL_COUNTS_PER_G, key=lambda c: abs(np.log(size / c)))
-    if abs(size / usual - 1) < CLOSE:
+    if abs(size / usual - 1) < LOW_COST_ERROR:
         entry = {"unit": COUNTS, "counts_per_unit": usual}
         return Guess(entry, f"whole numbers, {where}: counts, near the usual {usual:g} a g")
-    if abs(size / 1000.0 - 1) < CLOSE:
+    if abs(size / 1000.0 - 1) < LOW_COST_ERROR:
         return Guess({"unit": "mg"}, f"{where}, so mg")
     entry = {"unit": COUNTS, "counts_per_unit": float(f"{size:.3g}")}
     return Guess(entry, f"whole numbers, {where}: counts, {size:.3g} a g (no usual number)")
@@ -150,7 +150,7 @@ def sphere(points: Values) -> tuple[Values, float]:
     return centre, float(np.sqrt(max(solution[3] + centre @ centre, 0.0)))
 
 
-def rate_unit(rate: Values, moves: Sequence[Move], why_none: str, *, timed: bool) -> Guess:
+def rate_unit(rate: Values, moves: Sequence[MoveByHand], why_none: str, *, timed: bool) -> Guess:
     """Return the unit of (n, 3) angular rates from the ``moves`` between rests in which gravity turns.
 
     ``why_none``: the reason if there are no moves. Without a time (``timed`` False) an interval of 1 / ``ASSUMED_HZ``
@@ -167,11 +167,11 @@ def rate_unit(rate: Values, moves: Sequence[Move], why_none: str, *, timed: bool
         unit = ("deg/s", "rad/s")[best]
         text = f"taken as {unit} they turn gravity to within {misfit[best]:.1f} deg over {len(moves)} moves"
         if misfit[best] > CONVINCING_DEG:
-            return Guess({"unit": UNKNOWN}, f"{text}, and no better otherwise: not convincing")
+            return Guess({"unit": TO_DECIDE}, f"{text}, and no better otherwise: not convincing")
         return Guess({"unit": unit}, f"{text} (the other unit misses by {misfit[1 - best]:.0f} deg)")
     if largest > TOO_FAST_FOR_RADIANS:
         return Guess({"unit": "deg/s"}, f"up to {largest:.4g}, too fast for rad/s, so deg/s")
-    return Guess({"unit": UNKNOWN}, f"up to {largest:.4g}; {why_none or 'the time is not known'}: deg/s or rad/s?")
+    return Guess({"unit": TO_DECIDE}, f"up to {largest:.4g}; {why_none or 'the time is not known'}: deg/s or rad/s?")
 
 
 def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
@@ -184,8 +184,8 @@ def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
         entry, taken = _usual_counts(size, CLOSE_BY_TABLE)
         return Guess(entry, f"counts, {seen}{taken}")
     units = {"deg/s": 1.0, "rad/s": 1.0 / DEGREES}
-    unit = next((u for u, one in units.items() if abs(size / one - 1) < CLOSE_BY_TABLE), UNKNOWN)
-    return Guess({"unit": unit}, f"{seen}, " + ("neither deg/s nor rad/s" if unit == UNKNOWN else f"so {unit}"))
+    unit = next((u for u, one in units.items() if abs(size / one - 1) < CLOSE_BY_TABLE), TO_DECIDE)
+    return Guess({"unit": unit}, f"{seen}, " + ("neither deg/s nor rad/s" if unit == TO_DECIDE else f"so {unit}"))
 
 
 def slope(rate: Values, table: Values) -> float | None:
@@ -208,13 +208,13 @@ def _usual_counts(measured: float, close: float) -> tuple[dict[str, Any], str]:
     return {"unit": COUNTS, "counts_per_unit": float(f"{measured:.3g}")}, ""
 
 
-def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Guess:
-    unknown = {"unit": COUNTS, "counts_per_unit": UNKNOWN}
+def _counts_per_dps(moves: Sequence[MoveByHand], otherwise: str, *, timed: bool) -> Guess:
+    unknown = {"unit": COUNTS, "counts_per_unit": TO_DECIDE}
     if not moves:
         return Guess(unknown, otherwise)
-    misfit = misfit_deg(moves, (1 / SCALES).tolist())
+    misfit = misfit_deg(moves, (1 / COUNT_GRID).tolist())
     best = int(np.argmin(misfit))
-    measured, angle = float(SCALES[best]), misfit[best]
+    measured, angle = float(COUNT_GRID[best]), misfit[best]
     if angle > CONVINCING_DEG:
         return Guess(unknown, f"counts; at best they turn gravity to within {angle:.0f} deg: not convincing")
     seen = f"so gravity turns to within {angle:.1f} deg over {len(moves)} move{'s'[: len(moves) > 1]}"
@@ -229,7 +229,7 @@ def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Gu
 def other_range(guess: Guess, sensor: Sensor | None) -> list[str]:
     """Return a remark if the accelerometer's counts differ from those of the stated sensor."""
     seen = guess.entry.get("counts_per_unit")
-    if sensor is None or not seen or abs(seen / sensor.accelerometer.counts_per_unit - 1) < CLOSE:
+    if sensor is None or not seen or abs(seen / sensor.accelerometer.counts_per_unit - 1) < LOW_COST_ERROR:
         return []
     name, stated = sensor.name, sensor.accelerometer.counts_per_unit
     where = "sensor.accelerometer.range, and sensor.gyroscope.range"
@@ -252,12 +252,12 @@ def counts_of_sensor(guess: Guess, name: str, sensor: Sensor | None) -> Guess:
 def even_steps(values: Values) -> bool:
     """Return whether numbers grow evenly with the rows, like times and counters."""
     line = np.linspace(values[0], values[-1], len(values))
-    return bool(np.ptp(values) > 0.0 and np.abs(values - line).max() < EVEN * np.ptp(values))
+    return bool(np.ptp(values) > 0.0 and np.abs(values - line).max() < MAX_LINE_DEPARTURE * np.ptp(values))
 
 
 def temperature_counts(span: str, sensor: str) -> Guess:
     """Return the entry of a temperature in counts; its scale and offset are only in the data sheet of the sensor."""
-    known = MPU60X0_TEMPERATURE if sensor.startswith("mpu60") else dict.fromkeys(MPU60X0_TEMPERATURE, UNKNOWN)
+    known = MPU60X0_TEMPERATURE if sensor.startswith("mpu60") else dict.fromkeys(MPU60X0_TEMPERATURE, TO_DECIDE)
     evidence = (
         f"whole numbers {span}, so counts: degC = (counts - offset) / counts_per_unit, both in the data sheet "
         "(MPU-6000 and MPU-6050: degC = counts / 340 + 36.53, so counts_per_unit: 340, offset: -12420.2)"

@@ -15,9 +15,9 @@ import pandas as pd
 
 from pipeline.outcome import beyond_limits_groups, findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
-from pipeline.report.chart import Area, Dots, Figure, Layer, Line, Panel, chart, sentences
+from pipeline.report.chart import Area, Dots, Figure, Layer, LineMark, Panel, chart, sentences
 from pipeline.report.fleet import parameter_table, wide
-from pipeline.report.held_out_section import FAR
+from pipeline.report.held_out_section import MARK_ABOVE_FLOORS
 from pipeline.report.numbers import number, percent, plain, unit_text
 from pipeline.report.pages import script_data, template
 from pipeline.report.parameters import COLUMNS
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 UnitChart = tuple[Figure, dict[str, list[str]]]  # a chart of units, and the text of each dot by its colour
-FIRST = 100  # rows in the page; the script adds the others when they come into view
-NAMED = 3  # units that the finding of a chart names
+FIRST_ROWS = 100  # rows in the page; the script adds the others when they come into view
+NAMED_UNITS = 3  # units that the finding of a chart names
 FEWEST_UNITS, FAR_SHOWN = 3, 30  # units of the smallest distribution; most units far from the others that are listed
-MOST_DOTS, FARTHEST = 2000, 50  # units above which dots show only the farthest from the noise, and their number
-PARTS = 100  # of the fleet, each with its quantiles: one in 3.5 px
+MOST_DOTS, FARTHEST_UNITS = 2000, 50  # units above which dots show only the farthest from the noise, and their number
+QUANTILE_PARTS = 100  # of the fleet, each with its quantiles: one in 3.5 px
 MOST_GROUPS = 50  # serials of several units, and joint estimates, that are listed
 MOST_LOTS = 60  # lots above which no medians lot by lot are shown
 
@@ -93,7 +93,7 @@ def render(
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
         strips=[figure for figure, _ in plots],
         far_shown=FAR_SHOWN,
-        far=FAR,
+        far=MARK_ABOVE_FLOORS,
         causes=sorted(causes.items(), key=lambda cause: -len(cause[1])),
         found=verdict_groups(findings) + beyond_limits_groups(rows) + _not_held_out(rows),
         commands=next_commands(findings, settings or {"campaign": campaign}),
@@ -101,7 +101,7 @@ def render(
         history_data=script_data({"units": history["units"]}) if history else None,
         names=script_data([row["unit"] for row in rows]),
         values=script_data({figure.name: values for figure, values in [*fleet, *plots]}),
-        first=FIRST,
+        first=FIRST_ROWS,
         sections=comparisons,
         verdicts={verdict: verdict.css_class for verdict in Verdict},
         sensors=[s for s in SENSORS if frame[f"{s}_error_after"].notna().any()] or SENSORS,
@@ -175,7 +175,7 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
             layers += _quantiles(order, v, colour)
             legend.append((f"c{colour}", name))
         drawn = np.zeros(len(frame), bool)
-        drawn[np.argsort(-np.nan_to_num(after / floor))[:FARTHEST]] = True
+        drawn[np.argsort(-np.nan_to_num(after / floor))[:FARTHEST_UNITS]] = True
         dotted = judged
     for v, of, colour, name in dotted:
         chosen = np.flatnonzero(of & drawn if v is after else of)
@@ -189,14 +189,17 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
     words = f"Missing effects: {effects}." if effects else "No effect is named as missing."
     middle = [number(float(np.nanmedian(v))) if np.isfinite(v).any() else "not known" for v in (before, after, floor)]
     ratio, units = after / floor, frame["unit"].tolist()
-    far = [int(i) for i in np.argsort(-np.nan_to_num(ratio)) if ratio[i] > FAR]
-    finding = f"{sensor.capitalize()}: all {count} units are within {FAR:g} × the noise floor"
+    far = [int(i) for i in np.argsort(-np.nan_to_num(ratio)) if ratio[i] > MARK_ABOVE_FLOORS]
+    finding = f"{sensor.capitalize()}: all {count} units are within {MARK_ABOVE_FLOORS:g} × the noise floor"
     if far:
-        named = ", ".join(f"{units[i]} ({number(float(ratio[i]))} ×)" for i in far[:NAMED])
-        finding = (
-            f"{sensor.capitalize()}: {len(far)} of {count} units are beyond {FAR:g} × the noise floor; worst: {named}"
-        )
-    dots = f"the {FARTHEST} farthest from the noise as dots, median and 5 to 95 % of all" if many else "one dot a unit"
+        named = ", ".join(f"{units[i]} ({number(float(ratio[i]))} ×)" for i in far[:NAMED_UNITS])
+        beyond = f"{len(far)} of {count} units are beyond {MARK_ABOVE_FLOORS:g} × the noise floor"
+        finding = f"{sensor.capitalize()}: {beyond}; worst: {named}"
+    dots = (
+        f"the {FARTHEST_UNITS} farthest from the noise as dots, median and 5 to 95 % of all"
+        if many
+        else "one dot a unit"
+    )
     figure = chart(
         Figure(f"fleet-{sensor}", finding, f"Error on held-out motion, {dots}. {words}", tuple(legend)),
         f"Held-out error of {count} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
@@ -212,17 +215,23 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
 
 def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Layer]:
     """Return the median and the band from 5 to 95 % of neighbouring units."""
-    parts = [p for p in np.array_split(np.arange(len(order)), PARTS) if np.isfinite(values[p]).any()]
+    parts = [p for p in np.array_split(np.arange(len(order)), QUANTILE_PARTS) if np.isfinite(values[p]).any()]
     low, middle, high = np.array([np.nanquantile(values[p], [0.05, 0.5, 0.95]) for p in parts]).reshape(-1, 3).T
     x = np.array([order[p].mean() for p in parts])
-    return [Area(low, high, colour, x), Line(x, middle, colour)]
+    return [Area(low, high, colour, x), LineMark(x, middle, colour)]
 
 
-EDGE = 3.0  # largest share that is drawn: one unit in a wrong unit of measurement must not hide the others
-FEWEST_SIBLINGS, MOST = 3, 60  # siblings below which there is no plot, and above which only the farthest are drawn
+MAX_DRAWN_SHARE = 3.0  # largest share that is drawn: one unit in a wrong unit of measurement must not hide the others
+FEWEST_SIBLINGS, MAX_PLOTTED_UNITS = (
+    3,
+    60,
+)  # siblings below which there is no plot, and above which only the farthest are drawn
 ENDS = 20  # farthest units of each parameter that are then drawn, on either side
 ROW, LEFT = 17, 130  # px
-SPREAD, HALF = 0.6, 0.42  # of a row: range over which the units are distributed in their order; half height of a bar
+ROW_SPREAD, HALF_BAR = (
+    0.6,
+    0.42,
+)  # of a row: range over which the units are distributed in their order; half height of a bar
 
 
 def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[UnitChart]:
@@ -254,20 +263,20 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
     measures = dict(zip(table["label"], map(unit_text, table["measure"]), strict=True))
     share = value / limit
     height = len(labels) - np.arange(len(labels), dtype=float)  # the first row on top
-    offset = SPREAD * (0.5 - (np.arange(len(numbers)) + 0.5) / len(numbers))
+    offset = ROW_SPREAD * (0.5 - (np.arange(len(numbers)) + 0.5) / len(numbers))
     drawn = np.isfinite(share)
     layers = [_bar(np.array([-1.0, 1.0]), 0.4, height[0] + 0.6, 4)]
-    if many := len(numbers) > MOST:
+    if many := len(numbers) > MAX_PLOTTED_UNITS:
         rank = np.argsort(np.argsort(share, axis=0), axis=0)
         drawn &= (rank < ENDS) | (rank >= drawn.sum(axis=0) - ENDS)
         ends = np.nanquantile(share, [0.05, 0.95], axis=0).T
-        layers += [_bar(each, row - HALF, row + HALF, 3) for row, each in zip(height, ends, strict=True)]
+        layers += [_bar(each, row - HALF_BAR, row + HALF_BAR, 3) for row, each in zip(height, ends, strict=True)]
     beyond, values, legend = marked == 1.0, {}, []
     dots: list[Layer] = []
     for chosen, colour, words in ((drawn & ~beyond, 2, "within the limit"), (drawn & beyond, 0, "beyond the limit")):
         i, j = np.nonzero(chosen)
         if len(i):
-            x = 100.0 * np.clip(share[i, j], -EDGE, EDGE)
+            x = 100.0 * np.clip(share[i, j], -MAX_DRAWN_SHARE, MAX_DRAWN_SHARE)
             dots.append(Dots(x, height[j] + offset[i], colour, units=tuple((numbers[i] + 1).tolist())))
             legend.append((f"c{colour}", words))
             values[f"c{colour}"] = [
@@ -284,7 +293,7 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
         farthest=f"{units[numbers[worst]]}, {labels[column].lower()}",
         share=float(abs(share[worst, column])),
         ends=ENDS if many else 0,
-        edge=EDGE if np.nanmax(np.abs(share)) > EDGE else 0,
+        edge=MAX_DRAWN_SHARE if np.nanmax(np.abs(share)) > MAX_DRAWN_SHARE else 0,
         medians=[*zip(labels, np.nanmedian(share, axis=0).tolist(), strict=True)],
     )
     figure = Figure(name, finding, caption, tuple(legend))
@@ -294,4 +303,4 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
 
 
 def _bar(ends: Values, low: float, high: float, colour: int) -> Layer:
-    return Area(low, high, colour, 100.0 * np.clip(ends, -EDGE, EDGE))
+    return Area(low, high, colour, 100.0 * np.clip(ends, -MAX_DRAWN_SHARE, MAX_DRAWN_SHARE))

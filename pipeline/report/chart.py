@@ -78,7 +78,7 @@ def sentences(figure: str, **values: Any) -> tuple[str, str, str]:  # noqa: ANN4
 
 
 @dataclass(frozen=True)
-class Line:
+class LineMark:
     """Values joined by a line, broken where one is not finite; ``style``: "", ``dashed``, ``model`` or ``thick``."""
 
     x: Values
@@ -88,7 +88,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Samples:
+class SampleMarks:
     """Samples in order, (n,) or (n, k) with a colour for each column, drawn as dots or as ranges of buckets.
 
     ``mean`` adds the line of the buckets' means, which shows slow changes below the noise.
@@ -125,7 +125,7 @@ class Area:
     x: Values | None = None
 
 
-Layer = Line | Samples | Dots | Area
+Layer = LineMark | SampleMarks | Dots | Area
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,9 @@ def chart(
     parts.append(f'<g class="ticks">{labels}</g>')
     parts.append(text((x.start + x.stop) / 2, top - GAP + 28, x_label, "m"))
     attributes = x.attribute(x_label, columns) + (f' data-names="{units}"' if units else "")
-    long = [layer for p in panels for layer in p.layers if isinstance(layer, Samples) and len(layer.x) > MAXIMUM_DOTS]
+    long = [
+        layer for p in panels for layer in p.layers if isinstance(layer, SampleMarks) and len(layer.x) > MAXIMUM_DOTS
+    ]
     attributes += _full(long[0].x, long[0].x, x) if long else ""
     return figure.drawn(description, top - GAP + BOTTOM, "".join(parts), attributes)
 
@@ -222,11 +224,11 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
         low, high = (np.broadcast_to(end, len(at)) for end in (layer.low, layer.high))
         path = _line(np.concatenate([at, at[::-1]]), y.units(np.concatenate([low, high[::-1]])))
         return f'<path class="band c{layer.colour}" d="{path}z"/>'
-    if isinstance(layer, Samples):
+    if isinstance(layer, SampleMarks):
         columns = enumerate(np.atleast_2d(layer.y.T), layer.colour)
         return "".join(_samples(layer, column, f"c{colour}", x, y) for colour, column in columns)
     known = np.flatnonzero(np.isfinite(layer.x) & np.isfinite(layer.y))
-    if isinstance(layer, Line):
+    if isinstance(layer, LineMark):
         breaks = np.flatnonzero(np.diff(known) > 1) + 1
         ends = np.array([x.units(layer.x[known]), y.units(layer.y[known])])
         path = "".join(_line(*piece) for piece in (np.split(ends, breaks, axis=1) if breaks.size else [ends]))
@@ -240,7 +242,7 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
     return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, y.units(layer.y[known]))}"{units}/>'
 
 
-def _samples(layer: Samples, values: Values, colour: str, x: Axis, y: Axis) -> str:
+def _samples(layer: SampleMarks, values: Values, colour: str, x: Axis, y: Axis) -> str:
     """Return one column of samples as dots, or as the ranges of buckets."""
     known = np.isfinite(layer.x) & np.isfinite(values)
     known_x, known_y = layer.x[known], values[known]

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.estimation.engine import scaled_inverse
-from pipeline.estimation.lot_prior import FEWEST, LotPrior, Prediction, lot_priors, with_prior
+from pipeline.estimation.lot_prior import MIN_SIBLINGS, LotPrior, Prediction, lot_priors, with_prior
 from pipeline.estimation.uncertainty_budget import NOISE, own_and_bench
 from pipeline.estimation.uncertainty_budget import combined as budget_of
 from pipeline.io.files import wrong_name
@@ -68,11 +68,11 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and other elements of the matrix
 BENCH = "stated accuracies of the bench"
-SAME = ("sensor", "method", "table")  # equal in the calibrations of one estimate
+EQUAL_SETTINGS = ("sensor", "method", "table")  # equal in the calibrations of one estimate
 LINE = "prior of the lot"
 LACK_OF_FIT = "lack of fit"  # errors of a table are part of it: siblings may have it in common
 SHARED = f"{BENCH}, and {LACK_OF_FIT}"
-NONE = np.empty(0)
+NO_VALUES = np.empty(0)
 MOST_FREEDOM = 1e12  # instead of infinitely many degrees of freedom, for which JSON has no number
 DOUBTFUL = (
     Verdict.REFERENCE_IN_DOUBT,
@@ -112,7 +112,7 @@ def _refused(documents: Sequence[JSON]) -> str | None:
             other = files.setdefault(file["sha256"], document["unit"])
             if other != document["unit"]:
                 return f"{other} and {document['unit']} use the same recording, {file['file']}"
-    for key in SAME:
+    for key in EQUAL_SETTINGS:
         if len({str(document[key]) for document in documents}) > 1:
             return f"the calibrations differ in {key}: {', '.join(str(d[key]) for d in documents)}"
     for sensor in SENSORS:
@@ -197,7 +197,7 @@ def repeatability(x: Values, variance: Values, kind: Index) -> Values:
     return np.where(scattered, np.sqrt(high), 0.0)[kind]
 
 
-class Estimate(NamedTuple):
+class UnitEstimate(NamedTuple):
     """The estimate of a sensor of a unit, from which the prior of a lot is computed.
 
     Units with the same ``comparable`` may be siblings. In a file the arrays are lists.
@@ -217,14 +217,14 @@ class Estimate(NamedTuple):
     known: Mask  # parameters of the sensor itself with a stated uncertainty
 
     @classmethod
-    def read(cls, data: JSON) -> Estimate:
+    def read(cls, data: JSON) -> UnitEstimate:
         """Return the estimate of an entry of a file; equal texts of all units share their memory."""
         texts = {k: sys.intern(data[k]) for k in ("sensor", "lot", "comparable")}
         arrays = {k: np.array(data[k]) for k in ("values", "own", "freedom", "shared", "kind", "known")}
         return cls(**{**data, **texts, **arrays})
 
 
-class Prior(NamedTuple):
+class UnitPrior(NamedTuple):
     """The prior of a sensor of a unit, or why it has none."""
 
     lot: str
@@ -233,18 +233,18 @@ class Prior(NamedTuple):
     outlier: bool = False
     probability: float | None = None
     worst: str = ""  # the parameter with the largest difference of an outlier
-    predicted: Prediction = Prediction(NONE, NONE, NONE)
-    known: Mask = NONE.astype(bool)
-    shared: Values = NONE  # mean standard uncertainty of the siblings by errors that they may have in common
+    predicted: Prediction = Prediction(NO_VALUES, NO_VALUES, NO_VALUES)
+    known: Mask = NO_VALUES.astype(bool)
+    shared: Values = NO_VALUES  # mean standard uncertainty of the siblings by errors that they may have in common
 
     @classmethod
-    def read(cls, data: JSON) -> Prior:
+    def read(cls, data: JSON) -> UnitPrior:
         """Return the prior of an entry of a file."""
         known, predicted = np.array(data["known"], bool), Prediction(*map(np.array, data["predicted"]))
         return cls(**{**data, "known": known, "predicted": predicted, "shared": np.array(data["shared"])})
 
 
-def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> list[Estimate]:
+def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> list[UnitEstimate]:
     """Return the estimate of each sensor of a calibrated unit for the prior of its lot.
 
     ``row``: of ``units.csv``; ``calibration``, ``diagnosis``: as published.
@@ -261,7 +261,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
         refused = refused if fit.converged else f"the fit of its {sensor} did not converge"
         x = fit.parameters.values
         found.append(
-            Estimate(
+            UnitEstimate(
                 unit=calibration["unit"],
                 sensor=sensor,
                 lot=calibration["sensor"] + (f", lot {lot}" if lot else ""),
@@ -294,12 +294,12 @@ def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Valu
     return own, shared, (freedom, of_shared)
 
 
-def priors_of(found: Iterable[Estimate]) -> tuple[dict[tuple[str, str], Prior], list[JSON]]:
+def priors_of(found: Iterable[UnitEstimate]) -> tuple[dict[tuple[str, str], UnitPrior], list[JSON]]:
     """Return the prior of each unit and sensor, and the description of each lot and sensor in ``fleet.json``."""
-    lots: dict[tuple[str, str], dict[str, list[Estimate]]] = {}
+    lots: dict[tuple[str, str], dict[str, list[UnitEstimate]]] = {}
     for estimate in found:
         lots.setdefault((estimate.lot, estimate.sensor), {}).setdefault(estimate.comparable, []).append(estimate)
-    priors: dict[tuple[str, str], Prior] = {}
+    priors: dict[tuple[str, str], UnitPrior] = {}
     described = []
     for (lot, sensor), kinds in lots.items():
         of_lot = {e.unit: p for kind in kinds.values() for e, p in zip(kind, _priors(kind, len(kinds)), strict=True)}
@@ -313,25 +313,25 @@ def priors_of(found: Iterable[Estimate]) -> tuple[dict[tuple[str, str], Prior], 
     return priors, described
 
 
-def _priors(kind: list[Estimate], kinds: int) -> list[Prior]:
+def _priors(kind: list[UnitEstimate], kinds: int) -> list[UnitPrior]:
     """Return the priors of units that may be siblings; ``kinds``: number of such groups in the lot."""
     able, known = np.array([e.refused is None for e in kind]), np.all([e.known for e in kind], axis=0)
     names = {device: i for i, device in enumerate(dict.fromkeys(e.device for e in kind))}
     device = np.array([names[e.device] for e in kind])
     count, lot = len(set(device[able])), kind[0].lot
     if not known.any():
-        return [Prior(lot, refused=f"the method states no uncertainty of the {e.sensor}") for e in kind]
-    if count <= FEWEST:
+        return [UnitPrior(lot, refused=f"the method states no uncertainty of the {e.sensor}") for e in kind]
+    if count <= MIN_SIBLINGS:
         others = "; the other units of the lot differ in table, procedure, method, axes or effects" if kinds > 1 else ""
-        few = f"{count} devices of the lot can be compared, {FEWEST + 1} or more are needed{others}"
-        return [Prior(lot, refused=e.refused or few) for e in kind]
+        few = f"{count} devices of the lot can be compared, {MIN_SIBLINGS + 1} or more are needed{others}"
+        return [UnitPrior(lot, refused=e.refused or few) for e in kind]
     x, own = np.stack([e.values[known] for e in kind]), np.stack([e.own[np.ix_(known, known)] for e in kind])
     lots = lot_priors(x, own, np.stack([e.freedom[known] for e in kind]), able, (device, kind[0].kind[known]))
     shared = np.mean([e.shared for e, a in zip(kind, able, strict=True) if a], axis=0)
     return [_prior(e, lots, i, known, shared) for i, e in enumerate(kind)]
 
 
-def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, shared: Values) -> Prior:
+def _prior(estimate: UnitEstimate, lots: LotPrior, i: int, known: Mask, shared: Values) -> UnitPrior:
     siblings, p, refused, worst = int(lots.siblings[i]), float(lots.probability[i]), estimate.refused, ""
     outlier = not refused and bool(lots.outlier[i])
     if outlier:
@@ -339,13 +339,13 @@ def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, shared: Valu
         most = int(np.argmax(np.abs(lots.deviation[i])))
         worst = f"{plain(str(names[most]))} by {number(abs(float(lots.deviation[i, most])), 2)}"
         refused = f"it differs from its {siblings} siblings (p = {number(p, 2)})"
-    elif not refused and siblings < FEWEST:
-        refused = f"without outliers {siblings} siblings remain, {FEWEST} or more are needed"
+    elif not refused and siblings < MIN_SIBLINGS:
+        refused = f"without outliers {siblings} siblings remain, {MIN_SIBLINGS} or more are needed"
     predicted = Prediction(*(values[i] for values in lots.predicted))
-    return Prior(estimate.lot, siblings, refused, outlier, p, worst, predicted, known, shared)
+    return UnitPrior(estimate.lot, siblings, refused, outlier, p, worst, predicted, known, shared)
 
 
-def calibration_with_prior(calibration: JSON, priors: Mapping[str, Prior]) -> JSON | None:
+def calibration_with_prior(calibration: JSON, priors: Mapping[str, UnitPrior]) -> JSON | None:
     """Return a calibration with the priors of its sensors, in the form of ``calibrations/<unit>.json``.
 
     ``lot_prior`` states the prior of each sensor, or the reason why it has none. Returns None if no sensor has a prior.
@@ -361,7 +361,7 @@ def calibration_with_prior(calibration: JSON, priors: Mapping[str, Prior]) -> JS
     return document
 
 
-def _sensor_with_prior(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSON]:
+def _sensor_with_prior(sensor: str, part: JSON, prior: UnitPrior) -> tuple[JSON, JSON]:
     fit = SensorCalibration.from_json(sensor, part)
     own, shared, (freedom, of_shared) = _divided(fit)
     known, u = prior.known, np.sqrt(np.diag(shared))
@@ -389,7 +389,7 @@ def _sensor_with_prior(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSO
     }, added
 
 
-def with_card(page: str, calibration: JSON, document: JSON | None, priors: Mapping[str, Prior]) -> str:
+def with_card(page: str, calibration: JSON, document: JSON | None, priors: Mapping[str, UnitPrior]) -> str:
     """Return a unit's page with the section on its prior, before the section on its runs."""
     rows: dict[str, list[Any]] = {}
     with_priors = document or {"lot_prior": {}}

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 JSON = dict[str, Any]
-LEVEL = 0.05  # of a test, and 1 minus the coverage of an interval (JCGM 100:2008, 6.2.2: about 95 %)
+TEST_LEVEL = 0.05  # of a test, and 1 minus the coverage of an interval (JCGM 100:2008, 6.2.2: about 95 %)
 MEASURES = {"after": "rms error, held out", "truth": "rms error against the truth"}
 FIGURES = (
     "unit", "sensor", "before", "u_before", "after", "u_after", "truth", "u_truth", "noise_floor", "table_time",
@@ -62,7 +62,7 @@ FIGURES = (
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MeanWithUncertainty:
     """A mean or a difference with its standard uncertainty; NaN where it is unknown.
 
     The degrees of freedom are infinite where the stated uncertainties were used instead of the scatter.
@@ -78,7 +78,7 @@ class Estimate:
         """Half the width of the 95 % interval."""
         from scipy.special import stdtrit  # noqa: PLC0415  (only where a campaign compares)
 
-        return self.standard_uncertainty * float(stdtrit(self.degrees_of_freedom, 1.0 - LEVEL / 2.0))
+        return self.standard_uncertainty * float(stdtrit(self.degrees_of_freedom, 1.0 - TEST_LEVEL / 2.0))
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -99,7 +99,7 @@ class Estimate:
         return 2.0 * float(stdtr(self.degrees_of_freedom, -abs(self.significance)))
 
 
-def mean_of(values: ArrayLike, uncertainties: ArrayLike = math.nan) -> Estimate:
+def mean_of(values: ArrayLike, uncertainties: ArrayLike = math.nan) -> MeanWithUncertainty:
     """Return the mean of (n,) values with the uncertainty by their scatter; a single value keeps its uncertainty.
 
     An unknown uncertainty and the mean of no values are NaN.
@@ -107,11 +107,13 @@ def mean_of(values: ArrayLike, uncertainties: ArrayLike = math.nan) -> Estimate:
     v = np.asarray(values, float)
     if v.size < 2:
         alone, u = (float(np.append(a, math.nan)[0]) for a in (v, uncertainties))
-        return Estimate(alone, u, math.inf, v.size)
-    return Estimate(float(v.mean()), float(v.std(ddof=1) / math.sqrt(v.size)), v.size - 1.0, v.size)
+        return MeanWithUncertainty(alone, u, math.inf, v.size)
+    return MeanWithUncertainty(float(v.mean()), float(v.std(ddof=1) / math.sqrt(v.size)), v.size - 1.0, v.size)
 
 
-def difference(first: pd.DataFrame, second: pd.DataFrame, pairs: Mapping[str, str] | None = None) -> Estimate:
+def difference(
+    first: pd.DataFrame, second: pd.DataFrame, pairs: Mapping[str, str] | None = None
+) -> MeanWithUncertainty:
     """Return the mean of ``first`` minus the mean of ``second``: columns ``value`` and ``u`` (NaN: unknown) by unit.
 
     ``pairs``: unit to device; with it the differences are those within the devices, each by the mean of its units.
@@ -127,9 +129,9 @@ def difference(first: pd.DataFrame, second: pd.DataFrame, pairs: Mapping[str, st
         squares = [m.standard_uncertainty**2 for m in means]
         total = sum(squares)
         terms = sum(square**2 / m.degrees_of_freedom for square, m in zip(squares, means, strict=True))
-        return Estimate(value, math.sqrt(total), total**2 / terms if total else math.inf, count)
+        return MeanWithUncertainty(value, math.sqrt(total), total**2 / terms if total else math.inf, count)
     stated = math.hypot(*(_of_mean(group["u"]) for group in (first, second)))
-    return Estimate(value, stated, math.inf, count)
+    return MeanWithUncertainty(value, stated, math.inf, count)
 
 
 def _of_mean(uncertainties: pd.Series[float]) -> float:
@@ -149,8 +151,8 @@ def adjusted(p_values: Sequence[float]) -> list[float]:
 class Compared:
     """The mean logarithm of a group, and its difference from the reference group with the adjusted p-value."""
 
-    logarithm: Estimate
-    difference: Estimate | None
+    logarithm: MeanWithUncertainty
+    difference: MeanWithUncertainty | None
     p_value: float
 
     @property
@@ -169,7 +171,7 @@ class Compared:
         """The result of the test of the difference; empty where its uncertainty is unknown."""
         if self.difference is None or math.isnan(self.p_value):
             return ""
-        if self.p_value > LEVEL:
+        if self.p_value > TEST_LEVEL:
             return "not told apart"
         return "smaller" if self.difference.value < 0 else "larger"
 
@@ -208,7 +210,7 @@ def finding(groups: Mapping[str, pd.DataFrame], pairs: Mapping[str, str] | None)
     text = f"Smallest with {best}: {number(compared[best].mean)}"
     text += f" ({number(low)} to {number(high)})" if low < high else ""
     others = {name: c for name, c in compare(groups, best, pairs).items() if c.result}
-    near = [name for name, c in others.items() if c.p_value > LEVEL]
+    near = [name for name, c in others.items() if c.p_value > TEST_LEVEL]
     if not others:
         return text
     if not near:
@@ -361,7 +363,7 @@ def _parameters(units: Mapping[str, pd.DataFrame], against: str, pairs: Mapping[
             cells.append({
                 "value": measured(mean.value, U) if U > 0.0 else number(mean.value),
                 "significance": "" if math.isnan(change.significance) else number(change.significance, 2),
-                "beyond": change.p_value < LEVEL,
+                "beyond": change.p_value < TEST_LEVEL,
             })  # fmt: skip
         rows.append({"name": group, "cells": cells})
     return {"names": names, "rows": rows}

@@ -18,7 +18,7 @@ from pipeline.estimation.posterior import prior_limit
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, parameter_limits
 from pipeline.records import AXES, SENSOR_UNITS, Values
-from pipeline.report.chart import Dots, Figure, Layer, Line, Panel, chart, sentences
+from pipeline.report.chart import Dots, Figure, Layer, LineMark, Panel, chart, sentences
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import measured, number, percent, plain, unit_text
 
@@ -28,13 +28,18 @@ if TYPE_CHECKING:
     from pipeline.settings import DataSheet
 
 JSON = dict[str, Any]
-CLOSE = 0.8  # share of the selected effect's delta BIC above which another effect is named as a rival
-MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart or its caption shows
+RIVAL_SHARE = 0.8  # share of the selected effect's delta BIC above which another effect is named as a rival
+MAX_CHART_EFFECTS, MIN_CHART_EFFECTS, MOST_HIDDEN, MAX_CAPTION_BRACKETS = (
+    9,
+    3,
+    6,
+    2,
+)  # effects and brackets that a chart or its caption shows
 EXCLUDED = 0.5  # of the upper limit by the prior alone, below which the recordings exclude an effect: convention
 MOST_LIMITS = 8  # upper limits that a chart shows
 ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, more for correlated bins
 MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they are farther off
-SIGNALS = {
+SIGNAL_NAMES = {
     "temperature": "temperature, degC",
     "time": "time since power-on, s",
     "speed": "magnitude of the angular rate, deg/s",
@@ -106,8 +111,8 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
     selected = found.get("selected") or []
     if not entries:
         return None
-    helpful = [r for r in entries if _evidence(r) > 0 or r["effect"] in selected][:MOST]
-    shown = helpful if len(helpful) >= FEWEST else entries[:FEWEST]
+    helpful = [r for r in entries if _evidence(r) > 0 or r["effect"] in selected][:MAX_CHART_EFFECTS]
+    shown = helpful if len(helpful) >= MIN_CHART_EFFECTS else entries[:MIN_CHART_EFFECTS]
     rows = [_ranking_row(r, selected, passes=_passes(r, sensor)) for r in shown]
     brackets = _brackets(shown, selected)
     best = max((r for r in entries if r["effect"] not in selected), key=_evidence, default=None)
@@ -117,7 +122,7 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
         selected=selected,
         value=value,
         best=best,
-        close=best is not None and _evidence(best) > CLOSE * value,
+        close=best is not None and _evidence(best) > RIVAL_SHARE * value,
         passes=best is not None and _passes(best, sensor),
         slow=MIN_DELTA_BIC_OF_SLOW,
         brackets=brackets,
@@ -157,7 +162,7 @@ def _brackets(shown: Sequence[JSON], selected: Sequence[str]) -> list[dict[int, 
     for entry in sorted(shown, key=lambda r: r["effect"] not in selected):
         alike = {a["effect"]: a["share"] for a in entry.get("look_alikes") or [] if a["effect"] in rows}
         alike = {n: share for n, share in alike.items() if frozenset((n, entry["effect"])) not in joined}
-        if alike and len(brackets) < BRACKETS:
+        if alike and len(brackets) < MAX_CAPTION_BRACKETS:
             joined |= {frozenset((n, m)) for n in (*alike, entry["effect"]) for m in alike}
             brackets.append({rows[entry["effect"]]: "", **{rows[n]: percent(s) for n, s in alike.items()}})
     return brackets
@@ -174,7 +179,7 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
     scatter, residual, total = [], 0.0, 0.0
     for panel, (x, mean, error) in zip(shown["panels"], points, strict=True):
         line_x = np.array([x.min(), x.max()]) if panel["value"] else ends
-        line = Line(line_x, panel["value"] * line_x, 5, "model")
+        line = LineMark(line_x, panel["value"] * line_x, 5, "model")
         panels.append(Panel([line, _binned(panel)], f"{panel['axis']}, {unit}", 92, {"": 0.0}))
         squares = ((mean - panel["value"] * x) / error) ** 2
         scatter.append(float(np.mean(squares)))
@@ -239,7 +244,7 @@ def unexplained(sensor: str, found: JSON) -> list[Figure]:
             layers: list[Layer] = [_binned(panel)]
             if "curve" in panel:
                 curve_x, curve = (np.array(panel[key], float) for key in ("curve_x", "curve"))
-                layers.insert(0, Line(curve_x, curve, 5, "model"))
+                layers.insert(0, LineMark(curve_x, curve, 5, "model"))
                 scatter.append(float(np.mean(((mean - np.interp(x, curve_x, curve)) / error) ** 2)))
             panels.append(Panel(layers, f"{panel['axis']}, {unit}", 76, {"": 0.0}))
         finding, caption, description = sentences(
@@ -252,7 +257,7 @@ def unexplained(sensor: str, found: JSON) -> list[Figure]:
         )
         legend = (("c5", "suggested shape"),) if scatter else ()
         figure = Figure(f"{sensor}-unexplained-{covariate}", finding, caption, legend)
-        label = SIGNALS.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}")
+        label = SIGNAL_NAMES.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}")
         kind = "angle" if shown["signal"] == "angle" else ""
         figures.append(chart(figure, description, panels, label, kind=kind))
     return figures

@@ -42,9 +42,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 JSON = dict[str, Any]
-FEWEST = 20  # units, below which a median absolute deviation is too uncertain: its standard deviation is 17 % of it
-FAR = 6.0  # robust standard deviations, which noise does not exceed in 10,000 units with 24 parameters
-LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
+MIN_UNITS_OF_DEVIATION = (
+    20  # units, below which a median absolute deviation is too uncertain: its standard deviation is 17 % of it
+)
+OUTLIER_DEVIATIONS = 6.0  # robust standard deviations, which noise does not exceed in 10,000 units with 24 parameters
+FLEET_TEST_LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
 MOST_PAIRED = 1000  # units from which the slope is computed: it needs all pairs of them, 50 MB
 DAYS_OF_A_YEAR = 365.25
 SIBLINGS = ["sensor", "method"]
@@ -99,21 +101,21 @@ def _distributions(table: pd.DataFrame, _: int) -> Iterable[JSON]:
 
 def _far(table: pd.DataFrame, _: int) -> Iterable[JSON]:
     v, spread = table["value"], _spread(table["value"])
-    if v.count() >= FEWEST and spread > 0.0:
+    if v.count() >= MIN_UNITS_OF_DEVIATION and spread > 0.0:
         far = table.assign(z=(v - v.median()) / spread)
-        for unit in far[far["z"].abs() > FAR].to_dict("records"):
+        for unit in far[far["z"].abs() > OUTLIER_DEVIATIONS].to_dict("records"):
             lot = unit["lot"] if isinstance(unit["lot"], str) else None
             yield {"name": unit["unit"], "lot": lot, "value": unit["value"], "z": unit["z"]}
 
 
 def _drift(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
     known = table[["day", "value"]].dropna()
-    if len(known) < FEWEST or known.nunique().min() == 1:  # dates or values that are all the same
+    if len(known) < MIN_UNITS_OF_DEVIATION or known.nunique().min() == 1:  # dates or values that are all the same
         return
     from scipy import stats  # noqa: PLC0415  (0.3 s that few fleets need)
 
     rho, p = stats.spearmanr(known["day"], known["value"])
-    if p * parameters < LEVEL:
+    if p * parameters < FLEET_TEST_LEVEL:
         some = known.iloc[:: -(-len(known) // MOST_PAIRED)]
         slope = float(stats.theilslopes(some["value"], some["day"]).slope)
         found = {"rank_correlation": float(rho), "p_value": float(p), "per_year": slope * DAYS_OF_A_YEAR}
@@ -123,12 +125,12 @@ def _drift(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
 def _lots(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
     values = table["value"].dropna()
     lots = {lot: v for lot, v in values.groupby(table["lot"]) if len(v) >= 3}
-    if len(values) < FEWEST or len(lots) < 2 or np.ptp(values) == 0.0:
+    if len(values) < MIN_UNITS_OF_DEVIATION or len(lots) < 2 or np.ptp(values) == 0.0:
         return
     from scipy import stats  # noqa: PLC0415  (0.3 s that only lots need)
 
     p = float(stats.kruskal(*lots.values()).pvalue)
-    if p * parameters < LEVEL:
+    if p * parameters < FLEET_TEST_LEVEL:
         medians, middle = {lot: float(v.median()) for lot, v in lots.items()}, float(values.median())
         lot = max(medians, key=lambda lot: abs(medians[lot] - middle))
         yield {"p_value": p, "lot": lot, "lot_median": medians[lot], "median": middle}
@@ -162,7 +164,7 @@ def _against_stated(known: pd.DataFrame, parameters: int) -> JSON:
         largest = max(largest, float(np.max(np.abs(value[:, None] - value) / np.hypot(U[:, None], U))))
     p = float(chdtrc(freedom, chi))
     found = {"chi_square": chi, "degrees_of_freedom": freedom, "p_value": p, "largest_en": largest}
-    return found | {"beyond_uncertainty": p * parameters < LEVEL}
+    return found | {"beyond_uncertainty": p * parameters < FLEET_TEST_LEVEL}
 
 
 STATISTICS = {

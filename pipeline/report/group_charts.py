@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.report.axis import LINEAR_TO, Axis
-from pipeline.report.chart import LETTER, WIDTH, Dots, Figure, Layer, Line, Panel, Samples, chart, text
+from pipeline.report.chart import LETTER, WIDTH, Dots, Figure, Layer, LineMark, Panel, SampleMarks, chart, text
 from pipeline.report.numbers import number
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def stems(
     """
     values = np.array(list(groups.values()), float)
     at, zero = np.arange(1.0, len(values) + 1.0), np.zeros(len(values))
-    layers: list[Layer] = [Line(at, np.array(levels), 5, "dashed")] if len(levels) else []
+    layers: list[Layer] = [LineMark(at, np.array(levels), 5, "dashed")] if len(levels) else []
     for j, column in enumerate(values.T):
         layers.append(Dots(at + 0.8 * ((j + 0.5) / values.shape[1] - 0.5), column, j, zero, column))
     texts = "; ".join(f"{below}: {', '.join(number(v, 2) for v in group)}" for below, group in groups.items())
@@ -159,12 +159,12 @@ def curves(figure: Figure, points: Sequence[Point], label: str, x_label: str, *,
         of_series = sorted((p for p in points if p.series == series), key=lambda p: p.x)
         x, value, floor = (np.array(v, float) for v in zip(*((p.x, p.value, p.floor) for p in of_series), strict=True))
         low, high = np.array([p.interval for p in of_series]).T
-        layers.append(Line(x, value, colour % COLOURS, "model"))
+        layers.append(LineMark(x, value, colour % COLOURS, "model"))
         if np.isfinite(floor).any():
-            layers.append(Line(x, floor, colour % COLOURS, "dashed"))
+            layers.append(LineMark(x, floor, colour % COLOURS, "dashed"))
         units = [(p.x, unit) for p in of_series if len(p.units) > 1 for unit in p.units]
         unit_x, unit_y = np.array(units).reshape(-1, 2).T
-        layers += [Samples(unit_x, unit_y, colour % COLOURS), Dots(x, value, colour % COLOURS, low, high)]
+        layers += [SampleMarks(unit_x, unit_y, colour % COLOURS), Dots(x, value, colour % COLOURS, low, high)]
     places = [p.x for p in points]
     kind = "log" if min(places) > 0.0 and max(places) > DECADE * min(places) else ""
     names = [(p.x, p.value or 0.0, p.label) for p in points] if named else []

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.records import SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration, Values
-from pipeline.report.chart import Area, Figure, Layer, Line, Panel, Samples, chart, sentences
+from pipeline.report.chart import Area, Figure, Layer, LineMark, Panel, SampleMarks, chart, sentences
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
 from pipeline.validation.error_breakdown import with_known_effects
@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from pipeline.settings import Table
 
 JSON = dict[str, Any]
-ALIKE = 1.2  # held-out errors of diagnosis and validation that agree within this factor are shown as one series
-FAR = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
+EQUAL_ERROR_FACTOR = (
+    1.2  # held-out errors of diagnosis and validation that agree within this factor are shown as one series
+)
+MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
 SOURCES = {
     "static": "the static recording",
     "rests": "the rests",
@@ -98,7 +100,7 @@ def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
     chosen = [entries[name] for name in found.get("selected") or [] if name in entries]
     if not chosen or not reached or any(r.get("held_out_error_after") is None for r in chosen):
         return []
-    if not 1.0 / ALIKE < chosen[0]["held_out_error_before"] / reached < ALIKE:
+    if not 1.0 / EQUAL_ERROR_FACTOR < chosen[0]["held_out_error_before"] / reached < EQUAL_ERROR_FACTOR:
         return []
     words = "if added with the suggested shape" if found.get("suggested_effect") else "if added"
     return [Point(f"+ {plain(r['effect'])}, {words}", r["held_out_error_after"], 4) for r in chosen]
@@ -142,9 +144,9 @@ def held_out_over_time(
     ``by_hand``: the reference lacks the acceleration of the moving unit.
     """
     unit, x = SENSOR_UNITS[sensor], recording.time - recording.time[0]
-    after: list[Layer] = [Samples(x, calibrated, 2, mean=True)]
+    after: list[Layer] = [SampleMarks(x, calibrated, 2, mean=True)]
     panels = [
-        Panel([Samples(x, raw, 3), Samples(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),
+        Panel([SampleMarks(x, raw, 3), SampleMarks(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),
         Panel([Area(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),
     ]
     rms = [float(np.sqrt(np.nanmean(v**2))) for v in (raw, calibrated)]
@@ -173,4 +175,4 @@ def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:
     later = np.concatenate([v[len(v) // 50 + 1 :] for v in angles.values()])
     later = later[later > 0]
     limits = (float(later.min()) / 1.2, float(later.max()) * 1.2) if later.size else (1e-3, 1.0)
-    return Panel([Line(time, v, c) for c, v in angles.items()], label, 110, limits=limits, logarithmic=True)
+    return Panel([LineMark(time, v, c) for c, v in angles.items()], label, 110, limits=limits, logarithmic=True)

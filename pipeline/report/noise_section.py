@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
 from pipeline.estimation.noise_terms import UNITS, allan_variance, each_term
 from pipeline.records import AXES, SENSOR_UNITS
-from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, chart, sentences
+from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, LineMark, Panel, chart, sentences
 from pipeline.report.numbers import number, percent, plain
 
 if TYPE_CHECKING:
@@ -22,9 +22,11 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 # Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
 # 260 Hz) change the white noise of a sample by sqrt(52) = 7 at one sampling rate, its ranges by 2 to 8.
-FAR = 5.0
-NEAR = 1.3  # factor between both below which they count as equal: data sheets state typical values to about 30 %
-SURE = 0.9  # probability of a set of terms above which no other set is named
+MAX_TIMES_DATA_SHEET = 5.0
+EQUAL_NOISE_FACTOR = (
+    1.3  # factor between both below which they count as equal: data sheets state typical values to about 30 %
+)
+SURE_TERM_PROBABILITY = 0.9  # probability of a set of terms above which no other set is named
 SYMBOLS = dict(zip(UNITS, "QNBKGRA", strict=True))
 
 
@@ -41,7 +43,7 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
         curve, colour = {k: np.array(v) for k, v in part["allan"].items()}, AXES.index(axis)
         layers += [
             Area(curve["low"], curve["high"], colour, curve["tau_s"]),
-            Line(curve["tau_s"], curve["fit"], colour, "model"),
+            LineMark(curve["tau_s"], curve["fit"], colour, "model"),
             Dots(curve["tau_s"], curve["deviation"], colour),
         ]
     legend, tau = list(AXES_LEGEND), np.array(next(iter(axes.values()))["allan"]["tau_s"])
@@ -51,7 +53,7 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
         time = {"value": data_sheet.stated("wander_time_s") or DEFAULT_TIME_S}
         stated = {"value": data_sheet.stated("bias_wander") or 0.0, "correlation_time_s": time}
         variance = allan_variance("white", white, tau) + allan_variance("gauss_markov", stated, tau)
-        layers.append(Line(tau, np.sqrt(variance), 3, "dashed"))
+        layers.append(LineMark(tau, np.sqrt(variance), 3, "dashed"))
     mean = np.mean([part["allan"]["deviation"] for part in axes.values()], axis=0)
     finding, caption, description = sentences(
         "allan",
@@ -101,7 +103,7 @@ def remarks(noise: JSON | None) -> list[str]:
         lines = [f"not identified: {part['reason']}"] if part["reason"] else []
         lines += [f"in doubt: {doubt}" for doubt in part.get("doubts") or []]
         ranking = part.get("ranking") or []
-        if ranking and ranking[0]["probability"] < SURE and len(ranking) > 1:
+        if ranking and ranking[0]["probability"] < SURE_TERM_PROBABILITY and len(ranking) > 1:
             second = ", ".join(map(plain, ranking[1]["terms"]))
             best, next_best = (percent(r["probability"]) for r in ranking[:2])
             lines.append(f"these terms have a probability of {best}, the next best set ({second}) {next_best}")
@@ -135,10 +137,10 @@ def _white(axes: JSON, density: float | None) -> JSON:
     white = float(np.sqrt(np.mean(np.square(densities)))) if densities else None
     stated = (density or 0.0) / np.sqrt(2.0)
     ratio, cause = white / stated if white and stated else None, ""
-    if ratio and ratio > FAR:
+    if ratio and ratio > MAX_TIMES_DATA_SHEET:
         cause = ": vibration at rest, another range, or a column in another unit"
-    elif ratio and ratio < 1.0 / FAR:
+    elif ratio and ratio < 1.0 / MAX_TIMES_DATA_SHEET:
         cause = ": a filter in the sensor, smoothed or repeated samples, or a column in another unit"
     others = [name for name in SYMBOLS if name != "white" and name in names]
-    as_stated = ratio is not None and 1.0 / NEAR < ratio < NEAR
+    as_stated = ratio is not None and 1.0 / EQUAL_NOISE_FACTOR < ratio < EQUAL_NOISE_FACTOR
     return {"white": white, "ratio": ratio, "as_stated": as_stated, "cause": cause, "others": others}

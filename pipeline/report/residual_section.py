@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.model.kinematics import table_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, Integers, Motion, Recording, SensorCalibration, Values
-from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, Samples, chart, sentences
+from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, LineMark, Panel, SampleMarks, chart, sentences
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
 from pipeline.signal.encoder_rate import rate_by_angle
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from pipeline.settings import Table
 
 JSON = dict[str, Any]
-BINS = 36  # of a covariate, and of a turn: 10 deg each
-FEWEST = 5  # samples of a bin, below which it counts as empty: its scatter is unknown
+RESIDUAL_BINS = 36  # of a covariate, and of a turn: 10 deg each
+MIN_BIN_SAMPLES = 5  # samples of a bin, below which it counts as empty: its scatter is unknown
 HARMONICS = 12  # cycles a turn; averaging over 36 bins reduces the amplitude of the last one by 16 %
 ONE_IN_A_THOUSAND = float(np.sqrt(2.0 * np.log(1000.0)))  # quantile 0.999 of the Rayleigh distribution
 FLAT = 2.0  # mean square of the means over noise and wander, below which the page calls them flat
-NOISE = 1.1  # residual over noise below which the page states that the residual is noise
+NOISE_ALONE_RATIO = 1.1  # residual over noise below which the page states that the residual is noise
 MODEL_POINTS = 150  # of a model's line: about the number of ranges in a chart
 
 
@@ -115,16 +115,16 @@ def _binned_mean(covariate: Values, error: Values) -> _BinnedMean | None:
     low, high = (float(covariate.min()), float(covariate.max())) if len(covariate) else (0.0, 0.0)
     if not high - low > 1e-9 * max(1.0, abs(low)):
         return None
-    cell = np.minimum(((covariate - low) * (BINS / (high - low))).astype(np.int64), BINS - 1)
-    count = np.bincount(cell, minlength=BINS).astype(float)
-    count[count < FEWEST] = np.nan
+    cell = np.minimum(((covariate - low) * (RESIDUAL_BINS / (high - low))).astype(np.int64), RESIDUAL_BINS - 1)
+    count = np.bincount(cell, minlength=RESIDUAL_BINS).astype(float)
+    count[count < MIN_BIN_SAMPLES] = np.nan
     filled = np.isfinite(count)
     if filled.sum() < 2:
         return None
-    mean = np.stack([np.bincount(cell, e, BINS) / count for e in error.T], 1)
+    mean = np.stack([np.bincount(cell, e, RESIDUAL_BINS) / count for e in error.T], 1)
     between = np.sum(mean[filled] ** 2 * count[filled, None], axis=0) / count[filled].sum()
     scatter = np.sqrt(np.maximum(np.mean(error**2, axis=0) - between, 0.0)) + 1e-300
-    centre = low + (np.arange(BINS) + 0.5) * (high - low) / BINS
+    centre = low + (np.arange(RESIDUAL_BINS) + 0.5) * (high - low) / RESIDUAL_BINS
     return _BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
 
 
@@ -157,8 +157,8 @@ def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
 
 def _angle_bins(angle: Values) -> tuple[Integers, Integers]:
     """Return the bin, of 36 in a turn, of each of (n,) angles (deg), and the number of angles in each bin."""
-    cell = (np.mod(angle, 360.0) * (BINS / 360.0)).astype(np.int64) % BINS
-    return cell, np.bincount(cell, minlength=BINS)
+    cell = (np.mod(angle, 360.0) * (RESIDUAL_BINS / 360.0)).astype(np.int64) % RESIDUAL_BINS
+    return cell, np.bincount(cell, minlength=RESIDUAL_BINS)
 
 
 def harmonics(residual: Residual) -> Values | None:
@@ -172,10 +172,10 @@ def harmonics(residual: Residual) -> Values | None:
     cell, count = _angle_bins(angle)
     if not count.all():
         return None
-    mean = np.stack([np.bincount(cell, e, BINS) / count for e in residual.error.T], 1)
-    amplitude = np.abs(np.fft.rfft(mean, axis=0))[: HARMONICS + 1] * (2.0 / BINS)
+    mean = np.stack([np.bincount(cell, e, RESIDUAL_BINS) / count for e in residual.error.T], 1)
+    amplitude = np.abs(np.fft.rfft(mean, axis=0))[: HARMONICS + 1] * (2.0 / RESIDUAL_BINS)
     amplitude[0] /= 2.0
-    return np.asarray(amplitude / np.sinc(np.arange(HARMONICS + 1) / BINS)[:, None])
+    return np.asarray(amplitude / np.sinc(np.arange(HARMONICS + 1) / RESIDUAL_BINS)[:, None])
 
 
 def harmonic_noise(residual: Residual, white: Values, wander: Values, time: float) -> Values:
@@ -192,7 +192,9 @@ def harmonic_noise(residual: Residual, white: Values, wander: Values, time: floa
     turns = max(float(np.abs(np.diff(motion.angle)).sum()) / 360.0, 1.0)
     frequency = np.arange(HARMONICS + 1) * turns / duration
     spectrum = 2.0 * float(wander.max()) ** 2 * time / (1.0 + (2.0 * np.pi * frequency * time) ** 2)
-    of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(_angle_bins(motion.angle)[1], 1))) / BINS
+    of_white = (
+        float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(_angle_bins(motion.angle)[1], 1))) / RESIDUAL_BINS
+    )
     spread = np.sqrt(2.0 * of_white + 2.0 * spectrum / duration)
     spread[0] = np.hypot(np.sqrt(of_white), wander.max())  # a mean, not an amplitude
     return np.asarray(ONE_IN_A_THOUSAND * spread)
@@ -267,12 +269,12 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     known = bool(noise and noise.get("white"))
     sigma = np.hypot(white_noise(residual, noise), ((noise or {}).get("wander") or 0.0) if known else 0.0)
     every = slice(None, None, -(-len(x) // MODEL_POINTS))  # of the model, which has no noise, few points are enough
-    layers: list[Layer] = [Samples(x, residual.reading)]
-    layers += [Line(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
+    layers: list[Layer] = [SampleMarks(x, residual.reading)]
+    layers += [LineMark(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
     top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
     panels = [Panel(layers, f"reading, {unit}")]
     for i, axis in enumerate(AXES):
-        layers = [Area(-2 * sigma[i], 2 * sigma[i]), Samples(x, residual.error[:, i], i, mean=True)]
+        layers = [Area(-2 * sigma[i], 2 * sigma[i]), SampleMarks(x, residual.error[:, i], i, mean=True)]
         panels.append(Panel(layers, f"{axis}, {unit}", height=56, limits=(-top, top)))
     rms = np.sqrt(np.mean(residual.error**2, axis=0))
     ratio, outside = float((rms / sigma).max()), float(np.mean(np.abs(residual.error) > 2 * sigma))
@@ -286,7 +288,7 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
         known=known,
         rms=rms.tolist(),
         unit=unit,
-        noise=NOISE,
+        noise=NOISE_ALONE_RATIO,
     )
     return chart(
         Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model"))),

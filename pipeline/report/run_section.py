@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
 SHOWN = 12  # runs in a chart: the first, and the last ones
-LABEL = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
+LABEL_LETTERS = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
 STATES = 10_000  # of units in runs after the first that a campaign's page contains: 2 MB at 0.2 kB each
-SAME = 0.02  # relative change of an error that is not significant
+UNCHANGED_ERROR = 0.02  # relative change of an error that is not significant
 NEAR_FLOOR = 1.5  # error over noise floor below which a bar is green
 
 
@@ -58,7 +58,7 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
     unit, rows = SENSOR_UNITS[sensor], [_row(entry, part, sensor) for entry, part in shown]
     first, last = known[-2][1]["error"], known[-1][1]["error"]
     floor = known[-1][1]["floor"]
-    if abs(last - first) <= SAME * first:
+    if abs(last - first) <= UNCHANGED_ERROR * first:
         change = f"stays at {number(last)}"
     else:
         change = f"{'falls' if last < first else 'rises'} from {number(first)} to {number(last)}"
@@ -73,7 +73,7 @@ def _row(entry: JSON, part: JSON, sensor: str) -> Point:
     change, floor = entry["change"], part["floor"]
     words = change.words(sensor) or ["effects of the other sensor"] if change else part["effects"]
     label = f"run {entry['run']}" + (f"{':' if change else ' with'} {plain(', '.join(words))}" if words else "")
-    label = label if len(label) <= LABEL else f"{label[: LABEL - 1]}…"
+    label = label if len(label) <= LABEL_LETTERS else f"{label[: LABEL_LETTERS - 1]}…"
     label += f", {number(part['error'] / floor)} × floor" if floor else ""
     return Point(label, part["error"], 1 if floor and part["error"] < NEAR_FLOOR * floor else 3)
 

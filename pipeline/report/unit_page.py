@@ -13,7 +13,7 @@ from pipeline.files import json_text
 from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, left_out, sentences
 from pipeline.outcome import as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.records import MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
-from pipeline.report.chart import Figure, Layer, Line, Panel, chart
+from pipeline.report.chart import Figure, Layer, LineMark, Panel, chart
 from pipeline.report.diagnosis_section import (
     added_variable,
     limit_rows,
@@ -23,7 +23,7 @@ from pipeline.report.diagnosis_section import (
     upper_limits,
 )
 from pipeline.report.held_out_section import (
-    FAR,
+    MARK_ABOVE_FLOORS,
     attitude_over_time,
     checks,
     error_steps,
@@ -140,7 +140,7 @@ def _sensor(
     kind = "warn" if found.get("failed") else kind
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
-    far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
+    far = (last.get("rms_error") or 0.0) > MARK_ABOVE_FLOORS * (held_out.get("noise_floor") or np.inf)
     parameters, run = parameter_rows(sensor, part, data_sheet), settings.stated.run
     return {
         "held_out": held_out,
@@ -272,11 +272,11 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
     lanes = drawn[::-1]  # the first at the top
     layers: list[Layer] = []
     for y, r in enumerate(lanes, 1):
-        layers.append(Line(np.array([0.0, _duration(r)]) + begin[r.name], np.full(2, float(y)), 3))
+        layers.append(LineMark(np.array([0.0, _duration(r)]) + begin[r.name], np.full(2, float(y)), 3))
         for colour in sorted({c for *_, c in spans[r.name]}):
             ends = [(a, max(b, a + narrowest), np.nan) for a, b, c in spans[r.name] if c == colour]
             x = np.ravel(ends) + begin[r.name]
-            layers.append(Line(x, np.full(len(x), float(y)), colour, "thick"))
+            layers.append(LineMark(x, np.full(len(x), float(y)), colour, "thick"))
     count, colours = sum(map(len, spans.values())), {c for of in spans.values() for *_, c in of}
     finding = f"{count} rest{'s' if count != 1 else ''} in {len(drawn)} recording{'s' if len(drawn) != 1 else ''}"
     legend = tuple((f"c{c}", f"rest, {use}") for use, c in USES.items() if c in colours) or ((f"c{LOGGED}", "rest"),)

@@ -34,18 +34,24 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Recording, Values
 
 VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; a smaller error of the rate does no harm
-WHOLE = 1e-3  # of a step, to which the angles of an encoder are multiples of it: printed decimals
+STEP_MULTIPLE_TOLERANCE = 1e-3  # of a step, to which the angles of an encoder are multiples of it: printed decimals
 ORDERS = (2, 3, 4)  # a motor that ripples, a program of constant accelerations, motion by a wheel
-EDGE = 5  # samples of rest added at both ends of a motion, which begins and ends at zero rate
+ADDED_REST_SAMPLES = 5  # samples of rest added at both ends of a motion, which begins and ends at zero rate
 FEWEST_MOVED = 100  # changes of the angle: their autocorrelation is known to 0.1
-ROUNDED = -0.35  # autocorrelation, half way between that of rounding errors and that of ramps
-BEYOND = 1.5  # times the errors of rounding, above which errors are not rounding alone
-MOST, LEFT = 0.95, 0.759  # of the second differences, without the corners of ramps; their share of a normal variance
+ROUNDING_AUTOCORRELATION = -0.35  # autocorrelation, half way between that of rounding errors and that of ramps
+MAX_ROUNDING_RATIO = 1.5  # times the errors of rounding, above which errors are not rounding alone
+KEPT_SECOND_DIFFERENCES, KEPT_VARIANCE_SHARE = (
+    0.95,
+    0.759,
+)  # of the second differences, without the corners of ramps; their share of a normal variance
 AROUND = 9  # second differences over which an acceleration is taken as constant
-FEWEST = 6  # samples from which a rate and its derivative follow
-STEADY, MOSTLY = 0.05, 0.5  # of the median rate, within which a rate is steady; share of a motion with such a rate
-DENSITIES = (1e-6, 1e12)  # S, (deg/s)^2/s^(2k - 3): from a table at rest to 10,000 deg/s^2 in 0.1 s
-GAP = 1.5  # sampling intervals, above which the angle in between is unknown
+MIN_RATE_SAMPLES = 6  # samples from which a rate and its derivative follow
+STEADY, STEADY_SHARE = (
+    0.05,
+    0.5,
+)  # of the median rate, within which a rate is steady; share of a motion with such a rate
+ACCELERATION_DENSITIES = (1e-6, 1e12)  # S, (deg/s)^2/s^(2k - 3): from a table at rest to 10,000 deg/s^2 in 0.1 s
+MAX_ANGLE_GAP_INTERVALS = 1.5  # sampling intervals, above which the angle in between is unknown
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class EncoderRate:
 def rate_by_angle(recording: Recording) -> EncoderRate | None:
     """Return the rate from the angle; None where the table logs a rate or no angle, or below 6 samples."""
     angle = recording.table_angle
-    if recording.table_rate is not None or angle is None or recording.samples < FEWEST:
+    if recording.table_rate is not None or angle is None or recording.samples < MIN_RATE_SAMPLES:
         return None
     return _rate_of(recording.time * recording.table_seconds, angle)
 
@@ -95,17 +101,17 @@ def _errors(time: Values, angle: Values) -> tuple[float, float]:
     if np.count_nonzero(changes > rounding) < FEWEST_MOVED:
         return 0.0, 0.0
     usual = float(np.median(intervals))
-    apart = intervals > GAP * usual
+    apart = intervals > MAX_ANGLE_GAP_INTERVALS * usual
     bent = np.where(apart[1:] | apart[:-1], 0.0, np.diff(np.diff(angle) / intervals) * usual)
     bent -= np.convolve(bent, np.full(AROUND, 1.0 / AROUND), "same")
     power = float(bent @ bent)
-    if not (power > 0.0 and float(bent[1:] @ bent[:-1]) < ROUNDED * power):
+    if not (power > 0.0 and float(bent[1:] @ bent[:-1]) < ROUNDING_AUTOCORRELATION * power):
         return 0.0, 0.0
     moving = (changes[1:] > rounding) & (changes[:-1] > rounding)
-    squares = np.sort(bent[moving] ** 2)[: max(int(MOST * np.count_nonzero(moving)), 1)]
-    error = float(np.sqrt(np.mean(squares) / (6.0 * LEFT))) if moving.any() else 0.0
+    squares = np.sort(bent[moving] ** 2)[: max(int(KEPT_SECOND_DIFFERENCES * np.count_nonzero(moving)), 1)]
+    error = float(np.sqrt(np.mean(squares) / (6.0 * KEPT_VARIANCE_SHARE))) if moving.any() else 0.0
     step = step_of(changes, rounding, printed=True)
-    return (step, step / np.sqrt(12.0)) if step and error <= BEYOND * step / np.sqrt(12.0) else (0.0, error)
+    return (step, step / np.sqrt(12.0)) if step and error <= MAX_ROUNDING_RATIO * step / np.sqrt(12.0) else (0.0, error)
 
 
 def step_of(changes: Values, rounding: float, *, printed: bool = False) -> float:
@@ -120,7 +126,7 @@ def step_of(changes: Values, rounding: float, *, printed: bool = False) -> float
         return 0.0
     step = float(larger.min())
     multiples = changes / step
-    most = WHOLE * max(1.0, float(multiples.max()) if printed else 1.0)
+    most = STEP_MULTIPLE_TOLERANCE * max(1.0, float(multiples.max()) if printed else 1.0)
     return step if float(np.abs(multiples - np.rint(multiples)).max()) <= most else 0.0
 
 
@@ -134,17 +140,24 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
     smooth, rate, noise = angle.copy(), np.zeros(n), np.zeros(n)
     starts = np.flatnonzero(np.diff(angle, prepend=np.nan) != 0.0)
     lengths = np.diff(np.append(starts, n))
-    lasts = time[starts + lengths - 1] - time[starts] > (step / RATE_AT_REST_DPS or EDGE * interval)
+    lasts = time[starts + lengths - 1] - time[starts] > (step / RATE_AT_REST_DPS or ADDED_REST_SAMPLES * interval)
     moving = ~np.repeat(lasts, lengths)
-    apart = (np.flatnonzero(np.diff(time) > GAP * interval) + 1).tolist()  # first samples after a gap
+    apart = (
+        np.flatnonzero(np.diff(time) > MAX_ANGLE_GAP_INTERVALS * interval) + 1
+    ).tolist()  # first samples after a gap
     ends = [[first, *(i for i in apart if first < i < last), last] for first, last in runs(moving)]
     vague = np.zeros(n, bool)
     for first, last in itertools.chain.from_iterable(map(itertools.pairwise, ends)):
         before, after = first in apart, last in apart
-        around = slice(first if before else max(first - EDGE, 0), last if after else min(last + EDGE, n))
-        vague[first : first + EDGE * before] = vague[max(last - EDGE * after, first) : last] = before or after
+        around = slice(
+            first if before else max(first - ADDED_REST_SAMPLES, 0),
+            last if after else min(last + ADDED_REST_SAMPLES, n),
+        )
+        vague[first : first + ADDED_REST_SAMPLES * before] = vague[
+            max(last - ADDED_REST_SAMPLES * after, first) : last
+        ] = before or after
         part, span = slice(first - around.start, last - around.start), slice(first, last)
-        if around.stop - around.start <= 2 * EDGE:
+        if around.stop - around.start <= 2 * ADDED_REST_SAMPLES:
             rate[span], noise[span] = np.gradient(angle[around], time[around])[part], np.sqrt(0.5) * error / interval
             continue
         size = error if step else (_errors(time[around], angle[around])[1] or error)
@@ -153,7 +166,7 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
         usual = float(np.median(slope))
         steady = runs(np.abs(slope - usual) < STEADY * abs(usual))
         start, stop = max(steady, key=lambda run: run[1] - run[0], default=(0, 0))
-        if stop - start >= MOSTLY * len(slope):
+        if stop - start >= STEADY_SHARE * len(slope):
             spread = max(spread, _stretch(time[around][start:stop], angle[around][start:stop], size)[1])
         smooth[span], noise[span], rate[span] = found[part], spread, slope[part]
     return EncoderRate(smooth, rate, noise, vague)
@@ -166,7 +179,7 @@ def _stretch(time: Values, angle: Values, error: float) -> tuple[Values, float]:
 
     start = angle[0]
     smoothers = [_Smoother(time, angle - start, error**2, order) for order in ORDERS]
-    low, high = np.log(DENSITIES)
+    low, high = np.log(ACCELERATION_DENSITIES)
     fits = [minimize_scalar(s.loss, bounds=(low, high), method="bounded", options={"xatol": 0.1}) for s in smoothers]
     best = int(np.argmin([fit.fun for fit in fits]))
     factor, smooth = smoothers[best].solve(fits[best].x)

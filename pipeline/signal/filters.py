@@ -55,10 +55,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-GAP = 1.5  # medians of the interval: a lost sample makes two of one
+MAX_GAP_MEDIANS = 1.5  # medians of the interval: a lost sample makes two of one
 JITTER = 0.1  # of the interval: beyond it samples count as uneven
 IMPULSE_SAMPLES = 4096  # of a response, half of them on either side of the impulse: 20 s at 100 Hz
-FORGOTTEN = 1e-9  # of the variance: less does not change a digit that is published
+FORGOTTEN_VARIANCE = 1e-9  # of the variance: less does not change a digit that is published
 BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
     "low_pass": "lowpass",
     "high_pass": "highpass",
@@ -136,7 +136,7 @@ def filter_autocovariance(recording: Recording) -> Values:
         return np.ones(1)
     spectrum = np.fft.rfft(impulse_response(recording, IMPULSE_SAMPLES), 2 * IMPULSE_SAMPLES)
     covariance: Values = np.fft.irfft(np.abs(spectrum) ** 2)[:IMPULSE_SAMPLES]
-    far = np.flatnonzero(np.abs(covariance) > FORGOTTEN * covariance[0])[-1]
+    far = np.flatnonzero(np.abs(covariance) > FORGOTTEN_VARIANCE * covariance[0])[-1]
     return covariance[: far + 1]
 
 
@@ -259,7 +259,7 @@ def _section_filtered(sections: Values, starts: list[int], zero_phase: bool, rea
 
 def stretch_starts(recording: Recording) -> list[int]:
     """Return the first sample of each stretch without a gap, and the number of samples."""
-    gaps = np.flatnonzero(np.diff(recording.time) > GAP * recording.interval) + 1
+    gaps = np.flatnonzero(np.diff(recording.time) > MAX_GAP_MEDIANS * recording.interval) + 1
     return [0, *gaps.tolist(), recording.samples]
 
 
@@ -272,16 +272,16 @@ def _timing_notes(recording: Recording) -> tuple[Note, ...]:
         notes.append(Note("N-FILTER-RESTART", len(starts) - 2, 0, 0, detail))
     dt = np.diff(recording.time)
     uneven = np.abs(dt / recording.interval - 1.0)
-    count = int(np.sum((uneven > JITTER) & (dt <= GAP * recording.interval)))
+    count = int(np.sum((uneven > JITTER) & (dt <= MAX_GAP_MEDIANS * recording.interval)))
     if count > 0.05 * len(dt):
         detail = f"{recording.name}: {count} intervals are off the median by over 10 %; the filter takes them as even"
         notes.append(Note("N-FILTER-JITTER", count, 0, 0, detail))
     return tuple(notes)
 
 
-BLOCK = 256  # cells at once: their kernels stay in the processor's cache
+KERNEL_BLOCK = 256  # cells at once: their kernels stay in the processor's cache
 NARROWEST_S = 0.5  # below the thermal time constant of a package, which is seconds
-ROUNDING = 1e-12  # relative: some thousand roundings of a double
+RELATIVE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
 DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
 
 
@@ -293,7 +293,7 @@ def smooth_temperature(time: Values, temperature: Values, bandwidth: float = 10.
     if len(time) < 3 or time[-1] == time[0]:
         return _local_line(time, temperature, bandwidth)
     step = np.abs(np.diff(temperature))
-    noise, least = float(noise_of_steps(step)), ROUNDING * float(np.abs(temperature).max())
+    noise, least = float(noise_of_steps(step)), RELATIVE_ROUNDING * float(np.abs(temperature).max())
     if noise == 0.0 and step.any():  # a coarse thermometer: a change below half a count is not significant
         noise = float(step[step > 0].min())
         least += 0.5 * noise
@@ -324,8 +324,8 @@ def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:
     t = np.bincount(cell, time) / count
     value = np.bincount(cell, temperature) / count
     level = np.empty_like(t)
-    for start in range(0, len(t), BLOCK):
-        block = slice(start, start + BLOCK)
+    for start in range(0, len(t), KERNEL_BLOCK):
+        block = slice(start, start + KERNEL_BLOCK)
         near = slice(*np.searchsorted(t, [t[block][0] - 5 * bandwidth, t[block][-1] + 5 * bandwidth]))
         x, n, v = (t[near] - t[block][0]) / bandwidth, count[near], value[near] - value[start]
         middle = (t[block] - t[block][0]) / bandwidth

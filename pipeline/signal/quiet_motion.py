@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
     Spans = list[tuple[int, int]]
 
-DEGREE = 2  # of the parabola
+PARABOLA_DEGREE = 2  # of the parabola
 SIGNIFICANT_CREEP = 4.0  # standard deviations: of the two components, noise alone passes it in 3e-4
 FEWEST_OF_A_SLOPE = 8  # samples from which a slope has five degrees of freedom
 
@@ -110,7 +110,7 @@ def component_along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
 def _parabolas(time: Values) -> Values:
     """Return an orthonormal basis of the parabolas in time: (n, 3) array, the constant first."""
     x = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
-    return np.linalg.qr(np.polynomial.legendre.legvander(x, DEGREE))[0]
+    return np.linalg.qr(np.polynomial.legendre.legvander(x, PARABOLA_DEGREE))[0]
 
 
 @once
@@ -138,7 +138,7 @@ def creep_of_readings(time: Values, force: Values, share: float = 0.0) -> Creep:
     basis = _parabolas(time)
     along = basis.T @ force
     squares = np.sum((force - basis @ along) ** 2, axis=0)
-    freedom = n - DEGREE - 1
+    freedom = n - PARABOLA_DEGREE - 1
     across = along - np.outer(along @ u, u)  # the change of direction
     path, line = basis[:, 1:] @ across[1:], basis[:, 1:2] @ across[1:2]
     white = float(np.sqrt(squares.sum() / (3 * freedom)))
@@ -151,17 +151,17 @@ def creep_of_readings(time: Values, force: Values, share: float = 0.0) -> Creep:
     return Creep(measured, measured, uncertainty, 0.5 * variance, squares, freedom)
 
 
-WINDOW_S, FEWEST = 0.2, 3  # shorter than a move; samples that have a variance
-SIGNIFICANT = 6.0  # q above
-NEIGHBOURS = 5  # stretches: their median withstands two that turned
+QUIET_WINDOW_S, MIN_WINDOW_SAMPLES = 0.2, 3  # shorter than a move; samples that have a variance
+SIGNIFICANT_TURN = 6.0  # q above
+NEIGHBOUR_STRETCHES = 5  # stretches: their median withstands two that turned
 RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
 # Of a window's mean, whatever the tremor of the stretch. The rests of a published MPU-6050 recording in a hand reach
 # 1.7 except at the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
 TREMOR_LIMIT_DPS = 2.5
 SAME_DEG = 2.0  # the limit of a rest in ``pipeline.signal.rests``
 COARSE = float(np.sqrt(0.25 + 1.0 / 12.0))  # steps, scatter of readings with noise of half a step
-BLOCK, FEWEST_BLOCKS = 16, 8  # differences of a block; blocks of a recording that show its noise
-ROUNDING = 1e-6  # relative, of a difference of decimals
+DIFFERENCE_BLOCK, MIN_DIFFERENCE_BLOCKS = 16, 8  # differences of a block; blocks of a recording that show its noise
+DECIMAL_ROUNDING = 1e-6  # relative, of a difference of decimals
 
 
 def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: float, shortest: int) -> Spans:
@@ -170,7 +170,7 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     ``rate``: (n, 3), deg/s, finite in the stretches; ``stretches``: start and stop of each, in order; ``interval``:
     mean time between samples, s; ``shortest``: samples of the shortest piece that is a rest.
     """
-    size = max(FEWEST, round(WINDOW_S / interval))
+    size = max(MIN_WINDOW_SAMPLES, round(QUIET_WINDOW_S / interval))
     if not stretches or min(stop - start for start, stop in stretches) < size:
         return list(stretches)
     parts = [rate[start:stop] for start, stop in stretches]
@@ -184,9 +184,11 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     noise = np.array([median(variance) for _, variance in of_parts])
     spread = np.where(resting[:, None], spread, np.median(spread, axis=0))
     count = counts_of(differences)
-    limit = np.minimum(SIGNIFICANT * np.maximum(white, spread), np.maximum(SIGNIFICANT * white, TREMOR_LIMIT_DPS))
-    limit = np.maximum(limit, count * (1.0 + ROUNDING))
-    loud = SIGNIFICANT**2 * np.maximum(np.where(resting, noise, np.median(noise)), np.sum(count**2) / 12.0)
+    limit = np.minimum(
+        SIGNIFICANT_TURN * np.maximum(white, spread), np.maximum(SIGNIFICANT_TURN * white, TREMOR_LIMIT_DPS)
+    )
+    limit = np.maximum(limit, count * (1.0 + DECIMAL_ROUNDING))
+    loud = SIGNIFICANT_TURN**2 * np.maximum(np.where(resting, noise, np.median(noise)), np.sum(count**2) / 12.0)
     pieces: Spans = []
     for i, (start, stop) in enumerate(stretches):
         turns = np.any(off[i] > limit[i], axis=1) | (of_parts[i][1] > loud[i])
@@ -221,11 +223,11 @@ def coarse_steps(readings: Sequence[Values]) -> Values:
     steps, noise = [np.full(3, np.inf)], [np.full(3, np.inf)]
     for values in readings:
         differences = np.abs(np.diff(values[np.isfinite(values).all(axis=1)], axis=0))
-        count = len(differences) // BLOCK
-        if count < FEWEST_BLOCKS:
+        count = len(differences) // DIFFERENCE_BLOCK
+        if count < MIN_DIFFERENCE_BLOCKS:
             continue
         step = counts_of(differences)
-        blocks = differences[: count * BLOCK].reshape(count, BLOCK, 3)
+        blocks = differences[: count * DIFFERENCE_BLOCK].reshape(count, DIFFERENCE_BLOCK, 3)
         steps.append(np.where(step > 0.0, step, np.inf))
         noise.append(np.sqrt(0.5 * np.percentile(np.mean(blocks**2, axis=1), 25.0, axis=0)))
     step = np.min(steps, axis=0)
@@ -254,8 +256,8 @@ def _references(medians: Values, ends: Values) -> tuple[Values, Mask]:
         resting = ~(still & (np.abs(medians - middle).max(axis=1) > RATE_LIMIT_DPS))
         return np.where(resting[:, None], medians, middle), resting
     for i, median_rate in enumerate(medians):
-        first = int(np.clip(i - NEIGHBOURS // 2, 0, max(len(medians) - NEIGHBOURS, 0)))
-        around = median(medians[first : first + NEIGHBOURS])
+        first = int(np.clip(i - NEIGHBOUR_STRETCHES // 2, 0, max(len(medians) - NEIGHBOUR_STRETCHES, 0)))
+        around = median(medians[first : first + NEIGHBOUR_STRETCHES])
         if np.abs(median_rate - around).max() > RATE_LIMIT_DPS:
             out[i], resting[i] = around, False
     return out, resting

@@ -41,18 +41,18 @@ SETTLING_S = 0.3  # fifteen time constants of the slowest filter of 20 ms, as in
 WINDOW_S = 0.5  # shorter than a rest, longer than a tremor's period (8 to 12 Hz)
 GAP_S = 1.0  # longer than any regular interval of a log
 SHORTEST_REST_S = 1.0  # two windows
-MULTIPLES = np.geomspace(4.0, 1000.0, 25)  # of a variance: 2 to 30 times the noise, in steps of an eighth
-SMALLEST_VARIANCE = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
-NEIGHBOURS = 5  # rests: their median is robust against two that turned
+VARIANCE_MULTIPLES = np.geomspace(4.0, 1000.0, 25)  # of a variance: 2 to 30 times the noise, in steps of an eighth
+MIN_NOISE_VARIANCE_G2 = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
+NEIGHBOUR_RESTS = 5  # rests: their median is robust against two that turned
 TURN_LIMIT_DEG = 2.0  # 0.05 mg, see above
 # A steady tilt is modelled up to this rate (``pipeline.signal.quiet_motion``); units in a hand or on a soft support
 # creep by up to 0.3 deg/s.
 CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0
 SCATTER_LIMIT = 3.0  # times the noise; noise alone stays below 1.3 in the 100 samples of a rest at 100 Hz
 SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg
-SIGNIFICANT = 6.0  # standard deviations
-EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # edge of a rest that may move, at most a third of it; samples that this needs
-SETTLED = 8.0  # of the noise between successive samples: white noise passes in 1e-14
+SIGNIFICANT_REST_DEVIATIONS = 6.0  # standard deviations
+REST_EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # edge of a rest that may move, at most a third of it; samples that this needs
+SETTLED_DIFFERENCE_DEVIATIONS = 8.0  # of the noise between successive samples: white noise passes in 1e-14
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ def find_rests(recording: Recording) -> list[Rest]:
         return []
     variance = windows(force, size)[1]
     rounding = float(np.sum(counts_of(np.abs(np.diff(force[np.isfinite(force).all(axis=1)], axis=0))) ** 2)) / 12.0
-    noise = max(float(np.percentile(variance, 5.0)), rounding, SMALLEST_VARIANCE)
+    noise = max(float(np.percentile(variance, 5.0)), rounding, MIN_NOISE_VARIANCE_G2)
     variance[_spoilt(recording, size)] = np.inf
-    found = [_below(variance, multiple * noise, recording, size) for multiple in MULTIPLES]
+    found = [_below(variance, multiple * noise, recording, size) for multiple in VARIANCE_MULTIPLES]
     quiet = found[_plateau([len(rests) for rests in found])]
     rate = recording.gyroscope
     if rate is not None and quiet:
@@ -207,7 +207,7 @@ def _turn(recording: Recording, rest: Rest) -> str:
     moved = float(np.max(np.linalg.norm(means[:, None] - means[None], axis=2)))
     noise = float(np.sqrt(blocks.var(axis=1).sum(axis=1).mean() / quarter))
     angle = np.degrees(moved / length) if length > 0 else 0.0
-    if angle <= TURN_LIMIT_DEG or moved <= SIGNIFICANT * noise:
+    if angle <= TURN_LIMIT_DEG or moved <= SIGNIFICANT_REST_DEVIATIONS * noise:
         return ""
     return f"direction of the specific force moves by {angle:.1f} deg (limit {TURN_LIMIT_DEG:g} deg)"
 
@@ -224,12 +224,12 @@ def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
     means = np.array([part.mean(axis=0) for part in parts])
     reasons = []
     for i, part in enumerate(parts):
-        first = int(np.clip(i - NEIGHBOURS // 2, 0, max(len(rests) - NEIGHBOURS, 0)))
-        off = float(np.max(np.abs(means[i] - median(means[first : first + NEIGHBOURS]))))
+        first = int(np.clip(i - NEIGHBOUR_RESTS // 2, 0, max(len(rests) - NEIGHBOUR_RESTS, 0)))
+        off = float(np.max(np.abs(means[i] - median(means[first : first + NEIGHBOUR_RESTS]))))
         noise = float(np.max(part.std(axis=0))) / np.sqrt(len(part))
         reasons.append(
             f"angular rate is {off:.2f} deg/s off that of its neighbours (limit {RATE_LIMIT_DPS:g} deg/s)"
-            if off > max(RATE_LIMIT_DPS, SIGNIFICANT * noise)
+            if off > max(RATE_LIMIT_DPS, SIGNIFICANT_REST_DEVIATIONS * noise)
             else ""
         )
     return reasons
@@ -277,7 +277,7 @@ def _settled(recording: Recording, values: Values, stretches: Spans) -> Spans:
     """Remove samples that still move at the edges of rests: the clocks of sensor and table may differ."""
     ends = np.array(stretches, int).reshape(-1, 2)
     lengths = ends[:, 1] - ends[:, 0]
-    edges = np.minimum(int(EDGE_S / recording.interval) + 1, lengths // 3)
+    edges = np.minimum(int(REST_EDGE_S / recording.interval) + 1, lengths // 3)
     for edge in np.unique(edges[lengths >= FEWEST_TO_SETTLE]).tolist():
         alike = np.flatnonzero((edges == edge) & (lengths >= FEWEST_TO_SETTLE))
         length = int(lengths[alike].min())
@@ -286,7 +286,7 @@ def _settled(recording: Recording, values: Values, stretches: Spans) -> Spans:
         for side in (1, -1):
             ordered = inside if side == 1 else values[ends[alike, 1:] - 1 - np.arange(3 * edge)]
             middle = median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)
-            off = np.abs(ordered[:, :edge] - middle) > SETTLED * spread
+            off = np.abs(ordered[:, :edge] - middle) > SETTLED_DIFFERENCE_DEVIATIONS * spread
             moving = np.any(off & (spread > 0), axis=2)
             cut = np.where(moving, np.arange(1, edge + 1), 0).max(axis=1)
             ends[alike, 0 if side == 1 else 1] += side * cut

@@ -268,7 +268,9 @@ def _is_useful(group: Sequence[Move]) -> bool:
 
 
 SCALE = 0.1  # relative: three times the largest scale factor error of the shipped data sheets (MPU-6050: 3 %)
-ACROSS = 0.25  # 15 deg between the turn and a body axis: misalignment of the chip in its case, and error of the hand
+MAX_AXIS_SINE = (
+    0.25  # 15 deg between the turn and a body axis: misalignment of the chip in its case, and error of the hand
+)
 HALF_S = WINDOW_S + SHORTEST_REST_S  # shortest half of a divided rest that is found again: a window is trimmed
 
 
@@ -278,7 +280,7 @@ def multiples(angle: Values, stated_deg: float) -> tuple[int, int]:
     along = float(angle[axis])
     count = round(along / stated_deg)
     off, across = abs(along - count * stated_deg), float(np.linalg.norm(np.delete(angle, axis)))
-    agrees = off < min(SCALE * abs(count) * stated_deg, 0.25 * stated_deg) and across < ACROSS * abs(along)
+    agrees = off < min(SCALE * abs(count) * stated_deg, 0.25 * stated_deg) and across < MAX_AXIS_SINE * abs(along)
     return axis, count if agrees else 0
 
 

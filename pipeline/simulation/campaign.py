@@ -27,7 +27,7 @@ from pipeline.simulation.session import (
     ANGLE_DECIMALS,
     QUATERNION_DECIMALS,
     TEMPERATURE_DECIMALS,
-    Bench,
+    SimulatedBench,
     Streams,
     columns_of,
     programs_of,
@@ -143,12 +143,12 @@ def true_parameters(unit: UnitDescription, seed: int, number: int) -> dict[str, 
     }
 
 
-def _drawn(unit: UnitDescription, streams: Streams) -> tuple[dict[str, Bench], dict[str, Hidden]]:
+def _drawn(unit: UnitDescription, streams: Streams) -> tuple[dict[str, SimulatedBench], dict[str, Hidden]]:
     """Return the bench of each recording (``""``: of all others), and the effects of each sensor."""
     sensor_model = shipped_settings(sensor=unit.sensor).sensor
     effects = drawn_effects(unit.effects, sensor_model, streams["effects"])
 
-    def bench_of(other: Mapping[str, Any]) -> Bench:
+    def bench_of(other: Mapping[str, Any]) -> SimulatedBench:
         """Return the bench of the description, changed by ``other`` settings; with the same sensors."""
         table = shipped_settings(table=other.get("table", unit.table)).table
         rng = streams["bench"]
@@ -159,7 +159,7 @@ def _drawn(unit: UnitDescription, streams: Streams) -> tuple[dict[str, Bench], d
             **(other.get("imperfections", {}) if other else unit.imperfections),
         }
         given = {s: {**getattr(unit, s), **other.get(s, {})} for s in SENSORS}
-        return Bench(table, imperfections, drawn_sensors(sensor_model, given, effects, streams["unit"]))
+        return SimulatedBench(table, imperfections, drawn_sensors(sensor_model, given, effects, streams["unit"]))
 
     held_out = dict.fromkeys(("validation", "static"), bench_of(unit.held_out)) if unit.held_out else {}
     return {"": bench_of({}), **held_out}, effects

@@ -21,10 +21,10 @@ from pipeline.errors import ConfigurationError
 from pipeline.io.commanded_motion import Program
 from pipeline.records import AXES
 from pipeline.simulation.trajectory import (
+    CommandedTurns,
     Gimbals,
-    Moves,
     Planned,
-    Turn,
+    RestsAndMoves,
     axis_and_angle,
     orientations_24,
     random_attitudes,
@@ -177,7 +177,9 @@ def _turns(course: Course) -> list[Planned]:
     stay, step = rest(course.dwell_s), turn(course.step_deg, course.step_rate_dps, course.acceleration_dps2)
     stops = Program([stay, *[step, stay] * round(360.0 / course.step_deg)])
     rates = course.accelerometer_rates_dps
-    accelerometer = [_continuous(i, course, course.rest_s, rates) if rates else Turn(i, stops) for i in range(3)]
+    accelerometer = [
+        _continuous(i, course, course.rest_s, rates) if rates else CommandedTurns(i, stops) for i in range(3)
+    ]
     gyroscope = [_continuous(i, course, course.warm_up_rest_s, course.rates_dps) for i in range(3)]
     return [
         Planned(f"{prefix}_{AXES[turn.axis]}", role, turn.axis, turn)
@@ -186,21 +188,21 @@ def _turns(course: Course) -> list[Planned]:
     ]
 
 
-def _continuous(axis: int, course: Course, before_s: float, rates: Sequence[float]) -> Turn:
+def _continuous(axis: int, course: Course, before_s: float, rates: Sequence[float]) -> CommandedTurns:
     """Return turns at full rates about an axis, after a rest of ``before_s``."""
     steps = [rest(before_s)]
     for rate, sign in product(rates, course.signs):
         steps += [turn_with_plateau(sign * 360.0 * course.turns, rate, course.acceleration_dps2), rest(course.rest_s)]
-    return Turn(axis, Program(steps))
+    return CommandedTurns(axis, Program(steps))
 
 
 def _static(course: Course) -> list[Planned]:
     if course.static_s <= 0.0:
         return []
-    return [Planned("static", "static", None, Moves(Program([rest(course.static_s)]), np.eye(3)[:1]))]
+    return [Planned("static", "static", None, RestsAndMoves(Program([rest(course.static_s)]), np.eye(3)[:1]))]
 
 
-def _rests(attitudes: Values, course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
+def _rests(attitudes: Values, course: Course, rng: np.random.Generator, accuracy: float) -> RestsAndMoves:
     """Return rests in the attitudes, with a setting error of ``accuracy`` deg, and the shortest moves between them."""
     attitudes = attitudes @ rotation_by(accuracy * rng.standard_normal((len(attitudes), 3)))
     steps, axes = [rest(max(course.warm_up_rest_s, course.dwell_s))], []
@@ -208,7 +210,7 @@ def _rests(attitudes: Values, course: Course, rng: np.random.Generator, accuracy
         axis, angle = axis_and_angle(before.T @ after)
         steps += [turn(angle, course.step_rate_dps, course.acceleration_dps2), rest(course.dwell_s)]
         axes.append(axis)
-    return Moves(Program(steps), np.array(axes), attitudes[0])
+    return RestsAndMoves(Program(steps), np.array(axes), attitudes[0])
 
 
 def _with_transits(planned: Sequence[Planned], course: Course) -> list[Planned]:
@@ -225,11 +227,11 @@ def _with_transits(planned: Sequence[Planned], course: Course) -> list[Planned]:
         steps = [rest(course.pause_s / 2)]
         if angle > LEAST_ANGLE_DEG:
             steps += [turn(angle, TRANSIT_RATE_DPS, course.acceleration_dps2), rest(course.pause_s / 2)]
-        out += [Planned(TRANSIT, TRANSIT, None, Moves(Program(steps), axis[None], before)), two]
+        out += [Planned(TRANSIT, TRANSIT, None, RestsAndMoves(Program(steps), axis[None], before)), two]
     return out
 
 
-def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
+def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) -> RestsAndMoves:
     """Return rests on six faces, then turns about each axis with its face up; with fixed errors of each."""
     positions, tilt = six_positions(), accuracy * rng.standard_normal((6, 3))
     off = np.radians(course.turn_axis_error_deg) * rng.standard_normal((3, 3)) * (1.0 - np.eye(3))
@@ -250,4 +252,4 @@ def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) 
             steps += [turn(angle, rate, acceleration), stay]
             axes.append(about)
             attitude = attitude @ rotation_by(angle * about)
-    return Moves(Program(steps), np.array(axes), start)
+    return RestsAndMoves(Program(steps), np.array(axes), start)

@@ -55,7 +55,7 @@ from pipeline.model.effects import effect, effect_from
 from pipeline.model.effects.base import STANDARD_GRAVITY, parameter_limits, truth
 from pipeline.records import SENSORS, Motion
 from pipeline.signal.rests import still_samples
-from pipeline.simulation.trajectory import Turn, mounted, rotation_about, rotation_by
+from pipeline.simulation.trajectory import CommandedTurns, mounted, rotation_about, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
     from pipeline.records import Values
     from pipeline.settings import DataSheet, Sensor
-    from pipeline.simulation.trajectory import Gimbals, Moves
+    from pipeline.simulation.trajectory import Gimbals, RestsAndMoves
 
     Alteration = Callable[["Scene", Values], "Scene"]
     Hidden = dict[str, tuple[Effect, Values]]  # by name: an effect and the values of its parameters
@@ -81,7 +81,7 @@ LAG_RULE = NODES, np.tile(HALF, 2) * np.exp(-NODES) / np.sum(np.tile(HALF, 2) * 
 class Scene:
     """The motion of one sensor in one recording."""
 
-    trajectory: Turn | Moves | Gimbals
+    trajectory: CommandedTurns | RestsAndMoves | Gimbals
     start: float = 0.0  # s since power-on at which the trajectory begins
     axis: int | None = None  # of the turn
     gravity: float = 1.0  # g
@@ -149,7 +149,7 @@ def _of_turn(field_name: str, shape: tuple[int, ...] = (3, 2)) -> Alteration:
 
     def altered(scene: Scene, values: Values) -> Scene:
         turn = scene.trajectory
-        if scene.axis is None or not isinstance(turn, Turn):
+        if scene.axis is None or not isinstance(turn, CommandedTurns):
             return scene
         values = np.radians(values) if field_name == "direction" else values
         added = getattr(turn.errors, field_name) + values.reshape(shape)[scene.axis]

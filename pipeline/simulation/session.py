@@ -33,7 +33,7 @@ from pipeline.simulation import procedures
 from pipeline.simulation.description import FILE, PROGRAM, course_of, read_option
 from pipeline.simulation.procedures import ONE_RECORDING
 from pipeline.simulation.sensor import Scene, alter, bias_wander, decimals_of
-from pipeline.simulation.trajectory import Gimbals, Moves, Turn, random_errors, rotation_by
+from pipeline.simulation.trajectory import CommandedTurns, Gimbals, RestsAndMoves, random_errors, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -109,7 +109,7 @@ def random_environment(rng: np.random.Generator) -> Environment:
 
 
 @dataclass(frozen=True)
-class Bench:
+class SimulatedBench:
     """Where a recording is made: the table, its errors, and the sensors as mounted on it."""
 
     table: Table
@@ -119,7 +119,7 @@ class Bench:
 
 def record(
     planned: Sequence[Planned],
-    benches: Mapping[str, Bench],
+    benches: Mapping[str, SimulatedBench],
     effects: Mapping[str, Hidden],
     *,
     environment: Environment,
@@ -175,17 +175,17 @@ def _times(planned: Sequence[Planned], interval: float, pause: float) -> list[ND
     return out
 
 
-def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) -> Scene:
+def _scene(plan: Planned, bench: SimulatedBench, start: float, rng: np.random.Generator) -> Scene:
     """Return the scene of a recording on its bench, without hidden effects."""
     table, settings = bench.table, dict(bench.imperfections)
     trajectory = plan.trajectory
-    if isinstance(trajectory, Turn) and table.motion != "none":
+    if isinstance(trajectory, CommandedTurns) and table.motion != "none":
         stops_and_goes = np.all(np.abs(np.diff(trajectory.program.stops)) < 180.0)
         if plan.role == "accelerometer" and stops_and_goes:
             settings["rate_error"] = (0.0, 0.0, 0.0)  # motors lose steps in fast turns only
         errors = random_errors(trajectory.program, rng, settings, trajectory.axis)
         shaft = settings.get("sense", 1) if table.azimuth_of == "turn_axis" else 0
-        trajectory = Turn(trajectory.axis, trajectory.program, errors, shaft)
+        trajectory = CommandedTurns(trajectory.axis, trajectory.program, errors, shaft)
     up = rotation_by(np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0))[2]
     earth = earth_of(table)
     mounting = rotation_by(np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float))
@@ -194,12 +194,12 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
     )
 
 
-def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:
+def _log(plan: Planned, bench: SimulatedBench, time: Values) -> dict[str, Any]:
     """Return the table's log of the commanded motion."""
     trajectory = plan.trajectory
     if bench.table.motion == "none":
         return {}
-    if isinstance(trajectory, Turn):
+    if isinstance(trajectory, CommandedTurns):
         angle, rate = trajectory.program.at(time)[:2]
         sense = bench.imperfections.get("sense", 1)
         angle, rate = sense * angle + bench.imperfections.get("zero_deg", {}).get(plan.name, 0.0), sense * rate
@@ -208,7 +208,7 @@ def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:
         rate = np.linalg.norm(trajectory.pose(time).omega, axis=1)
         attitude = np.round(trajectory.quaternion(time), QUATERNION_DECIMALS)
         return {"table_attitude": attitude, "table_rate": np.round(rate, ANGLE_DECIMALS)}
-    assert isinstance(trajectory, Moves)  # noqa: S101
+    assert isinstance(trajectory, RestsAndMoves)  # noqa: S101
     return {"table_rate": np.zeros(len(time))} if plan.role == "static" else {}
 
 
@@ -254,7 +254,7 @@ def with_table_log(
         tau: Values = begin + log.interval_s * np.arange(int((end - begin) / log.interval_s), dtype=float)
         channels: dict[str, Any] = _logged(plans, plan_starts, (tau - offset) / (1.0 + drift))
         if unit.procedure != ONE_RECORDING:  # a turn has the encoder, other motion the attitude
-            turn = isinstance(plans[0].trajectory, Turn)
+            turn = isinstance(plans[0].trajectory, CommandedTurns)
             known = ("table_angle", "table_rate") if turn else ("table_attitude",)
             channels = {name: channels[name] for name in known}
         time_ns = np.rint(tau * NANOSECONDS).astype(np.int64)
@@ -340,6 +340,6 @@ def _procedure_text(name: str, course: Course) -> str:
     procedure = read_option("procedure", name)
     entries = {recording: dict(entry) for recording, entry in procedure["recordings"].items()}
     for planned in procedures.plan(name, course, np.random.default_rng(0)):
-        if isinstance(planned.trajectory, Turn) and planned.name in entries:
+        if isinstance(planned.trajectory, CommandedTurns) and planned.name in entries:
             entries[planned.name]["program"] = [s.json_value for s in as_program(planned.trajectory.program)]
     return COMMENT + yaml.safe_dump({**procedure, "recordings": entries}, sort_keys=False, width=120)

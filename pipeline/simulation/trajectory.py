@@ -168,7 +168,7 @@ class TurnErrors:
 
 
 @dataclass(frozen=True)
-class Turn:
+class CommandedTurns:
     """Turns about one body axis by a commanded program, with the table's errors."""
 
     axis: int
@@ -193,7 +193,7 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class Moves:
+class RestsAndMoves:
     """Rests in several attitudes and moves between them, each a turn about its axis."""
 
     program: Program  # move k turns from stops[k] to stops[k + 1]
@@ -317,7 +317,7 @@ class Planned:
     name: str
     role: str
     axis: int | None
-    trajectory: Turn | Moves | Gimbals
+    trajectory: CommandedTurns | RestsAndMoves | Gimbals
 
 
 def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) -> Gimbals:

@@ -24,7 +24,7 @@ from pipeline.report.comparison import against_truth, section
 from pipeline.report.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
 from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
-from pipeline.results_folder import NEW, PUBLISHED, finish_publishing, publish, published_units, record_units
+from pipeline.results_folder import NEW_FOLDER, PUBLISHED, finish_publishing, publish, published_units, record_units
 from pipeline.stages.summary import failed_files, failed_summary
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def gather_batch(job: Job) -> None:
     """
     results, run = job.results, job.run
     finish_publishing(results)
-    new = results / NEW
+    new = results / NEW_FOLDER
     shutil.rmtree(new, ignore_errors=True)
     for name in PUBLISHED:
         if "." not in name:
@@ -147,9 +147,9 @@ def _statistics(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, n
     rows = [u["row"] for u in units.values()]
     statistics = fleet_statistics(rows, parameters)
     if job.run["combine"] == "lot":
-        from pipeline.stages.prior import LOTS  # noqa: PLC0415  (only where a lot is the prior)
+        from pipeline.stages.prior import LOTS_FILE  # noqa: PLC0415  (only where a lot is the prior)
 
-        statistics["combined"] = Pack(job.output.parent / "lots.zip").json(LOTS)
+        statistics["combined"] = Pack(job.output.parent / "lots.zip").json(LOTS_FILE)
     if job.run["combine"] == "serial":
         from pipeline.report.combined import combined_calibrations  # noqa: PLC0415  (only for joint estimates)
 

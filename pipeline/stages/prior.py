@@ -10,7 +10,7 @@ from pipeline.errors import DamagedFileError
 from pipeline.exports import exports
 from pipeline.pack import DOCUMENTS, STAGE_OF, Pack, as_bytes, new_pack
 from pipeline.records import SENSORS, Validation, fit_from_json
-from pipeline.report.combined import Estimate, Prior, calibration_with_prior, priors_of, with_card
+from pipeline.report.combined import UnitEstimate, UnitPrior, calibration_with_prior, priors_of, with_card
 from pipeline.stages.batch import record_output
 from pipeline.stages.summary import failed_files
 from pipeline.stages.unit_files import StoredUnit
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
     from pipeline.stages.batch import Job
 
-LOTS = "told.json"  # description of the lots for ``fleet.json``
+LOTS_FILE = "told.json"  # description of the lots for ``fleet.json``
 
 
 def lots_batch(job: Job) -> None:
@@ -31,10 +31,10 @@ def lots_batch(job: Job) -> None:
         summaries = Pack(job.output.parent / name / "summary.zip")
         for unit in units:
             with suppress(DamagedFileError):  # ``gather`` records the failure of the unit
-                found += [Estimate.read(e) for e in summaries.json(f"{unit}.json").get("estimates", ())]
+                found += [UnitEstimate.read(e) for e in summaries.json(f"{unit}.json").get("estimates", ())]
     priors, lots = priors_of(found)
     with new_pack(job.output) as add:
-        add({LOTS: as_bytes(lots)})
+        add({LOTS_FILE: as_bytes(lots)})
         for name, units in batches.items():
             priors_of_batch = {u: {s: priors[u, s]._asdict() for s in SENSORS if (u, s) in priors} for u in units}
             add({f"{name}.json": as_bytes(priors_of_batch)})
@@ -51,7 +51,7 @@ def prior_unit(job: Job, unit: str, settings: Settings) -> Files:
     given = _of_batch(job.inputs["lots"], job.output.parent.name)[unit]
     if not given:
         return {}
-    priors = {sensor: Prior.read(prior) for sensor, prior in given.items()}
+    priors = {sensor: UnitPrior.read(prior) for sensor, prior in given.items()}
     calibration, validation, diagnosis = (job.inputs[STAGE_OF[of]].json(f"{unit}.json") for of in DOCUMENTS)
     document = calibration_with_prior(calibration, priors)
     files: Files = {}

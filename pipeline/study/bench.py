@@ -50,7 +50,7 @@ from pipeline.records import SENSORS, Recording, Values
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.simulation.session import Streams, random_environment
-from pipeline.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, Case
+from pipeline.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, StudyCase
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -74,7 +74,7 @@ CURVES: dict[str, Callable[[Values], Values]] = {  # of the scaled temperature
 GAUSS_MARKOV = ("normal", "wander")  # families of noise for which lambda is known
 
 
-def recordings_of(case: Case) -> list[Recording]:
+def recordings_of(case: StudyCase) -> list[Recording]:
     """Return the recordings of a case, without its truth."""
     sensor_model = shipped_settings(sensor=case.model).sensor
     noise_settings = {
@@ -121,7 +121,7 @@ def recordings_of(case: Case) -> list[Recording]:
 
 
 def _with_noise(
-    recordings: list[Recording], sensor: str, case: Case, data_sheet: DataSheet, rng: np.random.Generator
+    recordings: list[Recording], sensor: str, case: StudyCase, data_sheet: DataSheet, rng: np.random.Generator
 ) -> list[Recording]:
     """Add noise that the simulator does not have to one sensor, continuous over all recordings of the unit."""
     first = min(float(r.time[0]) for r in recordings)
@@ -145,7 +145,7 @@ def _with_noise(
     return [_added(r, sensor, added[np.rint((r.time - first) / interval).astype(int)]) for r in recordings]
 
 
-def _interval(case: Case) -> float:
+def _interval(case: StudyCase) -> float:
     return INTERVAL_BY_HAND_S if case.rests else INTERVAL_S
 
 
@@ -154,7 +154,7 @@ def _white(data_sheet: DataSheet) -> float:
     return float(data_sheet.noise_density * np.sqrt(0.5 / INTERVAL_S))
 
 
-def _with_shape(recordings: list[Recording], case: Case) -> list[Recording]:
+def _with_shape(recordings: list[Recording], case: StudyCase) -> list[Recording]:
     """Add physics in a functional form that is not in the catalogue."""
     if case.shape in CURVES:
         room = random_environment(Streams(case.seed, case.number)["room"])
@@ -183,7 +183,7 @@ def _added(recording: Recording, sensor: str, values: Values) -> Recording:
     return replace(recording, **added)
 
 
-def signals_left(case: Case) -> dict[str, float]:
+def signals_left(case: StudyCase) -> dict[str, float]:
     """Return lambda of each hidden effect; empty where the true noise is not white noise and Gauss-Markov wander."""
     if not case.hidden or case.noise not in GAUSS_MARKOV:
         return {}
@@ -217,7 +217,7 @@ def signals_left(case: Case) -> dict[str, float]:
     return {name: max(0.0, value) for name, value in found.items()}
 
 
-def at_detection(case: Case) -> Case:
+def at_detection(case: StudyCase) -> StudyCase:
     """Scale the effect of a case of the families ``limit`` to the stated share of its detection size.
 
     At the detection size, lambda is the threshold of the selection. lambda grows as the square of the size; a time
@@ -234,6 +234,6 @@ def at_detection(case: Case) -> Case:
     return replace(case, hidden={name: np.where(kept, values, share * np.array(values)).tolist()})
 
 
-def _used(case: Case) -> list[Recording]:
+def _used(case: StudyCase) -> list[Recording]:
     """Return the recordings that a fit uses, in order of time."""
     return sorted((r for r in recordings_of(case) if r.role in SENSORS), key=lambda r: int(r.time_ns[0]))

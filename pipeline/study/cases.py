@@ -68,12 +68,12 @@ STIM_SHARE = 0.25  # of the units of the families that have both models
 METHODS = REFERENCE, STAGED, BY_HAND = "reference_least_squares", "staged", "rests_and_moves"  # that fit a base
 INTERVAL_S, INTERVAL_BY_HAND_S = 0.12, 0.01  # of a sample: the default of a simulation; by hand, moves are faster
 TABLES = {"acutronic": 0.5, "mark2": 0.45, "single_axis": 0.05}  # and their shares; the last takes 20 times as long
-RESTS = 15, 40  # by hand; from 15 on, some are held out of a fit
+RESTS_BY_HAND = 15, 40  # by hand; from 15 on, some are held out of a fit
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 
 
 @dataclass(frozen=True)
-class Case:
+class StudyCase:
     """The truth of one unit of a study."""
 
     family: str
@@ -108,7 +108,7 @@ class Case:
         return {"key": self.key, **asdict(self)}
 
 
-def draw(family: str, number: int, seed: int) -> Case:
+def draw(family: str, number: int, seed: int) -> StudyCase:
     """Draw the case that family, number and seed determine."""
     rng = np.random.default_rng([seed, FAMILIES.index(family), number])
     kind, _, detail = family.partition("_")
@@ -117,18 +117,20 @@ def draw(family: str, number: int, seed: int) -> Case:
     procedure = str(rng.choice(["stop_and_go", "continuous", "one_way"], p=[0.5, 0.3, 0.2]))
     if kind == "null":
         by_hand, noise = detail.startswith("hand_"), detail.removeprefix("hand_")
-        case = Case(family, number, seed, model, sensor, procedure, noise=noise, wander=WANDER.get(noise, 1.0))
+        case = StudyCase(family, number, seed, model, sensor, procedure, noise=noise, wander=WANDER.get(noise, 1.0))
         if detail == "sensors" or by_hand:
             case = replace(case, model=str(rng.choice(sensor_files(INTERVAL_BY_HAND_S if by_hand else INTERVAL_S))))
         if detail == "sensors":
             return replace(case, noise="normal", table=str(rng.choice([*TABLES], p=[*TABLES.values()])))
-        rests = int(rng.integers(RESTS[0], RESTS[1] + 1)) if by_hand else 0
+        rests = int(rng.integers(RESTS_BY_HAND[0], RESTS_BY_HAND[1] + 1)) if by_hand else 0
         return replace(case, procedure="multi_position", method=BY_HAND, table="hand", rests=rests) if by_hand else case
     if kind in ("shape", "cycle"):
         procedure = "continuous" if detail == "band" else "stop_and_go"
         amplitude = tuple((rng.uniform(0.7, 1.3, 3) * rng.choice([-1.0, 1.0], 3)).tolist())
         room = CYCLE_DEGC if kind == "cycle" else None
-        return Case(family, number, seed, model, sensor, procedure, shape=detail, amplitude=amplitude, room_degc=room)
+        return StudyCase(
+            family, number, seed, model, sensor, procedure, shape=detail, amplitude=amplitude, room_degc=room
+        )
     if kind == "unseen":
         return _unseen(number, seed, rng)
     if kind == "staged":
@@ -139,7 +141,7 @@ def draw(family: str, number: int, seed: int) -> Case:
         for values in hidden.values():
             values.reshape(3, -1)[np.arange(3) != rng.integers(3)] = 0.0
     return replace(
-        Case(family, number, seed, model, sensor, procedure),
+        StudyCase(family, number, seed, model, sensor, procedure),
         hidden={name: values.tolist() for name, values in hidden.items()},
         wander=5.0 if detail == "wander" else 1.0,
         noise=family if family in ("lost", "coarse", "cold") else "normal",
@@ -161,14 +163,14 @@ def _names(kind: str, model: str, sensor: str, procedure: str, rng: np.random.Ge
             return names
 
 
-def _unseen(number: int, seed: int, rng: np.random.Generator) -> Case:
+def _unseen(number: int, seed: int, rng: np.random.Generator) -> StudyCase:
     """Draw an effect that is not observable: in turns in one direction, of the table to a gyroscope, or at rest."""
     cells = [("one_way", "gyroscope", name) for name in sorted(ONE_WAY["gyroscope"])]
     cells += [(way, "gyroscope", name) for way in ("stop_and_go", "one_way") for name in UNSEEN_GYROSCOPE]
     cells += [("at_rest", "accelerometer", name) for name in AT_REST]
     procedure, sensor, name = cells[int(rng.integers(len(cells)))]
     hidden = {name: drawn("mpu6050", sensor, name, rng).tolist()}
-    return Case("unseen", number, seed, "mpu6050", sensor, procedure, hidden)
+    return StudyCase("unseen", number, seed, "mpu6050", sensor, procedure, hidden)
 
 
 TABLE = {  # deg; ripple relative: a table of hobby parts, by assumption

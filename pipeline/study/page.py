@@ -13,7 +13,7 @@ from pipeline.report.pages import template
 from pipeline.study.cases import FAINT, SIZES
 from pipeline.study.scores import (
     GATES,
-    Score,
+    ScoreLine,
     accepted,
     answer_scores,
     false_selections,
@@ -145,7 +145,7 @@ def _outcome(case: ScoredCase) -> str:
     return "answered" if outside_answered(case) else "silent"
 
 
-def _misses(cases: Sequence[ScoredCase], scores: Sequence[Score]) -> Rows:
+def _misses(cases: Sequence[ScoredCase], scores: Sequence[ScoreLine]) -> Rows:
     by_key = {key: case for case in cases for key in (case.key, f"{case.key} {case.sensor}")}
     keys = [key for score in scores if score.goal for key in score.misses]
     rows = []

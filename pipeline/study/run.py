@@ -28,7 +28,7 @@ from pipeline.model.effects import leaving_out
 from pipeline.one_unit import unit_of_recordings, unit_row
 from pipeline.records import SENSORS, NotCalibrated
 from pipeline.study.bench import at_detection, recordings_of, signals_left
-from pipeline.study.cases import METHODS, Case, draw
+from pipeline.study.cases import METHODS, StudyCase, draw
 from pipeline.unit import STEPS, tasks_of
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def read_lines(path: Path) -> list[JSON]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
 
 
-def judge(case: Case) -> list[JSON]:
+def judge(case: StudyCase) -> list[JSON]:
     """Return the results of a case: one entry, or one for each sensor where nothing is hidden."""
     began = time.process_time()
     unit, state = diagnose_case(case)
@@ -138,7 +138,7 @@ def judge(case: Case) -> list[JSON]:
     return [result | {"cpu_s": spent} for result in out]
 
 
-def diagnose_case(case: Case) -> tuple[ConfiguredUnit, UnitState]:
+def diagnose_case(case: StudyCase) -> tuple[ConfiguredUnit, UnitState]:
     """Run the steps up to the diagnosis, without the effects that the case leaves out of the catalogue.
 
     Raises ``PipelineError`` if a step refuses the unit.

@@ -20,7 +20,7 @@ import scipy
 from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
 from pipeline.model.effects import effect
-from pipeline.report.chart import Dots, Figure, Line, Panel, chart
+from pipeline.report.chart import Dots, Figure, LineMark, Panel, chart
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
@@ -33,17 +33,17 @@ OF_WHICH = "... of those in which each stands out (lambda >= 100)"
 # Families with effects of the catalogue at the usual size and wander.
 IN_THE_CATALOGUE = ("single", "pairs", "triples", "one_axis")
 MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "triples")
-ALIKE = 0.95  # share of a signal above which effects are look-alikes, as on the pages
+LOOK_ALIKE_SIGNAL_SHARE = 0.95  # share of a signal above which effects are look-alikes, as on the pages
 EXCESS = 0.05  # of the noise floor: smallest held-out excess that is counted
 GATES = (6.0, 8.0, MIN_DELTA_BIC, 12.0, 14.0, MIN_DELTA_BIC_OF_SLOW, 18.0, 20.0)  # at which false selections count
 OF_SENSOR_FILE = ("white", "normal")  # noise of the families that the sensor file describes
 STANDS_OUT = 100.0  # lambda: the largest that a selection needs
-DOUBTFUL = (Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT)
+DOUBTFUL_VERDICTS = (Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT)
 
 
 def named(case: ScoredCase, hidden: str, name: str) -> bool:
     """Return whether a selected effect is the hidden one or its declared look-alike."""
-    return name == hidden or case.look_alikes.get(name, {}).get(hidden, 0.0) > ALIKE
+    return name == hidden or case.look_alikes.get(name, {}).get(hidden, 0.0) > LOOK_ALIKE_SIGNAL_SHARE
 
 
 def first_is_right(case: ScoredCase) -> bool:
@@ -71,7 +71,7 @@ def not_seen(case: ScoredCase) -> bool:
 
 def warned(case: ScoredCase) -> bool:
     """Return whether there is a warning: a doubtful verdict, a size beyond the limit, or more wander than expected."""
-    return bool(case.verdict in DOUBTFUL or not case.plausible or case.inflated)
+    return bool(case.verdict in DOUBTFUL_VERDICTS or not case.plausible or case.inflated)
 
 
 def outside_answered(case: ScoredCase) -> bool:
@@ -89,7 +89,7 @@ def hard_to_replace(case: ScoredCase) -> bool:
     name, whole = case.left_out[0], case.whole
     if whole is None or whole.selected[:1] != [name]:
         return False
-    return max(whole.look_alikes[name].values(), default=0.0) <= ALIKE
+    return max(whole.look_alikes[name].values(), default=0.0) <= LOOK_ALIKE_SIGNAL_SHARE
 
 
 def excess_gone(case: ScoredCase) -> float | None:
@@ -124,7 +124,7 @@ PLAN: list[tuple[str, str, Callable[[ScoredCase], bool], str]] = [
 ]
 
 
-class Score(NamedTuple):
+class ScoreLine(NamedTuple):
     """A line of a table: a share of ``total`` cases with its 95 % interval, or a mean or median without one.
 
     ``misses`` names the cases that do not belong to the share, in order.
@@ -152,11 +152,11 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
-def share(name: str, right: pd.Series[bool], goal: str = "") -> list[Score]:
+def share(name: str, right: pd.Series[bool], goal: str = "") -> list[ScoreLine]:
     """Return the share of the true values, with the labels of the others as misses; an empty list for no values."""
     hits, total = int(right.sum()), len(right)
     misses = tuple(map(str, right.index[~right]))
-    return [Score(name, hits / total, total, goal, wilson(hits, total), misses)] if total else []
+    return [ScoreLine(name, hits / total, total, goal, wilson(hits, total), misses)] if total else []
 
 
 def _judged(cases: Sequence[ScoredCase], right: Callable[[ScoredCase], bool]) -> pd.Series[bool]:
@@ -174,15 +174,15 @@ def family_of(case: ScoredCase) -> str:
     return "null" if case.family.startswith("null") else case.family
 
 
-def accepted(cases: Sequence[ScoredCase]) -> list[Score]:
+def accepted(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
     """Return the share of the units that no step of a run refused."""
     taken = pd.Series([not case.refused for case in cases], [case.key for case in cases], dtype=bool)
     return share("all families: no step of a run refuses the unit", taken, "100 %")
 
 
-def family_scores(cases: Sequence[ScoredCase]) -> list[Score]:
+def family_scores(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
     """Return the scores of every family that was run, and the share of the held-out excess that was removed."""
-    found: list[Score] = []
+    found: list[ScoreLine] = []
     for family, name, right, goal in PLAN:
         family_cases = [c for c in cases if c.family == family]
         if family == "removed":
@@ -226,7 +226,7 @@ def false_selections(cases: Iterable[ScoredCase]) -> list[list[Any]]:
     return rows
 
 
-def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[Score]:
+def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[ScoreLine]:
     """Return the mean of ``excess_gone`` over the units that have it; an empty list for fewer than two units."""
     gone = [excess_gone(case) for case in cases if not case.error]
     values = np.array([value for value in gone if value is not None])
@@ -234,14 +234,14 @@ def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[Score]:
         return []
     mean, half = float(values.mean()), Z * float(values.std(ddof=1) / np.sqrt(len(values)))
     least = f"held-out excess over the noise floor that is gone with what was selected, mean (least {values.min():.0%})"
-    return [Score(least, mean, len(values), ">= 98 %", (mean - half, mean + half))]
+    return [ScoreLine(least, mean, len(values), ">= 98 %", (mean - half, mean + half))]
 
 
 SETS = (
     "single", "one_axis", "staged", "lost", "coarse", "cold", "pairs", "pairs_wander", "triples", "unseen", "null",
 )  # fmt: skip  # families whose truth is a set of effects of the catalogue that the recordings can show
 # Family: the share of the detection size, and the goal of the median limit over the truth.
-LIMITS = {"limit_30": ("0.3", 4.0), "limit_60": ("0.6", 2.2), "limit_100": ("1", 1.6)}
+LIMIT_GOALS = {"limit_30": ("0.3", 4.0), "limit_60": ("0.6", 2.2), "limit_100": ("1", 1.6)}
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)  # of stated probabilities
 GOAL, FAMILY_GOAL, SIZE_GOAL = ">= 93.6 %", ">= 90 %", 3.0
 STYLE = (
@@ -276,7 +276,7 @@ def answered(cases: Iterable[ScoredCase]) -> list[ScoredCase]:
     return [c for c in cases if family_of(c) in SETS and (c.error or c.answer_set is not None)]
 
 
-def answer_scores(cases: Sequence[ScoredCase]) -> list[Score]:
+def answer_scores(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
     """Return the scores of answer sets and upper limits: how often they contain the truth, and their sizes."""
     known = answered(cases)
     found = share("truth in the 95 % answer set", _judged(known, in_the_set), GOAL)
@@ -285,15 +285,17 @@ def answer_scores(cases: Sequence[ScoredCase]) -> list[Score]:
         found += share(f"... {family}", _judged(family_cases, in_the_set), "" if family == "triples" else FAMILY_GOAL)
     found += share("most probable answer: exactly the truth", _judged(known, best_is_exact))
     found += share("... selected: exactly the truth", _judged(known, lambda c: _is_exactly(c, c.selected)))
-    over = {size: ratios(cases, family) for family, (size, _) in LIMITS.items()}
+    over = {size: ratios(cases, family) for family, (size, _) in LIMIT_GOALS.items()}
     for size, each in over.items():
         found += share(f"upper limits at {size} x the detection size: above the truth", pd.Series(each >= 1.0), GOAL)
     sizes = [len(case.answer_set) for case in known if case.answer_set is not None]
-    found += [Score("answers in a set, mean", float(np.mean(sizes)), len(sizes), f"<= {SIZE_GOAL:g}")] if sizes else []
-    for size, goal in LIMITS.values():
+    found += (
+        [ScoreLine("answers in a set, mean", float(np.mean(sizes)), len(sizes), f"<= {SIZE_GOAL:g}")] if sizes else []
+    )
+    for size, goal in LIMIT_GOALS.values():
         name = f"upper limit at {size} x the detection size over the truth, median"
         if len(over[size]):
-            found.append(Score(name, float(np.median(over[size])), len(over[size]), f"<= {goal:g}"))
+            found.append(ScoreLine(name, float(np.median(over[size])), len(over[size]), f"<= {goal:g}"))
     return found
 
 
@@ -308,7 +310,7 @@ def ratios(cases: Iterable[ScoredCase], family: str) -> np.ndarray:
     return np.array(over)
 
 
-def reliability(cases: Sequence[ScoredCase]) -> list[Score]:
+def reliability(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
     """Return the share of true effects in each bin of stated probability; the name is the bin's mean probability."""
     pairs = [
         (probability, name in true_set(case))
@@ -334,7 +336,9 @@ def reliability_diagram(cases: Sequence[ScoredCase]) -> str:
     points = "; ".join(
         f"said {at:.2g}: {round(b.value * b.total)} of {b.total}" for at, b in zip(said, bins, strict=True)
     )
-    panel = Panel([Line(ends, ends, 5, "dashed"), Dots(said, true, 2, low, high)], "true share", 300, limits=(0.0, 1.0))
+    panel = Panel(
+        [LineMark(ends, ends, 5, "dashed"), Dots(said, true, 2, low, high)], "true share", 300, limits=(0.0, 1.0)
+    )
     drawn = chart(figure, points, [panel], "said probability; bars: 95 % intervals", margin=0.02)
     head, tail = str(drawn.svg).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1).split("</title>", 1)
     return f"{head}</title>{STYLE}{tail}\n"

@@ -34,7 +34,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.model.effects.base import STANDARD_GRAVITY
-from pipeline.report.comparison import Estimate, mean_of
+from pipeline.report.comparison import MeanWithUncertainty, mean_of
 from pipeline.thesis.seeds import CAUSES, INTERVAL_S, LOST, TIME_CONSTANT_S
 from pipeline.thesis.tables import (
     ACCELEROMETER,
@@ -61,10 +61,10 @@ if TYPE_CHECKING:
     Place = tuple[str, str]  # set of recordings and method
 
 
-CONFIRMED, REFUTED, NONE, OPEN = "confirmed", "refuted", "no difference", "not decided"
-KINDS = {CONFIRMED: "good", REFUTED: "bad", NONE: "warn", OPEN: "warn"}  # CSS classes
+CONFIRMED, REFUTED, NO_DIFFERENCE, NOT_DECIDED = "confirmed", "refuted", "no difference", "not decided"
+KINDS = {CONFIRMED: "good", REFUTED: "bad", NO_DIFFERENCE: "warn", NOT_DECIDED: "warn"}  # CSS classes
 SMALLEST = 0.01  # of the error: smaller differences are negligible
-ALIKE = 0.05  # of the error: largest difference between rates that count as equal
+EQUAL_RATE_SHARE = 0.05  # of the error: largest difference between rates that count as equal
 READINGS = {"printed": "as printed", "staged": "errata corrected"}
 FILTERS = {
     "same-gain": "growth behind a filter of the same gain without delay",
@@ -80,17 +80,17 @@ TRUE_SCALE = {
 BIAS = [f"b_{a}_g" for a in AXES]
 
 
-class Line(NamedTuple):
+class FindingLine(NamedTuple):
     """One comparison: what is compared, the two means, the difference with its interval, and the verdict."""
 
     what: str
-    first: Estimate
-    second: Estimate
-    difference: Estimate
+    first: MeanWithUncertainty
+    second: MeanWithUncertainty
+    difference: MeanWithUncertainty
     verdict: str
 
 
-def verdict_of(lines: Sequence[Line]) -> str:
+def verdict_of(lines: Sequence[FindingLine]) -> str:
     """Return the common verdict of all comparisons of a conclusion, or the count of each verdict."""
     counts = {v: n for v in KINDS if (n := sum(line.verdict == v for line in lines))}
     return ", ".join(v if n == len(lines) else f"{v} in {n} of {len(lines)}" for v, n in counts.items())
@@ -104,16 +104,16 @@ class Errors:
         errors = judged["error"].where(judged["set"].str.contains("-gyro-"), 1000.0 * judged["error"])
         self._errors = judged.assign(error=errors).set_index(["set", "method", "seed"])["error"].sort_index()
 
-    def mean(self, name: str, method: str) -> Estimate:
+    def mean(self, name: str, method: str) -> MeanWithUncertainty:
         """Return the mean over seeds."""
         return mean_of(self._errors[name, method])
 
-    def line(self, what: str, smaller: Place, larger: Place) -> Line:
+    def line(self, what: str, smaller: Place, larger: Place) -> FindingLine:
         """Compare two (set, method); the thesis concludes that the first has the smaller error."""
         first = self._errors[smaller]
         return _compared(what, first, self._errors[larger], SMALLEST * mean_of(first).value)
 
-    def lines(self, what: str, smaller: str, larger: str, methods: Mapping[str, str] = READINGS) -> list[Line]:
+    def lines(self, what: str, smaller: str, larger: str, methods: Mapping[str, str] = READINGS) -> list[FindingLine]:
         """Compare two procedures on each device by each method."""
         return [
             self.line(f"{name}, {reading}: {what}", (f"{device}-{smaller}", method), (f"{device}-{larger}", method))
@@ -121,7 +121,9 @@ class Errors:
             for device, name in DEVICES.items()
         ]
 
-    def against_the_best(self, procedure_name: str, others: Iterable[str], methods: Mapping[str, str]) -> list[Line]:
+    def against_the_best(
+        self, procedure_name: str, others: Iterable[str], methods: Mapping[str, str]
+    ) -> list[FindingLine]:
         """Compare a procedure with the best of the others on each device by each method."""
         return [
             self.line(
@@ -134,7 +136,7 @@ class Errors:
             for best in self.ordered(device, others, method)[:1]
         ]
 
-    def growth(self, what: str, device: str, smaller: str, larger: str) -> Line:
+    def growth(self, what: str, device: str, smaller: str, larger: str) -> FindingLine:
         """Compare how two methods' errors grow from continuous 1 to 30 deg/s."""
         grown = []
         for method in (smaller, larger):
@@ -143,13 +145,13 @@ class Errors:
         fastest = self._errors[f"{device}-continuous-30dps", larger]
         return _compared(what, grown[0], grown[1], SMALLEST * mean_of(fastest).value)
 
-    def alike(self, device: str, procedures: Iterable[str], method: str) -> Line:
+    def alike(self, device: str, procedures: Iterable[str], method: str) -> FindingLine:
         """Judge whether the worst procedure of a device is within 5 % of the best."""
         best, *_, worst = self.ordered(device, procedures, method)
         what = f"{DEVICES[device]}: {_short(best)} against {_short(worst)}"
         line = self.line(what, (f"{device}-{best}", method), (f"{device}-{worst}", method))
-        (low, high), least = line.difference.interval, ALIKE * line.first.value
-        return line._replace(verdict=CONFIRMED if high < least else REFUTED if low > least else OPEN)
+        (low, high), least = line.difference.interval, EQUAL_RATE_SHARE * line.first.value
+        return line._replace(verdict=CONFIRMED if high < least else REFUTED if low > least else NOT_DECIDED)
 
     def ordered(self, device: str, procedures: Iterable[str], method: str) -> list[str]:
         """Sort procedures by a device's mean error, the smallest first."""
@@ -160,14 +162,14 @@ def _short(procedure: str) -> str:
     return in_words(procedure).removeprefix("gyro ")
 
 
-def _compared(what: str, first: pd.Series[float], second: pd.Series[float], negligible: float) -> Line:
+def _compared(what: str, first: pd.Series[float], second: pd.Series[float], negligible: float) -> FindingLine:
     """Compare the smaller value of each seed with the larger one."""
     difference = mean_of((second - first).dropna())
     low, high = difference.interval
-    verdict = CONFIRMED if low > 0.0 else REFUTED if high < 0.0 else OPEN
+    verdict = CONFIRMED if low > 0.0 else REFUTED if high < 0.0 else NOT_DECIDED
     if max(abs(low), abs(high)) < negligible:
-        verdict = NONE
-    return Line(what, mean_of(first), mean_of(second), difference, verdict)
+        verdict = NO_DIFFERENCE
+    return FindingLine(what, mean_of(first), mean_of(second), difference, verdict)
 
 
 def gain_of_filter(rate: float) -> float:
@@ -176,7 +178,7 @@ def gain_of_filter(rate: float) -> float:
     return float(k / abs(1.0 - (1.0 - k) * np.exp(-1j * np.radians(rate) * INTERVAL_S)))
 
 
-def conclusions(rows: pd.DataFrame) -> dict[str, list[Line]]:
+def conclusions(rows: pd.DataFrame) -> dict[str, list[FindingLine]]:
     """Return the comparisons of each conclusion of the thesis, from the rows of the study over seeds."""
     errors, devices = Errors(rows), DEVICES.items()
     unfiltered = {**READINGS, "unfiltered": "errata corrected, no filter"}

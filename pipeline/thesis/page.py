@@ -18,7 +18,7 @@ import pandas as pd
 from pipeline.estimation import correction
 from pipeline.io.yaml_file import read_yaml
 from pipeline.records import SENSOR_UNITS
-from pipeline.report.chart import AXES_LEGEND, Figure, Panel, Samples, chart
+from pipeline.report.chart import AXES_LEGEND, Figure, Panel, SampleMarks, chart
 from pipeline.report.group_charts import Point, curves, stems
 from pipeline.report.held_out_section import held_out_over_time
 from pipeline.report.numbers import MINUS, NOTHING, number
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from pipeline.report.comparison import Estimate
+    from pipeline.report.comparison import MeanWithUncertainty
 
 JSON = dict[str, Any]
 
@@ -85,7 +85,7 @@ def _text(value: float, digits: int, sign: str = "") -> str:
     return rounded.lstrip("+-") if float(rounded) == 0.0 else rounded.replace("-", MINUS)
 
 
-def _difference(estimate: Estimate) -> tuple[str, str]:
+def _difference(estimate: MeanWithUncertainty) -> tuple[str, str]:
     """Format a difference and its interval, rounded to two digits of half the interval."""
     half = estimate.expanded_uncertainty or 0.0
     decimals = max(0, 1 - math.floor(math.log10(half))) if half > 0.0 else 3
@@ -143,7 +143,7 @@ def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figur
     return chart(
         Figure(f"motion-{device}-{sensor}", finding, caption, AXES_LEGEND),
         f"{recording.samples} samples in {number(float(x[-1]))} s.",
-        [Panel([Samples(x, reading)], f"reading, {SENSOR_UNITS[sensor]}", 150)],
+        [Panel([SampleMarks(x, reading)], f"reading, {SENSOR_UNITS[sensor]}", 150)],
         "time, s",
     )
 

@@ -160,7 +160,7 @@ class Drawn:
         """Return the parameters from the stages, and the error after them."""
         estimator = accelerometer.Estimator.of(self.turns(), self._settings(as_printed=as_printed))
         found: dict[str, float] = {}
-        chain = accelerometer.Corrected()
+        chain = accelerometer.CorrectedForces()
         for name in accelerometer.STAGES:
             chain = estimator.after([name], chain)
             found |= {k: v for k, (v, _) in chain.values.items()}

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.estimation.design import Term
+from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.multi_position.faces_and_turns import turns_of
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
@@ -43,9 +43,12 @@ DRIFT_TIME_S = 60.0  # s over which a drift is stated
 DRIFT_STARTS = 60  # starts over which a drift is averaged
 SHORTEST_DRIFT_S = 10.0  # s: a drift over a shorter time is mostly noise
 CURVE_POINTS = 120  # points of the published curves
-STEP_S, STEP_DEG = 0.1, 5.0  # largest steps of the complementary filter, which integrates to first order
+MAX_FILTER_STEP_S, MAX_FILTER_STEP_DEG = (
+    0.1,
+    5.0,
+)  # largest steps of the complementary filter, which integrates to first order
 FILTER_GAIN = 0.5  # of the complementary filter: its library's default
-SETTLING_S = 10.0  # s after which the tilt counts
+TILT_SETTLING_S = 10.0  # s after which the tilt counts
 
 
 def attitude(
@@ -89,7 +92,7 @@ def attitude(
             up, true_up = level_in_body(fused), level_in_body(reference[:, steps].T)
             sine, cosine = np.linalg.norm(np.cross(up, true_up), axis=1), np.einsum("ij,ij->i", up, true_up)
             tilt, since = np.degrees(np.arctan2(sine, cosine)), time[steps] - time[0]
-            tilts[name] = float(np.sqrt(np.mean(tilt[since >= min(SETTLING_S, 0.5 * since[-1])] ** 2)))
+            tilts[name] = float(np.sqrt(np.mean(tilt[since >= min(TILT_SETTLING_S, 0.5 * since[-1])] ** 2)))
             curve[f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
     found = {"reason": None, "recording": recording.name, "seconds": seconds}
     return found | {"drift_deg": drifts, "tilt_rms_deg": tilts, "curve": curve}
@@ -148,7 +151,9 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     import imufusion  # noqa: PLC0415  (only units with a logged attitude need it)
 
     turns = angle_between(alone[:, :-1], alone[:, 1:])
-    within = min(STEP_S / float(np.median(np.diff(time))), STEP_DEG / max(float(turns.max()), 1e-9))
+    within = min(
+        MAX_FILTER_STEP_S / float(np.median(np.diff(time))), MAX_FILTER_STEP_DEG / max(float(turns.max()), 1e-9)
+    )
     chosen = np.arange(0, len(time), max(1, int(within)))
     intervals = np.diff(time[chosen])
     w, *v = _between(alone[:, chosen[:-1]], alone[:, chosen[1:]])
@@ -223,7 +228,7 @@ def gravity_direction(
     model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1, turns=turns)
     if model.moves is None:
         return {"reason": "no move is held out"}
-    terms = tuple(Term(effect(e.name), e.values) for e in gyroscope.effects)
+    terms = tuple(EffectColumns(effect(e.name), e.values) for e in gyroscope.effects)
     states = {
         "before": State(np.zeros(3), np.eye(3)),
         "after": State(gyroscope.bias, gyroscope.matrix, terms),

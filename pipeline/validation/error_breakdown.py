@@ -23,7 +23,7 @@ from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.mounting import SEPARATOR, Mounting
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
-from pipeline.model.measurement import Part, linear_truth, solve
+from pipeline.model.measurement import SensorEffects, linear_truth, solve
 from pipeline.records import FittedEffect, Motion, SensorCalibration, StepErrors, Values
 from pipeline.validation.samples import OTHER, Samples
 
@@ -141,7 +141,7 @@ def _with_effects(calibration: SensorCalibration, effects: Sequence[FittedEffect
         moves = [fitted for fitted in effects if fitted not in of_reading]
         return _by_calibrated_log(calibration, of_reading, samples), _moved_magnitude(samples, moves), None
     motion = _moved(samples.motion, effects)
-    rest = Part.of(calibration, of_reading).take_off(samples.reading, motion)
+    rest = SensorEffects.of(calibration, of_reading).take_off(samples.reading, motion)
     moved, logged = truth(samples.sensor, motion), truth(samples.sensor, samples.motion)
     change = np.linalg.norm(moved, axis=1) - np.linalg.norm(logged, axis=1)
     direction = moved if direction_known(calibration, samples) else None
@@ -208,4 +208,4 @@ def _by_calibrated_log(calibration: SensorCalibration, effects: Sequence[FittedE
         )
         return replace(found, specific_force_rate=nothing, angular_acceleration=nothing) if samples.resting else found
 
-    return solve({sensor: Part.of(calibration, effects)}, readings, motion_of)[sensor]
+    return solve({sensor: SensorEffects.of(calibration, effects)}, readings, motion_of)[sensor]

@@ -59,7 +59,7 @@ TAIL = 0.005  # probability on each side of a 99 % interval
 # Probabilities at which the factors are computed; the weight of each is the probability between the middles.
 LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
 WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
-BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time
+HELD_OUT_BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time
 SMALLEST_WIDTH = 0.5  # s of a wander of minutes, which may be a random walk (blind study, family null_random_walk)
 REST_SAMPLES = 300  # that determine the white noise without a static recording: a few rests of seconds
 EXACT_FREEDOM = 1e4  # degrees of freedom beyond which nu / chi^2(nu) is 1 to 1.4 %
@@ -239,7 +239,7 @@ def _form(
     of_parameters, of_blocks = np.zeros((q, q)), []
     for each in held_out:
         n, share = len(each.truth), each.number / total
-        count = max(1, min(n, round(BLOCKS * share)))
+        count = max(1, min(n, round(HELD_OUT_BLOCKS * share)))
         label = np.arange(n) * count // n
         first = np.searchsorted(label, np.arange(count))
         interval = (each.time[-1] - each.time[0]) / max(n - 1, 1) if n > 1 else 1.0

@@ -35,7 +35,7 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation import reference_least_squares
-from pipeline.estimation.accelerometer.nonlinear_least_squares import NAMES
+from pipeline.estimation.accelerometer.nonlinear_least_squares import MATRIX_NAMES
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.rest_means import count_of_rests
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
 
 FALSE_REFUSALS = 1e-3  # probability that a calibration as good as the raw readings is refused
 STRETCHES = 20  # a stretch of a recording of minutes is longer than the correlation time of most wander
-FEWEST_SAMPLES = 5  # of the t-test
+MIN_T_TEST_SAMPLES = 5  # of the t-test
 BIN_DEGC = 5.0  # a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
 SWEEP_DEGC = 2 * BIN_DEGC  # fills two bins; a unit that warms up on the bench changes by less
 FEWEST_IN_BIN = 10  # samples of a bin that is shown
@@ -308,7 +308,7 @@ def _why_not_held_out(case: HeldOutCase) -> str:
 def _fitted_exactly(calibration: SensorCalibration) -> int:
     """Return the number of rests by hand if the fit has a parameter for each, and so no residual; 0 otherwise."""
     for details in (stage.details for stage in calibration.stages if stage.details.get("rests_used")):
-        if details["orientations_used"] + len(details[KNOWN_BY_LIMIT]) <= len(NAMES):
+        if details["orientations_used"] + len(details[KNOWN_BY_LIMIT]) <= len(MATRIX_NAMES):
             return int(details["orientations_used"])
     return 0
 
@@ -322,7 +322,7 @@ def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: floa
     raw = np.concatenate([(np.linalg.norm(s.reading, axis=1) - s.magnitude)[s.known] for s in samples])
     calibrated = np.concatenate(after)
     sizes = [float(np.sqrt(np.mean(e**2))) for e in (raw, calibrated)]
-    if sizes[1] <= max(sizes[0], allowed) or len(raw) < FEWEST_SAMPLES:
+    if sizes[1] <= max(sizes[0], allowed) or len(raw) < MIN_T_TEST_SAMPLES:
         return None
     pieces = np.array_split(calibrated**2 - raw**2, min(STRETCHES, len(raw)))
     means = np.array([piece.mean() for piece in pieces])

@@ -37,7 +37,7 @@ from pipeline.model.effects.base import truth
 from pipeline.model.effects.equations import shifted
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.model.measurement import linear_truth
-from pipeline.signal.encoder_rate import FEWEST, EncoderRate, rate_by_angle
+from pipeline.signal.encoder_rate import MIN_RATE_SAMPLES, EncoderRate, rate_by_angle
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.signal.quiet_motion import creep_of_rest, posterior_creep_rates
 
@@ -312,7 +312,7 @@ def _rate_by_angle(recording: Recording) -> EncoderRate | None:
     if recording.table_attitude is not None or recording.gyroscope is None:
         return None
     finite = recording.gyroscope[np.isfinite(recording.gyroscope).all(axis=1)]
-    if len(finite) < FEWEST:
+    if len(finite) < MIN_RATE_SAMPLES:
         return None
     spread = np.linalg.eigvalsh(np.cov(finite.T))
     return by_angle if spread[1] <= OFF_AXIS_SHARE**2 * spread[2] else None

@@ -25,7 +25,7 @@ from pipeline.diagnosis.functional_forms import Factor, Form, Span, columns_of, 
 from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.diagnosis.words import in_words
-from pipeline.estimation.design import Term
+from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.generalized_least_squares import fit_joint, fit_terms
 from pipeline.estimation.noise import estimate_noise
@@ -264,7 +264,7 @@ def test_a_shape_gains_what_a_joint_fit_with_it_gains() -> None:
             "B": {"formula": "sin(5 * radians(angle))", "unit": "deg/s"},
         },
     }
-    terms = [*selection.fit.terms, Term(effect_from(definition, "test"), np.zeros(6))]
+    terms = [*selection.fit.terms, EffectColumns(effect_from(definition, "test"), np.zeros(6))]
     fit = fit_terms(selection.observations, terms, selection.start, selection.settings)
     formulas = harmonic(5).texts
     scan = Scan(selection)

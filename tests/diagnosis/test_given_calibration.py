@@ -8,10 +8,10 @@ from hand_simulator import Hand, draw
 from scipy.spatial.transform import Rotation
 from unit_settings import settings_of, with_noise
 
-from pipeline.diagnosis.findings import Case
+from pipeline.diagnosis.findings import DiagnosisInput
 from pipeline.diagnosis.method_errors import given_differences
 from pipeline.diagnosis.multi_position import _model_of_all_rests
-from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged
+from pipeline.diagnosis.verdict import HeldOut, VerdictInput, decide, judged
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.stages import fit_stage
@@ -19,7 +19,7 @@ from pipeline.records import Recording, SensorCalibration, SensorDiagnosis, Stag
 from pipeline.verdicts import Verdict
 
 ABOVE = HeldOut(0.5, 0.01, 0.1)
-GIVEN = Evidence("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE, method="given", on_table=False)
+GIVEN = VerdictInput("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE, method="given", on_table=False)
 FREE = SensorCalibration(
     "gyroscope", np.array([1.0, -2.0, 0.5]), np.diag([1.01, 0.99, 1.02]), covariance=np.eye(12) * 1e-8
 )
@@ -107,7 +107,7 @@ def test_the_diagnosis_of_a_gyroscope_by_hand_keeps_the_given_accelerometer() ->
     known = SensorCalibration("accelerometer", hand.bias["accelerometer"], frame @ hand.matrix["accelerometer"])
     gyroscope = SensorCalibration("gyroscope", hand.bias["gyroscope"], frame @ hand.matrix["gyroscope"])
     settings = settings_of(hand.settings, method={"given": {"accelerometer": known.to_json()}})
-    model = _model_of_all_rests(Case(gyroscope, [hand.recording], None, settings, known, []))
+    model = _model_of_all_rests(DiagnosisInput(gyroscope, [hand.recording], None, settings, known, []))
     spans = np.split(np.arange(len(hand.still)), np.flatnonzero(np.diff(hand.still.astype(int))) + 1)
     assert hand.recording.accelerometer is not None
     rests = [hand.recording.accelerometer[span].mean(axis=0) for span in spans if hand.still[span[0]]]

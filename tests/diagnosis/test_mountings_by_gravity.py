@@ -14,7 +14,7 @@ from bench_units import drawn, judged
 from unit_settings import with_noise
 
 from pipeline.diagnosis.diagnose import _doubts_of_gravity
-from pipeline.diagnosis.findings import Case
+from pipeline.diagnosis.findings import DiagnosisInput
 from pipeline.estimation.effects import mountings_by_gravity
 from pipeline.one_unit import unit_row
 from pipeline.preprocessing.checks import check_recordings
@@ -48,6 +48,6 @@ def test_a_tilt_that_shifts_no_mounting_is_no_doubt_about_the_gyroscope(tilt_deg
     settings = unit_row([f"sensor={description.sensor}", f"table={description.table}"]).config
     recordings = check_recordings(recordings, settings)
     by_gravity = mountings_by_gravity(with_noise(recordings, settings), settings)
-    case = Case(SensorCalibration("gyroscope"), recordings, None, settings, by_gravity, ["mounting"])
+    case = DiagnosisInput(SensorCalibration("gyroscope"), recordings, None, settings, by_gravity, ["mounting"])
     found = _doubts_of_gravity(SensorDiagnosis(Verdict.MISSING_EFFECT, [], selected=["table_tilt"]), case)
     assert bool(found) is doubted

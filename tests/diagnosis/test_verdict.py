@@ -9,7 +9,7 @@ import pytest
 from bench_session import Session, record
 
 from pipeline.diagnosis.diagnose import doubts_of, held_out_of
-from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged, verdict_of_selection
+from pipeline.diagnosis.verdict import HeldOut, VerdictInput, decide, judged, verdict_of_selection
 from pipeline.estimation.stages import declared
 from pipeline.one_unit import unit_of_recordings
 from pipeline.outcome import commands_of
@@ -29,7 +29,7 @@ REFERENCE, OF_STAGED, OF_HAND = (
         ("rests_and_moves", "rests_and_moves"),
     ]
 )
-NOTHING = Evidence("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, **REFERENCE)
+NOTHING = VerdictInput("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, **REFERENCE)
 BY_HAND = replace(NOTHING, **OF_HAND, on_table=False)
 MISSING = replace(NOTHING, found="missing_effect", selected=("g_sensitivity",), over_noise=9.0, left_over_noise=1.0)
 STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, **OF_STAGED)
@@ -93,7 +93,7 @@ def held_out(after: float) -> dict[str, float]:
         (replace(NOTHING, found="not_enough_data", published=BELOW), "floor_in_doubt", "too large"),
     ],
 )
-def test_the_first_that_applies_is_said_with_its_numbers(evidence: Evidence, verdict: str, words: str) -> None:
+def test_the_first_that_applies_is_said_with_its_numbers(evidence: VerdictInput, verdict: str, words: str) -> None:
     found, reason = decide(evidence)
     assert found == verdict
     assert words in reason

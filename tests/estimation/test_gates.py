@@ -56,7 +56,7 @@ def test_an_effect_that_takes_the_place_of_another_passes_the_gate(
     common = {"base": fit, "fit": fit, "candidates": dict.fromkeys(catalogue()), "limits": {"bias_drift": np.ones(3)}}
     taken: list[str] = []
 
-    hand = object.__new__(by_hand.Selection)
+    hand = object.__new__(by_hand.SelectionByHand)
     vars(hand).update(common, names=["g_sensitivity"], model=SimpleNamespace(sensor="gyroscope"))
     monkeypatch.setattr(hand, "_without", lambda _: SimpleNamespace(scores=scores), raising=False)
     monkeypatch.setattr(hand, "_remove", lambda _: None, raising=False)

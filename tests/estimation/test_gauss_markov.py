@@ -7,13 +7,13 @@ import pytest
 from scipy.integrate import dblquad
 
 from pipeline.estimation.gauss_markov import (
-    SLOW,
+    SLOW_SPECTRUM_SHARE,
     STATED_WIDTH,
     Blocks,
     GaussMarkov,
-    Prior,
     Products,
     Setting,
+    WanderPrior,
     block_covariance,
     constant_bias_s,
     orthonormal,
@@ -108,8 +108,8 @@ def test_products_of_samples_and_the_expected_bias_are_those_of_all_rows() -> No
 
 
 def test_a_stated_instability_leaves_no_hypothesis_without_any() -> None:
-    assert min(s.ratio for s in Prior(1e-3, 50.0).grid(1e-2)) > 0.0
-    free = Prior().grid(1e-2)
+    assert min(s.ratio for s in WanderPrior(1e-3, 50.0).grid(1e-2)) > 0.0
+    free = WanderPrior().grid(1e-2)
     none = sum(np.exp(s.prior) for s in free if s.ratio == 0.0)
     assert none / sum(np.exp(s.prior) for s in free) == pytest.approx(0.9)
 
@@ -117,8 +117,8 @@ def test_a_stated_instability_leaves_no_hypothesis_without_any() -> None:
 def test_what_a_static_recording_tells_counts_once_beside_what_the_sensor_file_states() -> None:
     tried = np.geomspace(1e-5, 1e-1, 30)
     likelihood = -0.5 * (np.log(tried / 2e-3) / 0.4) ** 2 + np.zeros((5, 1))
-    stated, white = Prior(1e-3, 80.0), 1e-2
-    grid = Prior(2e-3, 100.0, 0.4, stated, (tried, likelihood)).grid(white)
+    stated, white = WanderPrior(1e-3, 80.0), 1e-2
+    grid = WanderPrior(2e-3, 100.0, 0.4, stated, (tried, likelihood)).grid(white)
     wander = np.array([s.ratio * white for s in grid])
     near = (np.abs(np.log(wander / 1e-3)) < 2.5 * STATED_WIDTH) & np.isin([s.time for s in grid], [100.0])
     expected = -0.5 * (np.log(wander[near] / 1e-3) / STATED_WIDTH) ** 2 + np.interp(wander[near], tried, likelihood[0])
@@ -133,7 +133,7 @@ def test_a_bias_counts_as_constant_while_its_spectrum_is_below_that_of_white_noi
     lags = np.arange(-200_000, 200_001) * 0.01  # s
     frequency = 1.0 / (2.0 * constant_bias_s(noise, interval))
     spectrum = 0.01 * np.sum(wander**2 * np.exp(-np.abs(lags) / tau) * np.cos(2.0 * np.pi * frequency * lags))
-    assert spectrum == pytest.approx(SLOW * white**2 * interval, rel=0.01)
+    assert spectrum == pytest.approx(SLOW_SPECTRUM_SHARE * white**2 * interval, rel=0.01)
     assert constant_bias_s(Noise(np.full(3, white), np.zeros(3), tau, "static"), interval) == np.inf
     assert constant_bias_s(Noise(np.full(3, white), np.full(3, wander), tau, "rests"), interval) == np.inf
 

@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from unit_settings import settings_of, with_noise
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.design import Term, ordinary_base
+from pipeline.estimation.design import EffectColumns, ordinary_base
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gauss_markov import Products, Setting, selection_grid
 from pipeline.estimation.generalized_least_squares import fit_joint
@@ -139,8 +139,10 @@ def test_a_fit_may_take_a_selected_effect_to_where_the_motion_does_not_excite_it
     noise = estimate_noise("gyroscope", recordings, sheet)
     observations = observe("gyroscope", recordings, TABLE)
     start, warm_up = ordinary_base(observations, noise), effect("warm_up")
-    fitted = replace(start, terms=[Term(warm_up, np.array([300.0, -900.0, 100.0, 1e9]))])
-    ranking = Ranking(observations, start, fitted, {"warm_up": Term(warm_up, np.zeros(4))}, selection_grid(noise))
+    fitted = replace(start, terms=[EffectColumns(warm_up, np.array([300.0, -900.0, 100.0, 1e9]))])
+    ranking = Ranking(
+        observations, start, fitted, {"warm_up": EffectColumns(warm_up, np.zeros(4))}, selection_grid(noise)
+    )
     assert ranking.indices("warm_up") == []
     chosen = ranking.of_effects(["warm_up"])
     assert np.array_equal(ranking.log_likelihoods(chosen), ranking.log_likelihoods([]))

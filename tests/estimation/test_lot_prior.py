@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.estimation.lot_prior import FEWEST, LotPrior, Prediction, lot_priors, with_prior
+from pipeline.estimation.lot_prior import MIN_SIBLINGS, LotPrior, Prediction, lot_priors, with_prior
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.records import coverage_factor
 
@@ -119,5 +119,5 @@ def test_outliers_beyond_five_standard_deviations_are_found_and_are_no_siblings(
 
 
 def test_a_lot_of_few_units_is_not_used_up_by_its_own_test() -> None:
-    _, x, own = drawn(np.random.default_rng(9), FEWEST + 1, 1.0)
-    assert priors(x, own).siblings.min() >= FEWEST - 1
+    _, x, own = drawn(np.random.default_rng(9), MIN_SIBLINGS + 1, 1.0)
+    assert priors(x, own).siblings.min() >= MIN_SIBLINGS - 1

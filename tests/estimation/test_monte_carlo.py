@@ -12,7 +12,7 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.engine import Posterior
+from pipeline.estimation.engine import ErrorMixture
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.records import LIMIT, Budget, SensorCalibration
@@ -36,7 +36,7 @@ def stated(u: float, value: float = 0.0) -> SensorCalibration:
 
 
 def drawn(function: Any, u: float) -> Any:
-    errors = Posterior(np.ones(1), np.array([[[u**2]]]), np.inf)
+    errors = ErrorMixture(np.ones(1), np.array([[[u**2]]]), np.inf)
 
     def results(e: np.ndarray) -> np.ndarray:
         out = np.tile(np.concatenate([np.zeros(3), np.eye(3).ravel()]), (len(e), 1))
@@ -67,7 +67,7 @@ def test_the_same_run_gives_the_same_numbers() -> None:
 
 
 def test_noise_that_is_a_mixture_keeps_its_long_tails() -> None:
-    errors = Posterior(np.array([0.9, 0.1]), np.array([[[1.0]], [[100.0]]]), np.inf)
+    errors = ErrorMixture(np.array([0.9, 0.1]), np.array([[[1.0]], [[100.0]]]), np.inf)
     values = errors.draw(np.random.default_rng(1), 40_000)[:, 0]
     assert values.var() == pytest.approx(0.9 + 10.0, rel=0.05)
     assert np.mean(np.abs(values) > 5.0) == pytest.approx(0.1 * 0.6171, rel=0.1)

@@ -16,7 +16,7 @@ from pipeline.estimation.noise_terms import (
     QUANTISATION,
     WALK,
     WHITE,
-    Trial,
+    TermTrial,
     allan_variance,
     evaluate,
     fixed_shapes,
@@ -60,7 +60,7 @@ def test_likelihood_of_white_noise_and_walk_is_the_exact_restricted_one() -> Non
     spectrum = spectrum_of([np.stack([values, ramp], axis=1)[None]], DT)
     assert len(spectrum.omega) == n - 1
     parameters = np.array([2.0 * np.log(N), 2.0 * np.log(K), 0.0, 0.0])
-    fits = evaluate(spectrum, [Trial(0, (WHITE, WALK), (1,), parameters)])
+    fits = evaluate(spectrum, [TermTrial(0, (WHITE, WALK), (1,), parameters)])
     assert float(fits.deviance[0]) == pytest.approx(float(exact), rel=1e-9)
     assert float(fits.beta[0, 0]) == pytest.approx(float(np.linalg.solve(A, X.T @ inverse @ values)[1]), rel=1e-9)
 
@@ -159,7 +159,7 @@ def test_the_upper_limit_is_where_the_profile_likelihood_loses_its_quantile() ->
 
     def profile(K: float) -> float:
         start = np.array([0.0, 2.0 * np.log(K), 0.0, 0.0])
-        return float(maximised(spectrum, [Trial(0, (WHITE, WALK), (), start, held=1)]).deviance[0])
+        return float(maximised(spectrum, [TermTrial(0, (WHITE, WALK), (), start, held=1)]).deviance[0])
 
     least = min(profile(K) for K in np.geomspace(1e-5, 1.0, 120))
     assert profile(limit) - least == pytest.approx(1.644854**2, rel=0.05)

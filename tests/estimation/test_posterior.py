@@ -12,9 +12,17 @@ from scipy.linalg import null_space
 from scipy.special import logsumexp
 
 from pipeline.estimation.candidates import time_constants
-from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Given, Problem, Version, _explained, excited
+from pipeline.estimation.evidence import (
+    LIMIT_SCALES,
+    SCALE_PRIOR,
+    CandidateProblem,
+    Given,
+    Version,
+    _explained,
+    excited,
+)
 from pipeline.estimation.free_curves import BEND, free_curves
-from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantiles
+from pipeline.estimation.posterior import ODDS, UPPER_LIMIT_SHARE, Answers, SetSearch, answers, quantiles
 from pipeline.estimation.ranking import without
 from pipeline.records import Motion
 
@@ -57,14 +65,14 @@ class Dense:
         """Return log p of a set, all scales and noises enumerated, with its prior odds."""
         names = tuple(names)
         terms = [
-            self.log_evidence({n: float(SCALES[s]) for n, s in zip(names, picks, strict=True)}, theta)
+            self.log_evidence({n: float(LIMIT_SCALES[s]) for n, s in zip(names, picks, strict=True)}, theta)
             + sum(float(SCALE_PRIOR[s]) for s in picks)
-            for picks in product(range(len(SCALES)), repeat=len(names))
+            for picks in product(range(len(LIMIT_SCALES)), repeat=len(names))
             for theta in range(2)
         ]
         return float(logsumexp(terms)) + ODDS * len(names)
 
-    def problem(self) -> Problem:
+    def problem(self) -> CandidateProblem:
         """Return the same as products under each noise."""
         columns = np.column_stack([*self.Z.values(), self.y])
         products, prior = [], []
@@ -80,13 +88,13 @@ class Dense:
             for name, start, stop in zip(NAMES, edges[:-1], edges[1:], strict=True)
         }
         limits = {name: np.ones(k) for name, k in NAMES.items()}
-        return Problem(np.array(products), np.array(prior), 0.0, len(self.y) - 2.0, versions, limits)
+        return CandidateProblem(np.array(products), np.array(prior), 0.0, len(self.y) - 2.0, versions, limits)
 
 
 @pytest.mark.parametrize("sizes", [{}, {"a": 0.1}, {"a": 0.3, "c": 0.05}], ids=["nothing", "weak", "two"])
 def test_the_score_of_every_set_is_its_evidence_by_the_definition(sizes: dict[str, float]) -> None:
     dense = Dense(3, sizes)
-    search = Search(dense.problem())
+    search = SetSearch(dense.problem())
     zero = search.pool[frozenset()].score - dense.averaged(())
     for names, found in search.pool.items():
         expected = dense.averaged(sorted(names)) + zero
@@ -97,7 +105,7 @@ def test_the_score_of_every_set_is_its_evidence_by_the_definition(sizes: dict[st
 @pytest.mark.parametrize("sizes", [{}, {"a": 0.1}, {"a": 0.3, "c": 0.05}], ids=["nothing", "weak", "two"])
 def test_the_probabilities_of_all_sets_are_those_of_their_evidence_and_sum_to_one(sizes: dict[str, float]) -> None:
     dense = Dense(3, sizes)
-    found = answers([Search(dense.problem())], lambda _: 0, NAMES)
+    found = answers([SetSearch(dense.problem())], lambda _: 0, NAMES)
     stated = dict(found.sets)
     each = {names: dense.averaged(names) for names in stated}
     total = logsumexp(list(each.values()))
@@ -132,7 +140,7 @@ def test_an_upper_limit_is_the_quantile_of_draws_from_the_posterior() -> None:
     drawn = np.abs(mean[pick, 0] + deviation[pick, 0] * rng.standard_normal(len(pick)))
     alone = np.ones(1), np.zeros((1, 2)), np.array([[1.0, 2.0]])
     of_two, of_three, again = quantiles([alone, (weight, mean, deviation), alone])
-    assert of_three == pytest.approx([np.quantile(drawn, BELOW)], rel=0.01)
+    assert of_three == pytest.approx([np.quantile(drawn, UPPER_LIMIT_SHARE)], rel=0.01)
     assert of_two == pytest.approx([2.128045, 4.256090], rel=1e-6)  # of a normal distribution: 59/60 from one side
     assert again.tolist() == of_two.tolist()
 
@@ -142,19 +150,19 @@ def test_limits_of_absent_effects_cover_the_true_size_as_often_as_they_say() -> 
     for k in range(n):  # sizes drawn from the prior at its second scale
         size = abs(0.06 * rng.standard_normal())
         dense = Dense(1000 + k, {"b": size})
-        covered += answers([Search(dense.problem())], lambda _: 0, NAMES).upper_limit["b"][0] >= size
+        covered += answers([SetSearch(dense.problem())], lambda _: 0, NAMES).upper_limit["b"][0] >= size
     assert covered >= 54  # 3 % point of a binomial of 60 and 0.95
 
 
 def test_effects_that_exclude_each_other_are_never_together() -> None:
     dense = Dense(5, {"a": 0.3, "b": 0.3})
     free = dense.problem()
-    apart = Problem(
+    apart = CandidateProblem(
         free.products, free.prior, free.within, free.free, free.versions, free.limits,
         {"a": frozenset("b"), "b": frozenset("a")},
     )  # fmt: skip
-    assert frozenset("ab") in Search(free).pool
-    found = Search(apart)
+    assert frozenset("ab") in SetSearch(free).pool
+    found = SetSearch(apart)
     assert not any({"a", "b"} <= names for names in found.pool)
     assert set(answers([found], lambda _: 0, NAMES).upper_limit) == set(NAMES)
 
@@ -229,6 +237,6 @@ def test_one_direction_far_above_the_noise_is_scored_whatever_rounding_adds(colu
     added = rng.standard_normal((1, 2, columns, columns)) * (1e-11 if power > 1e12 else 0.0)
     inner = power * (u[..., :, None] * u[..., None, :] + added + added.swapaxes(2, 3))
     gain, log_det = _explained(inner, 0.5 * power * u, np.array([0.25 * power]))
-    shown = SCALES[:, None, None] ** 2 * power
+    shown = LIMIT_SCALES[:, None, None] ** 2 * power
     assert gain == pytest.approx(np.broadcast_to(0.25 * power * shown / (1.0 + shown), gain.shape), rel=1e-9)
     assert log_det == pytest.approx(np.broadcast_to(np.log1p(shown), gain.shape), abs=2e-2)

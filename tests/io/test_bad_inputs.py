@@ -15,7 +15,7 @@ from unit_settings import ingest_of, settings_of
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.io import text_log
-from pipeline.io.csv_layout import Layout
+from pipeline.io.csv_layout import TextLayout
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.read import read_recordings
 from pipeline.model.calibration_file import left_out
@@ -73,14 +73,14 @@ def test_bad_input_is_refused_by_its_code_with_its_facts(
 
 
 def _write_while_it_is_read(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
-    parse = Layout.parse
+    parse = TextLayout.parse
 
     def parse_and_write(*arguments: Any) -> Any:
         with file.open("ab") as stream:
             stream.write(b"30.0,0,0,1,0,0,0\n")
         return parse(*arguments)
 
-    monkeypatch.setattr(Layout, "parse", parse_and_write)
+    monkeypatch.setattr(TextLayout, "parse", parse_and_write)
 
 
 @pytest.mark.parametrize("number", [n for n, c in CASES.items() if not c.fault])

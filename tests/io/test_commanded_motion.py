@@ -14,7 +14,7 @@ from pipeline.io.commanded_motion import Program, follow_program
 from pipeline.records import Recording
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.session import Streams, as_program
-from pipeline.simulation.trajectory import Turn, rest, turn
+from pipeline.simulation.trajectory import CommandedTurns, rest, turn
 
 BIAS, SCALE = np.array([1.3, -0.4, 0.2]), 1.01
 COURSE = Course(step_deg=30.0, rates_dps=(30.0, 60.0), both_directions=True, validation_s=0.0, static_s=0.0)
@@ -22,7 +22,7 @@ COURSE = Course(step_deg=30.0, rates_dps=(30.0, 60.0), both_directions=True, val
 
 def program_of(name: str) -> Program:
     trajectory = next(p.trajectory for p in plan("three_axis_turns", COURSE, Streams(1, 0)["motion"]) if p.name == name)
-    assert isinstance(trajectory, Turn)
+    assert isinstance(trajectory, CommandedTurns)
     return trajectory.program
 
 

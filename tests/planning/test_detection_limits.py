@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.estimation.design import Term, ordinary_base
+from pipeline.estimation.design import EffectColumns, ordinary_base
 from pipeline.estimation.gates import passes
 from pipeline.estimation.gauss_markov import Blocks, Setting, selection_grid
 from pipeline.estimation.observations import observe
@@ -58,7 +58,7 @@ def _found(planned: dict[str, dict[str, Any]], names: dict[str, str], factor: fl
             noise = stated_noise(shipped.sensor.of(sensor), PROCEDURE.interval_s, long_rest=True)
             observations = observe(sensor, recordings, shipped.table)
             start = ordinary_base(observations, noise)
-            term = Term(effect(name), np.zeros(len(hidden[f"{sensor}.{name}"])))
+            term = EffectColumns(effect(name), np.zeros(len(hidden[f"{sensor}.{name}"])))
             ranking = Ranking(observations, start, start, {name: term}, selection_grid(noise))
             score = ranking.scores([], {})[0]
             found[sensor] += passes(score, sensor, len(catalogue()))

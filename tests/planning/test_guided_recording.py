@@ -14,8 +14,8 @@ from unit_settings import with_noise
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.planning.guide import (
     TURNS_DEG,
-    Progress,
-    Turn,
+    GuideProgress,
+    ProposedTurn,
     attitudes,
     default_goal,
     fitted_by_hand,
@@ -53,7 +53,7 @@ def recorded(attitudes: Sequence[Any], rng: np.random.Generator, white: float = 
     return Recording("recording", "rests", None, time, accelerometer=reading)
 
 
-def progress_of(recordings: list[Recording], settings: Settings, dwell: float) -> Progress:
+def progress_of(recordings: list[Recording], settings: Settings, dwell: float) -> GuideProgress:
     return progress_of_unit(fitted_by_hand(recordings, settings), settings, dwell)
 
 
@@ -165,7 +165,7 @@ def test_an_error_of_the_matrix_moves_the_integrated_vertical(angle: float) -> N
                 for _ in range(samples // 400):
                     attitude *= Rotation.from_rotvec(np.radians(read) * step * 400)
                 ends.append(attitude.inv().apply(np.eye(3)[up]))
-            expected = Turn(axis, up, angle).sensitivity() @ error
+            expected = ProposedTurn(axis, up, angle).sensitivity() @ error
             assert ends[1] - ends[0] == pytest.approx(expected, abs=3e-7)
 
 

@@ -303,8 +303,8 @@ def test_a_slow_turn_is_followed_although_the_bias_is_as_large_as_its_rate(rate_
 
 
 def test_a_bench_is_told_in_words() -> None:
-    from pipeline.preprocessing.bench import Bench  # noqa: PLC0415
+    from pipeline.preprocessing.bench import TurnMounting  # noqa: PLC0415
 
-    assert words(Bench("x", "-y", -1, 37.04)) == (
+    assert words(TurnMounting("x", "-y", -1, 37.04)) == (
         "body -y up at a table angle of 37.0 deg, the angle counted left-handed about x"
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.report.axis import Axis, log_ticks, round_ticks, tick_label
-from pipeline.report.chart import Area, Dots, Figure, Panel, Samples, chart
+from pipeline.report.chart import Area, Dots, Figure, Panel, SampleMarks, chart
 from pipeline.report.numbers import measured, number, span, typeset
 
 FIGURE = Figure("n", "t")
@@ -111,7 +111,7 @@ def test_few_samples_are_dots_at_their_values(*, hole: bool) -> None:
     x, block = np.sort(rng.random(100)), rng.standard_normal((100, 3))
     if hole:
         block[7, 1] = np.nan
-    svg = chart(FIGURE, "d", [Panel([Samples(x, block)], "y", height=100, limits=(-5.0, 5.0))], "x").svg
+    svg = chart(FIGURE, "d", [Panel([SampleMarks(x, block)], "y", height=100, limits=(-5.0, 5.0))], "x").svg
     across, up = Axis(x[0], x[-1], 64, 406), Axis(-5.0, 5.0, 108, 8)
     for column, path in zip(block.T, drawn(svg, "dots"), strict=True):
         known = np.isfinite(column)
@@ -122,7 +122,7 @@ def test_few_samples_are_dots_at_their_values(*, hole: bool) -> None:
 def test_many_samples_are_ranges_whose_means_are_a_line(count: int) -> None:
     rng = np.random.default_rng(4)
     x, y = np.arange(count, dtype=float), rng.standard_normal(count)
-    svg = chart(FIGURE, "d", [Panel([Samples(x, y, mean=True)], "y", height=100, limits=(-5.0, 5.0))], "x").svg
+    svg = chart(FIGURE, "d", [Panel([SampleMarks(x, y, mean=True)], "y", height=100, limits=(-5.0, 5.0))], "x").svg
     up = Axis(-5.0, 5.0, 108, 8)
     ((path,), (line,)) = drawn(svg, "strokes"), drawn(svg, "line")
     ranges = [(int(low), int(high)) for low, high in re.findall(r"M\d+ (\d+)V(\d+)", path)]
@@ -143,7 +143,7 @@ def test_an_interval_and_a_band_are_drawn_at_their_ends() -> None:
 def test_the_values_that_a_zoom_draws_end_at_the_limits_of_the_panel() -> None:
     x = np.linspace(0.0, 1.0, 2000)
     y = np.where(x < 0.5, 7.0, -0.5)  # beyond the limits, and a quarter above the lower one
-    panel = Panel([Samples(x, np.column_stack([y, y, y]))], "y", 100, limits=(-1.0, 1.0))
+    panel = Panel([SampleMarks(x, np.column_stack([y, y, y]))], "y", 100, limits=(-1.0, 1.0))
     drawn = str(chart(FIGURE, "n", [panel], "x").svg)
     curves = [np.frombuffer(b64decode(found), "<i2") for found in re.findall(r' data-full="([^"]+)"', drawn)]
     assert any(set(curve.tolist()) == {32767, -16384} for curve in curves)

@@ -17,7 +17,7 @@ from pipeline.files import write_json
 from pipeline.outcome import outcome, read_summary
 from pipeline.report import campaign_page
 from pipeline.report.certificate import certificate, certificate_page
-from pipeline.report.chart import Figure, Panel, Samples, chart
+from pipeline.report.chart import Figure, Panel, SampleMarks, chart
 from pipeline.report.fleet import parameter_table, write_summary
 from pipeline.report.parameters import COLUMNS, summary_row, unit_parameters
 from pipeline.report.unit_page import render
@@ -264,7 +264,7 @@ def test_a_chart_keeps_the_extremes_of_what_it_thins_out() -> None:
     y = np.sin(x / 50)
     with_spike = np.where(x == 54_321, 7.0, y)
     drawn = [
-        chart(Figure("n", "title"), "words", [Panel([Samples(x, v, 0)], "y", height=100, limits=(-8, 8))], "x").svg
+        chart(Figure("n", "title"), "words", [Panel([SampleMarks(x, v, 0)], "y", height=100, limits=(-8, 8))], "x").svg
         for v in (y, with_spike)
     ]
     full = [re.findall(r' data-full="([^"]*)"', svg) for svg in drawn]

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from pipeline.report import campaign_page, unit_page
-from pipeline.report.chart import Figure, Line, Panel, Samples, chart
+from pipeline.report.chart import Figure, LineMark, Panel, SampleMarks, chart
 from pipeline.report.pages import asset
 from pipeline.report.run_section import runs_data
 
@@ -42,8 +42,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "unit.html").write_text(unit_page.render(*unit.arguments, words=words))
     (folder / "campaign.html").write_text(campaign_page.render("factory", fleet(), failures(), history=runs()))
     x = np.linspace(0.0, 10.0, 11)
-    (folder / "chart.html").write_text(one_chart(Line(x, 3.0 * x - 1.0, 0)))
-    (folder / "samples.html").write_text(one_chart(Samples(*noisy_samples(), mean=True)))
+    (folder / "chart.html").write_text(one_chart(LineMark(x, 3.0 * x - 1.0, 0)))
+    (folder / "samples.html").write_text(one_chart(SampleMarks(*noisy_samples(), mean=True)))
     return folder
 
 
@@ -97,7 +97,7 @@ def noisy_samples() -> tuple[np.ndarray, np.ndarray]:
     return x, x + np.random.default_rng(4).standard_normal(len(x))
 
 
-def one_chart(layer: Line | Samples) -> str:
+def one_chart(layer: LineMark | SampleMarks) -> str:
     """Return a page with a chart."""
     svg = chart(Figure("line", "A line"), "It rises.", [Panel([layer], "height, m")], "way, km").svg
     legend = '<ul class="legend"><li><i class="c0"></i>the line</li></ul>'
@@ -269,11 +269,11 @@ def test_a_chart_of_many_units_shows_quantiles_and_names_the_farthest(
     file = tmp_path / "campaign.html"
     file.write_text(campaign_page.render("factory", fleet(), failures(), history=runs()))
     known = sorted((r for r in fleet() if r["status"] == "ok"), key=lambda r: -r["accelerometer_error_after"])
-    farthest = {r["unit"]: f"{r['accelerometer_error_after']:.6g}" for r in known[: campaign_page.FARTHEST]}
+    farthest = {r["unit"]: f"{r['accelerometer_error_after']:.6g}" for r in known[: campaign_page.FARTHEST_UNITS]}
     page = opened(browser, file)
     picture = page.locator("svg[data-names]").first
     dots = "e => [...e.querySelectorAll('.layers .dots')].reduce((n, p) => n + p.dataset.units.split(' ').length, 0)"
-    assert picture.evaluate(dots) == campaign_page.FARTHEST
+    assert picture.evaluate(dots) == campaign_page.FARTHEST_UNITS
     assert picture.locator(".band").count() == 3
     picture.focus()
     told = {}

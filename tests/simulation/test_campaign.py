@@ -16,7 +16,7 @@ from pipeline.errors import ConfigurationError, IngestError, MissingInputError
 from pipeline.io.read import read_recordings
 from pipeline.model.kinematics import reference_motion
 from pipeline.preprocessing.at_rest import check_axes
-from pipeline.preprocessing.evidence import Limits
+from pipeline.preprocessing.evidence import ChannelLimits
 from pipeline.preprocessing.reference_scale import doubt_of_angle
 from pipeline.records import SENSORS, Recording
 from pipeline.simulation.campaign import simulate_unit, write_campaign
@@ -57,7 +57,7 @@ def test_long_rests_before_a_turn_give_no_refusal_and_no_doubt_but_faults_do() -
     rests = np.concatenate([r.table_rate == 0.0 for r in turns if r.table_rate is not None])
     assert rests.mean() > 0.95
     check_axes(recordings)
-    limits = Limits.of(shipped_settings(sensor="mpu6050", table="acutronic"))
+    limits = ChannelLimits.of(shipped_settings(sensor="mpu6050", table="acutronic"))
     assert [doubt_of_angle(turn, limits) for turn in turns] == [None] * 3
     wrong = [replace(r, table_angle=1.005 * r.table_angle) for r in turns if r.table_angle is not None]  # counts a turn
     told = [str(doubt_of_angle(turn, limits)).partition("turns ")[2].partition(" ")[0] for turn in wrong]

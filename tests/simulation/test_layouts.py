@@ -16,7 +16,7 @@ from pipeline.simulation.campaign import simulate_unit, write_campaign
 from pipeline.simulation.description import UnitDescription, description_from
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.session import Streams, as_program
-from pipeline.simulation.trajectory import Turn
+from pipeline.simulation.trajectory import CommandedTurns
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,7 +59,7 @@ def test_a_log_of_its_own_is_the_rows_log_by_another_clock() -> None:
 def test_a_program_is_written_as_its_steps() -> None:
     course = Course(step_deg=30.0, rates_dps=(20.0, 60.0), both_directions=True)
     for part in plan("three_axis_turns", course, Streams(1, 0)["motion"]):
-        if isinstance(part.trajectory, Turn):
+        if isinstance(part.trajectory, CommandedTurns):
             program = part.trajectory.program
             written = Program(_flat(as_program(program)))
             assert len(written.stops) == len(program.stops)
@@ -71,7 +71,7 @@ def test_a_program_is_written_as_its_steps() -> None:
 def test_equal_steps_are_written_once() -> None:
     course = Course(step_deg=5.0)
     turn = next(p.trajectory for p in plan("three_axis_turns", course, Streams(1, 0)["motion"]) if p.name == "accel_x")
-    assert isinstance(turn, Turn)
+    assert isinstance(turn, CommandedTurns)
     steps = as_program(turn.program)
     assert max(s.get("repeat", 0) for s in steps) > 60
     assert len(steps) < 6

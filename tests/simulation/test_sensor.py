@@ -23,7 +23,14 @@ from pipeline.simulation.sensor import (
     bias_wander,
     decimals_of,
 )
-from pipeline.simulation.trajectory import Turn, TurnErrors, random_gimbals, rest, rotation_by, turn_with_plateau
+from pipeline.simulation.trajectory import (
+    CommandedTurns,
+    TurnErrors,
+    random_gimbals,
+    rest,
+    rotation_by,
+    turn_with_plateau,
+)
 
 if TYPE_CHECKING:
     from pipeline.records import Motion
@@ -37,7 +44,7 @@ SIZES = {
 
 def turn_scene(axis: int = 2, rate: float = 200.0, acceleration: float = 100.0) -> Scene:
     there, back = (turn_with_plateau(angle, rate, acceleration) for angle in (360.0, -360.0))
-    return Scene(Turn(axis, Program([rest(1.0), there, rest(1.0), back, rest(1.0)])), axis=axis)
+    return Scene(CommandedTurns(axis, Program([rest(1.0), there, rest(1.0), back, rest(1.0)])), axis=axis)
 
 
 def test_a_lever_arm_of_5_cm_at_200_deg_s_reads_omega_squared_r() -> None:
@@ -119,7 +126,7 @@ def test_a_mounting_and_a_zero_of_one_recording_are_the_rotations_of_their_effec
     program = plain.trajectory.program
     ahead = Program(program.steps)
     ahead.knots[:, 1] += zero
-    turned = replace(plain, trajectory=Turn(axis, ahead))
+    turned = replace(plain, trajectory=CommandedTurns(axis, ahead))
     for name, values, log, true in (
         ("mounting", theta, plain, replace(plain, mounting=rotation_by(theta))),
         ("encoder_zero", np.array([zero]), turned, plain),

@@ -10,8 +10,8 @@ from pipeline.io.commanded_motion import Program
 from pipeline.model.kinematics import UP_AT_ZERO, attitude_matrix, turn_about_axis
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.trajectory import (
-    Moves,
-    Turn,
+    CommandedTurns,
+    RestsAndMoves,
     TurnErrors,
     axis_and_angle,
     random_gimbals,
@@ -38,11 +38,11 @@ def trajectories() -> Iterator[tuple[str, Any]]:
         vibration=0.02,
         vibration_frequency=3.0,
     )
-    yield "turn", Turn(0, a_program())
-    yield "turn with errors", Turn(2, a_program(), errors)
+    yield "turn", CommandedTurns(0, a_program())
+    yield "turn with errors", CommandedTurns(2, a_program(), errors)
     yield "random motion", random_gimbals(60.0, 40.0, np.random.default_rng(1))
     axes = np.array([[0.6, 0.0, 0.8], [0.0, 1.0, 0.0]])
-    yield "moves", Moves(a_program(), axes, rotation_about(np.array([1.0, 0, 0]), np.array([20.0]))[0])
+    yield "moves", RestsAndMoves(a_program(), axes, rotation_about(np.array([1.0, 0, 0]), np.array([20.0]))[0])
 
 
 @pytest.mark.parametrize(("name", "trajectory"), list(trajectories()))
@@ -88,7 +88,7 @@ def test_an_angle_may_be_asked_for_at_any_time() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_gravity_in_a_turn_is_the_up_vector_turned_back(axis: int) -> None:
-    turn = Turn(axis, a_program())
+    turn = CommandedTurns(axis, a_program())
     time = np.linspace(0.0, turn.duration, 301)
     up = turn.pose(time).level[:, 2, :]
     np.testing.assert_allclose(up, turn_about_axis(UP_AT_ZERO[axis], axis, -turn.program.at(time)[0]), atol=1e-12)
@@ -134,7 +134,7 @@ def test_axis_and_angle_are_found_at_half_a_turn_too() -> None:
 def test_the_six_positions_show_each_axis_up_and_down() -> None:
     (recording, *_) = plan("six_positions", Course(validation_s=0.0, static_s=0.0), np.random.default_rng(0))
     moves = recording.trajectory
-    assert isinstance(moves, Moves)
+    assert isinstance(moves, RestsAndMoves)
     ups = np.round(moves.attitudes()[:, 2, :], 9)
     assert {tuple(u) for u in (ups + 0.0)} == {tuple(s * np.eye(3)[a] + 0.0) for a in range(3) for s in (1.0, -1.0)}
 
@@ -142,7 +142,7 @@ def test_the_six_positions_show_each_axis_up_and_down() -> None:
 def test_the_24_orientations_are_eight_about_each_axis() -> None:
     (recording, *_) = plan("orientations_24", Course(validation_s=0.0, static_s=0.0), np.random.default_rng(0))
     moves = recording.trajectory
-    assert isinstance(moves, Moves)
+    assert isinstance(moves, RestsAndMoves)
     ups = moves.attitudes()[:, 2, :]
     assert len(ups) == 24
     for axis in range(3):

@@ -23,7 +23,7 @@ from pipeline.records import Recording, coverage_factor
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
-    from pipeline.planning.guide import Progress
+    from pipeline.planning.guide import GuideProgress
 
 RATE_HZ, MOVE_S, SETTLES_S = 20.0, 2.5, 0.5  # a rest is found half a second late
 HAND_DEG = 1.0  # as configs/table/hand.yaml
@@ -73,7 +73,7 @@ class Unit:
         self.log.append(np.round(reading * SHEET.counts_per_unit) / SHEET.counts_per_unit)
         self.up = up
 
-    def inside(self, progress: Progress) -> float:
+    def inside(self, progress: GuideProgress) -> float:
         """Return how many of the nine parameters are inside their expanded uncertainty."""
         product = np.linalg.inv(self.gain @ self.gain.T)  # L^T L, of the lower triangular L with the same lengths
         L = np.linalg.cholesky(product[::-1, ::-1])[::-1, ::-1].T

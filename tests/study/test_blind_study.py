@@ -16,7 +16,7 @@ from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.model.effects import catalogue
 from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
-from pipeline.study.cases import FAMILIES, SIZES, Case, draw
+from pipeline.study.cases import FAMILIES, SIZES, StudyCase, draw
 from pipeline.study.result import ScoredCase
 from pipeline.study.run import diagnose_case, judge, read_lines, scored
 from pipeline.study.scores import exact, first_is_right, in_the_set, not_seen, outside_answered
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 SEED = 2
 
 
-def said(case: Case) -> ScoredCase:
+def said(case: StudyCase) -> ScoredCase:
     _, state = diagnose_case(case)
     return ScoredCase.from_json(case.to_json() | scored(state, case.sensor))
 
@@ -73,7 +73,7 @@ def test_recordings_tell_nothing_of_what_is_hidden_in_them_but_by_their_samples(
 
 def test_physics_of_a_form_of_its_own_is_what_it_says() -> None:
     case = draw("shape_gear_mesh", 1, SEED)
-    plain = recordings_of(Case("single", 1, SEED, case.model, case.sensor, case.procedure))
+    plain = recordings_of(StudyCase("single", 1, SEED, case.model, case.sensor, case.procedure))
     size = {"accelerometer": 2e-3, "gyroscope": 0.03}[case.sensor]
     for with_it, without in zip(recordings_of(case), plain, strict=True):
         if with_it.table_angle is None:

@@ -29,7 +29,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.result import model_of
-from pipeline.estimation.multi_position.selection import Selection
+from pipeline.estimation.multi_position.selection import SelectionByHand
 from pipeline.estimation.noise import estimate_noise
 from pipeline.io.read import read_recordings
 from pipeline.simulation.description import shipped_settings
@@ -149,7 +149,7 @@ def named(which: str, seed: int, rest_s: float | None = None) -> bool:
     calibration = FITS[sensor].fit(with_noise([drawn.recording], settings), None, settings)
     model = model_of([drawn.recording], calibration, noise, settings)
     assert model is not None
-    return effect in Selection(model, calibration, [], noise, settings.sensor.of(sensor)).names
+    return effect in SelectionByHand(model, calibration, [], noise, settings.sensor.of(sensor)).names
 
 
 @pytest.mark.study

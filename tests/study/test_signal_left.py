@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from pipeline.study.bench import signals_left
-from pipeline.study.cases import Case, draw
+from pipeline.study.cases import StudyCase, draw
 
 
 def test_twice_the_effect_leaves_four_times_the_signal() -> None:
-    case = Case("single", 0, 3, "mpu6050", "accelerometer", "stop_and_go", {"cubic_nonlinearity": [5e-3] * 3})
+    case = StudyCase("single", 0, 3, "mpu6050", "accelerometer", "stop_and_go", {"cubic_nonlinearity": [5e-3] * 3})
     (once,), (twice,) = (
         signals_left(replace(case, hidden={name: (factor * np.array(values)).tolist()})).values()
         for factor in (1.0, 2.0)
@@ -23,7 +23,7 @@ def test_twice_the_effect_leaves_four_times_the_signal() -> None:
 
 def test_an_effect_is_left_with_less_beside_its_look_alike() -> None:
     hidden = {"bias_temperature": [0.16] * 3, "warm_up": [0.3, 0.3, 0.3, 180.0]}
-    case = Case("pairs", 1, 3, "mpu6050", "gyroscope", "stop_and_go", hidden)
+    case = StudyCase("pairs", 1, 3, "mpu6050", "gyroscope", "stop_and_go", hidden)
     beside = signals_left(case)
     for name, values in hidden.items():
         alone = signals_left(replace(case, hidden={name: values}))[name]

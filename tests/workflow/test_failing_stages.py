@@ -27,7 +27,7 @@ from pipeline.errors import ConfigurationError, DamagedFileError, InputError
 from pipeline.one_unit import try_unit, unit_of_campaign
 from pipeline.outcome import outcome
 from pipeline.pack import Batch, Pack
-from pipeline.results_folder import HELD
+from pipeline.results_folder import OPEN_LOCKS
 from pipeline.stages import batch, diagnose, gather, report
 from pipeline.stages.unit_files import StoredUnit
 from pipeline.unit import Task, run_step
@@ -315,7 +315,7 @@ def test_units_beyond_the_limit_are_published_on_request_with_the_same_bytes(
     check_commands(apart, results, tmp_path, capsys)
     for unit in packed.units:
         unpack.main([str(apart), unit])
-        HELD.pop().close()
+        OPEN_LOCKS.pop().close()
         assert f"reports/{unit}.html" in capsys.readouterr().out
     unpacked = contents(apart)
     assert {f"reports/{unit}.html" for unit in packed.units} < links(apart / "index.html")
@@ -373,5 +373,5 @@ def run_gather(campaign: Campaign) -> None:
     try:
         batch.main("gather", ["--config", str(part), "--output", str(campaign.results / "batches" / "gathered.json")])
     finally:
-        while HELD:
-            HELD.pop().close()  # a job is a process of its own
+        while OPEN_LOCKS:
+            OPEN_LOCKS.pop().close()  # a job is a process of its own

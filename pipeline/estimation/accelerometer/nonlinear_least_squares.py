@@ -25,11 +25,11 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.correction import Multiply, Step, Subtract
 from pipeline.estimation.engine import LinearMap
-from pipeline.estimation.gauss_markov import WHITE, Prior
+from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, AccelerometerModel, limit_of_misalignment
-from pipeline.estimation.multi_position.fit import Fit
+from pipeline.estimation.multi_position.fit import FitByHand
 from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.model import NoiseHypothesis, State, prior_hypotheses
 from pipeline.estimation.multi_position.result import (
@@ -44,7 +44,7 @@ from pipeline.estimation.multi_position.result import (
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.stages import FitStage
-from pipeline.estimation.turns import Part, noise_of_turns
+from pipeline.estimation.turns import TurnPart, noise_of_turns
 from pipeline.estimation.uncertainty_budget import (
     combined,
     gravity_line,
@@ -82,15 +82,19 @@ TRIANGLE = slice(BIAS.stop, None)  # of the nine values: the elements of L; the 
 PLACE = np.arange(BASE_COUNT)[[*range(BIAS.stop), *(MATRIX.start + np.ravel_multi_index((ROWS, COLUMNS), (3, 3)))]]
 PLACED = np.eye(BASE_COUNT)[:, PLACE]
 ELEMENTS = [(AXES[i], AXES[j]) for i, j in zip(ROWS, COLUMNS, strict=True)]
-NAMES = np.array([*BIAS_NAMES] + [f"scale_factor_{i}" if i == j else f"misalignment_{i}{j}" for i, j in ELEMENTS])
+MATRIX_NAMES = np.array(
+    [*BIAS_NAMES] + [f"scale_factor_{i}" if i == j else f"misalignment_{i}{j}" for i, j in ELEMENTS]
+)
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
 IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
-UNKNOWN = 0.05  # standard uncertainty, g or relative, beyond which a bias or scale factor is called undetermined
+MAX_KNOWN_UNCERTAINTY = (
+    0.05  # standard uncertainty, g or relative, beyond which a bias or scale factor is called undetermined
+)
 FALSE_ALARM = 1e-3  # probability that a recording without outliers has one
 SMALLEST_OUTLIER_G = 1e-6  # rests of a noise-free recording are no outliers
 FEWEST_TO_JUDGE = 18  # rests, two for each parameter
 OUTLIER_SHARE = 0.2  # of the rests, the most that are called outliers
-MOST_ROWS = 600  # for which errors are drawn from a covariance
+MAX_COVARIANCE_ROWS = 600  # for which errors are drawn from a covariance
 OF_LENGTH = {
     **NOT_INCLUDED,
     "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
@@ -103,7 +107,7 @@ class _Solved:
     """A fit of m rows and then k pseudo-observations."""
 
     model: AccelerometerModel
-    fit: Fit
+    fit: FitByHand
     columns: Values  # (m + k, 9); over the standard deviation of each
     share: Values  # (m + k,); white noise over that standard deviation
 
@@ -125,7 +129,7 @@ class _Solved:
     @property
     def spare(self) -> int:
         """Rows and pseudo-observations minus parameters."""
-        return len(self.residual) - len(NAMES)
+        return len(self.residual) - len(MATRIX_NAMES)
 
     @property
     def uncertainty(self) -> Values:
@@ -206,7 +210,7 @@ def _without(rows: Orientations, refused: Mapping[int, str]) -> Orientations:
     return replace(rows, rests=rows.rests.select(kept), left_out=tuple(left_out))
 
 
-def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: float) -> _Solved:
+def _fit_determined(rows: Orientations, gravity_g: float, prior: WanderPrior, limit: float) -> _Solved:
     """Fit the nine values, with the limit of each misalignment that the orientations determine worse."""
     count = len(rows.rests.time)
     if count < 6:
@@ -217,7 +221,7 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: f
     try:
         solved = _fitted(rows, gravity_g, prior, MISALIGNMENT, limit)
         # A variance of more than half that of the limit is mostly the limit's.
-        by_limit = MISALIGNMENT & ((solved.uncertainty > limit * np.sqrt(0.5)) | (count < len(NAMES)))
+        by_limit = MISALIGNMENT & ((solved.uncertainty > limit * np.sqrt(0.5)) | (count < len(MATRIX_NAMES)))
         if not np.array_equal(by_limit, MISALIGNMENT):
             solved = _fitted(rows, gravity_g, prior, by_limit, limit)
     except NotObservableError as lack:
@@ -226,10 +230,10 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: Prior, limit: f
             "with each axis up, down and level, spread evenly"
         ) from lack
     u = solved.uncertainty
-    weak = (u > UNKNOWN) & ~MISALIGNMENT
+    weak = (u > MAX_KNOWN_UNCERTAINTY) & ~MISALIGNMENT
     if weak.any():
         raise NotObservableError(
-            f"the {count} orientations are nearly degenerate: they leave {', '.join(NAMES[weak])} open to "
+            f"the {count} orientations are nearly degenerate: they leave {', '.join(MATRIX_NAMES[weak])} open to "
             f"{float(u[weak].max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled "
             f"columns; {_unused(rows)}). Record rests with each axis up, down and level, spread evenly, not all in one "
             "plane or direction"
@@ -244,22 +248,24 @@ def _unused(rows: Orientations) -> str:
     return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation{unless}"
 
 
-def _fitted(rows: Orientations, gravity_g: float, prior: Prior, by_limit: Mask, limit: float) -> _Solved:
+def _fitted(rows: Orientations, gravity_g: float, prior: WanderPrior, by_limit: Mask, limit: float) -> _Solved:
     """Fit the nine values; raise ``NotObservableError`` if orientations and limits do not determine them."""
     noise = Noise(rows.white, np.zeros(3), prior.time, "rests")
-    limits = dict.fromkeys(NAMES[by_limit].tolist(), limit)
+    limits = dict.fromkeys(MATRIX_NAMES[by_limit].tolist(), limit)
     model = AccelerometerModel(rows.rests, PLACED, gravity_g, noise, known_by_limit=limits, wander=rows.by_hand)
     values = _start(rows.rests.reading, gravity_g, tilted=not by_limit.any())
     state = State(values[BIAS], triangle(values))
     equations = model.equations(state)
-    ScaledColumns.of(equations.base).require_full_rank(NAMES.tolist())
-    known = Prior(0.0, prior.time) if not rows.by_hand else prior
+    ScaledColumns.of(equations.base).require_full_rank(MATRIX_NAMES.tolist())
+    known = WanderPrior(0.0, prior.time) if not rows.by_hand else prior
     noises = prior_hypotheses(known, float(np.mean(model.white)), model.kinds)
     if known.wander == 0.0:  # on a table the wander follows from all readings
         noises = [noise for noise in noises if noise.bias.ratio == 0.0]
-    if len(equations.residual) - len(NAMES) <= 1:  # too few rows to show a scatter: the prior of the wander replaces it
+    if (
+        len(equations.residual) - len(MATRIX_NAMES) <= 1
+    ):  # too few rows to show a scatter: the prior of the wander replaces it
         white = float(np.median(equations.error[: model.rests_equations]))
-        noises = [NoiseHypothesis(WHITE, (prior.wander / white,))]
+        noises = [NoiseHypothesis(WHITE_SETTING, (prior.wander / white,))]
     noises = [replace(noise, known=True) for noise in noises]  # by the scatter within the rests
     fitted = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
     equations = model.equations(fitted.state)
@@ -312,7 +318,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     solved: _Solved,
     before: SensorCalibration,
     steps: Sequence[Step],
-    prior: Prior,
+    prior: WanderPrior,
     settings: Settings,
 ) -> SensorCalibration:
     """Return the calibration under white noise and bias wander, estimated from the residuals of ``y = b + K u``.
@@ -327,7 +333,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
         keep = np.zeros(recording.samples, bool)
         for start, stop in rows.rests.span[rows.rests.recording == i]:
             keep[start:stop] = True
-        parts.append(Part(recording, motion, keep & sound_samples(recording, "accelerometer")))
+        parts.append(TurnPart(recording, motion, keep & sound_samples(recording, "accelerometer")))
     truth = (rows.rests.reading - solved.fit.state.bias) @ solved.fit.state.matrix.T
     along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ solved.fit.state.matrix
     noise, row = noise_of_turns(parts, prior, settings.table), np.repeat(np.arange(len(count)), count)
@@ -347,7 +353,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     complete, trials = combined(calibration, lines, missing | OF_LENGTH), settings.uncertainty.monte_carlo
     if not trials:
         return complete
-    if len(count) > MOST_ROWS:
+    if len(count) > MAX_COVARIANCE_ROWS:
         reason = f"{len(count)} readings of a continuous turn are too many equations to draw; it is made for rests"
         return replace(complete, budget=complete.budget and replace(complete.budget, monte_carlo=NoMonteCarlo(reason)))
     moved = quadratic_results(solved.columns / share[:, None], curvature(solved.model, solved.fit), np.diag(share**2))
@@ -370,7 +376,7 @@ def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]
             L[k] /= S[k]
             of_L[k, k], of_L[k, ELEMENTS.index((j, j))] = 1.0 / S[k], -L[k] / S[k]
     units = [*base_units("accelerometer")[BIAS]] + ["1" if i == j else "rad" for i, j in ELEMENTS]
-    named = zip(NAMES.tolist(), zip(values.tolist(), units, strict=True), strict=True)
+    named = zip(MATRIX_NAMES.tolist(), zip(values.tolist(), units, strict=True), strict=True)
     return stage_parameters(dict(named), J @ covariance[np.ix_(PLACE, PLACE)] @ J.T)
 
 

@@ -29,9 +29,9 @@ import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.accelerometer.turn_extremes import (
+    AxisTurns,
     Extremes,
     Sinusoid,
-    Turn,
     by_turn,
     certificate_of,
     extremes_of_samples,
@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 REPLICATES = 60  # synthetic turns: their covariance is known to a tenth
 SEED = 20190508  # any number
 AS_PRINTED = "the printed variant takes single samples, through which no error of the table can be followed"
-STEP = 1e-7  # g, of the differences: truncation and rounding are then both about 1e-8 of the derivative
+DIFFERENCE_STEP_G = 1e-7  # g, of the differences: truncation and rounding are then both about 1e-8 of the derivative
 ASYMMETRY = "scale_factor_asymmetry"
 
 
@@ -191,7 +191,7 @@ FIT_STAGES = {
 
 
 @dataclass(frozen=True)
-class Corrected:
+class CorrectedForces:
     """The output of a stage: the correction so far in both forms, and the parameters of the last stage."""
 
     steps: list[Step] = field(default_factory=list)
@@ -201,7 +201,7 @@ class Corrected:
     values: Quantities = field(default_factory=dict)
 
     @classmethod
-    def of(cls, previous: SensorCalibration | None) -> Corrected:
+    def of(cls, previous: SensorCalibration | None) -> CorrectedForces:
         """Return the output of the stage before."""
         if previous is None or not previous.stages:
             return cls()
@@ -219,7 +219,7 @@ class Corrected:
         """Half the difference of both sides: (3,) array."""
         return (1.0 / self.positive - 1.0 / self.negative) / 2.0
 
-    def after(self, step: Step, *, averaged: bool) -> Corrected:
+    def after(self, step: Step, *, averaged: bool) -> CorrectedForces:
         """Return the correction after a further step; ``averaged``: the factors of both sides are averaged."""
         steps = [*self.steps, step]
         if isinstance(step, Subtract):
@@ -236,12 +236,12 @@ class Corrected:
         return np.concatenate([base_values(self.bias, np.diag(1.0 / self.k)), self.c, parameters])
 
 
-def follow(extremes: Extremes, names: Sequence[str], start: Corrected | None = None) -> Corrected:
+def follow(extremes: Extremes, names: Sequence[str], start: CorrectedForces | None = None) -> CorrectedForces:
     """Run stages one after the other, each on the output of the one before.
 
     ``start``: output of the stage before the first.
     """
-    found = start or Corrected()
+    found = start or CorrectedForces()
     for step in found.steps:
         extremes = extremes.corrected(step)
     for name in names:
@@ -257,7 +257,7 @@ def follow(extremes: Extremes, names: Sequence[str], start: Corrected | None = N
 class Estimator:
     """The estimates of the stages, without their uncertainty, from the turns of recordings."""
 
-    turns: list[Turn]
+    turns: list[AxisTurns]
     gravity_g: float
     as_printed: bool
 
@@ -274,7 +274,7 @@ class Estimator:
         """The sinusoid of each channel in each turn."""
         return sinusoids_of(self.turns)
 
-    def after(self, names: Sequence[str], start: Corrected | None = None) -> Corrected:
+    def after(self, names: Sequence[str], start: CorrectedForces | None = None) -> CorrectedForces:
         """Return the output of stages; ``start``: output of the stage before the first."""
         if self.as_printed:
             return follow(extremes_of_samples(self.turns, self.gravity_g), names, start)
@@ -295,7 +295,7 @@ def fit(
     def chain(values: Values) -> Values:
         return follow(extremes_of_sinusoids(by_turn(sinusoids, values), gravity_g), [*before, name]).vector()
 
-    found = estimator.after([name], Corrected.of(previous))
+    found = estimator.after([name], CorrectedForces.of(previous))
     # A separate sinusoid for each turn and channel would absorb the changes of the bias from turn to turn.
     noise = noise_of_turns([part for turn in turns for part in turn.parts], prior, settings.table, two_sided=True)
     if estimator.as_printed:
@@ -339,14 +339,16 @@ def fit(
 def _linear_map(sinusoids: Sequence[Sequence[Sinusoid]], theta: Values, chain: Callable[[Values], Values]) -> LinearMap:
     """Return the map from readings to ``Corrected.vector``, by the derivative of all stages so far."""
     here = chain(theta)
-    columns = np.stack([(chain(theta + STEP * e) - here) / STEP for e in np.eye(len(theta))], axis=1)
+    columns = np.stack(
+        [(chain(theta + DIFFERENCE_STEP_G * e) - here) / DIFFERENCE_STEP_G for e in np.eye(len(theta))], axis=1
+    )
     x, y, z = (np.asarray(scipy.linalg.block_diag(*(turn[c].weights for turn in sinusoids))) for c in range(3))
     J_x, J_y, J_z = np.split(columns, np.cumsum([len(x), len(y)]), axis=1)
     return LinearMap((x, y, z), (J_x, J_y, J_z))
 
 
 def _resampled(
-    turns: Sequence[Turn],
+    turns: Sequence[AxisTurns],
     sinusoids: Sequence[Sequence[Sinusoid]],
     noise: ResidualNoise,
     gravity_g: float,

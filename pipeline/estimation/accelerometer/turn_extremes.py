@@ -39,16 +39,16 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.correction import Step, TwoSided
 from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
-from pipeline.estimation.turns import Part, filtered_alike
+from pipeline.estimation.turns import TurnPart, filtered_alike
 from pipeline.records import AXES, Mask, Values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-ROUNDS = 12  # of the phase
+PHASE_ITERATIONS = 12  # of the phase
 SAME_PHASE = 1e-12  # rad
-WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
+MIN_TURN_SINGULAR_VALUE = 1e-3  # smallest singular value of unit columns that still counts as determined
 OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y, z
 
 
@@ -109,15 +109,15 @@ class Extremes:
 
 
 @dataclass(frozen=True)
-class Turn:
+class AxisTurns:
     """The used samples of all recordings of turns about one axis."""
 
     angle: Values  # (n,), deg
     reading: Values  # (n, 3), g
-    parts: list[Part]
+    parts: list[TurnPart]
 
 
-def turns_of(parts: Sequence[Part], *, as_printed: bool) -> list[Turn]:
+def turns_of(parts: Sequence[TurnPart], *, as_printed: bool) -> list[AxisTurns]:
     """Return the turns about x, y and z; raise ``NotObservableError`` if there is none about one of the axes."""
     turns = []
     for axis in range(3):
@@ -130,11 +130,11 @@ def turns_of(parts: Sequence[Part], *, as_printed: bool) -> list[Turn]:
                 "of x, y and z; record it, or choose reference_least_squares"
             )
         angle = np.concatenate([np.asarray(part.motion.angle)[part.keep] for part in used])
-        turns.append(Turn(angle, np.concatenate([part.reading("accelerometer") for part in used]), used))
+        turns.append(AxisTurns(angle, np.concatenate([part.reading("accelerometer") for part in used]), used))
     return turns
 
 
-def samples_of(part: Part, *, as_printed: bool) -> Mask:
+def samples_of(part: TurnPart, *, as_printed: bool) -> Mask:
     """Return which samples of a part are used."""
     return part.keep if as_printed else filtered_alike(part)
 
@@ -161,7 +161,7 @@ def fit_sinusoid(angle_deg: Values, reading: Values, *, sides: bool, where: str)
     columns = harmonic = np.column_stack([np.ones_like(angle), np.cos(angle), np.sin(angle)])
     factors = _factors(columns, where)
     coefficients = factors.solve(reading)
-    for _ in range(ROUNDS if sides else 0):
+    for _ in range(PHASE_ITERATIONS if sides else 0):
         phase = np.arctan2(coefficients[2], coefficients[1])
         columns = np.column_stack([harmonic, np.abs(np.cos(angle - phase))])
         factors = _factors(columns, where)
@@ -180,7 +180,7 @@ def _factors(columns: Values, where: str) -> ScaledColumns:
     n, p = columns.shape
     if n >= p:
         factors = ScaledColumns.of(columns)
-        if factors.singular[-1] > WEAKEST_DIRECTION:
+        if factors.singular[-1] > MIN_TURN_SINGULAR_VALUE:
             return factors
     raise NotObservableError(
         f"{where} does not show a sinusoid: {n} samples over too few angles; turn the table once around, stopping at "
@@ -188,7 +188,7 @@ def _factors(columns: Values, where: str) -> ScaledColumns:
     )
 
 
-def sinusoids_of(turns: Sequence[Turn]) -> list[list[Sinusoid]]:
+def sinusoids_of(turns: Sequence[AxisTurns]) -> list[list[Sinusoid]]:
     """Fit a sinusoid to each channel in each turn: ``[turn][channel]``."""
     return [
         [
@@ -220,7 +220,7 @@ def extremes_of_sinusoids(coefficients: Sequence[Sequence[Values]], gravity_g: f
     return Extremes(angle, angle + 180.0, high, low, level, height, gravity_g, as_printed=False)
 
 
-def extremes_of_samples(turns: Sequence[Turn], gravity_g: float) -> Extremes:
+def extremes_of_samples(turns: Sequence[AxisTurns], gravity_g: float) -> Extremes:
     """Return the extremes as the largest and smallest samples of the turns, the readings of each pose from one sample.
 
     An axis is level in two poses of each turn in which it goes up and down, and in all four poses of the turn about it.

@@ -46,7 +46,7 @@ from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.reference_least_squares import of_channels
 from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import Part, noise_of_fit, parts_of, used_motions
+from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
 from pipeline.records import (
     AFTER_BASE,
@@ -75,9 +75,9 @@ FIT_STAGES = {
         sensors=("gyroscope",), needs=("bias",), changes=("matrix",), accepts=("readings", "bias"), free=True
     ),
 }
-STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
+DIFFERENCE_STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
 MOTION_SHARE = 0.01  # of the largest rate, above which the table turns
-SLOWEST_DPS = 0.02  # five times Earth's rotation, which a log may contain
+MIN_RATE_DPS = 0.02  # five times Earth's rotation, which a log may contain
 DELAYS_TO_SETTLE = 5.0  # after which an RC filter holds less than 1 % of a change of rate
 SMALLEST_ANGLE_DEG = 1.0  # a smaller turn hardly determines the matrix
 
@@ -93,7 +93,7 @@ class Factors(NamedTuple):
 class Forward(NamedTuple):
     """The least squares ``Y = U A^T`` of integrated readings and rates."""
 
-    turns: Turns
+    turns: TurnIntegrals
     Y: Values  # (t, 3), deg; readings less bias, integrated over each turn
     U: Values  # (t, 3), deg; rates
     columns: ScaledColumns  # of U
@@ -181,7 +181,9 @@ def calibration_matrix(A: Values, *, as_printed: bool) -> Values:
     return A if as_printed else np.asarray(np.linalg.solve(A, np.eye(3)))
 
 
-def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_printed: bool) -> tuple[LinearMap, Values]:
+def _linear_map(
+    turns: TurnIntegrals, A: Values, previous: SensorCalibration, *, as_printed: bool
+) -> tuple[LinearMap, Values]:
     """Return the map from readings to bias, matrix, S, T and M (12 + 15), and their covariance by the bias before.
 
     Without a rest in the turns' recordings the bias is from another recording, and its covariance adds to the other;
@@ -204,7 +206,7 @@ def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_prin
             [channels[:, 0], calibration_matrix(channels[:, 1:], as_printed=as_printed).ravel(), found]
         )
 
-    x, y, z = np.split(derivative(results, theta, np.full(theta.size, STEP)), 3, axis=1)
+    x, y, z = np.split(derivative(results, theta, np.full(theta.size, DIFFERENCE_STEP)), 3, axis=1)
     if not from_rests and previous.covariance is not None:
         for channel, J in enumerate((x, y, z)):
             of_bias += previous.covariance[channel, channel] * np.outer(J @ lever, J @ lever)
@@ -220,7 +222,7 @@ def _values(factors: Factors) -> dict[str, tuple[float, str]]:
 
 
 @dataclass(frozen=True)
-class Turns:
+class TurnIntegrals:
     """Samples at rest and in turns of all recordings, stacked, with their weights in the integrals."""
 
     reading: Values  # (n, 3), deg/s
@@ -228,7 +230,7 @@ class Turns:
     rest: Mask  # (n,)
     weight: Values  # (n,), s; of each sample in the integral over its turn; 0 at rest
     turn: Index  # (n,); turn of each sample, -1 at rest
-    parts: list[Part]
+    parts: list[TurnPart]
     left_out: int  # turns with clipped or stuck readings
 
     def integral(self, values: Values) -> Values:
@@ -239,7 +241,7 @@ class Turns:
         return np.stack([np.bincount(self.turn[inside], column, size) for column in weighted.T], axis=1)
 
 
-def turns_of(parts: Sequence[Part]) -> Turns:
+def turns_of(parts: Sequence[TurnPart]) -> TurnIntegrals:
     """Stack the samples at rest and in turns of recordings."""
     columns, chosen, found, left_out = [], [], 0, 0
     for part in parts:
@@ -257,14 +259,14 @@ def turns_of(parts: Sequence[Part]) -> Turns:
         columns.append([values[keep] for values in each])
         chosen.append(replace(part, keep=keep))
     reading, rate, rest, weight, turn = (np.concatenate(column) for column in zip(*columns, strict=True))
-    return Turns(reading, rate, rest, weight, turn, chosen, left_out)
+    return TurnIntegrals(reading, rate, rest, weight, turn, chosen, left_out)
 
 
-def _moves(part: Part) -> list[tuple[int, int]]:
+def _moves(part: TurnPart) -> list[tuple[int, int]]:
     """Return the stretches in which the table turns in one direction, until the filtered reading has settled."""
     motion = part.motion
     rate = motion.rate if motion.rate is not None else np.linalg.norm(motion.angular_rate, axis=1)
-    threshold = max(SLOWEST_DPS, MOTION_SHARE * float(np.max(np.abs(rate))))
+    threshold = max(MIN_RATE_DPS, MOTION_SHARE * float(np.max(np.abs(rate))))
     lag = int(np.ceil(DELAYS_TO_SETTLE * float(part.recording.filter.get("delay_s", 0.0)) / part.recording.interval))
     moving = sorted(runs(rate > threshold) + runs(rate < -threshold))
     out, end = [], 0

@@ -18,8 +18,8 @@ from pipeline.estimation.correction import Multiply, Step, Subtract
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
-from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, accelerometer_of, model_of
-from pipeline.estimation.multi_position.model import NEW, State, prior_hypotheses
+from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, accelerometer_of, model_of
+from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import wander_prior
@@ -34,8 +34,10 @@ if TYPE_CHECKING:
 NAME = "rests_and_moves"
 FIT_STAGES = {NAME: FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
-UNKNOWN = 0.05  # standard uncertainty beyond which an element of the matrix is called undetermined
-ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
+MAX_KNOWN_ELEMENT_UNCERTAINTY = (
+    0.05  # standard uncertainty beyond which an element of the matrix is called undetermined
+)
+RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
 def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
@@ -46,24 +48,26 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     """
     filtered, procedure = recordings.filtered, settings.procedure
     if not is_multi_position("gyroscope", filtered):
-        raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
+        raise CannotCalibrateError(
+            f"rests and moves need a recording by hand with the gyroscope's readings: {RECORDING_ADVICE}"
+        )
     if not any(r.role == ROLE and r.accelerometer is not None for r in filtered):
         raise CannotCalibrateError(
             "rests and moves need the readings of both sensors: gravity before and after each move shows by how much "
             "the unit turned. A gyroscope alone needs a rate table"
         )
-    noise, advice = recordings.noises["gyroscope"], ADVICE + advice_on_held_out(filtered, procedure)
+    noise, advice = recordings.noises["gyroscope"], RECORDING_ADVICE + advice_on_held_out(filtered, procedure)
     accelerometer = accelerometer_of(recordings, settings)
     model = model_of(filtered, None, noise, procedure, accelerometer)
     if model is None or (model.moves is None and model.turns is None):
         rests = rests_of("gyroscope", filtered, procedure)
         raise CannotCalibrateError(
-            f"the gyroscope's matrix needs at least {FEWEST_MOVES} moves between rests, without gaps or clipped "
+            f"the gyroscope's matrix needs at least {MIN_MOVES} moves between rests, without gaps or clipped "
             f"readings{clipped_moves(filtered, rests) if rests else ''}: {advice}"
         )
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     base = model.equations(start).base
-    if ScaledColumns.of(base, NEW).rank < base.shape[1]:
+    if ScaledColumns.of(base, MIN_NEW_NORM_SHARE).rank < base.shape[1]:
         raise NotObservableError(
             f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {advice}"
         )
@@ -78,8 +82,8 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         assert model is not None  # noqa: S101
         model, fitted, outlying = fit_robustly(model, partial(fit_model, start=fitted.state), filtered)
     moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(fitted.covariance))[MATRIX]
-    if np.any(u > UNKNOWN):
-        weak = [name for name, one in zip(MATRIX_NAMES, u, strict=True) if one > UNKNOWN]
+    if np.any(u > MAX_KNOWN_ELEMENT_UNCERTAINTY):
+        weak = [name for name, one in zip(MATRIX_NAMES, u, strict=True) if one > MAX_KNOWN_ELEMENT_UNCERTAINTY]
         raise NotObservableError(
             f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u.max()):.2g} "
             f"(standard uncertainty), as if all were about one axis: {advice}"

@@ -33,7 +33,7 @@ from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage, staged_result
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import Part, noise_of_fit, parts_of, steady_turns, used_motions
+from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
 from pipeline.records import AFTER_BASE, AXES, BASE, Mask, Recording, SensorCalibration, Values, motion_at_rest
 from pipeline.signal.rests import runs
@@ -46,9 +46,11 @@ if TYPE_CHECKING:
     from pipeline.records import UnitRecordings
     from pipeline.settings import Settings
 
-STEP = 1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
-FORGOTTEN = 1e-5  # share of a change of rate in a filter's output, below which the filter has settled
-DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
+DIFFERENCE_STEP_DPS = (
+    1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
+)
+FORGOTTEN_RATE_CHANGE = 1e-5  # share of a change of rate in a filter's output, below which the filter has settled
+KNOWN_DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
 
 
 def bias(response: Response) -> Outcome:
@@ -103,7 +105,7 @@ FIT_STAGES = {
 
 
 @dataclass(frozen=True)
-class Corrected:
+class CorrectedRates:
     """The output of a stage: the correction so far, and the parameters of the last stage."""
 
     steps: list[Step] = field(default_factory=list)
@@ -126,25 +128,25 @@ class Corrected:
         return np.concatenate([offset, matrix.ravel(), [value for value, _ in self.values.values()]])
 
 
-def follow(response: Response, names: Sequence[str], start: Sequence[Step] = ()) -> Corrected:
+def follow(response: Response, names: Sequence[str], start: Sequence[Step] = ()) -> CorrectedRates:
     """Run stages one after the other, each on the output of the one before.
 
     ``start``: the correction by the stages before the first of ``names``.
     """
-    found = Corrected([*start])
+    found = CorrectedRates([*start])
     for step in found.steps:
         response = response.after(step)
     for name in names:
         step, values = STAGES[name](response)
         response = response.after(step)
-        found = Corrected([*found.steps, step], values)
+        found = CorrectedRates([*found.steps, step], values)
     return found
 
 
 class Estimates(NamedTuple):
     """The estimates from samples at rest and in steady turns, without their uncertainty."""
 
-    samples: Samples
+    samples: TurnSamples
     weights: Values  # (4, n); ``theta = weights @ readings``
     theta: Values  # (4, 3); mean reading at rest, and the response to the rate about each axis
     response: Response
@@ -179,7 +181,7 @@ def fit(
     here = theta.T.ravel()
     so_far = previous.stages[-1].correction if previous and previous.stages else None
     found = follow(response, [name], steps_of(so_far))
-    x, y, z = np.split(derivative(chain, here, np.full(here.size, STEP)), 3, axis=1)
+    x, y, z = np.split(derivative(chain, here, np.full(here.size, DIFFERENCE_STEP_DPS)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
     reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings.table)
     noise = noise_of_fit(samples.parts, reference, residuals, design, prior)
@@ -239,12 +241,12 @@ class Response:
 
 
 @dataclass(frozen=True)
-class Samples:
+class TurnSamples:
     """The used samples, stacked."""
 
     reading: Values  # (n, 3), deg/s; less Earth's rotation where it is known
     rate: Values  # (n, 3), deg/s; signed rate of the table about its turn axis, in the column of the axis; 0 at rest
-    parts: list[Part]
+    parts: list[TurnPart]
 
     @property
     def speed(self) -> Values:
@@ -253,7 +255,7 @@ class Samples:
         return np.asarray(np.abs(self.rate).sum(axis=0) / np.maximum(moving, 1))
 
 
-def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Samples:
+def samples_of(parts: Sequence[TurnPart], recordings: Sequence[Recording]) -> TurnSamples:
     """Return the samples at rest and in steady turns; without a rest, also the samples of a static recording."""
     chosen, readings, rates = [], [], []
     for part in parts:
@@ -269,10 +271,10 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
     if all(np.any(rate, axis=1).all() for rate in rates):
         for recording in recordings:
             if recording.role == "static" and recording.gyroscope is not None:
-                chosen.append(Part(recording, motion_at_rest(recording.time), recording.valid))
+                chosen.append(TurnPart(recording, motion_at_rest(recording.time), recording.valid))
                 readings.append(chosen[-1].reading("gyroscope"))
                 rates.append(np.zeros_like(readings[-1]))
-    return Samples(np.concatenate(readings), np.concatenate(rates), chosen)
+    return TurnSamples(np.concatenate(readings), np.concatenate(rates), chosen)
 
 
 def _memory(recording: Recording) -> float:
@@ -285,11 +287,11 @@ def _memory(recording: Recording) -> float:
 
         covariance = np.abs(filter_autocovariance(recording))
     except (ConfigurationError, KeyError):
-        return DELAYS_TO_SETTLE * float(applied["delay_s"])
-    return float(np.flatnonzero(covariance > FORGOTTEN * covariance[0])[-1] + 1) * recording.interval
+        return KNOWN_DELAYS_TO_SETTLE * float(applied["delay_s"])
+    return float(np.flatnonzero(covariance > FORGOTTEN_RATE_CHANGE * covariance[0])[-1] + 1) * recording.interval
 
 
-def _without_tails(part: Part, memory: float) -> Mask:
+def _without_tails(part: TurnPart, memory: float) -> Mask:
     """Return the samples at rest in which a filter has settled after a turn, and before the next turn."""
     still, time = part.motion.still.copy(), part.motion.time
     before = memory if part.recording.filter.get("zero_phase") else 0.0

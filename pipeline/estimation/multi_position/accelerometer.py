@@ -27,22 +27,29 @@ import numpy as np
 import scipy
 
 from pipeline.estimation.multi_position.faces_and_turns import Faces, faces_of
-from pipeline.estimation.multi_position.model import Block, Equations, State, effect_readings, motion_of, stacked
+from pipeline.estimation.multi_position.model import (
+    EquationBlock,
+    Equations,
+    State,
+    effect_readings,
+    motion_of,
+    stacked,
+)
 from pipeline.estimation.rest_means import HELD_OUT, Rests, rests_of
 from pipeline.records import BASE_COUNT, base_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.design import Term
+    from pipeline.estimation.design import EffectColumns
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
     from pipeline.settings import DataSheet, Settings
 
-ROUNDS = 12  # of effects that depend on the force
-SETTLED = 1e-12  # g
+FORCE_ITERATIONS = 12  # of effects that depend on the force
+SETTLED_FORCE_G = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g
 KNOWN_BY_LIMIT = "known_by_limit"  # in the details of a stage: misalignments with a pseudo-observation, each with its u
-COLUMN = {"misalignment_yx": 4, "misalignment_zx": 6, "misalignment_zy": 7}  # of b and the lower triangle of L
+MATRIX_COLUMN = {"misalignment_yx": 4, "misalignment_zx": 6, "misalignment_zy": 7}  # of b and the lower triangle of L
 
 
 class AccelerometerModel:
@@ -77,7 +84,7 @@ class AccelerometerModel:
         self.rests_equations = len(rests.time)
         self.stretches = len(rests.time) if wander else 0
 
-    def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
+    def equations(self, state: State, candidates: Sequence[EffectColumns] = ()) -> Equations:
         """Return the linearised equations at given parameters."""
         rests = self.rests
         force, v = self.specific_force(state, rests)
@@ -89,12 +96,12 @@ class AccelerometerModel:
         motion = self._motion(self.gravity * n, rests)
         base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
 
-        def effect_columns(term: Term) -> Values:
+        def effect_columns(term: EffectColumns) -> Values:
             return term.effect.columns(self.sensor, motion, state.K, term.values)
 
         places, H = np.arange(self.stretches), np.zeros((3, len(error), self.stretches))
         H[:, places, places] = (along * self.white / error[:, None]).T[:, places]
-        of_rests = Block(
+        of_rests = EquationBlock(
             (target - length) / error,
             base / error[:, None],
             lambda term: np.einsum("nc,ncp->np", -along, effect_columns(term)) / error[:, None],
@@ -105,8 +112,8 @@ class AccelerometerModel:
         )
         if self.faces is None:
             u = np.array(list(self.known_by_limit.values()))
-            angles = self.directions[:, [COLUMN[name] for name in self.known_by_limit]].T
-            of_limits = Block(
+            angles = self.directions[:, [MATRIX_COLUMN[name] for name in self.known_by_limit]].T
+            of_limits = EquationBlock(
                 -angles @ base_values(state.bias, state.matrix) / u,
                 angles / u[:, None],
                 lambda term: np.zeros((len(u), len(term.values))),
@@ -117,7 +124,7 @@ class AccelerometerModel:
         WM = W @ state.matrix
         wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,m,c->r", WM**2, rests.share, self.white**2))
         by_matrix = np.einsum("rmi,mj->rij", W, v).reshape(-1, 9)
-        of_faces = Block(
+        of_faces = EquationBlock(
             -np.einsum("rmc,mc->r", W, force) / wide,
             np.concatenate([-WM.sum(axis=1), by_matrix], axis=1) / wide[:, None],
             lambda term: np.einsum("rmc,mcp->rp", -WM, effect_columns(term)) / wide[:, None],
@@ -130,12 +137,12 @@ class AccelerometerModel:
         """Return the specific force of each rest, g, and v: (m, 3) arrays."""
         v, K = rests.reading - state.bias, state.K
         force = v @ state.matrix.T
-        for _ in range(ROUNDS if state.terms else 0):
+        for _ in range(FORCE_ITERATIONS if state.terms else 0):
             size = np.linalg.norm(force, axis=1, keepdims=True)
             motion = self._motion(self.gravity * force / size, rests)
             v = rests.reading - state.bias - effect_readings(self.sensor, state.terms, motion, K)
             before, force = force, v @ state.matrix.T
-            if np.abs(force - before).max() < SETTLED:
+            if np.abs(force - before).max() < SETTLED_FORCE_G:
                 break
         return force, v
 

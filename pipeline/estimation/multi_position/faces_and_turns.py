@@ -25,17 +25,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.multi_position.model import Block, State, effect_readings, motion_of
+from pipeline.estimation.multi_position.model import EquationBlock, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
 from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, Values
-from pipeline.signal.segments import ACROSS, multiples
+from pipeline.signal.segments import MAX_AXIS_SINE, multiples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.design import Term
-    from pipeline.settings import Faces as StatedFaces
+    from pipeline.estimation.design import EffectColumns
+    from pipeline.settings import FacesByHand as StatedFaces
     from pipeline.settings import HandTurns
 
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
@@ -92,7 +92,7 @@ def face_of(force: Values) -> tuple[Index, Index, Values, Values]:
 
 
 @dataclass(frozen=True)
-class Turns:
+class TurnsByHand:
     """The samples of t turns of a stated total angle, padded to the longest, and their equations."""
 
     name: tuple[str, ...]  # of each turn's recording
@@ -110,7 +110,7 @@ class Turns:
     value: Values
     error: Values
 
-    def equations(self, state: State, white: Values) -> Block:
+    def equations(self, state: State, white: Values) -> EquationBlock:
         """Return the equations; ``white`` (3,) is the noise of a sample."""
         WM = self.rows @ state.matrix
         motion, v = self._samples(state)
@@ -120,12 +120,12 @@ class Turns:
         bias = -np.einsum("rtc,t->rc", WM, self.weight.sum(axis=1))
         matrix = np.einsum("rti,tj->rij", self.rows, total).reshape(-1, 9)
 
-        def columns(term: Term) -> Values:
+        def columns(term: EffectColumns) -> Values:
             Z = term.effect.columns("gyroscope", motion, state.K, term.values).reshape(*self.weight.shape, 3, -1)
             return np.asarray(-np.einsum("rtc,ts,tscp->rp", WM, self.weight, Z) / error[:, None])
 
         residual = (self.value - np.einsum("rtc,tc->r", WM, total)) / error
-        return Block(residual, np.concatenate([bias, matrix], axis=1) / error[:, None], columns, error)
+        return EquationBlock(residual, np.concatenate([bias, matrix], axis=1) / error[:, None], columns, error)
 
     def described(self, state: State) -> list[dict[str, Any]]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""
@@ -178,7 +178,7 @@ def turns_of(
     accelerometer: SensorCalibration,
     turns: HandTurns,
     role: str = ROLE,
-) -> tuple[Turns | None, list[tuple[Recording, float, Values]]]:
+) -> tuple[TurnsByHand | None, list[tuple[Recording, float, Values]]]:
     """Return the moves that are turns by a multiple of the stated angle, and all moves.
 
     A move is from one rest to the next of its recording. A recording that the procedure states as a turn about an axis
@@ -222,7 +222,7 @@ def turns_of(
         rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != axis]
         value += [0.0, 0.0]
         error += 2 * [turns.axis_accuracy_deg]
-    return Turns(
+    return TurnsByHand(
         name=tuple(r.name for r, _ in chosen),
         axis=axes,
         stated=stated,
@@ -237,7 +237,9 @@ def turns_of(
     ), moves
 
 
-def require_turns(found: Turns | None, moves: Sequence[tuple[Recording, float, Values]], turns: HandTurns) -> None:
+def require_turns(
+    found: TurnsByHand | None, moves: Sequence[tuple[Recording, float, Values]], turns: HandTurns
+) -> None:
     """Raise ``NotObservableError`` if an axis has no stated turn, or a recording of a turn has another turn."""
     expected = f"a multiple of {turns.angle_deg:g} deg, within a tenth of it and a quarter of that angle"
     advice = (
@@ -258,7 +260,7 @@ def require_turns(found: Turns | None, moves: Sequence[tuple[Recording, float, V
             )
     for axis, name in enumerate(AXES):
         if name not in {turned for _, turned in pairs}:
-            about = [m for m in moves if np.linalg.norm(np.delete(m[2], axis)) < ACROSS * abs(m[2][axis])]
+            about = [m for m in moves if np.linalg.norm(np.delete(m[2], axis)) < MAX_AXIS_SINE * abs(m[2][axis])]
             largest = max(about, key=lambda m: abs(m[2][axis]), default=None)
             seen = f"{in_words(largest[2])} at {largest[1]:.1f} s of {largest[0].name}" if largest else "none"
             raise NotObservableError(

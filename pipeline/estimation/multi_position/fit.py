@@ -36,9 +36,17 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
-from pipeline.estimation.engine import Posterior
+from pipeline.estimation.engine import ErrorMixture
 from pipeline.estimation.least_squares import ScaledColumns, gauss_newton
-from pipeline.estimation.multi_position.model import NEW, Equations, Model, NoiseHypothesis, State, project_out, stepped
+from pipeline.estimation.multi_position.model import (
+    MIN_NEW_NORM_SHARE,
+    Equations,
+    Model,
+    NoiseHypothesis,
+    State,
+    project_out,
+    stepped,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -48,22 +56,22 @@ if TYPE_CHECKING:
 
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
-ROUNDS = 60  # of Gauss-Newton
-SMALL_STEP = 3e-3  # of a standard uncertainty: the last step taken
+MAX_GAUSS_NEWTON_ITERATIONS = 60  # of Gauss-Newton
+SMALL_LAST_STEP = 3e-3  # of a standard uncertainty: the last step taken
 STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
 SAME_SCALE = 1e-4  # relative change of the noise's scale below which the weight of the prior is not changed
-OPEN = 1e-7  # of the largest singular value, below which a combination of parameters takes no step
-NONE = 1e-8  # share of its columns below which a combination of parameters is not determined
-FAR = 12.0  # of log L below the best: a weight of 6e-6
-STEPS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
+OPEN_SINGULAR_VALUE = 1e-7  # of the largest singular value, below which a combination of parameters takes no step
+UNDETERMINED_COLUMN_SHARE = 1e-8  # share of its columns below which a combination of parameters is not determined
+NEGLIGIBLE_LOG_LIKELIHOOD = 12.0  # of log L below the best: a weight of 6e-6
+SCATTER_FACTORS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
 SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid
 RARE = 1e-3  # weight of a level below which it does not change the average
-FALSE_ALARM, FREEDOM = 1e-3, 4.0  # p and v
-ROBUST_ROUNDS, SETTLED = 6, 0.05  # weights that change by less are final
+OUTLIER_FALSE_ALARM, FREEDOM = 1e-3, 4.0  # p and v
+ROBUST_ROUNDS, SETTLED_WEIGHT_CHANGE = 6, 0.05  # weights that change by less are final
 
 
 @dataclass(frozen=True)
-class Fit:
+class FitByHand:
     """The best fit to rests and moves."""
 
     state: State
@@ -103,7 +111,7 @@ def fit(
     hypotheses: Sequence[NoiseHypothesis],
     limits: Limits,
     freedom: float | None = None,
-) -> Fit:
+) -> FitByHand:
     """Fit bias, matrix and effects from given values.
 
     ``freedom``: degrees of freedom of the noise's scale, if other readings determine it; by default of the residuals.
@@ -122,7 +130,7 @@ def fit(
 
     def small(step: Values, factors: ScaledColumns) -> bool:
         uncertainty = np.sqrt(scale * np.diag(factors.covariance()))
-        return bool(np.all(np.abs(step) <= np.maximum(SMALL_STEP * uncertainty, 1e-13)))
+        return bool(np.all(np.abs(step) <= np.maximum(SMALL_LAST_STEP * uncertainty, 1e-13)))
 
     while True:
         equations = next((e for s, e in evaluated if s is state), None) or model.equations(state)
@@ -130,11 +138,18 @@ def fit(
         likeliest = project_out(equations, hypotheses).of_model()[1]
         solved = solve(equations, hypotheses[likeliest], *prior)
         same = not np.any(prior[0]) or abs(solved.scale - scale) <= SAME_SCALE * scale
-        if (likeliest == best and same) or rounds > ROUNDS // 2:
+        if (likeliest == best and same) or rounds > MAX_GAUSS_NEWTON_ITERATIONS // 2:
             break
         best, scale = likeliest, solved.scale
         evaluated.clear()
-        state, _, more = gauss_newton(residual_at, state, partial(stepped, model), small, ROUNDS - rounds, OPEN)
+        state, _, more = gauss_newton(
+            residual_at,
+            state,
+            partial(stepped, model),
+            small,
+            MAX_GAUSS_NEWTON_ITERATIONS - rounds,
+            OPEN_SINGULAR_VALUE,
+        )
         rounds += more
     uncertainty = np.sqrt(np.diag(solved.covariance))
     converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
@@ -147,8 +162,8 @@ def fit(
     weight = np.exp(restricted - restricted.max())
     weight /= weight.sum()
     spare = max(len(equations.residual) - solved.rank, 1) if freedom is None else freedom
-    covariance, degrees = Posterior(weight, np.array([s.covariance for s in every]), spare).averaged()
-    return Fit(
+    covariance, degrees = ErrorMixture(weight, np.array([s.covariance for s in every]), spare).averaged()
+    return FitByHand(
         state=state,
         covariance=covariance,
         log_likelihood=likelihood,
@@ -191,7 +206,11 @@ def refined(
     scores = project_out(equations, hypotheses).scores()
     if len(hypotheses) == 1:
         return list(hypotheses), float(scores.max())
-    near = [noise for noise, score in zip(hypotheses, scores, strict=True) if score > scores.max() - FAR]
+    near = [
+        noise
+        for noise, score in zip(hypotheses, scores, strict=True)
+        if score > scores.max() - NEGLIGIBLE_LOG_LIKELIHOOD
+    ]
 
     def restricted(noise: NoiseHypothesis) -> float:
         return solve(equations, noise, *prior).restricted
@@ -199,7 +218,7 @@ def refined(
     likelihoods = np.array([restricted(noise) for noise in near])
     best, top = near[int(np.argmax(likelihoods))], float(likelihoods.max())
     weight = np.exp(likelihoods - top)
-    for factor in STEPS:
+    for factor in SCATTER_FACTORS:
         for j in (j for j, level in enumerate(best.levels) if level > 0.0):
             for other in (best.scaled(j, factor), best.scaled(j, 1.0 / factor)):
                 score = restricted(other)
@@ -210,8 +229,8 @@ def refined(
         given = np.array([noise.levels[j] for noise in near])
         chosen = [float(k) for k in np.unique(given) if weight[given == k].sum() > RARE * weight.sum()]
         if level > 0.0:
-            around = [restricted(best.scaled(j, factor)) for factor in (STEPS[-1], 1.0 / STEPS[-1])]
-            bend = (2.0 * top - sum(around)) / np.log(STEPS[-1]) ** 2
+            around = [restricted(best.scaled(j, factor)) for factor in (SCATTER_FACTORS[-1], 1.0 / SCATTER_FACTORS[-1])]
+            bend = (2.0 * top - sum(around)) / np.log(SCATTER_FACTORS[-1]) ** 2
             if bend > SHARP**-2:
                 chosen = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
         levels.append(chosen)
@@ -229,7 +248,7 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
     size = np.where(size > 0.0, size, 1.0)
     gram, along = (X / size).T @ (X / size), (X / size).T @ r
     w, V = np.linalg.eigh(gram)
-    kept = w > NONE * w[-1]
+    kept = w > UNDETERMINED_COLUMN_SHARE * w[-1]
     shown = (V[:, kept] / np.sqrt(w[kept])).T @ along
     rank, rss = int(kept.sum()), max(float(r @ r - shown @ shown), 0.0)
     spare = max(n - rank, 1)
@@ -251,7 +270,7 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
     )
 
 
-def plausible(model: Model, fitted: Fit, limits: Limits) -> bool:
+def plausible(model: Model, fitted: FitByHand, limits: Limits) -> bool:
     """Return whether every effect is within its limits, or exceeds them by less than its uncertainty."""
     uncertainty = np.sqrt(np.diag(fitted.covariance))
     return all(
@@ -260,7 +279,7 @@ def plausible(model: Model, fitted: Fit, limits: Limits) -> bool:
     )
 
 
-def require_observable(model: Model, fitted: Fit, limits: Limits) -> None:
+def require_observable(model: Model, fitted: FitByHand, limits: Limits) -> None:
     """Raise ``NotObservableError``, with the effects or parameters, if rests and moves do not determine them."""
     equations = model.equations(fitted.state)
     limited = _prior(model, fitted.state, limits)[0] > 0.0
@@ -269,11 +288,11 @@ def require_observable(model: Model, fitted: Fit, limits: Limits) -> None:
     lost = []
     for term, Z in zip(fitted.state.terms, equations.effects, strict=True):
         size, rest = np.linalg.norm(Z, axis=0), np.linalg.norm(Z - Q @ (Q.T @ Z), axis=0)
-        if np.all(rest <= NEW * np.where(size > 0.0, size, 1.0)):
+        if np.all(rest <= MIN_NEW_NORM_SHARE * np.where(size > 0.0, size, 1.0)):
             lost.append(term.effect)
     scaled = equations.columns / np.maximum(np.linalg.norm(equations.columns, axis=0), 1e-300)
     weak = np.linalg.eigh(scaled.T @ scaled + np.diag(limited.astype(float)))
-    undetermined = np.abs(weak.eigenvectors[:, weak.eigenvalues < NONE])[-len(names) :]
+    undetermined = np.abs(weak.eigenvectors[:, weak.eigenvalues < UNDETERMINED_COLUMN_SHARE])[-len(names) :]
     loose = [name for name, row in zip(names, undetermined, strict=True) if np.any(row > 0.2)]
     if lost or loose:
         advice = "; ".join(f"{e.name} needs {e.excitation}" for e in lost or [t.effect for t in fitted.state.terms])
@@ -284,8 +303,8 @@ def require_observable(model: Model, fitted: Fit, limits: Limits) -> None:
 
 
 def fit_robustly(
-    model: GyroscopeModel, fit_model: Callable[[GyroscopeModel], Fit], recordings: Sequence[Recording]
-) -> tuple[GyroscopeModel, Fit, list[dict[str, Any]]]:
+    model: GyroscopeModel, fit_model: Callable[[GyroscopeModel], FitByHand], recordings: Sequence[Recording]
+) -> tuple[GyroscopeModel, FitByHand, list[dict[str, Any]]]:
     """Fit rests and moves, with weights of Student's t if a move is an outlier.
 
     ``fit_model``: function that fits a model. Returns model and fit with the variance by the weights, and the outliers:
@@ -295,13 +314,13 @@ def fit_robustly(
     if moves is None:
         return model, fitted, []
     t, error = _over_noise(model, fitted)
-    limit = np.sqrt(2.0 * np.log(len(t) / FALSE_ALARM))
+    limit = np.sqrt(2.0 * np.log(len(t) / OUTLIER_FALSE_ALARM))
     if not np.any(t > limit):
         return model, fitted, []
     weight = np.ones(len(t))
     for _ in range(ROBUST_ROUNDS):
         before, weight = weight, np.minimum(1.0, (FREEDOM + 2.0) / (FREEDOM + t**2))
-        if np.abs(weight - before).max() < SETTLED:
+        if np.abs(weight - before).max() < SETTLED_WEIGHT_CHANGE:
             break
         variance = np.where(t > 0.0, (error / np.maximum(t, 1e-12)) ** 2, 0.0)
         model = model.with_excess(variance * (1.0 / weight - 1.0))
@@ -320,7 +339,7 @@ def fit_robustly(
     return model, fitted, outlying
 
 
-def _over_noise(model: GyroscopeModel, fitted: Fit) -> tuple[Values, Values]:
+def _over_noise(model: GyroscopeModel, fitted: FitByHand) -> tuple[Values, Values]:
     """Return t of each move, and its residual, deg."""
     C = model.equations(fitted.state).covariance(fitted.noise)
     error = fitted.error[model.of_moves].reshape(-1, 2)

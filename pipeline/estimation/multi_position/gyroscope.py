@@ -35,9 +35,23 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.least_squares import cholesky
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
-from pipeline.estimation.multi_position.faces_and_turns import Turns, require_turns, turns_of
-from pipeline.estimation.multi_position.model import Block, Equations, State, effect_readings, motion_of, stacked
-from pipeline.estimation.multi_position.moves import Gravity, Moves, moves_of, observed_rests, tangents, to_the_end
+from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, require_turns, turns_of
+from pipeline.estimation.multi_position.model import (
+    EquationBlock,
+    Equations,
+    State,
+    effect_readings,
+    motion_of,
+    stacked,
+)
+from pipeline.estimation.multi_position.moves import (
+    GravityAtRests,
+    Moves,
+    moves_of,
+    observed_rests,
+    tangents,
+    to_the_end,
+)
 from pipeline.estimation.stages import given_calibration, is_given
 from pipeline.model.kinematics import skew
 from pipeline.records import BASE, BASE_COUNT, BIAS, MATRIX
@@ -45,18 +59,18 @@ from pipeline.records import BASE, BASE_COUNT, BIAS, MATRIX
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.design import Term
-    from pipeline.estimation.multi_position.fit import Fit
+    from pipeline.estimation.design import EffectColumns
+    from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, UnitRecordings, Values
     from pipeline.settings import Procedure, Settings
 
-FEWEST_MOVES = 6  # two equations each, for the nine of the matrix
-ROUNDS = 6  # of effects that depend on the rate
+MIN_MOVES = 6  # two equations each, for the nine of the matrix
+RATE_ITERATIONS = 6  # of effects that depend on the rate
 SETTLED_DPS = 1e-7  # change of the rate that ends these rounds
 MOVED = "accelerometer_moved"
-MANY = 1e6  # degrees of freedom beyond which Student's t is normal to 1e-6
-DRAWS, TAIL = 4000, 0.005  # as in the 99 % interval of other held-out errors: 20 draws are beyond it
+NORMAL_DEGREES_OF_FREEDOM = 1e6  # degrees of freedom beyond which Student's t is normal to 1e-6
+INTERVAL_DRAWS, INTERVAL_TAIL = 4000, 0.005  # as in the 99 % interval of other held-out errors: 20 draws are beyond it
 
 
 class GyroscopeModel:
@@ -73,11 +87,11 @@ class GyroscopeModel:
         self,
         rests: Rests,
         moves: Moves | None,
-        gravity: Gravity,
+        gravity: GravityAtRests,
         noise: Noise | None,
         *,
-        fewest: int = FEWEST_MOVES,
-        turns: Turns | None = None,
+        fewest: int = MIN_MOVES,
+        turns: TurnsByHand | None = None,
     ) -> None:
         self.every, self.at_rests, self.noise, self.fewest = rests, gravity, noise, fewest
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
@@ -92,7 +106,7 @@ class GyroscopeModel:
             self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
             self.excess = np.zeros(self.moves.count)
 
-    def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
+    def equations(self, state: State, candidates: Sequence[EffectColumns] = ()) -> Equations:
         """Return the linearised equations at given parameters."""
         blocks = [self._at_rest(state)]
         if self.moves is not None:
@@ -161,14 +175,14 @@ class GyroscopeModel:
         S = S + float(scatter.get("scatter_of_directions") or 0.0) ** 2 * np.asarray(block.direction)
         S = S + ratio**2 * np.einsum("cnk,cmk->nm", H, H)
         rng = np.random.default_rng(0)
-        drawn = rng.standard_normal((DRAWS, n)) @ cholesky(S).T  # continuous in S, as eigenvectors are not
-        errors = draw_normal(rng, covariance[BASE, BASE], DRAWS)
+        drawn = rng.standard_normal((INTERVAL_DRAWS, n)) @ cholesky(S).T  # continuous in S, as eigenvectors are not
+        errors = draw_normal(rng, covariance[BASE, BASE], INTERVAL_DRAWS)
         for part in (BIAS, MATRIX):  # the wander reduces the degrees of freedom of the bias
-            least = min(float(freedom[part].min()), MANY)
-            errors[:, part] *= np.sqrt(least / rng.chisquare(least, (DRAWS, 1)))
+            least = min(float(freedom[part].min()), NORMAL_DEGREES_OF_FREEDOM)
+            errors[:, part] *= np.sqrt(least / rng.chisquare(least, (INTERVAL_DRAWS, 1)))
         drawn += errors @ block.base.T
         rms = np.sqrt(2.0 * np.mean((drawn * block.error) ** 2, axis=1))
-        return float(np.quantile(rms, 1.0 - TAIL))
+        return float(np.quantile(rms, 1.0 - INTERVAL_TAIL))
 
     def _rate_at_rest(self, rests: Rests, force: Values, state: State) -> tuple[Values, Motion]:
         """Return the readings at rests minus those that the model predicts, (m, 3), and the motion."""
@@ -176,7 +190,7 @@ class GyroscopeModel:
         predicted = state.bias + effect_readings(self.sensor, state.terms, motion, state.K) + rests.creep @ state.K.T
         return rests.reading - predicted, motion
 
-    def _at_rest(self, state: State) -> Block:
+    def _at_rest(self, state: State) -> EquationBlock:
         rests, K = self.rests, state.K
         residual, motion = self._rate_at_rest(rests, self.force, state)
         error = np.sqrt(rests.share[:, None]) * self.white
@@ -187,11 +201,11 @@ class GyroscopeModel:
         for c in range(3):
             bias[c, np.arange(m), c, np.arange(m)] = self.white[c] / error[:, c]
 
-        def columns(term: Term) -> Values:
+        def columns(term: EffectColumns) -> Values:
             Z = term.effect.columns(self.sensor, motion, K, term.values) / error[:, :, None]
             return np.asarray(Z.reshape(3 * m, -1))
 
-        return Block(
+        return EquationBlock(
             (residual / error).ravel(),
             base.reshape(3 * m, BASE_COUNT),
             columns,
@@ -212,7 +226,7 @@ class GyroscopeModel:
         rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + about[:, None, None] ** 2 * upward
         return scipy.linalg.block_diag(*(K @ rate @ K.T / error[:, :, None] / error[:, None, :]))
 
-    def _of_moves(self, state: State) -> Block:
+    def _of_moves(self, state: State) -> EquationBlock:
         moves, gravity = self.moves, self.at_rests
         assert moves is not None  # noqa: S101
         k, n = np.arange(moves.count), 2 * moves.count
@@ -237,7 +251,7 @@ class GyroscopeModel:
         bias = np.zeros((3, moves.count, 2, moves.count))
         bias[:, k, :, k] = (-W @ noise.sum(axis=1)).transpose(0, 2, 1)
 
-        def columns(term: Term) -> Values:
+        def columns(term: EffectColumns) -> Values:
             Z = term.effect.columns(self.sensor, motion, state.K, term.values).reshape(*moves.weight.shape, 3, -1)
             return np.asarray((W @ -np.einsum("ksej,ksjp->kep", PM, Z)).reshape(n, -1))
 
@@ -247,7 +261,7 @@ class GyroscopeModel:
         means = (WD * gravity.spread[:, None]).reshape(n, -1)
         other_move = np.kron(np.eye(moves.count), np.ones((2, 2))) == 0.0
         directions = np.median(error) * self.gravity * np.radians(WD).reshape(n, -1)  # by errors of a typical white one
-        return Block(
+        return EquationBlock(
             np.einsum("kij,kj->ki", W, apart).ravel() - shared @ gravity.moved,
             (W @ base).reshape(n, BASE_COUNT),
             columns,
@@ -260,7 +274,7 @@ class GyroscopeModel:
             shared=shared,
         )
 
-    def accelerometer_errors(self, fitted: Fit) -> Values:
+    def accelerometer_errors(self, fitted: FitByHand) -> Values:
         """Return the estimate of the accelerometer's errors of bias and matrix from the moves: (12,) array."""
         equations = self.equations(fitted.state)
         shared = np.zeros((len(equations.residual), BASE_COUNT))
@@ -283,7 +297,7 @@ class GyroscopeModel:
 
         plain = v = moves.reading - state.bias
         rate, A, motion = integrated(plain)
-        for _ in range(ROUNDS if state.terms else 0):
+        for _ in range(RATE_ITERATIONS if state.terms else 0):
             v, before = plain - effect_readings(self.sensor, state.terms, motion, K).reshape(plain.shape), rate
             rate, A, motion = integrated(v)
             if np.abs(rate - before).max() < SETTLED_DPS:

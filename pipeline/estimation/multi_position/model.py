@@ -43,26 +43,28 @@ import numpy as np
 import scipy
 
 from pipeline.estimation import design
-from pipeline.estimation.gauss_markov import SURE, Prior, Setting, block_covariance, selection_grid
+from pipeline.estimation.gauss_markov import NO_INSTABILITY_ODDS, Setting, WanderPrior, block_covariance, selection_grid
 from pipeline.estimation.least_squares import cholesky
 from pipeline.records import BIAS, Index, Mask, Motion, Noise, Values, matrix_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.estimation.design import Term
+    from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
-NEW = 1e-3  # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
+MIN_NEW_NORM_SHARE = (
+    1e-3  # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
+)
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
 # refines their steps where the data determine the scatter better.
 UNLIKELY = -4.0  # prior log weight of a setting, e^-4 of the likeliest
-FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the bias instability of the prior
-RATIOS = (0.1, 0.3, 1.0)  # of bias instability to white noise where none is stated
-SCATTER = (0.0, 1.0, 3.0, 9.0, 27.0)  # of rests, of moves and of directions, for a covariance
+INSTABILITY_FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the bias instability of the prior
+INSTABILITY_RATIOS = (0.1, 0.3, 1.0)  # of bias instability to white noise where none is stated
+START_SCATTERS = (0.0, 1.0, 3.0, 9.0, 27.0)  # of rests, of moves and of directions, for a covariance
 SELECTION_SCATTER = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves, where models are compared
 
 
@@ -89,7 +91,7 @@ class NoiseHypothesis:
     @property
     def free_scale(self) -> bool:
         """Whether C is scaled to the residuals."""
-        return not self.known or max(self.scatter) >= SCATTER[-1]
+        return not self.known or max(self.scatter) >= START_SCATTERS[-1]
 
     def at(self, levels: Sequence[float]) -> NoiseHypothesis:
         """Return the hypothesis at other levels."""
@@ -106,7 +108,7 @@ class State:
 
     bias: Values
     matrix: Values
-    terms: tuple[Term, ...] = ()
+    terms: tuple[EffectColumns, ...] = ()
 
     @property
     def K(self) -> Values:  # noqa: N802  (as in every equation)
@@ -173,12 +175,12 @@ class Equations:
 
 
 @dataclass(frozen=True)
-class Block:
+class EquationBlock:
     """Equations of one kind, over the white noise of each: rests, moves, faces or turns; symbols of ``Equations``."""
 
     residual: Values  # (n,)
     base: Values  # (n, 12), of bias and matrix
-    columns: Callable[[Term], Values]  # (n, p), of an effect
+    columns: Callable[[EffectColumns], Values]  # (n, p), of an effect
     error: Values  # (n,)
     bias: Values | None = None  # (3, n, t); None: zeros
     stretches: tuple[Values, Values, Index] | None = None  # start, length, recording; None: those of the rests
@@ -189,7 +191,9 @@ class Block:
     shared: Values | None = None  # (n, 12); change of moves by errors of the accelerometer's calibration
 
 
-def stacked(blocks: Sequence[Block], model: Model, state: State, candidates: Sequence[Term]) -> Equations:
+def stacked(
+    blocks: Sequence[EquationBlock], model: Model, state: State, candidates: Sequence[EffectColumns]
+) -> Equations:
     """Stack blocks of equations; the block of the rests is the first."""
     sizes = [len(block.residual) for block in blocks]
     edges = np.cumsum([0, *sizes])
@@ -256,7 +260,7 @@ def motion_of(time: Values, force: Values, rate: Values, temperature: Values, *,
     )
 
 
-def effect_readings(sensor: str, terms: Sequence[Term], motion: Motion, K: Values) -> Values:
+def effect_readings(sensor: str, terms: Sequence[EffectColumns], motion: Motion, K: Values) -> Values:
     """Return what effects add to the readings: (n, 3) array."""
     readings = (term.effect.reading(sensor, motion, K, term.values) for term in terms)
     return np.asarray(sum(readings, np.zeros_like(motion.specific_force)))
@@ -275,23 +279,27 @@ def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesi
     return hypotheses + [replace(h, direction=c) for h in steady_moves for c in SELECTION_SCATTER[1][1:]]
 
 
-def prior_hypotheses(prior: Prior, white: float, kinds: int) -> list[NoiseHypothesis]:
+def prior_hypotheses(prior: WanderPrior, white: float, kinds: int) -> list[NoiseHypothesis]:
     """Return the hypotheses over which a covariance is averaged.
 
     ``prior``: of the bias instability. ``white``: white noise of a sample, unit of the sensor. ``kinds``: number of
     kinds of scatter.
     """
-    bias = np.append(0.0, prior.wander * FACTORS if prior.wander > 0.0 else white * np.array(RATIOS))
+    bias = np.append(
+        0.0, prior.wander * INSTABILITY_FACTORS if prior.wander > 0.0 else white * np.array(INSTABILITY_RATIOS)
+    )
     pairs = zip((bias / white).tolist(), prior.log_belief(bias).tolist(), strict=True)
-    none = float(np.log(SURE * (len(SCATTER) - 1)))  # no scatter is stated, so that none at all is the likeliest
+    none = float(
+        np.log(NO_INSTABILITY_ODDS * (len(START_SCATTERS) - 1))
+    )  # no scatter is stated, so that none at all is the likeliest
     hypotheses = [
         NoiseHypothesis(Setting(ratio, prior.time, belief), level, none=none)
         for ratio, belief in pairs
         if np.isfinite(belief)
-        for level in product(SCATTER, repeat=kinds)
+        for level in product(START_SCATTERS, repeat=kinds)
     ]
-    steady_moves = [h for h in hypotheses if kinds > 1 and h.scatter[1] in {SCATTER[0], SCATTER[2]}]
-    return hypotheses + [replace(h, direction=c) for h in steady_moves for c in SCATTER[2:]]
+    steady_moves = [h for h in hypotheses if kinds > 1 and h.scatter[1] in {START_SCATTERS[0], START_SCATTERS[2]}]
+    return hypotheses + [replace(h, direction=c) for h in steady_moves for c in START_SCATTERS[2:]]
 
 
 def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
@@ -352,11 +360,14 @@ class ProjectedCandidates:
 
 
 def _orthonormalizers(columns: Values, sizes: Values) -> Values:
-    """Return the (t, p, p) factors that make (t, n, p) columns orthonormal; directions below ``NEW`` are zeros."""
+    """Return the (t, p, p) factors that make (t, n, p) columns orthonormal.
+
+    Directions below ``MIN_NEW_NORM_SHARE`` are zeros.
+    """
     size = np.where(sizes > 0.0, sizes, 1.0)
     products = columns.transpose(0, 2, 1) @ columns / (size[:, :, None] * size[:, None, :])
     values, vectors = np.linalg.eigh(products)
-    kept = values > NEW**2
+    kept = values > MIN_NEW_NORM_SHARE**2
     return vectors * (kept / np.sqrt(np.where(kept, values, 1.0)))[:, None, :] / size[:, :, None]
 
 

@@ -58,18 +58,18 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Mask, Recording, SensorCalibration, Values
     from pipeline.settings import Procedure
 
-LONGEST_S = 60.0  # see ``moves_of``
-GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
+MAX_MOVE_S = 60.0  # see ``moves_of``
+MAX_INTERPOLATED_INTERVALS = 3.5  # intervals without a sample, over which a rate is not interpolated
 ENVELOPE = 10  # samples, of which one at least is stamped without delay
 DROPPED = 0.5  # of an interval, by which a dropped sample makes at least one half of the stamps late
-ROUNDED = 0.1  # of an interval, by which the digits of a file move stamps off a regular clock
-CLEAR = 20.0  # gain of twice a log likelihood by another clock
+ROUNDED_STAMP_INTERVALS = 0.1  # of an interval, by which the digits of a file move stamps off a regular clock
+CLEAR_CLOCK_GAIN = 20.0  # gain of twice a log likelihood by another clock
 SMOOTH = 4  # bends in a row, see above
 SHARED_BEND = 0.12  # rms, see above
-BENT = 8.0  # second difference over white noise; noise alone has 2.4
+BENT_RATE_RATIO = 8.0  # second difference over white noise; noise alone has 2.4
 NEAR_S = 0.5  # see above
 FEWEST_NEAR = 10  # samples
-SIGNIFICANT = 4.0  # standard deviations, see above
+SIGNIFICANT_OFFSET_DEVIATIONS = 4.0  # standard deviations, see above
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
         for row, clock in zip(rows.tolist(), clocks, strict=True):
             time[row] = clock[at[row] - spans[row].start]
     weight = trapezoids(time)
-    excess, doubt = _bends(reading, weight, BENT * float(np.linalg.norm(rests.white)))
+    excess, doubt = _bends(reading, weight, BENT_RATE_RATIO * float(np.linalg.norm(rests.white)))
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
     warm = rests.temperature[before][:, None]
     temperature = warm + share * (rests.temperature[after][:, None] - warm)
@@ -216,23 +216,30 @@ def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values)
     """
     whole = _regular_stamps(time)
     if whole is not None:
-        rounded = np.abs(time - whole).max() <= ROUNDED * (whole[1] - whole[0])
+        rounded = np.abs(time - whole).max() <= ROUNDED_STAMP_INTERVALS * (whole[1] - whole[0])
         gain = _roughness(time, rate, white) - _roughness(whole, rate, white)
-        return [(whole if gain > (-CLEAR if rounded else CLEAR) else time)[span] for span in moves]
+        return [
+            (whole if gain > (-CLEAR_CLOCK_GAIN if rounded else CLEAR_CLOCK_GAIN) else time)[span] for span in moves
+        ]
     pairs = [(span, _regular_stamps(time[span])) for span in moves]
     gain = sum(
         _roughness(time[span], rate[span], white) - _roughness(line, rate[span], white)
         for span, line in pairs
         if line is not None
     )
-    return [time[span] if line is None or gain <= CLEAR else line for span, line in pairs]
+    return [time[span] if line is None or gain <= CLEAR_CLOCK_GAIN else line for span, line in pairs]
 
 
 def sound_span(recording: Recording, span: slice) -> bool:
     """Return whether the gyroscope's samples can be integrated: all valid, without a gap, for less than a minute."""
     time = recording.time[span]
     whole = bool(np.all(sound_samples(recording, "gyroscope")[span]))
-    return whole and len(time) > 2 and time[-1] - time[0] < LONGEST_S and np.diff(time).max() < GAP * recording.interval
+    return (
+        whole
+        and len(time) > 2
+        and time[-1] - time[0] < MAX_MOVE_S
+        and np.diff(time).max() < MAX_INTERPOLATED_INTERVALS * recording.interval
+    )
 
 
 def to_the_end(rate: Values, time: Values) -> Values:
@@ -258,7 +265,7 @@ def tangents(u: Values) -> Values:
 
 
 @dataclass(frozen=True)
-class Gravity:
+class GravityAtRests:
     """Gravity at every rest."""
 
     force: Values  # (m, 3), g; specific force of each rest's mean
@@ -280,7 +287,7 @@ def observed_rests(
     procedure: Procedure,
     role: str = ROLE,
     moved: Values | None = None,
-) -> tuple[Rests, Gravity] | None:
+) -> tuple[Rests, GravityAtRests] | None:
     """Return the gyroscope's rests and gravity at them, or None where the recordings of a role hold none.
 
     ``moved`` is added to bias and matrix of the accelerometer, (12,): gravity is linear in their errors from there on.
@@ -301,7 +308,7 @@ def observed_rests(
 
 def gravity_of(
     recordings: Sequence[Recording], rests: Rests, accelerometer: SensorCalibration, moved: Values | None = None
-) -> Gravity:
+) -> GravityAtRests:
     """Return gravity at the rests of the accelerometer; ``moved``: see ``observed_rests``."""
     root = root_of(accelerometer.parameters.covariance[BASE, BASE])
     moved = np.zeros(BASE_COUNT) if moved is None else moved
@@ -323,16 +330,16 @@ def gravity_of(
         near = _unit(force_of(reading))
         half = (0.5 if at_start else -0.5) * rests.length[:, None]
         steady = _unit(u + half * np.cross(np.radians(rests.creep), u))  # du/dt = -w x u
-        creeps = np.linalg.norm(near - steady, axis=1) > SIGNIFICANT * np.sqrt(share * white)
+        creeps = np.linalg.norm(near - steady, axis=1) > SIGNIFICANT_OFFSET_DEVIATIONS * np.sqrt(share * white)
         ends.append(np.where(creeps[:, None], near, steady))
         noise = np.where(creeps, np.maximum(noise, share), noise)
-        creeping |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT * np.sqrt(share * white)
+        creeping |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT_OFFSET_DEVIATIONS * np.sqrt(share * white)
     between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
     spread = np.sqrt(noise * white + max(between, default=0.0) ** 2)
     unsure = np.linalg.norm(force, axis=1) * np.radians(rests.creep_error) * 0.5 * rests.length
     v = rests.reading - accelerometer.bias
     shared = -accelerometer.matrix @ root[BIAS] + np.einsum("mj,ijp->mip", v, root[MATRIX].reshape(3, 3, -1))
-    return Gravity(force, ends[0], ends[1], spread, unsure, root, shared, creeping, np.linalg.pinv(root) @ moved)
+    return GravityAtRests(force, ends[0], ends[1], spread, unsure, root, shared, creeping, np.linalg.pinv(root) @ moved)
 
 
 def _unit(force: Values) -> Values:

@@ -24,9 +24,9 @@ from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
-from pipeline.estimation.multi_position.fit import Fit, fit, plausible, require_observable
+from pipeline.estimation.multi_position.fit import FitByHand, fit, plausible, require_observable
 from pipeline.estimation.multi_position.model import Model, State, prior_hypotheses, selection_hypotheses, stepped
-from pipeline.estimation.multi_position.selection import Selection, fit_configured, refusal
+from pipeline.estimation.multi_position.selection import SelectionByHand, fit_configured, refusal
 from pipeline.estimation.noise import wander_prior, with_noises
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.stages import is_given, unknown_uncertainty
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from pipeline.settings import Procedure, Settings
 
 
-STEP = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
+STEP_UNCERTAINTIES = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
 REMARK = {
     "accelerometer": "white noise, bias wander and further scatter of the rests, estimated from the residuals",
     "gyroscope": "white noise, bias wander, scatter of rests and moves, and the accelerometer's own calibration",
@@ -101,7 +101,7 @@ def fit_effects_by_rests(
     model = model_of(recordings.filtered, before, noise, settings, other)
     if model is None:
         return before
-    names = Selection(model, before, [], noise, data_sheet).names if wanted == AUTO else list(wanted)
+    names = SelectionByHand(model, before, [], noise, data_sheet).names if wanted == AUTO else list(wanted)
     if not names:
         return before
     for name in names:
@@ -122,7 +122,7 @@ def fit_effects_by_rests(
     return calibration_of(model, fitted, before, settings)
 
 
-def calibration_of(model: Model, fitted: Fit, before: SensorCalibration, settings: Settings) -> SensorCalibration:
+def calibration_of(model: Model, fitted: FitByHand, before: SensorCalibration, settings: Settings) -> SensorCalibration:
     """Convert a fit to a calibration with the stage ``effects``."""
     details = {
         "samples": round(model.samples()),
@@ -142,7 +142,7 @@ def with_stage(  # noqa: PLR0917  (what a fit by hand is)
     name: str,
     details: dict[str, Any],
     model: Model,
-    fitted: Fit,
+    fitted: FitByHand,
     steps: Sequence[Step],
     parameters: dict[str, dict[str, Any]],
 ) -> SensorCalibration:
@@ -165,7 +165,7 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     name: str,
     details: dict[str, Any],
     model: Model,
-    fitted: Fit,
+    fitted: FitByHand,
     settings: Settings,
     steps: Sequence[Step] = (),
     *,
@@ -207,13 +207,13 @@ def after_stage(  # noqa: PLR0917  (what a fit by hand is)
     return _with_monte_carlo(complete, model, fitted, trials, lines[1:]) if trials else complete
 
 
-def _places(model: Model, fitted: Fit) -> Values:
+def _places(model: Model, fitted: FitByHand) -> Values:
     """Return the map from base and effect parameters to bias, matrix and effect parameters: (12 + p, b + p) array."""
     base = model.directions
     return np.asarray(scipy.linalg.block_diag(base, np.eye(len(fitted.covariance) - base.shape[1])))
 
 
-def limits_contribution(model: Model, fitted: Fit) -> tuple[list[Contribution], Values]:
+def limits_contribution(model: Model, fitted: FitByHand) -> tuple[list[Contribution], Values]:
     """Return the line of the misalignments known by the sensor file's limit, if any, and its first-order covariance."""
     place = _places(model, fitted)
     if not model.known_by_limit:
@@ -229,7 +229,7 @@ def limits_contribution(model: Model, fitted: Fit) -> tuple[list[Contribution], 
 
 
 def _with_monte_carlo(
-    calibration: SensorCalibration, model: Model, fitted: Fit, trials: int, direct: Sequence[Contribution]
+    calibration: SensorCalibration, model: Model, fitted: FitByHand, trials: int, direct: Sequence[Contribution]
 ) -> SensorCalibration:
     """Return a calibration whose budget also has a Monte Carlo run; ``direct``: its sources of type B."""
     equations = model.equations(fitted.state)
@@ -256,10 +256,10 @@ def _with_monte_carlo(
     return with_trials(calibration, draw, trials, direct)
 
 
-def curvature(model: Model, fitted: Fit) -> Values:
+def curvature(model: Model, fitted: FitByHand) -> Values:
     """Return the derivative of the columns with respect to the parameters: (n, p, p) array, symmetric."""
     slopes = []
-    for j, step in enumerate(np.diag(STEP * np.sqrt(np.diag(fitted.covariance)))):
+    for j, step in enumerate(np.diag(STEP_UNCERTAINTIES * np.sqrt(np.diag(fitted.covariance)))):
         (up, more), (down, less) = (stepped(model, fitted.state, sign * step) for sign in (1.0, -1.0))
         change = model.equations(up).columns - model.equations(down).columns
         slopes.append(change / (more[j] - less[j]) if step[j] > 0.0 else np.zeros_like(change))

@@ -20,22 +20,22 @@ import numpy as np
 import scipy
 
 from pipeline.estimation.candidates import limits_of, starts_of, time_constants
-from pipeline.estimation.design import Term
-from pipeline.estimation.evidence import Problem, linear_problem
+from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.evidence import CandidateProblem, linear_problem
 from pipeline.estimation.gates import MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import random_walks
-from pipeline.estimation.multi_position.fit import Fit, fit
+from pipeline.estimation.multi_position.fit import FitByHand, fit
 from pipeline.estimation.multi_position.model import (
-    NEW,
+    MIN_NEW_NORM_SHARE,
     Model,
     NoiseHypothesis,
     State,
     project_out,
     selection_hypotheses,
 )
-from pipeline.estimation.posterior import Answers, Search, answers, excluded
+from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without
-from pipeline.estimation.selection import MOST
+from pipeline.estimation.selection import MAX_SELECTED_EFFECTS
 from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import Effect, Owner
 
@@ -47,14 +47,14 @@ if TYPE_CHECKING:
     from pipeline.settings import DataSheet
 
 
-ROUNDS = 3 * MOST
+MAX_SELECTION_ROUNDS = 3 * MAX_SELECTED_EFFECTS
 POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
-FAR = 5.0  # times its limits, which bound an amplitude that a time constant leaves undetermined
+MAX_TIMES_LIMIT = 5.0  # times its limits, which bound an amplitude that a time constant leaves undetermined
 COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
 
 
 @dataclass(frozen=True)
-class Scored:
+class CandidateScores:
     """The scores of all candidates, given a model."""
 
     scores: dict[str, Score]  # of those that the equations show
@@ -70,16 +70,18 @@ def fit_configured(
     configured: Sequence[str],
     hypotheses: Sequence[NoiseHypothesis],
     limits: Mapping[str, Values] | None = None,
-) -> Fit:
+) -> FitByHand:
     """Fit base and configured effects, from the best of their starts."""
     fits = []
     for terms in starts_of(configured, model.sensor, start):
-        state = State(start.bias, start.matrix, tuple(Term(t.effect, np.array(t.values, float)) for t in terms))
+        state = State(
+            start.bias, start.matrix, tuple(EffectColumns(t.effect, np.array(t.values, float)) for t in terms)
+        )
         fits.append(fit(model, state, hypotheses, limits or {}))
     return max(fits, key=lambda fitted: fitted.log_likelihood)
 
 
-class Selection:
+class SelectionByHand:
     """The selected effects, and the scores of every candidate: ``first`` and ``last`` before and after the search.
 
     ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``data_sheet``: the
@@ -101,15 +103,15 @@ class Selection:
         self.limits = limits_of(model.sensor, data_sheet)
         effects = catalogue().items()
         self.candidates = [e for n, e in effects if n not in configured and not refusal(e, model.sensor, model.rests)]
-        self.bounds = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}
+        self.bounds = {n: MAX_TIMES_LIMIT * limit for n, limit in self.limits.items() if effect(n).nonlinear}
         self.base = fit_configured(model, start, configured, self.hypotheses, self.bounds)
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
-        self.cache: dict[tuple[tuple[str, ...], tuple[str, ...]], Scored] = {}
+        self.cache: dict[tuple[tuple[str, ...], tuple[str, ...]], CandidateScores] = {}
         self.first = self.last = self._scored([])
-        for _ in range(ROUNDS):
-            best = self._best(self.last) if len(self.names) < MOST else None
+        for _ in range(MAX_SELECTION_ROUNDS):
+            best = self._best(self.last) if len(self.names) < MAX_SELECTED_EFFECTS else None
             if best is not None:
                 self._add(best)
                 self._drop()
@@ -120,25 +122,25 @@ class Selection:
         self.fits = [self.base, *parts, self.fit] if self.names else [self.base]
         self.own = {name: self._without(name) for name in self.names}
 
-    def _scored(self, names: Sequence[str]) -> Scored:
+    def _scored(self, names: Sequence[str]) -> CandidateScores:
         """Score every effect given base, configured and some of the selected effects."""
         key = tuple(self.names), tuple(names)
         if key not in self.cache:
             self.cache[key] = self._score_all(names)
         return self.cache[key]
 
-    def _score_all(self, names: Sequence[str]) -> Scored:
+    def _score_all(self, names: Sequence[str]) -> CandidateScores:
         fitted = {term.effect.name: term.values for term in self.fit.state.terms}
         terms = []
         for candidate in (c for c in self.candidates if c.name not in names):
             values = candidate.starts(self.model.sensor)
             if candidate.name in fitted:
                 values = [np.where(_nonlinear(candidate, self.model.sensor), fitted[candidate.name], 0.0)]
-            terms += [Term(candidate, v) for v in values]
+            terms += [EffectColumns(candidate, v) for v in values]
         equations = self.model.equations(self._state(names), terms)
         projected = project_out(equations, self.hypotheses)
         before, at = projected.of_model()
-        out = Scored({}, {}, {}, {}, {})
+        out = CandidateScores({}, {}, {}, {}, {})
         for j, term in enumerate(terms):
             name, count = term.effect.name, projected.count(j, at)
             if count == 0:
@@ -160,9 +162,9 @@ class Selection:
         self._refine(out, names, before)
         return out
 
-    def _score(self, term: Term, added: int, gain: float, raw: Values, residual: Values) -> Score:
+    def _score(self, term: EffectColumns, added: int, gain: float, raw: Values, residual: Values) -> Score:
         """Return the score of a candidate after one linear step."""
-        inverse = np.linalg.pinv(raw, rcond=NEW)
+        inverse = np.linalg.pinv(raw, rcond=MIN_NEW_NORM_SHARE)
         n, step = len(residual), inverse @ residual
         rest = residual - raw @ step
         values = term.values + step
@@ -178,14 +180,14 @@ class Selection:
             plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= self.limits[term.effect.name])),
         )
 
-    def _refine(self, scored: Scored, names: Sequence[str], before: float) -> None:
+    def _refine(self, scored: CandidateScores, names: Sequence[str], before: float) -> None:
         """Fit the competing nonlinear candidates to their optimum, which one linear step may not reach."""
         top = max((s.delta_bic for s in scored.scores.values()), default=0.0)
         for score in list(scored.scores.values()):
             curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > MIN_DELTA_BIC)
             if not curved or score.delta_bic < max(COMPETES * top, 0.0):
                 continue
-            refit = self._fitted(self._state(names), Term(effect(score.name), score.values))
+            refit = self._fitted(self._state(names), EffectColumns(effect(score.name), score.values))
             gain = max(2.0 * (refit.log_likelihood - before), 0.0) * scored.spare[score.name]
             scored.scores[score.name] = replace(
                 score,
@@ -200,12 +202,12 @@ class Selection:
         terms = (t for i, t in enumerate(self.fit.state.terms) if i < configured or t.effect.name in names)
         return replace(self.fit.state, terms=tuple(terms))
 
-    def _fitted(self, start: State, *further: Term) -> Fit:
+    def _fitted(self, start: State, *further: EffectColumns) -> FitByHand:
         """Fit from a state, with further effects."""
         state = replace(start, terms=(*start.terms, *further))
         return fit(self.model, state, self.hypotheses, self.bounds)
 
-    def _best(self, scored: Scored) -> Score | None:
+    def _best(self, scored: CandidateScores) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
         passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s, self.names)]
         return max(passing, key=lambda s: s.delta_bic - (0.0 if s.plausible else MIN_DELTA_BIC), default=None)
@@ -227,14 +229,14 @@ class Selection:
     def _add(self, score: Score) -> None:
         self.names.append(score.name)
         self.steps[score.name] = score
-        self.fit = self._fitted(self.fit.state, Term(effect(score.name), score.values))
+        self.fit = self._fitted(self.fit.state, EffectColumns(effect(score.name), score.values))
 
     def _remove(self, name: str) -> None:
         self.names.remove(name)
         del self.steps[name]
         self.fit = self._fitted(replace(self.base.state, terms=self._state(self.names).terms))
 
-    def _without(self, name: str) -> Scored:
+    def _without(self, name: str) -> CandidateScores:
         return self._scored([n for n in self.names if n != name])
 
     def _drop(self) -> None:
@@ -278,13 +280,13 @@ def refusal(candidate: Effect, sensor: str, rests: Rests) -> str:
     return next((reason for applies, reason in checks if applies), "")
 
 
-def posterior(selection: Selection, hidden: Collection[str]) -> Answers:
+def posterior(selection: SelectionByHand, hidden: Collection[str]) -> Answers:
     """Return probabilities, answer set and upper limits; ``hidden``: effects that the recordings cannot show."""
     effects = {e.name: e for e in selection.candidates if e.name not in hidden or e.name in selection.names}
-    return answers([Search(_problem(selection, effects), seeds=[selection.names])], lambda _: 0, effects)
+    return answers([SetSearch(_problem(selection, effects), seeds=[selection.names])], lambda _: 0, effects)
 
 
-def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
+def _problem(selection: SelectionByHand, effects: Mapping[str, Effect]) -> CandidateProblem:
     """Return the linear problem at the fit of the selected effects."""
     model, state = selection.model, selection.fits[-1].state
     configured = len(selection.base.state.terms)
@@ -308,7 +310,7 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     size = np.sqrt(np.maximum(np.einsum("tii->ti", products), 1e-300))
     scaled = products / (size[:, :, None] * size[:, None, :])
     eigenvalues = np.linalg.eigvalsh(scaled[:, :known, :known])
-    rank = int(np.sum(eigenvalues[0] > NEW**2))
+    rank = int(np.sum(eigenvalues[0] > MIN_NEW_NORM_SHARE**2))
     logarithm = np.sum(np.log(np.maximum(eigenvalues[:, -rank:], 1e-300)), axis=1)
     logarithm += 2.0 * np.sum(np.log(size[:, :known]), axis=1) + np.array([log for _, log in whitened])
     ends = np.cumsum([0, *(Z.shape[1] for Z in columns)]).tolist()
@@ -322,6 +324,6 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
         excluded([*effects.values()]),
         samples=samples,
         free=float(max(samples - rank, 1)),
-        new=NEW,
+        new=MIN_NEW_NORM_SHARE,
         least=1.0,
     )

@@ -27,7 +27,7 @@ from pipeline.io.yaml_file import load_yaml
 from pipeline.model.effects.base import Effect
 from pipeline.model.effects.declaration import read_declaration
 from pipeline.model.effects.formula_effect import FormulaEffect
-from pipeline.model.effects.mounting import OWN, in_session
+from pipeline.model.effects.mounting import SETUP_EFFECTS, in_session
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 FOLDER = CONFIGS / "effect"
 BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
-LARGEST_BYTES, LARGEST_SIZE = 16384, 1000  # of one file; the largest built-in one has 2 kB and 70 values
+MAX_EFFECT_BYTES, MAX_EFFECT_VALUES = 16384, 1000  # of one file; the largest built-in one has 2 kB and 70 values
 OF_PYTHON = ("name", "owner", "layout", "meaning", "excitation", "experiment", "source")
 _registered: dict[str, Effect] = {}
 _left_out: set[str] = set()
@@ -127,7 +127,7 @@ def effect(name: str) -> Effect:
     if not name.partition("@")[2]:
         raise ConfigurationError(f"no effect is called {name!r}; known: {', '.join(catalogue())}")
     base = name.partition("@")[0]
-    return in_session(name, OWN.get(base) or effect(base))
+    return in_session(name, SETUP_EFFECTS.get(base) or effect(base))
 
 
 def effect_of(fitted: FittedEffect) -> Effect:
@@ -198,8 +198,8 @@ def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
 
     Raises ``ConfigurationError`` with the faulty line.
     """
-    text = read_text(file, LARGEST_BYTES, "an effect")
-    given = load_yaml(text, str(file), LARGEST_SIZE)
+    text = read_text(file, MAX_EFFECT_BYTES, "an effect")
+    given = load_yaml(text, str(file), MAX_EFFECT_VALUES)
     if not isinstance(given, dict):
         raise ConfigurationError("an effect is expected: name, owner, sensors, meaning, terms", str(file))
     lines = partial(_lines, text)

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
 OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
-STEP_DEG = 5e-3  # above an encoder's resolution (1e-3 deg), below a step of a program (0.1 deg)
-TURNING_DPS = 0.25  # above a gyroscope's noise and residual bias, below a slow turn of a table (1 deg/s)
+MIN_PROGRAM_STEP_DEG = 5e-3  # above an encoder's resolution (1e-3 deg), below a step of a program (0.1 deg)
+MIN_TURNING_DPS = 0.25  # above a gyroscope's noise and residual bias, below a slow turn of a table (1 deg/s)
 
 
 class Quantity(TypedDict):
@@ -58,7 +58,7 @@ class Layout(StrEnum):
 
 
 @dataclass(frozen=True)
-class Parameter:
+class EffectParameter:
     """One parameter of an effect: its name, unit and meaning."""
 
     name: str
@@ -93,7 +93,7 @@ class Effect(abc.ABC):
     definition: dict[str, Any] | None = None  # content of a user's file; stored in every calibration with the effect
 
     @abc.abstractmethod
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return the parameters for ``sensor``; units in g or deg/s and their products."""
 
     @abc.abstractmethod
@@ -221,14 +221,14 @@ def turning_direction(motion: Motion) -> Values:
         return motion.direction
     if motion.axis is not None and motion.rate is not None and motion.angle is not None:
         step = np.diff(motion.angle, prepend=motion.angle[0])
-        stepped = np.where(np.abs(step) > STEP_DEG, np.sign(step), 0)
+        stepped = np.where(np.abs(step) > MIN_PROGRAM_STEP_DEG, np.sign(step), 0)
         sign = np.where(np.abs(motion.rate) > RATE_AT_REST_DPS, np.sign(motion.rate), stepped)
         now = np.zeros_like(motion.angular_rate)
         now[:, motion.axis] = sign
         turning = sign != 0
     else:
         magnitude = length(motion.angular_rate)
-        turning = magnitude > TURNING_DPS
+        turning = magnitude > MIN_TURNING_DPS
         now = motion.angular_rate / np.where(turning, magnitude, 1.0)[:, None]
     last = np.maximum.accumulate(np.where(turning, np.arange(len(turning)), -1))
     return np.asarray(np.where(last[:, None] >= 0, now[last], 0.0))
@@ -250,9 +250,9 @@ def every_axis(regressors: Values) -> Values:
     return per_axis(np.broadcast_to(regressors[:, None, :], (len(regressors), 3, regressors.shape[1])))
 
 
-def axis_parameters(symbol: str, unit: str, meaning: str) -> tuple[Parameter, ...]:
+def axis_parameters(symbol: str, unit: str, meaning: str) -> tuple[EffectParameter, ...]:
     """Return one parameter an axis, ``<symbol>_x .. <symbol>_z``."""
-    return tuple(Parameter(f"{symbol}_{a}", unit, f"{meaning}, {a} axis") for a in "xyz")
+    return tuple(EffectParameter(f"{symbol}_{a}", unit, f"{meaning}, {a} axis") for a in "xyz")
 
 
 def unit_of(sensor: str) -> str:

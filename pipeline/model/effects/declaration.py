@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.checked import Check, WrongValueError, each, expected, fields, flag, items, one_of, text
-from pipeline.model.effects.base import Owner, Parameter
+from pipeline.model.effects.base import EffectParameter, Owner
 from pipeline.model.formula import SIGNALS, Formula, parse
 from pipeline.records import AXES, SENSORS
 
@@ -94,14 +94,14 @@ class Declaration:
             return [(a, f"{term}_{a}") for a in self.axes]
         return [("", term)]
 
-    def parameters_of(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters_of(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return the coefficients: those of x, of y, of z, then the shared ones."""
-        found: dict[str, list[Parameter]] = {axis: [] for axis in (*self.axes, "")}
+        found: dict[str, list[EffectParameter]] = {axis: [] for axis in (*self.axes, "")}
         for name, term in {**self.terms, **self.parameters}.items():
             unit = term.unit if isinstance(term.unit, str) else term.unit[sensor]
             meaning = term.meaning or f"coefficient of {term.text}"
             for axis, coefficient in self.coefficients(name):
-                found[axis].append(Parameter(coefficient, unit, f"{meaning}, {axis} axis" if axis else meaning))
+                found[axis].append(EffectParameter(coefficient, unit, f"{meaning}, {axis} axis" if axis else meaning))
         return tuple(parameter for of_axis in found.values() for parameter in of_axis)
 
 

@@ -45,13 +45,13 @@ if TYPE_CHECKING:
     from pipeline.records import Motion, Values
 
 
-UPRIGHT = 0.5  # sine of the elevation of the turn axis, which is 0 (level axis) or 1 (vertical axis)
+VERTICAL_SINE = 0.5  # sine of the elevation of the turn axis, which is 0 (level axis) or 1 (vertical axis)
 SIGNS = np.array([[1.0], [-1.0]])  # of d_x and d_y in the equation above
 STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # from a part of some grams to a box of some kilograms, in factors of three
-SHORTEST_S, LONGEST_S = 1.0, 1e5  # a shorter warm-up is a step at the start, a longer one a drift
+MIN_WARM_UP_S, MAX_WARM_UP_S = 1.0, 1e5  # a shorter warm-up is a step at the start, a longer one a drift
 START_LAG_S = 0.005  # not 0, where a lag and a time offset have the same column; below the lag of a 30 Hz filter
 PPM = 1e-6  # one part in a million
-STEP_S = 1e-5  # of the central difference: its rounding is 1e-11 of u per second
+DIFFERENCE_STEP_S = 1e-5  # of the central difference: its rounding is 1e-11 of u per second
 
 
 class TableTilt(DeclaredEffect):
@@ -103,7 +103,7 @@ class TableAxisNonorthogonality(_OfTurns):
         assert motion.level is not None  # noqa: S101
         assert motion.rate is not None  # noqa: S101
         assert motion.angle is not None  # noqa: S101
-        upright = abs(motion.level[0, 2, axis]) > UPRIGHT
+        upright = abs(motion.level[0, 2, axis]) > VERTICAL_SINE
         up = motion.level[0, 2] if upright else UP_AT_ZERO[axis]
         f, columns = motion.specific_force, []
         for step in (1, 2):
@@ -184,7 +184,7 @@ class WarmUp(DeclaredEffect):
     def stepped(self, values: Values, step: Values) -> Values:
         """Return ``values + step`` with the time constant at most halved or doubled."""
         new = values + step
-        new[3] = np.clip(new[3], max(values[3] / 2.0, SHORTEST_S), min(values[3] * 2.0, LONGEST_S))
+        new[3] = np.clip(new[3], max(values[3] / 2.0, MIN_WARM_UP_S), min(values[3] * 2.0, MAX_WARM_UP_S))
         return new
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
@@ -297,11 +297,13 @@ class LowPassLag(_Timing):
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return ``K du'/dtau``: ``-K du/dt`` at a lag of 0, else a central difference."""
-        if values[0] <= STEP_S:
+        if values[0] <= DIFFERENCE_STEP_S:
             slope = -truth_rate(sensor, motion)
         else:
-            later, sooner = (truth(sensor, self.moved(motion, values + d)) for d in (STEP_S, -STEP_S))
-            slope = (later - sooner) / (2.0 * STEP_S)
+            later, sooner = (
+                truth(sensor, self.moved(motion, values + d)) for d in (DIFFERENCE_STEP_S, -DIFFERENCE_STEP_S)
+            )
+            slope = (later - sooner) / (2.0 * DIFFERENCE_STEP_S)
         return np.asarray(slope @ K.T)[:, :, None]
 
     def moved(self, motion: Motion, values: Values) -> Motion:

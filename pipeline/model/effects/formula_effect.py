@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.model.effects.base import Effect, Layout, Parameter, length, per_axis, truth, turning_direction
+from pipeline.model.effects.base import Effect, EffectParameter, Layout, length, per_axis, truth, turning_direction
 from pipeline.model.formula import OF_THE_MOTION, SIGNALS, c_number
 from pipeline.records import AXES, Motion, Values
 
@@ -47,7 +47,7 @@ class DeclaredEffect(Effect):
             setattr(self, name, getattr(declared, name))
         self._parameters = {sensor: declared.parameters_of(sensor) for sensor in declared.sensors}
 
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return the parameters that the file declares."""
         return self._parameters[sensor]
 

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth, unit_of
+from pipeline.model.effects.base import Effect, EffectParameter, Layout, Owner, truth, unit_of
 from pipeline.model.effects.formula_effect import DeclaredEffect
 from pipeline.model.kinematics import skew, turn_by_vector
 from pipeline.records import MATRIX
@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion, Values
 
-ROUNDS = 6  # of a fixed point; rotations of 10 deg converge by a factor of 30 in each
-STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
+ROTATION_ITERATIONS = 6  # of a fixed point; rotations of 10 deg converge by a factor of 30 in each
+ROTATION_STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
 VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "direction", "level")
 
 
@@ -68,8 +68,8 @@ def rotation_columns(
 
     ``rotation``: (p, p) rows of angles to (p, 3, 3) rotations R.
     """
-    steps = STEP_DEG * np.eye(len(values))
-    slopes = (rotation(values + steps) - rotation(values - steps)) / (2.0 * STEP_DEG)
+    steps = ROTATION_STEP_DEG * np.eye(len(values))
+    slopes = (rotation(values + steps) - rotation(values - steps)) / (2.0 * ROTATION_STEP_DEG)
     u = truth(sensor, motion)
     return np.stack([u @ (K @ slope).T for slope in slopes], axis=2)
 
@@ -109,11 +109,11 @@ class _OfRecordings(DeclaredEffect):
         """Return whether there are parameters for the recording of a motion."""
         return self.owner_of(motion.recording, motion.setup) in self.recordings
 
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return the parameters of each recording, one recording after the other."""
         del sensor
         return tuple(
-            Parameter(f"{name}{suffix}", "deg", f"{self.what}{suffix.replace('_', ' about body ')}, {name}")
+            EffectParameter(f"{name}{suffix}", "deg", f"{self.what}{suffix.replace('_', ' about body ')}, {name}")
             for name in self.recordings
             for suffix in self.suffixes
         )
@@ -169,7 +169,7 @@ def in_mean_frame(K: Values, values: Values) -> tuple[Values, Values]:
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s that only fits of mountings pay)
 
     found, turned = Rotation.from_rotvec(values.reshape(-1, 3), degrees=True), Rotation.identity()
-    for _ in range(ROUNDS):  # each lowers the mean by the square of the largest rotation, rad
+    for _ in range(ROTATION_ITERATIONS):  # each lowers the mean by the square of the largest rotation, rad
         turned = turned * Rotation.from_rotvec(-(found * turned).as_rotvec().mean(axis=0))
     return K @ turned.as_matrix(), (found * turned).as_rotvec(degrees=True).ravel()
 
@@ -185,12 +185,12 @@ def errors_in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Va
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s that only fits of mountings pay)
 
-    steps = Rotation.from_rotvec(STEP_DEG * np.eye(3), degrees=True)
+    steps = Rotation.from_rotvec(ROTATION_STEP_DEG * np.eye(3), degrees=True)
     G, mean = np.zeros((count, 3)), np.zeros((3, count))
     G[MATRIX] = np.stack([np.radians(1.0) * (K @ turn).ravel() for turn in skew(np.eye(3))], axis=1)
     theta = values.reshape(-1, 3)
     moved = [(Rotation.from_rotvec(t, degrees=True) * steps).as_rotvec(degrees=True) - t for t in theta]
-    G[at] = np.concatenate([change.T for change in moved]) / STEP_DEG
+    G[at] = np.concatenate([change.T for change in moved]) / ROTATION_STEP_DEG
     mean[:, at] = np.tile(np.eye(3), len(theta)) / len(theta)
     return np.asarray(np.eye(count) - G @ np.linalg.solve(mean @ G, mean))
 
@@ -227,10 +227,10 @@ class _Mounting(Effect):
     experiment = EXPERIMENT
     source = "rotation of the body frame"
 
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return theta."""
         del sensor
-        return tuple(Parameter(f"theta_{a}", "deg", f"turn of the unit, its part about body {a}") for a in "xyz")
+        return tuple(EffectParameter(f"theta_{a}", "deg", f"turn of the unit, its part about body {a}") for a in "xyz")
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the derivative by central differences."""
@@ -252,9 +252,9 @@ class _Bias(Effect):
     experiment = EXPERIMENT
     source = "IEEE Std 1554-2005, turn-on to turn-on repeatability"
 
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return db."""
-        return tuple(Parameter(f"db_{a}", unit_of(sensor), f"difference of the bias of {a}") for a in "xyz")
+        return tuple(EffectParameter(f"db_{a}", unit_of(sensor), f"difference of the bias of {a}") for a in "xyz")
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return ones."""
@@ -262,7 +262,7 @@ class _Bias(Effect):
         return np.ones((len(motion.time), 1))
 
 
-OWN: dict[str, Effect] = {effect.name: effect for effect in (_Mounting(), _Bias())}
+SETUP_EFFECTS: dict[str, Effect] = {effect.name: effect for effect in (_Mounting(), _Bias())}
 
 
 class _InSession(Effect):
@@ -274,7 +274,7 @@ class _InSession(Effect):
             setattr(self, attribute, getattr(base, attribute))
         self.name = name
 
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return the parameters of the effect."""
         return self.base.parameters(sensor)
 

@@ -15,7 +15,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit, triangle
 from pipeline.estimation.correction import corrected, steps_of
-from pipeline.estimation.gauss_markov import Prior
+from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.model import State, prior_hypotheses
@@ -235,7 +235,7 @@ def test_noise_within_a_rest_does_not_lengthen_gravity() -> None:
     rests = gathered("accelerometer", [recording], {0: [Rest(4 * k, 4 * k + 4) for k in range(24)]})
     model = AccelerometerModel(rests, np.eye(12)[:, FITTED], 0.998, None)
     assert model.white == pytest.approx([0.1] * 3)
-    found = fit_model(model, State(BIAS, MATRIX), prior_hypotheses(Prior(1e-4, 100.0), 0.1, 1), {})
+    found = fit_model(model, State(BIAS, MATRIX), prior_hypotheses(WanderPrior(1e-4, 100.0), 0.1, 1), {})
     assert found.state.matrix == pytest.approx(np.eye(3), abs=1e-9)
     assert found.state.bias == pytest.approx(np.zeros(3), abs=1e-9)
 

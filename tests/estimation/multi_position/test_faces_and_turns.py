@@ -11,9 +11,9 @@ from scipy import stats
 from unit_settings import settings_of, with_noise
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.gauss_markov import WHITE
+from pipeline.estimation.gauss_markov import WHITE_SETTING
 from pipeline.estimation.multi_position.fit import fit
-from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, GyroscopeModel, model_of
+from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, GyroscopeModel, model_of
 from pipeline.estimation.multi_position.model import NoiseHypothesis, State
 from pipeline.estimation.noise import estimate_noise, noise_of
 from pipeline.estimation.stages import fit_stage, last_fit
@@ -164,7 +164,7 @@ def test_a_part_with_too_few_moves_is_fitted_by_its_rests_and_turns_alone(whole:
     model = model_of(whole.recordings, None, noise, whole.settings.procedure, whole.fit("accelerometer"))
     assert model is not None
     assert model.moves is not None
-    used = np.arange(model.moves.count) < FEWEST_MOVES
+    used = np.arange(model.moves.count) < MIN_MOVES
     few = GyroscopeModel(model.every, model.moves.select(used), model.at_rests, noise, turns=model.turns)
     held = np.arange(len(few.rests.time)) == np.flatnonzero(~few.every.held_out).tolist().index(model.moves.after[0])
     part = few.without(held)
@@ -172,8 +172,8 @@ def test_a_part_with_too_few_moves_is_fitted_by_its_rests_and_turns_alone(whole:
     assert (few.kinds, part.moves, alone.kinds) == (2, None, 1)
     start = State(np.average(part.rests.reading, axis=0), np.eye(3))
     levels = 0.0, 2.0, 6.0
-    both = fit(part, start, [NoiseHypothesis(WHITE, (a, b)) for a in levels for b in levels], {})
-    one = fit(alone, start, [NoiseHypothesis(WHITE, (a,)) for a in levels], {})
+    both = fit(part, start, [NoiseHypothesis(WHITE_SETTING, (a, b)) for a in levels for b in levels], {})
+    one = fit(alone, start, [NoiseHypothesis(WHITE_SETTING, (a,)) for a in levels], {})
     assert both.state.matrix == pytest.approx(one.state.matrix, abs=1e-12)
     assert both.state.bias == pytest.approx(one.state.bias, abs=1e-12)
     assert both.log_likelihood == pytest.approx(one.log_likelihood, abs=1e-9)

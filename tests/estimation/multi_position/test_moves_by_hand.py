@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from unit_settings import settings_of, with_noise
 
 from pipeline.errors import CannotCalibrateError
-from pipeline.estimation.design import Term
+from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.gyroscope import model_of
@@ -67,8 +67,8 @@ def test_derivatives_of_the_moves_are_those_of_their_residuals() -> None:
     model = model_of(unit.recordings, None, None, unit.settings.procedure, unit.calibrated("accelerometer"))
     assert model is not None
     terms = (
-        Term(effect("scale_factor_asymmetry"), np.array([2e-4, -1e-4, 1e-4])),
-        Term(effect("g_sensitivity"), np.full(9, 0.002)),
+        EffectColumns(effect("scale_factor_asymmetry"), np.array([2e-4, -1e-4, 1e-4])),
+        EffectColumns(effect("g_sensitivity"), np.full(9, 0.002)),
     )
     near = unit.calibrated("gyroscope")
     state = State(near.bias, near.matrix, terms)
