@@ -19,7 +19,7 @@ from pipeline.files import CONFIGS
 from pipeline.history import SENSORS, digest
 from pipeline.io.files import recording_files
 from pipeline.settings import Board, Settings, Stated, Unit
-from pipeline.unit import BENCH, STEPS
+from pipeline.unit import STEPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +33,7 @@ EFFECTS = CONFIGS / "effect"  # read by pipeline.model.effects
 IMPORT = re.compile(
     r"^[ \t]*(?:from (pipeline[\w.]*|jinja2) import (\([^)]*\)|.*)|import (pipeline[\w.]*))", re.MULTILINE
 )
-OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": BENCH}
+OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": STEPS["validate"].settings}
 
 
 def config_sha256(settings: Settings) -> str:

@@ -89,7 +89,7 @@ def diagnose(
     try:
         findings = procedure.findings(case)
     except NotObservableError as reason:
-        return judge(None, _not_enough_data(sensor, configured, reason.message, procedure.NEEDED))[0]
+        return judge(None, _not_enough_data(sensor, configured, reason.message, procedure.NEEDED_RECORDING))[0]
     diagnosis, unknown = judge(findings, diagnosis_of(findings, case))
     if unknown and findings.search:
         findings = findings.search() or findings

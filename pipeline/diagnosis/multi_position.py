@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Noise, Recording, SensorCalibration
     from pipeline.settings import Settings
 
-NEEDED_RECORDING_BY_HAND = MORE_RESTS
+NEEDED_RECORDING = MORE_RESTS
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
 REST_FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
 SPARE = 2  # least number of equations beyond the parameters in a fold

@@ -13,6 +13,7 @@ from pipeline.__main__ import main
 from pipeline.commands import guide
 from pipeline.files import CONFIGS
 from pipeline.records import Recording
+from pipeline.settings import HandTurns
 from pipeline.signal.rests import find_rests
 from pipeline.signal.segments import turns_by_hand
 from pipeline.simulation.campaign import write_campaign
@@ -300,7 +301,7 @@ def test_the_windows_of_a_procedure_are_read_as_a_run_reads_them(
     face = [int(np.argmax(np.abs(values[r.start : r.stop, 1:4].mean(axis=0)))) for r in found]
     since = values[:, 0] - values[0, 0]
     windows = [("null", since[r.start], since[r.stop - 1]) for r in found]
-    stated = {"angle_deg": 360.0, "holdout_every": 0}
+    stated = HandTurns(angle_deg=360.0, accuracy_deg=1.0, axis_accuracy_deg=1.0, holdout_every=0)
     turns = {"xyz"[t.axis]: (t.before[1], t.after[0]) for t in turns_by_hand(recording, found, stated)}
     assert set(turns) == set("xyz")
     assert set(face) == {0, 1, 2}

@@ -73,7 +73,7 @@ def test_equal_steps_are_written_once() -> None:
     turn = next(p.trajectory for p in plan("three_axis_turns", course, Streams(1, 0)["motion"]) if p.name == "accel_x")
     assert isinstance(turn, CommandedTurns)
     steps = as_program(turn.program)
-    assert max(s.get("repeat", 0) for s in steps) > 60
+    assert max(getattr(step, "repeat", 0) for step in steps) > 60
     assert len(steps) < 6
 
 

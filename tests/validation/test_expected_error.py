@@ -14,6 +14,9 @@ from pipeline.validation.expected_error import LinearizedSamples, expected_rms_e
 
 UNITS, SAMPLES, INTERVAL = 2000, 300, 0.2
 WHITE, TAU = 0.01, 20.0
+IDEAL = settings_of()
+EXACT = {s: IDEAL.sensor.of(s).replaced(counts_per_unit=np.inf) for s in ("accelerometer", "gyroscope")}
+UNROUNDED = IDEAL.sensor.replaced(**EXACT)  # without quantisation
 
 
 def truth_of(size: float) -> np.ndarray:
@@ -74,7 +77,7 @@ def interval(
     found = SensorCalibration("gyroscope", covariance=covariance, degrees_of_freedom=smallest, freedom=each)
     spread = [np.broadcast_to(v**2, (SAMPLES, 3)) for v in (noise.white, noise.wander)]
     held_out = LinearizedSamples(INTERVAL * np.arange(SAMPLES), *spread, truth, J, SAMPLES, correlated)
-    return expected_rms_error(found, [held_out], noise, settings_of())
+    return expected_rms_error(found, [held_out], noise, IDEAL.replaced(sensor=UNROUNDED))
 
 
 def test_the_interval_holds_99_percent_of_units_whose_noise_a_filter_has_correlated() -> None:

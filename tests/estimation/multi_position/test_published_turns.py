@@ -17,6 +17,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.io.read import read_recordings
+from pipeline.settings import Window
 from pipeline.signal.segments import cut
 from pipeline.simulation.description import shipped_settings
 
@@ -139,7 +140,8 @@ def test_the_session_in_parts_agrees_with_the_published_calibration(tmp_path: Pa
     for name in (*PARTS[0], *PARTS[1]):
         own = np.flatnonzero(names == name)
         axis = name[0] if name in PARTS[1] else None
-        windows.append({"role": "rests", "axis": axis, "start_s": own[0] / 204.8, "stop_s": (own[-1] + 1) / 204.8})
+        start, stop = float(own[0]) / 204.8, float(own[-1] + 1) / 204.8
+        windows.append(Window.model_validate({"role": "rests", "axis": axis, "start_s": start, "stop_s": stop}))
     parts = cut(recordings[0], windows)
     found = FITS[sensor].fit(with_noise(parts, settings), None, settings)
     # K R of the published file is counts a m/s^2 or deg/s. Its turns are taken as -360 deg; the readings show +360.
