@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 
 Groups: TypeAlias = tuple[tuple[str, str], ...]  # group and option
 INSTANCE = "${ingest.instance}"
+WITHOUT_CONSTANT = ("high_pass", "band_pass")  # filters of ``configs/filter`` whose output has no constant part
 OF_A_SETUP = ("mounting", "bias")  # effects that exist only for one setup (pipeline.model.effects.mounting)
 
 
@@ -282,6 +283,12 @@ class Composer:
             except ConfigurationError as error:
                 raise Problem(error.message) from error
             self._valid_ingest.add(ingest)
+        for sensor in SENSORS if settings.filter.name in WITHOUT_CONSTANT else ():
+            if any(declared(sensor, stage).known for stage in settings.method.stages.of(sensor) or ()):
+                raise Problem(
+                    f"filter={settings.filter.name} removes the slow changes of a bias, and method.{sensor}="
+                    f"{settings.method.of(sensor)} subtracts them: choose another filter or another method"
+                )
         if (settings.table.latitude_deg is None) != (settings.table.azimuth_deg is None):
             raise Problem(
                 "table.latitude_deg and table.azimuth_deg: set both (Earth's rotation is modelled) or neither (null)"

@@ -81,7 +81,7 @@ class LogProfile:
             for axis_map in maps.values():
                 axis_matrix(axis_map)
             return cls(CANONICAL_CSV if log["ingest"] is None else Ingest(name="", **log["ingest"]), maps)
-        except (KeyError, TypeError, ConfigurationError) as error:
+        except (KeyError, TypeError, ValueError, ConfigurationError) as error:
             expected = "log is invalid; expected ingest, an object or null, and axis_map, for example [+x, +y, +z]"
             raise InputError(f"{expected}; got {error}", file) from None
 

@@ -334,6 +334,17 @@ def with_profile(calibration: Path, csv_section: dict[str, Any], axis_map: Seque
     return calibration
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [{"ingest": {"csv": {}, "delimiters": ";"}}, {"ingest": {"csv": "columns"}}, {"axis_map": ["+x"]}],
+)
+def test_a_damaged_profile_of_a_calibration_is_refused_by_name(calibration: Path, changed: dict[str, Any]) -> None:
+    data = json.loads(with_profile(calibration, counts_profile()).read_text(encoding="utf-8"))
+    data["log"] |= changed
+    with pytest.raises(InputError, match="log is invalid"):
+        LogProfile.of_calibration(data, str(calibration))
+
+
 def counts_profile(**more: Any) -> dict[str, Any]:
     scales = {"accel": ("a", 16384.0), "gyro": ("g", 131.0)}
     columns: dict[str, Any] = {"time": {"column": "time_ms", "unit": "ms"}}

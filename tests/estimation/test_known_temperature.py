@@ -217,6 +217,10 @@ def test_a_turn_without_temperature_leaves_the_sensor_uncalibrated_with_the_reas
         ),
         (["method=judged", *KNOWN], "given cannot follow known_temperature: it does not honour readings"),
         (["method=alone", *KNOWN], "no stage fits bias or matrix"),
+        (
+            ["method=known_temperature", "filter=high_pass", *KNOWN],
+            "filter=high_pass removes the slow changes of a bias",
+        ),
         (["method=known_temperature", *KNOWN[2:]], "sensor.accelerometer.known_temperature states neither bias nor"),
     ],
 )
