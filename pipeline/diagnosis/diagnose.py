@@ -34,10 +34,8 @@ if TYPE_CHECKING:
     from pipeline.settings import Effects, Settings
 
 
-IN_DOUBT = (
-    Verdict.REFERENCE_IN_DOUBT,
-    Verdict.UNEXPLAINED,
-)  # an accelerometer whose mountings may be wrong
+# an accelerometer whose mountings may be wrong
+IN_DOUBT = Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED
 LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that tilt a turn axis in the body
 COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # errors of a method that its uncertainty excludes
 

@@ -49,9 +49,8 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
-MIN_FURTHER_GAIN_SHARE = (
-    0.02  # least delta BIC of a further term over that of the first: less may be rounding of the first's constants
-)
+# least delta BIC of a further term over that of the first: less may be rounding of the first's constants
+MIN_FURTHER_GAIN_SHARE = 0.02
 MAX_FORMULA_TERMS = 3
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance

@@ -31,9 +31,8 @@ if TYPE_CHECKING:
 
 CYCLES = range(1, 13)
 POWERS = range(1, 6)
-POLYNOMIAL_ORDER = (
-    5  # of a polynomial; as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
-)
+# of a polynomial; as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
+POLYNOMIAL_ORDER = 5
 COARSE_STEP_POSITIONS = 20  # of a step in the coarse scan, which places it to 1/40 of the span
 SPEEDS = 40  # largest number of speeds between which steps are tried
 SHARPEST = 1.0 / 80.0  # least width of a soft step, share of the span: smoothing makes a sharp step this wide

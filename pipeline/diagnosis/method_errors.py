@@ -38,9 +38,8 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings, Table
 
 MIN_MEAN_SQUARE_SHARE = 0.02  # of the mean square: a smaller part adds less than 1 % to the rms error
-SIGNIFICANT_METHOD_ERROR = (
-    5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
-)
+# standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
+SIGNIFICANT_METHOD_ERROR = 5.0
 
 
 def method_errors(

@@ -48,9 +48,8 @@ DEGREE = 5  # up to four turning points over the span; faster changes are steps
 MIN_CYCLES, MAX_CYCLES = 3, 8  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # periods a turn; the catalogue contains one
 STEP_POSITIONS = 16  # of steps: the nearest one is within 1/32 of the span
-MAX_SHARE_OF_LINEARISATION = (
-    0.05  # of the gain by effects of time or temperature: less may be the error of a smoothed temperature
-)
+# of the gain by effects of time or temperature: less may be the error of a smoothed temperature
+MAX_SHARE_OF_LINEARISATION = 0.05
 RESIDUAL_OVER_NOISE = 1.1  # times the white noise: a larger residual may contain a step
 SIGNALS = {"time": "time", "temperature": "temperature", "rate": "speed"}  # of covariates, for steps and polynomials
 SIMULATIONS = 199  # standard error of the share: 3.5 % at most

@@ -45,9 +45,8 @@ PLOT_BINS = 40  # points that are distinct in a plot
 PLOT_DIGITS = 5  # more than a plot shows
 CURVE = 60  # points of the curve of a suggested form
 MIN_INFORMATION_SHARE = 0.01  # of the information on a shared coefficient; an axis with less is not shown
-MIN_REST_POWER_SHARE = (
-    0.9  # least share of a column's power in the rests; below it, a plot of rests does not show the effect
-)
+# least share of a column's power in the rests; below it, a plot of rests does not show the effect
+MIN_REST_POWER_SHARE = 0.9
 MAX_PLOTS = 3  # plots of dependences
 ABSCISSA_SIGNALS = {"rate": "speed", "specific_force": "u"}  # abscissa of a covariate without a form, if not itself
 

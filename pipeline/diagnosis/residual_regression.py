@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 
 Curves: TypeAlias = "Callable[[Motion], Values]"  # to (n, 1, q), or (n, 3, q) if they differ between the axes
 
-MIN_NEW_COLUMN_SHARE = (
-    1e-3  # least remaining share of a new column's norm, without base and effects (EXCITED of the ranking)
-)
+# least remaining share of a new column's norm, without base and effects (EXCITED of the ranking)
+MIN_NEW_COLUMN_SHARE = 1e-3
 UNIT_ROUNDOFF = float(np.finfo(np.float64).eps) / 2.0  # u
 
 

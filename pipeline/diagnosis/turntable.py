@@ -39,9 +39,8 @@ if TYPE_CHECKING:
 
 
 NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
-UNEXPLAINABLE_RATIO = (
-    1.1  # mean square of a residual over that of noise below which effects cannot explain a part of the excess
-)
+# mean square of a residual over that of noise below which effects cannot explain a part of the excess
+UNEXPLAINABLE_RATIO = 1.1
 
 
 def findings(case: DiagnosisInput) -> Findings:

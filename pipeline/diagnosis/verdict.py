@@ -20,20 +20,16 @@ if TYPE_CHECKING:
     from pipeline.records import Agreement, SensorDiagnosis
 
 EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
-MIN_EXPLAINED_EXCESS = (
-    0.5  # least share of the residual's excess that selected effects explain if the residual has another cause too
-)
+# least share of the residual's excess that selected effects explain if the residual has another cause too
+MIN_EXPLAINED_EXCESS = 0.5
 BELIEVED = 3  # most effects at once; a selection takes more only to imitate physics outside the catalogue
 UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by the selected effects: least delta BIC of a covariate that counts
-MAX_UNKNOWN_PROBABILITY = (
-    0.5  # probability of physics outside the catalogue above which the selected effects are no explanation
-)
-LIKELY_AT_FLOOR = (
-    0.9  # the same if the held-out error with the selected effects is at the noise floor (thermal_ramp, long-004)
-)
-MAX_HELD_OUT_INCREASE = (
-    0.3  # of the noise's mean square: largest increase of the held-out mean square by the selected effects
-)
+# probability of physics outside the catalogue above which the selected effects are no explanation
+MAX_UNKNOWN_PROBABILITY = 0.5
+# the same if the held-out error with the selected effects is at the noise floor (thermal_ramp, long-004)
+LIKELY_AT_FLOOR = 0.9
+# of the noise's mean square: largest increase of the held-out mean square by the selected effects
+MAX_HELD_OUT_INCREASE = 0.3
 HELPFUL = 0.1  # least relative reduction of the held-out mean square by an effect that is offered
 LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms of 3 x 1000 samples
 DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null families was 0.006

@@ -32,9 +32,8 @@ Signals: TypeAlias = "dict[str, Values]"
 ROW_S = 0.1  # rows: short against moves by hand, of seconds; longer ones lose angular acceleration
 CHIP_BLOCK_S, MAX_CHIP_BLOCKS = 4.0, 300  # of the bias's wander, as in ``observations``
 LEAST_S = 10.0  # that two chips have in common: twelve blocks of a second separate five columns from noise
-CLEAR_SIGNAL_DEVIATIONS = (
-    5.0  # standard deviations of noise, below which a signal is set to its mean; noise alone never exceeds them
-)
+# standard deviations of noise, below which a signal is set to its mean; noise alone never exceeds them
+CLEAR_SIGNAL_DEVIATIONS = 5.0
 FOLLOWED = 0.1  # fourth difference over the range of five samples, above which sampling does not follow the motion
 LEAST_SAMPLES = 12  # of a recording: a quintic spline and its edges
 MAX_CHIP_GAP_INTERVALS = 1.5  # sampling intervals

@@ -51,9 +51,8 @@ if TYPE_CHECKING:
 OBSERVED = 0.5  # standard uncertainty over that of the prior, above which a parameter is not observable
 ROTATION_DEVIATION_FACTOR = 10.0  # times the standard deviation of the gyroscopes' rotation: a hundredth of the weight
 MIN_COMPARED_ROWS = 20  # at rest and in motion, whose noise is compared
-DOUBTFUL_P_VALUE = (
-    0.001  # p-value of the agreement of both rotations, below which it is in doubt (Pearson's chi^2, 3 degrees)
-)
+# p-value of the agreement of both rotations, below which it is in doubt (Pearson's chi^2, 3 degrees)
+DOUBTFUL_P_VALUE = 0.001
 ROUGHER = 2.0  # noise in motion over that at rest, above which the model does not explain the motion
 SHEAR = 1e-6  # relative, of the differences
 WHY = {

@@ -40,10 +40,8 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Motion, Noise, Values
 
 REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
-MIN_DESIGN_SINGULAR_VALUE, PART_OF_IT = (
-    1e-3,
-    0.1,
-)  # singular value of unit columns that is determined; share of its vector
+# singular value of unit columns that is determined; share of its vector
+MIN_DESIGN_SINGULAR_VALUE, PART_OF_IT = 1e-3, 0.1
 SIGNALS = (  # fields of ``Motion`` on which formulas depend
     "time", "specific_force", "angular_rate", "angular_acceleration", "temperature", "angle", "rate", "level",
     "direction",

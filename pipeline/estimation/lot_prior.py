@@ -24,9 +24,8 @@ from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.records import MEDIAN_SIZE, Index, Mask, Values
 
 MIN_SIBLINGS = 8  # siblings; docs/fleet.md has the errors and intervals in lots of 12 units
-MAX_FALSE_PRIOR_SHARE = (
-    0.05  # largest share of a lot without the prior by chance, which does no harm (measured: docs/fleet.md)
-)
+# largest share of a lot without the prior by chance, which does no harm (measured: docs/fleet.md)
+MAX_FALSE_PRIOR_SHARE = 0.05
 FAR_LEVEL = 0.001  # below it a unit is no sibling of others; 0.05 would exclude 4 % of a lot and narrow its spread
 GRID = np.geomspace(0.01, 10.0, 64)  # of tau, over the spread of the estimates; steps of 12 %
 OMEGA = 0.5  # standard deviation of log tau within a kind: axes differ by a factor of 1.6 (assumption)

@@ -38,9 +38,8 @@ SEED = 101  # any number
 BATCH = 500  # trials drawn at a time, which bounds the memory
 TWO_DIGITS = 1_000_000  # trials
 NEWTONS = 6  # each squares the relative error of a step; one by a wide prior starts at some 0.5
-MIN_SINGULAR_VALUE_SHARE = (
-    3e-7  # of the largest singular value of unit columns, the root of 1e-13: the rounding of their products
-)
+# of the largest singular value of unit columns, the root of 1e-13: the rounding of their products
+MIN_SINGULAR_VALUE_SHARE = 3e-7
 
 
 class Distribution(NamedTuple):

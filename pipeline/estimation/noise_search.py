@@ -83,7 +83,7 @@ class Candidate:
 
     kinds: Composition
     columns: tuple[int, ...]
-    parameters: Values  # as in ``Trial.parameters``
+    parameters: Values  # as in ``TermTrial.parameters``
     bic: float
     fit: TermFits  # of one row
 

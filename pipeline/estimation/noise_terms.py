@@ -223,7 +223,7 @@ class TermFits:
             getattr(self, name)[index] = getattr(others, name)
 
     def own(self, row: int = 0) -> Values:
-        """Return the parameters of one fit, as in ``Trial.parameters``."""
+        """Return the parameters of one fit, as in ``TermTrial.parameters``."""
         k, terms = int(np.sum(self.kinds[row] >= 0)), self.kinds.shape[1]
         return self.parameters[row, [*range(k), *range(terms, terms + k)]]
 

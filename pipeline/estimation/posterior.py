@@ -42,13 +42,10 @@ FIRST_VERSION_AND_SCALE = 0, 3  # version and scale at which the search for the 
 ODDS = float(np.log(INCLUSION / (1.0 - INCLUSION)))
 BEAM, MAX_SET_SIZE = 6, 5  # sets that are extended, and their largest size
 BEAM_LOG_EVIDENCE = 12.0  # of log E below the best, beyond which a set of the beam is not examined further
-EXTENDED_LOG_EVIDENCE = (
-    7.0  # of log E below the best, within which a set is extended, and its best scales are determined
-)
-MOST_NEAR, SCALE_SEARCH_ITERATIONS = (
-    16,
-    3,
-)  # number of these sets; iterations of the search for the best scales, and of exchanges
+# of log E below the best, within which a set is extended, and its best scales are determined
+EXTENDED_LOG_EVIDENCE = 7.0
+# number of these sets; iterations of the search for the best scales, and of exchanges
+MOST_NEAR, SCALE_SEARCH_ITERATIONS = 16, 3
 CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in those sensors
 ANSWER_SET_PROBABILITY = 0.95  # probability of an answer set
 UPPER_LIMIT_SHARE = 29.0 / 30.0  # of an upper limit, see above

@@ -26,13 +26,11 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Values
 
 EXCITED = 1e-3  # share of a column's norm, after projection of the base, from which on it is determined
-MIN_NEW_VARIANCE = (
-    1e-4  # the same of the variance of a candidate's weakest direction, after projection of the selected effects
-)
+# the same of the variance of a candidate's weakest direction, after projection of the selected effects
+MIN_NEW_VARIANCE = 1e-4
 UNIT_COLUMN_RIDGE = 1e-11  # of unit columns: 1e5 times the rounding of a double
-MIN_LEFT_SQUARE_SHARE = (
-    1e-10  # share of a column's square after a projection, below which it is rounding: ten times that of the ridge
-)
+# share of a column's square after a projection, below which it is rounding: ten times that of the ridge
+MIN_LEFT_SQUARE_SHARE = 1e-10
 
 
 @dataclass(frozen=True)

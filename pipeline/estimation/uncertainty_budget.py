@@ -52,9 +52,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import WanderPrior
     from pipeline.settings import Settings, Table
 
-CHANCE_VARIANCE_SHARE = (
-    0.1  # share of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
-)
+# share of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
+CHANCE_VARIANCE_SHARE = 0.1
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not show it: calibrate the unit again after switching it off"

@@ -58,9 +58,8 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 TEMPLATES = Path(__file__).parent / "templates"
-FIXED_POINT_ITERATIONS = (
-    12  # of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal
-)
+# of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal
+FIXED_POINT_ITERATIONS = 12
 IN_C = set(SIGNALS) - {"specific_force_rate"}
 CALL = re.compile(r"(\w+)\(")  # of a function in C
 

@@ -41,9 +41,8 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.json``
-MAX_CALIBRATION_BYTES = (
-    50_000_000  # of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100
-)
+# of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100
+MAX_CALIBRATION_BYTES = 50_000_000
 UNIT_SCALE = (0.5, 2.0)  # range of the singular values of a matrix if readings and truth have the same unit
 EFFECT_IN_C = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
 TURNED_READINGS = re.compile(r"Turn\s+the\s+readings\s+to\s+body\s+axes\s+first:\s[^.]*\.")  # a remark in our exports

@@ -50,9 +50,8 @@ WORSE_FACTORS = {"accelerometer": 1.2, "gyroscope": 3.0}
 CHANGED = {"accelerometer": 0.05, "gyroscope": 5.0}
 SIGNIFICANT_ERRORS = 5.0  # least error after compensation, in standard errors of the mean of a rest
 APART_DEG = 30.0  # least angle between different orientations, and least turn of gravity for the check of the rate
-UNIT_FACTOR_DISTANCE = (
-    0.15  # relative difference between the median |a| and the factor of a unit that identifies the unit
-)
+# relative difference between the median |a| and the factor of a unit that identifies the unit
+UNIT_FACTOR_DISTANCE = 0.15
 USUAL_G = (0.5, 2.0)  # median |a| of a log, also of walking, driving and flying
 CELLS, LEAST_CELLS, SHARE = 200, 10, 0.6  # of a column; least share of cells with 12 decimals, 0.9 expected
 MIN_DIFFERENT_COUNTS = 10  # least number of different integers that indicates raw counts

@@ -5,9 +5,9 @@ samples without a pause takes row k at ``t_k = a + T k``, and the last row of bu
 arrives. So T is the slope of the line through the times of the bursts over the numbers of their last rows. The line
 replaces the times if
 
-    at least FEWEST_BURSTS bursts determine T to within LARGEST_UNCERTAINTY,
-    the times of the bursts scatter about it by less than T, and MARGIN for the jitter of the clock that logs them: each
-    lost row moves all later bursts by T,
+    at least FEWEST_BURSTS bursts determine T to within MAX_INTERVAL_UNCERTAINTY,
+    the times of the bursts scatter about it by less than T, and MARGIN_INTERVALS for the jitter of the clock that logs
+    them: each lost row moves all later bursts by T,
     and the step from burst to burst is the step within a burst: rows of two sensors differ by their biases.
 
 The uncertainty of T is twice the standard one of the regression, and at least ``1.5 T / n`` for n rows: errors within
@@ -40,17 +40,14 @@ UNTIMED = 0.95  # share of the rows of bursts that have no time of their own, if
 REPEATED = 0.5  # share of such rows that repeat the row before them, above which they were logged twice
 MIN_BURSTS = 3  # bursts, to call them so
 FEWEST_BURSTS = 10  # that determine a clock
-MAX_INTERVAL_UNCERTAINTY = (
-    1e-3  # of the interval: a tenth of what the clock of a MEMS sensor may be off (configs/sensor)
-)
+# of the interval: a tenth of what the clock of a MEMS sensor may be off (configs/sensor)
+MAX_INTERVAL_UNCERTAINTY = 1e-3
 MARGIN_INTERVALS = 0.5  # of the interval
 ONE_SENSOR = 6.0  # standard errors
 SAME_SIZE, MAX_BURST_DISTANCE = 0.8, 1.5  # share of bursts of the usual size +-1; times the usual distance
 READ_OUT_NS, LARGEST_FIFO = 2_000_000, 4096  # interval of rows while a FIFO is read by I2C, and its rows
-MAX_BURST_SHARE, LONGEST_NS = (
-    0.25,
-    1e9,
-)  # of the time between bursts, and of a burst; longer ones are of a logger that pauses
+# of the time between bursts, and of a burst; longer ones are of a logger that pauses
+MAX_BURST_SHARE, LONGEST_NS = 0.25, 1e9
 
 
 @dataclass(frozen=True)

@@ -65,10 +65,8 @@ AT_REST_DPS = 0.02  # assumed noise of the rates of table encoders at rest
 MIN_PIECE_SAMPLES = 4  # samples of a piece
 FEWEST_PIECES = 8  # by which the usual scatter is known
 RATIO = 4.0  # a scatter twice the usual one
-SIGNIFICANT_DEVIATIONS, CHI_SQUARE_TAIL = (
-    6.0,
-    18.0,
-)  # P(chi^2 > nu + 6 sqrt(2 nu) + 18) < exp(-9) (Laurent and Massart 2000, lemma 1)
+# P(chi^2 > nu + 6 sqrt(2 nu) + 18) < exp(-9) (Laurent and Massart 2000, lemma 1)
+SIGNIFICANT_DEVIATIONS, CHI_SQUARE_TAIL = 6.0, 18.0
 LARGEST_SHARE = 0.1  # of the pieces
 
 

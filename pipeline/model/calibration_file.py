@@ -64,9 +64,8 @@ LARGEST_FACTOR = 1000.0
 # Two axes 1 deg apart have a condition of 2 / sin(1 deg) = 115; a sensor's axes are 90 deg apart within some degrees.
 LARGEST_CONDITION = 100.0
 
-MIN_EXPORTED_TIME_S = (
-    0.1  # estimators average over longer times, between two images or scans: a faster process counts as white
-)
+# estimators average over longer times, between two images or scans: a faster process counts as white
+MIN_EXPORTED_TIME_S = 0.1
 WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
 LEFT_OUT_REASONS = {
     "N-STUCK": "stuck",

@@ -29,12 +29,8 @@ if TYPE_CHECKING:
     Signals = Mapping[str, Values]
     Evaluate = Callable[[Signals], Any]
 
-MAX_FORMULA_LENGTH, MAX_FORMULA_DEPTH, MAX_FORMULA_NODES, LARGEST_POWER = (
-    500,
-    40,
-    200,
-    20.0,
-)  # above every shipped formula; they bound the cost
+# above every shipped formula; they bound the cost
+MAX_FORMULA_LENGTH, MAX_FORMULA_DEPTH, MAX_FORMULA_NODES, LARGEST_POWER = 500, 40, 200, 20.0
 
 
 class Signal(NamedTuple):

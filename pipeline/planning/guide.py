@@ -72,9 +72,8 @@ SHARPNESS = 8  # exponent of a smooth norm for the largest U, within 32 % of it 
 SWEEPS = 10  # of the exchange, which usually ends after two or three
 MAX_PLANNED_RESTS = 60  # planned rests: some 7 min
 MIN_RESTS = 9  # rests of the fit, one for each parameter
-SAME_DIRECTION = (
-    0.08  # difference of components of the vertical, 5 deg from an edge: within it, the name does not change
-)
+# difference of components of the vertical, 5 deg from an edge: within it, the name does not change
+SAME_DIRECTION = 0.08
 LEVEL_DEG = 3.0  # largest tilt that is not mentioned: units are set down by hand to about 1 deg
 BETWEEN_SIDES = np.tan(np.radians(22.5))  # ratio of two components above which a corner is raised, not a side
 

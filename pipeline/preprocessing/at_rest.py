@@ -49,16 +49,11 @@ if TYPE_CHECKING:
 
 
 REST_BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
-MIN_SAMPLES_OF_REST, MIN_RESTS_OF_SCATTER = (
-    8,
-    3,
-)  # samples of a rest, and rests of a recording, that determine the usual scatter
+# samples of a rest, and rests of a recording, that determine the usual scatter
+MIN_SAMPLES_OF_REST, MIN_RESTS_OF_SCATTER = 8, 3
 LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer than 1 of 10^9 blocks
-QUARTER_SIZE, UNUSUAL, MAX_SCATTER_DEVIATION = (
-    0.6745,
-    5.0,
-    0.4,
-)  # quartile of a normal distribution; factor and limit of s
+# quartile of a normal distribution; factor and limit of s
+QUARTER_SIZE, UNUSUAL, MAX_SCATTER_DEVIATION = 0.6745, 5.0, 0.4
 OF_RESTS, OF_SHEET = 2.0, 4.0  # a running bench adds noise to that on a desk; data sheets state typical noise
 STEPPED_DEG = 0.1  # between two samples of a rest: five times what RATE_AT_REST_DPS turns in a second
 SIGNIFICANT_DEVIATIONS_AT_REST = 6.0  # standard deviations, as in pipeline.signal.rests

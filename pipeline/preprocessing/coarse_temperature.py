@@ -33,11 +33,8 @@ DRIFT_DENSITIES = tuple(10.0 ** np.arange(-12.0, -3.0))  # lambda, degC^2 / s^3:
 THERMAL_TIME_CONSTANTS_S = (None, *np.geomspace(50.0, 1600.0, 21))  # theta: of packages on boards to that of housings
 AMPLITUDE_DEGC = 10.0  # standard deviation of c and of the level, about the mean
 FEWEST_CHANGES = 2  # of the reading: without them nothing is known between the steps
-MAX_NEWTON_ITERATIONS, SETTLED_LOG_POSTERIOR, MIN_STEP_SHARE = (
-    40,
-    1e-3,
-    1e-3,
-)  # of Newton's method; change of the log posterior; share of a step
+# of Newton's method; change of the log posterior; share of a step
+MAX_NEWTON_ITERATIONS, SETTLED_LOG_POSTERIOR, MIN_STEP_SHARE = 40, 1e-3, 1e-3
 DOUBLE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
 
 

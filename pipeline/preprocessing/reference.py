@@ -62,9 +62,8 @@ if TYPE_CHECKING:
 
 
 MIN_REFERENCE_SAMPLES = 32  # samples, two short stretches
-MIN_SHARE_OF_USUAL_GAIN = (
-    0.5  # of the usual gain, which the axis turned about reaches; of an interval, between its end and its mean
-)
+# of the usual gain, which the axis turned about reaches; of an interval, between its end and its mean
+MIN_SHARE_OF_USUAL_GAIN = 0.5
 SAME_GAIN = 0.1  # relative difference between gains of one gyroscope in two turns
 FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
 DELAY_STEP_S = 0.05  # step in which delays are tried; a parabola finds what lies between

@@ -78,9 +78,8 @@ TIME_UNIT_FACTORS = (
 )
 OTHER_AXIS = 0.5  # the axis that turns reads more than twice as much as one that leans by up to 26 deg
 LEAST_TOTAL_DEG = 1.0  # over a recording, for a ratio
-MAX_RATIO_SPREAD = (
-    0.2  # relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale
-)
+# relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale
+MAX_RATIO_SPREAD = 0.2
 CONSTANT_RATE_CHANGE = 1e-2  # relative change of a constant rate
 MIN_STEADY_INTERVALS = 10  # intervals at constant rate
 MOSTLY_EVEN = 0.7  # of the angle that is turned
@@ -90,11 +89,8 @@ SIGNIFICANT_UNCERTAINTIES = 6.0  # standard uncertainties, as in pipeline.signal
 QUARTZ = 2e-4  # relative: two quartz clocks of +-100 ppm each
 GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz, errors of its phase by lever arms
 SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, error of gravity's direction by an accelerometer's nonlinearities
-FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, GEAR_ITERATIONS = (
-    200,
-    24,
-    4,
-)  # samples; blocks of a sandwich estimate; Gauss-Newton steps
+# samples; blocks of a sandwich estimate; Gauss-Newton steps
+FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, GEAR_ITERATIONS = 200, 24, 4
 CONVERGED = 1e-12  # relative step, far below the uncertainty of any ratio
 SHARES = np.arange(1, BLOCKS_OF_A_GEAR) / BLOCKS_OF_A_GEAR
 UNIT_FACTOR_TOLERANCE = 0.1  # relative: how near a factor has to be to one of a unit to be called so

@@ -47,10 +47,8 @@ SMALLEST_DEG = 0.3
 TIMES_STATED = 3.0  # standard uncertainties of the table's orthogonality and angle
 NOISE_PQ_G = 5e-4  # by wander, drift and nonlinearity in p and q in the blind study: 0.03 deg
 NOISE_C_G = 4e-3  # likewise in c: half of a K2 of 6e-3 1/g (twice 0.3 %), or 8 degC at 5e-4 g/degC
-CLEAR_CHI_SQUARE, OF_TWO_MORE = (
-    1.0,
-    4.0,
-)  # chi-square by which leans have to be better than seats: 1 sigma; 2 sigma with tilt
+# chi-square by which leans have to be better than seats: 1 sigma; 2 sigma with tilt
+CLEAR_CHI_SQUARE, OF_TWO_MORE = 1.0, 4.0
 MAX_SEAT_CHI_SQUARE = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
 GAUGE = 1e-6  # weight with which the seats have the smallest sum of squares
 # Columns of the design of ``_fit``: K comes before the bias.

@@ -222,16 +222,12 @@ def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Layer
 
 
 MAX_DRAWN_SHARE = 3.0  # largest share that is drawn: one unit in a wrong unit of measurement must not hide the others
-FEWEST_SIBLINGS, MAX_PLOTTED_UNITS = (
-    3,
-    60,
-)  # siblings below which there is no plot, and above which only the farthest are drawn
+# siblings below which there is no plot, and above which only the farthest are drawn
+FEWEST_SIBLINGS, MAX_PLOTTED_UNITS = 3, 60
 ENDS = 20  # farthest units of each parameter that are then drawn, on either side
 ROW, LEFT = 17, 130  # px
-ROW_SPREAD, HALF_BAR = (
-    0.6,
-    0.42,
-)  # of a row: range over which the units are distributed in their order; half height of a bar
+# of a row: range over which the units are distributed in their order; half height of a bar
+ROW_SPREAD, HALF_BAR = 0.6, 0.42
 
 
 def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[UnitChart]:

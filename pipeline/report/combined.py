@@ -74,11 +74,8 @@ LACK_OF_FIT = "lack of fit"  # errors of a table are part of it: siblings may ha
 SHARED = f"{BENCH}, and {LACK_OF_FIT}"
 NO_VALUES = np.empty(0)
 MOST_FREEDOM = 1e12  # instead of infinitely many degrees of freedom, for which JSON has no number
-DOUBTFUL = (
-    Verdict.REFERENCE_IN_DOUBT,
-    Verdict.MISSING_EFFECT,
-    Verdict.UNEXPLAINED,
-)  # U is too small
+# U is too small
+DOUBTFUL = Verdict.REFERENCE_IN_DOUBT, Verdict.MISSING_EFFECT, Verdict.UNEXPLAINED
 
 
 def combined_calibrations(

@@ -29,12 +29,8 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 RIVAL_SHARE = 0.8  # share of the selected effect's delta BIC above which another effect is named as a rival
-MAX_CHART_EFFECTS, MIN_CHART_EFFECTS, MOST_HIDDEN, MAX_CAPTION_BRACKETS = (
-    9,
-    3,
-    6,
-    2,
-)  # effects and brackets that a chart or its caption shows
+# effects and brackets that a chart or its caption shows
+MAX_CHART_EFFECTS, MIN_CHART_EFFECTS, MOST_HIDDEN, MAX_CAPTION_BRACKETS = 9, 3, 6, 2
 EXCLUDED = 0.5  # of the upper limit by the prior alone, below which the recordings exclude an effect: convention
 MOST_LIMITS = 8  # upper limits that a chart shows
 ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, more for correlated bins

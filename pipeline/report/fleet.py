@@ -42,9 +42,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 JSON = dict[str, Any]
-MIN_UNITS_OF_DEVIATION = (
-    20  # units, below which a median absolute deviation is too uncertain: its standard deviation is 17 % of it
-)
+# units, below which a median absolute deviation is too uncertain: its standard deviation is 17 % of it
+MIN_UNITS_OF_DEVIATION = 20
 OUTLIER_DEVIATIONS = 6.0  # robust standard deviations, which noise does not exceed in 10,000 units with 24 parameters
 FLEET_TEST_LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
 MOST_PAIRED = 1000  # units from which the slope is computed: it needs all pairs of them, 50 MB

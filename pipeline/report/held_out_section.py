@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from pipeline.settings import Table
 
 JSON = dict[str, Any]
-EQUAL_ERROR_FACTOR = (
-    1.2  # held-out errors of diagnosis and validation that agree within this factor are shown as one series
-)
+# held-out errors of diagnosis and validation that agree within this factor are shown as one series
+EQUAL_ERROR_FACTOR = 1.2
 MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
 SOURCES = {
     "static": "the static recording",

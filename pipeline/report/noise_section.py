@@ -23,9 +23,8 @@ JSON = dict[str, Any]
 # Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
 # 260 Hz) change the white noise of a sample by sqrt(52) = 7 at one sampling rate, its ranges by 2 to 8.
 MAX_TIMES_DATA_SHEET = 5.0
-EQUAL_NOISE_FACTOR = (
-    1.3  # factor between both below which they count as equal: data sheets state typical values to about 30 %
-)
+# factor between both below which they count as equal: data sheets state typical values to about 30 %
+EQUAL_NOISE_FACTOR = 1.3
 SURE_TERM_PROBABILITY = 0.9  # probability of a set of terms above which no other set is named
 SYMBOLS = dict(zip(UNITS, "QNBKGRA", strict=True))
 

@@ -40,16 +40,12 @@ ADDED_REST_SAMPLES = 5  # samples of rest added at both ends of a motion, which 
 FEWEST_MOVED = 100  # changes of the angle: their autocorrelation is known to 0.1
 ROUNDING_AUTOCORRELATION = -0.35  # autocorrelation, half way between that of rounding errors and that of ramps
 MAX_ROUNDING_RATIO = 1.5  # times the errors of rounding, above which errors are not rounding alone
-KEPT_SECOND_DIFFERENCES, KEPT_VARIANCE_SHARE = (
-    0.95,
-    0.759,
-)  # of the second differences, without the corners of ramps; their share of a normal variance
+# of the second differences, without the corners of ramps; their share of a normal variance
+KEPT_SECOND_DIFFERENCES, KEPT_VARIANCE_SHARE = 0.95, 0.759
 AROUND = 9  # second differences over which an acceleration is taken as constant
 MIN_RATE_SAMPLES = 6  # samples from which a rate and its derivative follow
-STEADY, STEADY_SHARE = (
-    0.05,
-    0.5,
-)  # of the median rate, within which a rate is steady; share of a motion with such a rate
+# of the median rate, within which a rate is steady; share of a motion with such a rate
+STEADY, STEADY_SHARE = 0.05, 0.5
 ACCELERATION_DENSITIES = (1e-6, 1e12)  # S, (deg/s)^2/s^(2k - 3): from a table at rest to 10,000 deg/s^2 in 0.1 s
 MAX_ANGLE_GAP_INTERVALS = 1.5  # sampling intervals, above which the angle in between is unknown
 

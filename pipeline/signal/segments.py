@@ -268,9 +268,8 @@ def _is_useful(group: Sequence[Move]) -> bool:
 
 
 SCALE = 0.1  # relative: three times the largest scale factor error of the shipped data sheets (MPU-6050: 3 %)
-MAX_AXIS_SINE = (
-    0.25  # 15 deg between the turn and a body axis: misalignment of the chip in its case, and error of the hand
-)
+# 15 deg between the turn and a body axis: misalignment of the chip in its case, and error of the hand
+MAX_AXIS_SINE = 0.25
 HALF_S = WINDOW_S + SHORTEST_REST_S  # shortest half of a divided rest that is found again: a window is trimmed
 
 

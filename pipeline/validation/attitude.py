@@ -43,10 +43,8 @@ DRIFT_TIME_S = 60.0  # s over which a drift is stated
 DRIFT_STARTS = 60  # starts over which a drift is averaged
 SHORTEST_DRIFT_S = 10.0  # s: a drift over a shorter time is mostly noise
 CURVE_POINTS = 120  # points of the published curves
-MAX_FILTER_STEP_S, MAX_FILTER_STEP_DEG = (
-    0.1,
-    5.0,
-)  # largest steps of the complementary filter, which integrates to first order
+# largest steps of the complementary filter, which integrates to first order
+MAX_FILTER_STEP_S, MAX_FILTER_STEP_DEG = 0.1, 5.0
 FILTER_GAIN = 0.5  # of the complementary filter: its library's default
 TILT_SETTLING_S = 10.0  # s after which the tilt counts
 

@@ -87,9 +87,8 @@ MATRIX_NAMES = np.array(
 )
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
 IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
-MAX_KNOWN_UNCERTAINTY = (
-    0.05  # standard uncertainty, g or relative, beyond which a bias or scale factor is called undetermined
-)
+# standard uncertainty, g or relative, beyond which a bias or scale factor is called undetermined
+MAX_KNOWN_UNCERTAINTY = 0.05
 FALSE_ALARM = 1e-3  # probability that a recording without outliers has one
 SMALLEST_OUTLIER_G = 1e-6  # rests of a noise-free recording are no outliers
 FEWEST_TO_JUDGE = 18  # rests, two for each parameter

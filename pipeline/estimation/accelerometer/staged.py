@@ -337,7 +337,7 @@ def fit(
 
 
 def _linear_map(sinusoids: Sequence[Sequence[Sinusoid]], theta: Values, chain: Callable[[Values], Values]) -> LinearMap:
-    """Return the map from readings to ``Corrected.vector``, by the derivative of all stages so far."""
+    """Return the map from readings to ``CorrectedForces.vector``, by the derivative of all stages so far."""
     here = chain(theta)
     columns = np.stack(
         [(chain(theta + DIFFERENCE_STEP_G * e) - here) / DIFFERENCE_STEP_G for e in np.eye(len(theta))], axis=1

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 NAME = "rests_and_moves"
 FIT_STAGES = {NAME: FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
-MAX_KNOWN_ELEMENT_UNCERTAINTY = (
-    0.05  # standard uncertainty beyond which an element of the matrix is called undetermined
-)
+# standard uncertainty beyond which an element of the matrix is called undetermined
+MAX_KNOWN_ELEMENT_UNCERTAINTY = 0.05
 RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 

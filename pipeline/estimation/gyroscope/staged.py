@@ -46,9 +46,8 @@ if TYPE_CHECKING:
     from pipeline.records import UnitRecordings
     from pipeline.settings import Settings
 
-DIFFERENCE_STEP_DPS = (
-    1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
-)
+# deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
+DIFFERENCE_STEP_DPS = 1e-5
 FORGOTTEN_RATE_CHANGE = 1e-5  # share of a change of rate in a filter's output, below which the filter has settled
 KNOWN_DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
 

@@ -56,9 +56,8 @@ if TYPE_CHECKING:
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
-MIN_NEW_NORM_SHARE = (
-    1e-3  # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
-)
+# share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
+MIN_NEW_NORM_SHARE = 1e-3
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
 # refines their steps where the data determine the scatter better.
 UNLIKELY = -4.0  # prior log weight of a setting, e^-4 of the likeliest
