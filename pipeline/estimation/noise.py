@@ -404,9 +404,9 @@ def wander_prior(noise: Noise | None, data_sheet: DataSheet) -> WanderPrior:
     ``sqrt(tau / T)``. If that is below ``SHARPEST_WIDTH``, the likelihood is widened to that of a shorter rest, because
     no sensor is exactly a Gauss-Markov process. Above the likeliest wander, the likelihood is at least
     ``exp(-MAX_PRIOR_WIDTHS**2)`` of its maximum: the residuals of turns can show more wander than the rest (lack of
-    fit). Noise that is correlated over seconds (a filter in the sensor, values repeated between samples, chance in a short rest)
-    does not determine a slow wander, and is white noise in the means of the blocks of a fit: then the prior is that of
-    the sensor file.
+    fit). Noise that is correlated over seconds (a filter in the sensor, values repeated between samples, chance in a
+    short rest) does not determine a slow wander, and is white noise in the means of the blocks of a fit: then the
+    prior is that of the sensor file.
     """
     stated = WanderPrior(data_sheet.bias_wander, data_sheet.wander_time_s)
     if noise is None or noise.source != "static" or noise.likelihood is None or fast(noise):
