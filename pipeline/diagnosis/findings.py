@@ -22,7 +22,7 @@ from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
 from pipeline.model.effects import effect
-from pipeline.records import Answer, Candidate, SensorDiagnosis
+from pipeline.records import Answer, Candidate, SensorDiagnosis, standard_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -181,7 +181,7 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Any], bool]:
     if score.name in findings.selected:
         base = len(findings.covariance) - sum(len(term.values) for term in findings.terms)
         term, block = placed(findings.terms, base)[score.name]
-        values, uncertainty = term.values, np.sqrt(np.clip(np.diag(findings.covariance)[block], 0.0, None))
+        values, uncertainty = term.values, standard_uncertainty(findings.covariance)[block]
         if score.name in findings.limits:
             plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= findings.limits[score.name]))
     described = effect(score.name).of_recordings(findings.turns).parameters(findings.sensor)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis.words import listed
+from pipeline.estimation.free_curves import CURVE_DEGREE
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.formula import parse
 
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
 CYCLES = range(1, 13)
 POWERS = range(1, 6)
-# of a polynomial; as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
-POLYNOMIAL_ORDER = 5
 COARSE_STEP_POSITIONS = 20  # of a step in the coarse scan, which places it to 1/40 of the span
 SPEEDS = 40  # largest number of speeds between which steps are tried
 SHARPEST = 1.0 / 80.0  # least width of a soft step, share of the span: smoothing makes a sharp step this wide
@@ -285,7 +284,7 @@ def powers(span: Span, name: str) -> tuple[str, ...]:
     if name == "u" or name.startswith("f"):
         scale = f"{span.rounded(max(abs(span.low), abs(span.high))):g}"
         x = name if scale == "1" else f"({name} / {scale})"
-    return (x, *(f"{x} ** {p}" for p in range(2, POLYNOMIAL_ORDER + 1)))
+    return (x, *(f"{x} ** {p}" for p in range(2, CURVE_DEGREE + 1)))
 
 
 def polynomial(signal: str, formulas: tuple[str, ...], order: int) -> Factor:

@@ -30,6 +30,7 @@ from numpy.polynomial.chebyshev import chebvander
 
 from pipeline.diagnosis.functional_forms import Span, available_signals, signals_of
 from pipeline.diagnosis.residual_regression import Curves, ProjectedCurves, Scan, each_explains
+from pipeline.estimation.free_curves import CURVE_DEGREE, MAX_CURVE_CYCLES
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import GaussMarkov, selection_grid
 from pipeline.model.effects import effect
@@ -44,8 +45,7 @@ if TYPE_CHECKING:
     Basis = tuple[str, Callable[[Motion], Values], list[Block]]  # covariate, its curves by motion: (n, q), and blocks
     Tests = tuple[list[str], Values, Index]  # covariate, delta BIC and number of parameters of each test
 
-DEGREE = 5  # up to four turning points over the span; faster changes are steps
-MIN_CYCLES, MAX_CYCLES = 3, 8  # periods a turn: one and two look like base and catalogue
+MIN_CYCLES = 3  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # periods a turn; the catalogue contains one
 STEP_POSITIONS = 16  # of steps: the nearest one is within 1/32 of the span
 # of the gain by effects of time or temperature: less may be the error of a smoothed temperature
@@ -124,7 +124,9 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
             scanned.append((signal, places[every // 2 :: every]))
             names += [covariate] * 2 * len(scanned[-1][1])
     steps = len(names)
-    ripples = (MAX_CYCLES - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in covariates else 0
+    ripples = (
+        (MAX_CURVE_CYCLES - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in covariates else 0
+    )
 
     def curves(motion: Motion) -> Values:
         signals, columns = signals_of(motion), []
@@ -213,9 +215,9 @@ def _bases_of(selection: Selection) -> list[Basis]:
     available = available_signals(observations)
     for covariate, signal in SIGNALS.items():
         if signal in available:
-            bases.append((covariate, _chebyshev(Span.of(observations, signal)), [(range(DEGREE), 2)]))
+            bases.append((covariate, _chebyshev(Span.of(observations, signal)), [(range(CURVE_DEGREE), 2)]))
     if any(part.motion.axis is not None for part in observations.parts):
-        count = MAX_CYCLES - MIN_CYCLES + 1
+        count = MAX_CURVE_CYCLES - MIN_CYCLES + 1
         single: list[Block] = [((j, count + j), 2) for j in range(count)]
         bases.append(("angle", _harmonics, [*single, (range(2 * count), 2 * count)]))
     return bases
@@ -226,7 +228,7 @@ def _chebyshev(span: Span) -> Callable[[Motion], Values]:
 
     def curves(motion: Motion) -> Values:
         x = 2.0 * (np.asarray(signals_of(motion)[span.signal]) - span.low) / span.size - 1.0
-        return np.asarray(chebvander(x, DEGREE)[:, 1:], np.float64)
+        return np.asarray(chebvander(x, CURVE_DEGREE)[:, 1:], np.float64)
 
     return curves
 
@@ -234,12 +236,12 @@ def _chebyshev(span: Span) -> Callable[[Motion], Values]:
 def _harmonics(motion: Motion, fewest: int = MIN_CYCLES) -> Values:
     """Return cos and sin of the table's angle times ``fewest`` to 8: (n, 2 m) array."""
     if motion.angle is None:
-        return np.zeros((len(motion.time), 2 * (MAX_CYCLES - fewest + 1)))
-    turns = np.radians(motion.angle)[:, None] * np.arange(fewest, MAX_CYCLES + 1)
+        return np.zeros((len(motion.time), 2 * (MAX_CURVE_CYCLES - fewest + 1)))
+    turns = np.radians(motion.angle)[:, None] * np.arange(fewest, MAX_CURVE_CYCLES + 1)
     return np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
 
 
 def _force(motion: Motion) -> Values:
     """Return Chebyshev polynomials of degree 3 to 5 of each component of the specific force: (n, 9) array."""
     scaled = motion.specific_force / max(float(np.abs(motion.specific_force).max()), 1.0)
-    return np.concatenate([chebvander(scaled[:, i], DEGREE)[:, 3:] for i in range(3)], axis=1)
+    return np.concatenate([chebvander(scaled[:, i], CURVE_DEGREE)[:, 3:] for i in range(3)], axis=1)

@@ -24,7 +24,7 @@ import scipy
 
 from pipeline.estimation.design import true_motion
 from pipeline.estimation.gauss_markov import WHITE_SETTING, GaussMarkov
-from pipeline.estimation.ranking import MIN_LEFT_SQUARE_SHARE, UNIT_COLUMN_RIDGE
+from pipeline.estimation.ranking import MIN_LEFT_SQUARE_SHARE, MIN_NEW_COLUMN_SHARE, UNIT_COLUMN_RIDGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 Curves: TypeAlias = "Callable[[Motion], Values]"  # to (n, 1, q), or (n, 3, q) if they differ between the axes
 
-# least remaining share of a new column's norm, without base and effects (EXCITED of the ranking)
-MIN_NEW_COLUMN_SHARE = 1e-3
 UNIT_ROUNDOFF = float(np.finfo(np.float64).eps) / 2.0  # u
 
 

@@ -17,6 +17,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.noise import noise_of, wander_prior
+from pipeline.estimation.observations import BIAS_BLOCKS, SHORTEST_BLOCK_S
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects.base import STANDARD_GRAVITY
 from pipeline.model.kinematics import skew, turn_by_vector
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 Signals: TypeAlias = "dict[str, Values]"
 
 ROW_S = 0.1  # rows: short against moves by hand, of seconds; longer ones lose angular acceleration
-CHIP_BLOCK_S, MAX_CHIP_BLOCKS = 4.0, 300  # of the bias's wander, as in ``observations``
 LEAST_S = 10.0  # that two chips have in common: twelve blocks of a second separate five columns from noise
 # standard deviations of noise, below which a signal is set to its mean; noise alone never exceeds them
 CLEAR_SIGNAL_DEVIATIONS = 5.0
@@ -253,7 +253,7 @@ def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> RotationF
     held_out = [rows for held, rows in pairs if held]
     times = [rows[0]["time"] for rows in used]
     span = sum(float(np.ptp(t)) for t in times)
-    length = max(min(CHIP_BLOCK_S, span / 12.0), span / MAX_CHIP_BLOCKS)
+    length = max(min(SHORTEST_BLOCK_S, span / 12.0), span / BIAS_BLOCKS)
     blocks = Blocks.of_rows([(t, np.ones(len(t))) for t in times], range(len(times)), length)
     return RotationFits(R, fits, (a, b), clear, blocks, _joined(held_out) if held_out else None)
 

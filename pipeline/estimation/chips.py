@@ -42,7 +42,16 @@ from pipeline.estimation.engine import assess_noise, scaled_inverse
 from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, own_and_bench
 from pipeline.model.kinematics import turn_by_vector
-from pipeline.records import AXES, MATRIX, SENSOR_UNITS, SENSORS, SensorCalibration, Values, coverage_factor
+from pipeline.records import (
+    AXES,
+    MATRIX,
+    SENSOR_UNITS,
+    SENSORS,
+    SensorCalibration,
+    Values,
+    coverage_factor,
+    standard_uncertainty,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -281,7 +290,7 @@ def _estimated(R: Values, estimate: ChipMounting, chips: Sequence[Chip]) -> dict
     for e in estimate.errors:
         G = factor[:, None] * (of_values @ e.of_fits + of_axes @ e.of_axes)
         covariance += (C := G @ e.covariance @ G.T)
-        u.append(np.sqrt(np.clip(np.diag(C), 0.0, None)))
+        u.append(standard_uncertainty(C))
         lines.append({"source": e.source, "type": e.kind, "contribution": u[-1].tolist()})
     freedom = effective_degrees_of_freedom(np.array(u), np.array([e.freedom for e in estimate.errors]))
     standard = np.sqrt(np.diag(covariance))

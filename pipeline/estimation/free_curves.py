@@ -35,7 +35,8 @@ BEND_WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharp
 # Prior probability of a bend over that of an effect. With it, a bend was an answer in all 54 simulated units (seed 61)
 # that hid one and selected a slow effect, and below 0.5 in all 34 (seed 62) that hid the slow effect.
 BEND_SHARE = 0.5
-CURVE_DEGREE, MAX_CURVE_CYCLES = 5, 8  # as in the tests that find a dependence (pipeline.diagnosis.residual_dependence)
+CURVE_DEGREE = 5  # up to four turning points over the span; faster changes are steps
+MAX_CURVE_CYCLES = 8  # periods a turn
 
 
 class FreeCurve(Effect):

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.uncertainty_budget import with_uncertainty
+from pipeline.model.effects.base import with_truth
 from pipeline.model.measurement import SensorEffects, compensate
 from pipeline.records import (
     BASE_NAMES,
@@ -57,11 +58,7 @@ def subtracted(
     ``calibration``: its bias and matrix are used. A recording without a temperature loses the readings of this sensor;
     raises ``CannotCalibrateError`` if its role is one of ``needed``.
     """
-    sensor, found = calibration.sensor, []
-    field, part = (
-        "specific_force" if sensor == "accelerometer" else "angular_rate",
-        SensorEffects.of(calibration, known),
-    )
+    sensor, part, found = calibration.sensor, SensorEffects.of(calibration, known), []
     for recording in recordings:
         reading = recording.reading(sensor)
         if reading is None:
@@ -77,7 +74,7 @@ def subtracted(
             continue
         motion = replace(motion_at_rest(recording.time), temperature=temperature_of(recording))
         truth = compensate(calibration, reading, motion, known)
-        corrected = part.take_off(reading, replace(motion, **{field: truth}))  # type: ignore[arg-type]
+        corrected = part.take_off(reading, with_truth(motion, sensor, truth))
         found.append(recording.with_readings(**{sensor: corrected}))
     return found
 

@@ -18,7 +18,7 @@ from pipeline.estimation.evidence import CandidateProblem, linear_problem
 from pipeline.estimation.gauss_markov import WHITE_SETTING, random_walks
 from pipeline.estimation.generalized_least_squares import JointFit, design_at, fit_terms
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
-from pipeline.estimation.ranking import EXCITED, without
+from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
 from pipeline.estimation.selection import DELAYS, Selection
 from pipeline.records import BASE_COUNT
 
@@ -161,6 +161,6 @@ def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, Effec
         excluded([term.effect for term in candidates.values()]),
         samples=samples,
         free=samples - known,
-        new=EXCITED,
+        new=MIN_NEW_COLUMN_SHARE,
         within=float(np.sum(observations.scatter / fit.scale**2)),
     ).under(slice(1, None))

@@ -17,7 +17,7 @@ import scipy
 
 from pipeline.estimation.design import Design, EffectColumns, Start
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
-from pipeline.records import BASE_COUNT
+from pipeline.records import BASE_COUNT, standard_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations
     from pipeline.records import Index, Values
 
-EXCITED = 1e-3  # share of a column's norm, after projection of the base, from which on it is determined
+MIN_NEW_COLUMN_SHARE = 1e-3  # share of a column's norm, after projection of the base, from which on it is determined
 # the same of the variance of a candidate's weakest direction, after projection of the selected effects
 MIN_NEW_VARIANCE = 1e-4
 UNIT_COLUMN_RIDGE = 1e-11  # of unit columns: 1e5 times the rounding of a double
@@ -91,7 +91,7 @@ class Ranking:
         self.blocks: list[Values] = []
         for span in self.spans:
             values, vectors = np.linalg.eigh(self.projected[0, span, span] / np.outer(size[span], size[span]))
-            kept = values > EXCITED**2
+            kept = values > MIN_NEW_COLUMN_SHARE**2
             self.blocks.append(vectors[:, kept] / np.sqrt(values[kept]) / size[span, None])
         ends = np.cumsum([block.shape[1] for block in self.blocks]).tolist()
         self.places = [np.arange(end - block.shape[1], end) for block, end in zip(self.blocks, ends, strict=True)]
@@ -198,7 +198,7 @@ class Ranking:
         values, uncertainty = term.values.copy(), np.zeros(len(term.values))
         linear = slice(0, len(block))
         values[linear] = block @ solved + (term.values[linear] if term.effect.moves else 0.0)
-        uncertainty[linear] = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        uncertainty[linear] = standard_uncertainty(covariance)
         return values, uncertainty
 
     def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:

@@ -40,6 +40,7 @@ from pipeline.records import (
     Values,
     base_units,
     base_values,
+    standard_uncertainty,
 )
 
 if TYPE_CHECKING:
@@ -252,7 +253,7 @@ def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Val
 
 def stage_parameters(values: Mapping[str, tuple[float, str]], covariance: Values) -> dict[str, dict[str, Any]]:
     """Return the parameters of a stage as published."""
-    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None)).tolist()
+    u = standard_uncertainty(covariance).tolist()
     return {
         name: {"value": value, "unit": unit, "standard_uncertainty": uncertainty}
         for (name, (value, unit)), uncertainty in zip(values.items(), u, strict=True)
@@ -269,7 +270,7 @@ def effect_parameters(
     sensor: str, terms: Sequence[EffectColumns], covariance: Values
 ) -> tuple[tuple[FittedEffect, ...], dict[str, dict[str, Any]]]:
     """Return the fitted effects, and their parameters as published with a stage; they follow bias and matrix."""
-    u = iter(np.sqrt(np.clip(np.diag(covariance)[AFTER_BASE], 0.0, None)).tolist())
+    u = iter(standard_uncertainty(covariance)[AFTER_BASE].tolist())
     effects, parameters = [], {}
     for term in terms:
         pairs = zip(term.effect.parameters(sensor), term.values.tolist(), strict=True)

@@ -12,14 +12,14 @@ angular rate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from pipeline.errors import ConvergenceError
 from pipeline.model.effects import effect_of, owner_of
-from pipeline.model.effects.base import Effect, Owner, truth
+from pipeline.model.effects.base import Effect, Owner, truth, with_truth
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -76,10 +76,9 @@ def compensate(
     ``effects``: those to subtract, by default all effects of the sensor. Errors as of ``solve``.
     """
     sensor = calibration.sensor
-    field = "specific_force" if sensor == "accelerometer" else "angular_rate"
 
     def motion_at(truths: Truths, _number: int) -> Motion:
-        return replace(motion, **{field: truths[sensor]})  # type: ignore[arg-type]
+        return with_truth(motion, sensor, truths[sensor])
 
     part = SensorEffects.of(calibration, sensor_effects(calibration) if effects is None else effects)
     return solve({sensor: part}, {sensor: reading}, motion_at)[sensor]

@@ -41,6 +41,7 @@ from pipeline.records.parameters import (
     base_values,
     coverage_factor,
     matrix_of,
+    standard_uncertainty,
 )
 from pipeline.records.recording import (
     AXES,
@@ -146,4 +147,5 @@ __all__ = [
     "once",
     "once_of_log",
     "rate_of_attitude",
+    "standard_uncertainty",
 ]

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from pipeline.records.parameters import standard_uncertainty
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -94,7 +96,7 @@ class Contribution:
     @property
     def standard_uncertainty(self) -> Values:
         """Standard uncertainty of each parameter from this source: (p,) array."""
-        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+        return standard_uncertainty(self.covariance)
 
     def of(self, selected: slice) -> Contribution:
         """Return the contribution to the selected parameters."""

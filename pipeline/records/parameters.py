@@ -58,6 +58,11 @@ def coverage_factor(degrees_of_freedom: ArrayLike, probability: float = 0.95) ->
     return factors
 
 
+def standard_uncertainty(covariance: Values) -> Values:
+    """Return the standard uncertainties of a (p, p) covariance: (p,) array; rounding below 0 counts as 0."""
+    return np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+
+
 @dataclass(frozen=True)
 class Parameters:
     """p parameters of a sensor, or some of them."""
@@ -74,7 +79,7 @@ class Parameters:
     @property
     def standard_uncertainty(self) -> Values:
         """Standard uncertainty of each parameter: (p,) array."""
-        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+        return standard_uncertainty(self.covariance)
 
     @property
     def coverage_factor(self) -> Values:

@@ -22,7 +22,17 @@ import numpy as np
 
 from pipeline.estimation.candidates import is_held
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, limited_effects, without_rotation
-from pipeline.records import AFTER_BASE, AXES, BASE_NAMES, BIAS, BIAS_NAMES, MATRIX, MATRIX_NAMES, SENSORS
+from pipeline.records import (
+    AFTER_BASE,
+    AXES,
+    BASE_NAMES,
+    BIAS,
+    BIAS_NAMES,
+    MATRIX,
+    MATRIX_NAMES,
+    SENSORS,
+    standard_uncertainty,
+)
 from pipeline.report.held_out_section import first_and_last_step, passes
 from pipeline.report.numbers import plain
 from pipeline.verdicts import Verdict
@@ -124,7 +134,7 @@ def _elements(part: JSON, matrix: np.ndarray, J: np.ndarray) -> Callable[[str, i
     covariance = (part.get("covariance") or {}).get("values")
     u: np.ndarray | None = None
     if covariance is not None and k[0][0] is not None:
-        u = np.sqrt(np.clip(np.diag(J @ np.array(covariance, float)[MATRIX, MATRIX] @ J.T), 0.0, None)).reshape(3, 3)
+        u = standard_uncertainty(J @ np.array(covariance, float)[MATRIX, MATRIX] @ J.T).reshape(3, 3)
 
     def element(name: str, i: int, j: int) -> Parameter:
         U = None if u is None else float(k[i][j] * u[i, j])

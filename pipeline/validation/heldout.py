@@ -35,7 +35,7 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation import reference_least_squares
-from pipeline.estimation.accelerometer.nonlinear_least_squares import MATRIX_NAMES
+from pipeline.estimation.accelerometer.nonlinear_least_squares import PARAMETER_NAMES
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.rest_means import count_of_rests
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
@@ -308,7 +308,7 @@ def _why_not_held_out(case: HeldOutCase) -> str:
 def _fitted_exactly(calibration: SensorCalibration) -> int:
     """Return the number of rests by hand if the fit has a parameter for each, and so no residual; 0 otherwise."""
     for details in (stage.details for stage in calibration.stages if stage.details.get("rests_used")):
-        if details["orientations_used"] + len(details[KNOWN_BY_LIMIT]) <= len(MATRIX_NAMES):
+        if details["orientations_used"] + len(details[KNOWN_BY_LIMIT]) <= len(PARAMETER_NAMES):
             return int(details["orientations_used"])
     return 0
 

@@ -82,7 +82,7 @@ TRIANGLE = slice(BIAS.stop, None)  # of the nine values: the elements of L; the 
 PLACE = np.arange(BASE_COUNT)[[*range(BIAS.stop), *(MATRIX.start + np.ravel_multi_index((ROWS, COLUMNS), (3, 3)))]]
 PLACED = np.eye(BASE_COUNT)[:, PLACE]
 ELEMENTS = [(AXES[i], AXES[j]) for i, j in zip(ROWS, COLUMNS, strict=True)]
-MATRIX_NAMES = np.array(
+PARAMETER_NAMES = np.array(
     [*BIAS_NAMES] + [f"scale_factor_{i}" if i == j else f"misalignment_{i}{j}" for i, j in ELEMENTS]
 )
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
@@ -128,7 +128,7 @@ class _Solved:
     @property
     def spare(self) -> int:
         """Rows and pseudo-observations minus parameters."""
-        return len(self.residual) - len(MATRIX_NAMES)
+        return len(self.residual) - len(PARAMETER_NAMES)
 
     @property
     def uncertainty(self) -> Values:
@@ -220,7 +220,7 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: WanderPrior, li
     try:
         solved = _fitted(rows, gravity_g, prior, MISALIGNMENT, limit)
         # A variance of more than half that of the limit is mostly the limit's.
-        by_limit = MISALIGNMENT & ((solved.uncertainty > limit * np.sqrt(0.5)) | (count < len(MATRIX_NAMES)))
+        by_limit = MISALIGNMENT & ((solved.uncertainty > limit * np.sqrt(0.5)) | (count < len(PARAMETER_NAMES)))
         if not np.array_equal(by_limit, MISALIGNMENT):
             solved = _fitted(rows, gravity_g, prior, by_limit, limit)
     except NotObservableError as lack:
@@ -232,7 +232,7 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: WanderPrior, li
     weak = (u > MAX_KNOWN_UNCERTAINTY) & ~MISALIGNMENT
     if weak.any():
         raise NotObservableError(
-            f"the {count} orientations are nearly degenerate: they leave {', '.join(MATRIX_NAMES[weak])} open to "
+            f"the {count} orientations are nearly degenerate: they leave {', '.join(PARAMETER_NAMES[weak])} open to "
             f"{float(u[weak].max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled "
             f"columns; {_unused(rows)}). Record rests with each axis up, down and level, spread evenly, not all in one "
             "plane or direction"
@@ -250,18 +250,18 @@ def _unused(rows: Orientations) -> str:
 def _fitted(rows: Orientations, gravity_g: float, prior: WanderPrior, by_limit: Mask, limit: float) -> _Solved:
     """Fit the nine values; raise ``NotObservableError`` if orientations and limits do not determine them."""
     noise = Noise(rows.white, np.zeros(3), prior.time, "rests")
-    limits = dict.fromkeys(MATRIX_NAMES[by_limit].tolist(), limit)
+    limits = dict.fromkeys(PARAMETER_NAMES[by_limit].tolist(), limit)
     model = AccelerometerModel(rows.rests, PLACED, gravity_g, noise, known_by_limit=limits, wander=rows.by_hand)
     values = _start(rows.rests.reading, gravity_g, tilted=not by_limit.any())
     state = State(values[BIAS], triangle(values))
     equations = model.equations(state)
-    ScaledColumns.of(equations.base).require_full_rank(MATRIX_NAMES.tolist())
+    ScaledColumns.of(equations.base).require_full_rank(PARAMETER_NAMES.tolist())
     known = WanderPrior(0.0, prior.time) if not rows.by_hand else prior
     noises = prior_hypotheses(known, float(np.mean(model.white)), model.kinds)
     if known.wander == 0.0:  # on a table the wander follows from all readings
         noises = [noise for noise in noises if noise.bias.ratio == 0.0]
     if (
-        len(equations.residual) - len(MATRIX_NAMES) <= 1
+        len(equations.residual) - len(PARAMETER_NAMES) <= 1
     ):  # too few rows to show a scatter: the prior of the wander replaces it
         white = float(np.median(equations.error[: model.rests_equations]))
         noises = [NoiseHypothesis(WHITE_SETTING, (prior.wander / white,))]
@@ -375,7 +375,7 @@ def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]
             L[k] /= S[k]
             of_L[k, k], of_L[k, ELEMENTS.index((j, j))] = 1.0 / S[k], -L[k] / S[k]
     units = [*base_units("accelerometer")[BIAS]] + ["1" if i == j else "rad" for i, j in ELEMENTS]
-    named = zip(MATRIX_NAMES.tolist(), zip(values.tolist(), units, strict=True), strict=True)
+    named = zip(PARAMETER_NAMES.tolist(), zip(values.tolist(), units, strict=True), strict=True)
     return stage_parameters(dict(named), J @ covariance[np.ix_(PLACE, PLACE)] @ J.T)
 
 

@@ -12,7 +12,7 @@ acts on the sensor at the sample's time stamp (``Effect.moved``).
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -198,6 +198,13 @@ def _watched(seen: set[str]) -> Motion:
 def truth(sensor: str, motion: Motion) -> Values:
     """Return what an ideal sensor would read: (n, 3) array, specific force in g or angular rate in deg/s."""
     return motion.specific_force if sensor == "accelerometer" else motion.angular_rate
+
+
+def with_truth(motion: Motion, sensor: str, values: Values) -> Motion:
+    """Return a motion with other (n, 3) values of ``truth``."""
+    if sensor == "accelerometer":
+        return replace(motion, specific_force=values)
+    return replace(motion, angular_rate=values)
 
 
 def truth_rate(sensor: str, motion: Motion) -> Values:
