@@ -2,5 +2,5 @@
 
 The campaign ``data/thesis`` simulates every device, table and procedure of the thesis and calibrates each by every
 method; this package compares the printed figures with the results, and tests the conclusions over many seeds. See
-docs/thesis.md.
+docs/evidence.md.
 """
