@@ -420,7 +420,7 @@ def _recipe(reading: Reading, parts: int) -> str:
     if entry.windows:
         return (
             "The procedure cuts this recording into windows, and its time falls back within it. Write a file for each "
-            "window, or one file whose time never falls back (docs/by_hand.md, Parts)."
+            "window, or one file whose time never falls back (docs/record.md, Parts)."
         )
     here = {k: v for k, v in entry.json_value.items() if v is not None or k == "axis"}
     lines = [f"procedure.recordings.{name}.session=1"]

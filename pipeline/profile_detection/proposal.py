@@ -222,7 +222,7 @@ def _labels(log: Log) -> list[str]:
             named = ", ".join(labels[:MOST_LABELS]) + " .." * (len(labels) > MOST_LABELS)
             found.append(
                 f"column {log.names[index]} labels {len(labels)} parts ({named}), which may not follow each other in "
-                "time: give each rest and turn as a window or a separate file, see docs/by_hand.md#parts"
+                "time: give each rest and turn as a window or a separate file, see docs/record.md#parts"
             )
     return found
 

@@ -110,7 +110,7 @@ def test_sessions_one_after_the_other_are_noticed(reference: Path) -> None:
     text = as_yaml(proposal, "annotated")
     assert "# not used: part (not all of it is numbers)" in text
     assert "column part labels 9 parts (x_a, x_p, x_rot, y_a ..)" in text
-    assert "docs/by_hand.md#parts" in text
+    assert "docs/record.md#parts" in text
     assert not any(
         "labels" in r for r in proposed(reference / "ferraris_wearable" / "example_ferraris_session.csv").remarks
     )
