@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.correction import Multiply, Step, Subtract
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
@@ -43,7 +43,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     """Fit bias and matrix of the gyroscope (``pipeline.estimation.stages``).
 
     Role ``rests``, with the readings of the accelerometer, which is calibrated first. Raises ``CannotCalibrateError``
-    also where there are too few moves: the unit then keeps the calibration of its accelerometer.
+    also where moves and turns do not determine the matrix: the unit then keeps the calibration of its accelerometer.
     """
     filtered, procedure = recordings.filtered, settings.procedure
     if not is_multi_position("gyroscope", filtered):
@@ -67,7 +67,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     base = model.equations(start).base
     if ScaledColumns.of(base, MIN_NEW_NORM_SHARE).rank < base.shape[1]:
-        raise NotObservableError(
+        raise CannotCalibrateError(
             f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {advice}"
         )
     prior = wander_prior(noise, settings.sensor.gyroscope)
@@ -83,7 +83,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(fitted.covariance))[MATRIX]
     if np.any(u > MAX_KNOWN_ELEMENT_UNCERTAINTY):
         weak = [name for name, one in zip(MATRIX_NAMES, u, strict=True) if one > MAX_KNOWN_ELEMENT_UNCERTAINTY]
-        raise NotObservableError(
+        raise CannotCalibrateError(
             f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u.max()):.2g} "
             f"(standard uncertainty), as if all were about one axis: {advice}"
         )

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import NotObservableError
+from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.multi_position.model import EquationBlock, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
@@ -240,7 +240,7 @@ def turns_of(
 def require_turns(
     found: TurnsByHand | None, moves: Sequence[tuple[Recording, float, Values]], turns: HandTurns
 ) -> None:
-    """Raise ``NotObservableError`` if an axis has no stated turn, or a recording of a turn has another turn."""
+    """Raise ``CannotCalibrateError`` if an axis has no stated turn, or a recording of a turn has another turn."""
     expected = f"a multiple of {turns.angle_deg:g} deg, within a tenth of it and a quarter of that angle"
     advice = (
         "turn the unit from rest to rest about each body axis, and state the angle in procedure.turns.angle_deg; an "
@@ -254,7 +254,7 @@ def require_turns(
     for part in {id(r): r for r, _, _ in moves if r.axis is not None}.values():
         if (part.name, str(part.axis)) not in pairs:
             seen = ", ".join(in_words(angle) for r, _, angle in moves if r is part)
-            raise NotObservableError(
+            raise CannotCalibrateError(
                 f"recording {part.name} is no turn about {part.axis} by {expected}: the readings show {seen}; {advice}",
                 part.source.get("file"),
             )
@@ -263,6 +263,6 @@ def require_turns(
             about = [m for m in moves if np.linalg.norm(np.delete(m[2], axis)) < MAX_AXIS_SINE * abs(m[2][axis])]
             largest = max(about, key=lambda m: abs(m[2][axis]), default=None)
             seen = f"{in_words(largest[2])} at {largest[1]:.1f} s of {largest[0].name}" if largest else "none"
-            raise NotObservableError(
+            raise CannotCalibrateError(
                 f"there is no turn about {name} by {expected}; the largest about {name} is {seen}: {advice}"
             )
