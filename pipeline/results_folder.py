@@ -21,6 +21,7 @@ Edited files
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import filecmp
 import hashlib
@@ -62,7 +63,7 @@ REPLACED = "replaced-"  # and the date: folder of the results for what a run rep
 SUGGESTED_SUFFIX = "_unknown.yaml"  # end of the name of a suggested formula: <unit>_<sensor>_unknown.yaml
 DELAYED_SIGNALS = {signal.SIGINT, signal.SIGTERM}  # blocked during the exchange, which takes milliseconds
 SNAKEMAKE_TIMESTAMP = ".snakemake_timestamp"  # Snakemake writes it into every output folder
-OPEN_LOCKS: list[IO[str]] = []  # locks, open until the process ends
+OPEN_LOCKS: list[IO[str]] = []  # locks of this process
 
 
 class BusyError(PipelineError):
@@ -96,6 +97,13 @@ def hold_as_job(results: Path) -> None:
         stream = _open(results / JOBS_LOCK)
         _locked(stream, fcntl.LOCK_SH)
         OPEN_LOCKS.append(stream)
+
+
+@atexit.register
+def release_locks() -> None:
+    """Release the locks of this process."""
+    while OPEN_LOCKS:
+        OPEN_LOCKS.pop().close()
 
 
 def _open(path: Path) -> IO[str]:

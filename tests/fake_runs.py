@@ -22,7 +22,6 @@ from pipeline.config.owner import check_owner, claim, complete_record
 from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch
 from pipeline.results_folder import (
     NEW_FOLDER,
-    OPEN_LOCKS,
     PUBLISHED,
     _digest,
     _record,
@@ -180,9 +179,3 @@ def as_of_version_1(results: Path) -> None:
                  for name in PUBLISHED} if "written" in found else {}  # fmt: skip
         files = found.get("files") or {name: _digest(states) for name, states in below.items()}
         record.write_text(json.dumps({"again": found["again"], "files": files}))
-
-
-def release() -> None:
-    """Release the locks, as the end of a process does."""
-    while OPEN_LOCKS:
-        OPEN_LOCKS.pop().close()

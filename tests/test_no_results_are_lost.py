@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from fake_runs import as_of_version_1, campaign_of, release, run, sha256, units_of, write_campaign
+from fake_runs import as_of_version_1, campaign_of, run, sha256, units_of, write_campaign
 
 from pipeline import files, results_folder
 from pipeline.commands import unpack
 from pipeline.config.owner import OtherCampaignError, check_owner
 from pipeline.errors import MissingInputError
 from pipeline.pack import PACKS, Pack
-from pipeline.results_folder import BusyError, finish_publishing, read_owner, take_run, unit_of
+from pipeline.results_folder import BusyError, finish_publishing, read_owner, release_locks, take_run, unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -60,7 +60,7 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(results_folder, "flush_file_system", lambda _: None)
     monkeypatch.setattr(files, "flush_file_system", lambda _: None)
     yield
-    release()
+    release_locks()
 
 
 class World:
@@ -123,7 +123,7 @@ class World:
             except KilledError:
                 return True
             finally:
-                release()
+                release_locks()
         return False
 
     # What may happen, each with its check.
@@ -220,7 +220,7 @@ class World:
         with pytest.raises(BusyError):
             take_run(self.results)
         assert self.tree() == before
-        release()
+        release_locks()
 
     def change_sheet(self) -> None:
         campaign = self.random.choice(self.campaigns())

@@ -3,6 +3,8 @@
 import csv
 import io
 import os
+import subprocess
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -10,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import results_folder, run_progress
-from pipeline.results_folder import BusyError, hold_as_job, jobs_running, take_run
+from pipeline import run_progress
+from pipeline.results_folder import BusyError, hold_as_job, jobs_running, release_locks, take_run
 from pipeline.run_progress import Progress, _cause, duration
 
 
@@ -77,20 +79,24 @@ def test_the_cause_of_a_broken_job_is_the_end_of_its_log(tmp_path: Path, log: st
     assert _cause(tmp_path / "log") == cause
 
 
-def test_results_are_held_by_one_run_and_jobs_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(results_folder, "OPEN_LOCKS", [])
+def test_results_are_held_by_one_run_and_jobs_are_seen(tmp_path: Path) -> None:
     take_run(tmp_path)
     with pytest.raises(BusyError, match=r"another run works on these results \(process [0-9]+ on"):
         take_run(tmp_path)
     assert not jobs_running(tmp_path)
     hold_as_job(tmp_path)
     assert jobs_running(tmp_path)
-    for stream in results_folder.OPEN_LOCKS:
-        stream.close()
+    release_locks()
     assert not jobs_running(tmp_path)
-    results_folder.OPEN_LOCKS.clear()
     take_run(tmp_path)
-    results_folder.OPEN_LOCKS[0].close()
+    release_locks()
+
+
+def test_a_process_closes_its_locks_at_its_end(tmp_path: Path) -> None:
+    holding = "import sys, pathlib, pipeline.results_folder as r; r.hold_as_job(pathlib.Path(sys.argv[1]))"
+    command = [sys.executable, "-W", "always", "-c", holding, str(tmp_path)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
+    assert not done.stderr
 
 
 def test_a_command_tells_the_time_left_on_a_terminal_and_each_half_minute_elsewhere(

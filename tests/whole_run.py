@@ -8,7 +8,7 @@ from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.owner import check_owner, claim, complete_record
 from pipeline.io.digests import digests_of_files
 from pipeline.model.effects import forget
-from pipeline.results_folder import OPEN_LOCKS, read_owner
+from pipeline.results_folder import read_owner, release_locks
 from pipeline.stages import batch
 
 if TYPE_CHECKING:
@@ -55,8 +55,7 @@ def run_jobs(campaign: Campaign, stages: Collection[str] = tuple(batch.INPUTS)) 
             assert batch.main(stage, [*config, *given, *options, "--output", str(target)]) == 0
         finally:
             forget()  # a job is a process of its own
-            while OPEN_LOCKS:
-                OPEN_LOCKS.pop().close()
+            release_locks()
     if "gather" not in stages:
         return 0
     mark, failures = campaign.results / "complete.json", batches / "gathered.json"

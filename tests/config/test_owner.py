@@ -7,14 +7,14 @@ import shutil
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from fake_runs import as_of_version_1, campaign_of, release, run, sha256, units_of, write_campaign
+from fake_runs import as_of_version_1, campaign_of, run, sha256, units_of, write_campaign
 
 from pipeline.commands import add, explain, simulate, unpack
 from pipeline.commands import run as run_command
 from pipeline.config import load_campaign, owner
 from pipeline.config.owner import OtherCampaignError, check_owner, claim
 from pipeline.errors import ConfigurationError
-from pipeline.results_folder import read_owner
+from pipeline.results_folder import read_owner, release_locks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,7 +36,7 @@ def bench(tmp_path: Path, template: Path) -> Iterator[Bench]:
     write_campaign(tmp_path / "a" / "bench", {"U1": "one", "U2": "two"})
     made.run("a")
     yield made
-    release()
+    release_locks()
 
 
 class Bench:
@@ -54,7 +54,7 @@ class Bench:
         try:
             run(self.campaign(place, take_over=take_over), {}, packed=packed)
         finally:
-            release()
+            release_locks()
 
     def copy(self, place: str, to: str, **others: str) -> None:
         shutil.copytree(self.directory / place / "bench", self.directory / to / "bench")

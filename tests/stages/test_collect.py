@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.pack import Pack
-from pipeline.results_folder import OPEN_LOCKS
+from pipeline.results_folder import release_locks
 from pipeline.stages import batch
 
 DEMO = Path(__file__).parents[2] / "data" / "demo"
@@ -37,8 +37,7 @@ def members(campaign: Path, *, collected: bool) -> dict[str, bytes]:
             campaign.rename(campaign.with_name("away"))
         batch.main("ingest", ["--config", str(config), "--output", str(packs["ingest"]), *options])
     finally:
-        while OPEN_LOCKS:
-            OPEN_LOCKS.pop().close()
+        release_locks()
     made = Pack(packs["ingest"])
     if collected:
         stored = Pack(packs["collect"]).names()

@@ -28,7 +28,7 @@ from pipeline.files import json_text
 from pipeline.one_unit import try_unit, unit_of_campaign
 from pipeline.outcome import outcome
 from pipeline.pack import Batch, Pack
-from pipeline.results_folder import OPEN_LOCKS
+from pipeline.results_folder import release_locks
 from pipeline.settings import Settings
 from pipeline.stages import batch, diagnose, gather, report
 from pipeline.stages.unit_files import StoredUnit
@@ -319,7 +319,7 @@ def test_units_beyond_the_limit_are_published_on_request_with_the_same_bytes(
     check_commands(apart, results, tmp_path, capsys)
     for unit in packed.units:
         unpack.main([str(apart), unit])
-        OPEN_LOCKS.pop().close()
+        release_locks()
         assert f"reports/{unit}.html" in capsys.readouterr().out
     unpacked = contents(apart)
     assert {f"reports/{unit}.html" for unit in packed.units} < links(apart / "index.html")
@@ -377,5 +377,4 @@ def run_gather(campaign: Campaign) -> None:
     try:
         batch.main("gather", ["--config", str(part), "--output", str(campaign.results / "batches" / "gathered.json")])
     finally:
-        while OPEN_LOCKS:
-            OPEN_LOCKS.pop().close()  # a job is a process of its own
+        release_locks()  # a job is a process of its own

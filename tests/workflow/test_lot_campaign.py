@@ -12,7 +12,7 @@ from whole_run import run_campaign
 import pipeline
 from pipeline.commands import simulate, unpack
 from pipeline.config import load_campaign, settings_of_jobs
-from pipeline.results_folder import OPEN_LOCKS
+from pipeline.results_folder import release_locks
 from pipeline.stages import batch
 
 pytestmark = pytest.mark.workflow
@@ -74,8 +74,7 @@ def _packed_the_same(directory: Path, published: dict[str, bytes]) -> None:
     try:
         assert batch.main("gather", ["--config", config, "--output", str(batches / "gathered.json")]) == 0
     finally:
-        while OPEN_LOCKS:
-            OPEN_LOCKS.pop().close()
+        release_locks()
     assert not (campaign.results / "combined" / "A001.json").exists()
     assert unpack.main([str(campaign.results), "A001"]) == 0
     assert {path: (campaign.results / path).read_bytes() for path in published} == published
