@@ -37,12 +37,12 @@ BEFORE = {  # what a reader would have at that command
     "python -m pipeline simulate my_fleet --units 3",
     "snakemake --cores 2 --config campaign=my_bench": U1.format("my_bench"),
     "apply.md": "cp data/demo/raw/mpu6050-1/static.csv drive.csv; "
-    "cp data/demo/raw/mpu6050-1-mcap/validation.mcap drive.mcap",
-    "effects_of_your_own.md": "cp log.csv LOG.csv; python -m pipeline new data/bench --sensor mpu6050; "
-    + U1.format("data/bench"),
-    "exports.md": "cd results/demo/exports/mpu6050-1; cp kalibr.yaml ../../../../my_kalibr.yaml; "
+    "cp data/demo/raw/mpu6050-1-mcap/validation.mcap drive.mcap; "
+    "cd results/demo/exports/mpu6050-1; cp kalibr.yaml ../../../../my_kalibr.yaml; "
     "cp imu_tk_acc.calib ../../../../rig_acc.calib; cp imu_tk_gyro.calib ../../../../rig_gyro.calib; "
     "cp inav.txt ../../../..",
+    "effects_of_your_own.md": "cp log.csv LOG.csv; python -m pipeline new data/bench --sensor mpu6050; "
+    + U1.format("data/bench"),
     "fleet.md": "printf 'unit,sensor\\nU0123,mpu6050\\n' > my_fleet/units.csv",
     "record.md": "rm -rf my_bench",
     "your_bench.md": "sed '1s/time_s/Time (s)/; 1s/accel_\\(.\\)_g/A\\1 (g)/g; 1s/gyro_\\(.\\)_dps/G\\1 (deg\\/s)/g' "
@@ -67,7 +67,6 @@ NOT_RUN = {  # by the start of the command, and why
     "python -m pipeline guide": "waits for a growing log; tests/commands run it",
     "python -m pipeline thesis seeds": "some minutes; tests/thesis makes some of its rows",
     "python -m pytest": "the tests themselves",
-    "python -m pipeline apply --calibration U1.json drive/": "needs a log in two files; test_apply.py has one",
     "python benchmarks/peers.py": "needs other programs, which it compiles",
 }
 NOT_RUN_IN = {

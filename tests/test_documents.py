@@ -5,6 +5,7 @@ import runpy
 from pathlib import Path
 
 import pytest
+from document_tables import with_tables
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [
@@ -48,6 +49,12 @@ def test_every_document_is_in_the_index() -> None:
     assert not [
         file.name for file in (ROOT / "docs").glob("*.md") if file.name != "README.md" and f"({file.name}" not in index
     ]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: file.name)
+def test_generated_tables_are_those_of_the_code(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    assert text == with_tables(text), "run python tests/document_tables.py"
 
 
 def test_the_readme_is_short() -> None:

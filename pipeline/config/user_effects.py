@@ -147,7 +147,7 @@ def with_given(settings: Settings, campaign: Path) -> Settings:
 
     method, effects = settings.method, {sensor: settings.effects.of(sensor) for sensor in SENSORS}
     if not method.file:
-        raise Problem("method=given: method.file is not set; name the calibration, in any format of docs/exports.md")
+        raise Problem("method=given: method.file is not set; name the calibration, in any format of docs/apply.md")
     if stated := [f"table.{key}" for key in OF_BENCH if getattr(settings.table, key)]:
         raise Problem(f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null")
     file = campaign / method.file.replace("{unit}", settings.unit)

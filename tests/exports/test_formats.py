@@ -29,8 +29,7 @@ FILES = {
     *("imucal.json", "inav.txt", "kalibr.yaml", "kalibr_imu.yaml", "kalibr_imu_chain.yaml", "paparazzi_imu.xml"),
     *("px4.params", "realsense_calibration.json"),
 }
-DOCUMENT = (Path(__file__).parents[2] / "docs" / "exports.md").read_text()
-EXAMPLE = DOCUMENT[DOCUMENT.index("consumer: my flight controller") :].partition("\n```\n")[0]
+EXAMPLE = (Path(__file__).parent / "my_flight_controller.j2").read_text()
 ACCELEROMETER = np.array([[0.994, 0.004, -0.002], [0.021, 1.007, 0.003], [-0.005, 0.012, 0.951]])
 GYROSCOPE = np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0.005, 0.998]])
 
@@ -70,7 +69,7 @@ def samples(n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rng.uniform(-1.5, 1.5, (n, 3)), rng.uniform(-200, 200, (n, 3)), rng.uniform(10, 50, n)
 
 
-def test_the_template_of_the_documentation_adds_a_format_whose_file_is_named_by_the_unit(
+def test_the_example_of_a_template_adds_a_format_whose_file_is_named_by_the_unit(
     tmp_path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run writes the file; convert takes the format from the name of OUT, writes OUT, and reads it by its keys."""

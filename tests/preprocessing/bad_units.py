@@ -277,3 +277,14 @@ def cases() -> dict[str, Case]:
             at("", of("gyroscope", same_axes)), "copied_axis", "gyro_y is a copy of gyro_x in 100%", "accel_x.csv"
         ),
     }
+
+
+INPUTS = {  # what each number is; docs/bad_inputs.md lists what happens
+    "49": "table, gyroscope and gravity disagree in scale: another unit; by little",
+    "50": "times in ms or us declared as s",
+    "51": "a table's channel contradicts the others in some rows; by little",
+    "52": "a table's channel is late or early",
+    "53": "the static recording moves: in a part; for most of it",
+    "54": "two recordings share samples",
+    "55": "an axis is constant in turns; a copy of another axis",
+}
