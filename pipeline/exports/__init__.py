@@ -125,7 +125,7 @@ def formats() -> dict[str, tuple[Format, Template]]:
         try:
             declared = Format(**{"file": template.stem, **check(yaml.safe_load(header))})
         except WrongValueError as wrong:
-            raise ConfigurationError(f"{template}: {wrong}. tests/exports/my_flight_controller.j2 is an example") from None
+            raise ConfigurationError(f"{template}: {wrong}. CONTRIBUTING.md names an example") from None
         same = [name for name, (other, _) in formats_by_name.items() if other.file == declared.file]
         if same:
             raise ConfigurationError(
