@@ -33,8 +33,6 @@ from pipeline.estimation.uncertainty_budget import (
     with_uncertainty,
 )
 from pipeline.model.kinematics import EARTH_RATE_DPS
-from pipeline.preprocessing.evidence import EXPANDED
-from pipeline.preprocessing.reference_scale import SIGNIFICANT_UNCERTAINTIES, rate_against_angle
 from pipeline.records import (
     BIAS,
     MATRIX,
@@ -65,10 +63,13 @@ IN_LOCAL_GRAVITY = (
 )
 
 
-def with_stated(calibration: SensorCalibration, recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
+def with_stated(
+    calibration: SensorCalibration, recordings: UnitRecordings, settings: Settings, rate_error: float = 0.0
+) -> SensorCalibration:
     """Add temperature, repeatability and a counted time to a calibration's budget, as far as they are known.
 
-    ``recordings``: of the fit; their temperature and notes are used.
+    ``recordings``: of the fit; their temperature and notes are used. ``rate_error``: e of the table's log, relative
+    (``pipeline.preprocessing.reference_scale.rate_error``).
     """
     filtered, noise = recordings.filtered, recordings.noises[calibration.sensor]
     before, budget = calibration.covariance, calibration.budget
@@ -85,7 +86,7 @@ def with_stated(calibration: SensorCalibration, recordings: UnitRecordings, sett
             lines += warm
     missing |= _rounding(noise, calibration.sensor)
     lines += _counted_time(calibration, filtered, limits.get("clock_rate"))
-    lines += _rate_off_angle(calibration, filtered, settings.table)
+    lines += _rate_off_angle(calibration, rate_error)
     lines += _of_bursts(calibration, filtered)
     known = {line.source.partition(" (")[0] for line in lines} | set(missing)
     up_to: dict[str, dict[str, float]] = {}
@@ -138,22 +139,12 @@ def _of_bursts(calibration: SensorCalibration, recordings: Sequence[Recording]) 
     return [replace(clock_contribution(calibration, ppm, NORMAL, remark), source=BURSTS)]
 
 
-def _rate_off_angle(
-    calibration: SensorCalibration, recordings: Sequence[Recording], table: Table
-) -> list[Contribution]:
+def _rate_off_angle(calibration: SensorCalibration, rate_error: float) -> list[Contribution]:
     """Return the line of a table whose rate is not the change of its angle, beyond the rate's stated accuracy."""
-    if calibration.sensor != "gyroscope":
+    if calibration.sensor != "gyroscope" or not rate_error:
         return []
-    turns = [r for r in recordings if r.role == "gyroscope" and r.table_angle is not None]
-    found = filter(None, map(rate_against_angle, turns))
-    off = max(
-        (abs(ratio - 1.0) for ratio, spread, _ in found if abs(ratio - 1.0) > SIGNIFICANT_UNCERTAINTIES * spread),
-        default=0.0,
-    )
-    if off <= EXPANDED * table.rate_accuracy:
-        return []
-    remark = f"the table's rate and the change of its angle differ by up to {1e6 * off:.3g} ppm"
-    return [clock_contribution(calibration, 1e6 * off / np.sqrt(3.0), RECTANGULAR, remark)]
+    remark = f"the table's rate and the change of its angle differ by up to {1e6 * rate_error:.3g} ppm"
+    return [clock_contribution(calibration, 1e6 * rate_error / np.sqrt(3.0), RECTANGULAR, remark)]
 
 
 def _clock_unstated(entry: NotIncluded) -> bool:

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.preprocessing.evidence import (
+    EXPANDED,
     axis_index,
     gaps,
     gravity_turned,
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from pipeline.errors import IngestError
     from pipeline.preprocessing.evidence import ChannelLimits
     from pipeline.records import Mask, Recording, Values
+    from pipeline.settings import Table
 
     Units = Sequence[tuple[float, str]]
 
@@ -287,6 +289,17 @@ def rate_against_angle(recording: Recording) -> tuple[float, float, int] | None:
     found = rate[1:][even] * dt[even] / np.diff(recording.table_angle)[even]
     ratio = float(np.median(found))
     return ratio, MEDIAN_SIZE * float(np.median(np.abs(found - ratio))) / np.sqrt(samples), samples
+
+
+def rate_error(recordings: Sequence[Recording], table: Table) -> float:
+    """Return the largest relative difference of rate and change of the angle in the gyroscope's turns.
+
+    0 where it is insignificant, or within the rate's stated accuracy.
+    """
+    turns = [r for r in recordings if r.role == "gyroscope" and r.table_angle is not None]
+    found = [(abs(ratio - 1.0), spread) for ratio, spread, _ in filter(None, map(rate_against_angle, turns))]
+    error = max((off for off, spread in found if off > SIGNIFICANT_UNCERTAINTIES * spread), default=0.0)
+    return error if error > EXPANDED * table.rate_accuracy else 0.0
 
 
 def _against_phase(recording: Recording, steps: Values, even: Mask) -> tuple[float, float] | None:

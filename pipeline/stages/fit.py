@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.stages import GIVEN, fit_stage
 from pipeline.estimation.stated_lines import with_stated
+from pipeline.preprocessing.reference_scale import rate_error
 from pipeline.records import NotCalibrated
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ def fit(
         return previous
     try:
         found = fit_stage(sensor, stage, recordings, previous, settings)
-        # only after the last stage, or it would be counted twice; a given calibration states its own uncertainty
-        return with_stated(found, recordings, settings) if last and stage != GIVEN else found
+        if not last or stage == GIVEN:  # it would be counted twice; a given calibration states its own uncertainty
+            return found
+        return with_stated(found, recordings, settings, rate_error(recordings.filtered, settings.table))
     except CannotCalibrateError as reason:
         return NotCalibrated(reason.message)

@@ -17,6 +17,7 @@ from pipeline.estimation.stated_lines import with_stated
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.io.arrow import to_parquet
 from pipeline.model.calibration_file import beyond_uncertainty
+from pipeline.preprocessing.reference_scale import rate_error
 from pipeline.records import FittedEffect, Noise, Note, UnitRecordings
 from pipeline.settings import Settings
 from pipeline.stages import batch
@@ -199,13 +200,16 @@ def test_a_rate_that_is_not_the_change_of_its_angle_is_in_the_uncertainty() -> N
     turns = [replace(r, table_rate=(1.0 + off) * r.table_rate) for r in turns]
     config = settings(rate_accuracy=5e-6)
     fit = reference_least_squares.fit("gyroscope", with_noise(turns, config), None, config)
-    truth, found = np.linalg.inv(K), with_stated(fit, with_noise(turns, config), config).to_json()
+    truth, different = np.linalg.inv(K), rate_error(turns, config.table)
+    assert different == pytest.approx(off, rel=0.01)
+    found = with_stated(fit, with_noise(turns, config), config, different).to_json()
     error = np.abs(np.diag(np.array(found["matrix"]) - truth))
     assert error == pytest.approx(off * np.diag(truth), rel=0.2)  # the rate was wrong; angle and time were right
     assert np.all(error > np.diag(fit.to_json()["expanded_uncertainty"]["matrix"]))
     assert np.all(error < np.diag(found["expanded_uncertainty"]["matrix"]))
-    precise = with_stated(fit, with_noise(turns, config), settings_of(config, **{"table.rate_accuracy": 1e-4}))
-    assert np.array_equal(precise.covariance, fit.covariance)  # the stated accuracy explains the difference
+    precise = settings_of(config, **{"table.rate_accuracy": 1e-4})
+    assert rate_error(turns, precise.table) == 0.0  # the stated accuracy explains the difference
+    assert np.array_equal(with_stated(fit, with_noise(turns, precise), precise).covariance, fit.covariance)
 
 
 @pytest.mark.parametrize(
