@@ -53,7 +53,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import WanderPrior
     from pipeline.settings import Settings, Table
 
-# share of a variance, up to which a part of it may be chance (docs/fleet.md, The lot as prior)
+# share of a variance, up to which a part of it may be chance: the lack of fit was 0 to 5 % on a table within its stated
+# accuracies, 18 to 73 % with 0.02 deg between its axes (12 simulated units each, 18 positions)
 CHANCE_VARIANCE_SHARE = 0.1
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
