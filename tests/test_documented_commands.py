@@ -35,7 +35,7 @@ U1 = "cp data/demo/raw/mpu6050-1/*.csv {0}/raw/U1/"
 BEFORE = {  # what a reader would have at that command
     "README.md": "cp data/demo/raw/mpu6050-1/validation.csv log.csv; snakemake --cores 2; "
     "python -m pipeline simulate my_fleet --units 3",
-    "snakemake --cores 2 --config campaign=my_bench": U1.format("my_bench"),
+    "python -m pipeline check --campaign my_bench": U1.format("my_bench"),
     "apply.md": "cp data/demo/raw/mpu6050-1/static.csv drive.csv; "
     "cp data/demo/raw/mpu6050-1-mcap/validation.mcap drive.mcap; "
     "cd results/demo/exports/mpu6050-1; cp kalibr.yaml ../../../../my_kalibr.yaml; "
