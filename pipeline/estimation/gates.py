@@ -6,7 +6,7 @@ where p is the p-value of the likelihood ratio, m the number of candidates (Bonf
 the effects that are already selected, whose equations are of first order. A slow effect depends on time and temperature
 alone: wander of the bias that the noise model does not describe has a similar signal.
 
-False selections (counts by gate: docs/blind_study.md): of 607 units by hand with nothing hidden, 9 gain more than 10 by
+False selections (docs/blind_study.md): of 607 units by hand with nothing hidden, 9 gain more than 10 by
 a slow effect (1.5 %, 95 % interval 0.7 to 2.8 %) and 1 more than 16 (0.16 %, 0.004 to 0.91 %), all with five times the
 stated wander or a random walk; no other effect gains more than 4 (0 to 0.61 %). Of 204 units on a table none gains more
 than 10 (0 to 1.8 %).
