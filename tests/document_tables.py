@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import sys
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,7 +98,15 @@ def held(declared: Format) -> str:
     return ", ".join([*words, *(["noise"] if declared.noise else [])])
 
 
-TABLES = {"bad_inputs": bad_inputs, "exports": exports}
+def sensors() -> str:
+    """Return the names of the sensor files."""
+    names = [
+        f"`{file.stem}`" for file in sorted((ROOT / "configs" / "sensor").glob("*.yaml")) if file.stem != "generic"
+    ]
+    return "\n".join(textwrap.wrap(", ".join(names), 120)) + "\n"
+
+
+TABLES = {"bad_inputs": bad_inputs, "exports": exports, "sensors": sensors}
 
 
 def with_tables(text: str) -> str:

@@ -57,8 +57,9 @@ def test_generated_tables_are_those_of_the_code(document: Path) -> None:
     assert text == with_tables(text), "run python tests/document_tables.py"
 
 
-def test_the_readme_is_short() -> None:
+def test_the_documents_are_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 160
+    assert sum(len(file.read_text().split()) for file in (ROOT / "docs").glob("*.md")) <= 25_000
 
 
 def test_figures_of_the_blind_study_are_those_of_its_table() -> None:

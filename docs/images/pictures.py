@@ -26,6 +26,7 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 TUTORIAL = ROOT / "docs" / "find_the_missing_effect.md"
 HIDDEN = "mpu6050-2-hidden"
+MARGIN = 16  # px, below the last element of a picture
 COLOURS = 96  # of a picture: those of a page and the edges of its letters
 
 
@@ -43,11 +44,14 @@ def smaller(name: str) -> None:
     few.save(HERE / name, optimize=True)
 
 
-def top(browser: Browser, page: Path, name: str, width: int, height: int) -> None:
-    """Take the top of a page."""
-    view = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")
+def top(browser: Browser, page: Path, name: str, width: int, last: str) -> None:
+    """Take the top of a page, up to the end of the first element that a selector finds."""
+    view = browser.new_page(viewport={"width": width, "height": 900}, color_scheme="light")
     view.goto(page.as_uri())
-    view.screenshot(path=HERE / name)
+    box = view.locator(last).first.bounding_box()
+    assert box is not None
+    clip = {"x": 0, "y": 0, "width": width, "height": box["y"] + box["height"] + MARGIN}
+    view.screenshot(path=HERE / name, full_page=True, clip=clip)
     smaller(name)
 
 
@@ -94,11 +98,10 @@ def demo(browser: Browser, folder: Path) -> None:
     """Take the pictures of the demo's pages, before and after the missing effect is added."""
     results = run(folder / "results", "demo")
     pages = results / "reports"
-    top(browser, pages / f"{HIDDEN}.html", "page.png", 1180, 560)
-    top(browser, results / "index.html", "page_campaign_light.png", 1440, 1080)
-    figures(browser, pages / "mpu6050-1.html", "page_attitude.png", "attitude-error")
+    top(browser, pages / f"{HIDDEN}.html", "page.png", 1180, ".cards")
+    top(browser, results / "index.html", "page_campaign_light.png", 1440, "section:has(#found)")
     run(folder / "results", "demo", f'unit_overrides={{{HIDDEN}: ["effects.gyroscope=[g_sensitivity]"]}}')
-    top(browser, pages / f"{HIDDEN}.html", "page_unit_light.png", 1180, 900)
+    top(browser, pages / f"{HIDDEN}.html", "page_unit_light.png", 1180, ".cards")
 
 
 def main() -> None:
