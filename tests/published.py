@@ -31,7 +31,7 @@ def validate(*arguments: Any, **keywords: Any) -> dict[str, Any]:
 def candidate(name: str, **values: Any) -> Candidate:
     """Return the evidence for an effect, with no figure but those given."""
     none: dict[str, Any] = dict.fromkeys(("held_out_error_before", "held_out_error_after"))
-    rest = {"delta_bic": 0.0, "p_value": 1.0, "parameters": {}, "explained_share": 0.0, "look_alikes": []}
+    rest = {"delta_bic": 0.0, "p_value": 1.0, "parameters": {}, "explained_share": 0.0, "look_alikes": {}}
     return Candidate(name, **{**none, **rest, "plausible": True, **values})
 
 

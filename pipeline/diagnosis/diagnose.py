@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -157,15 +157,15 @@ def evidence_of(
             *doubts_of(sensor, recordings, seats=not _seats_explained(found, sensor, findings)),
             *(findings.departures if findings else ()),
         ],
-        approximations=[error["name"] for error in found.method_errors if error["name"] in COMPARED],
-        unknown=[entry["covariate"] for entry in found.unexplained if not entry.get("explained_by")],
+        approximations=[error.name for error in found.method_errors if error.name in COMPARED],
+        unknown=[entry.covariate for entry in found.unexplained if not entry.explained_by],
         beyond=[
             name.removeprefix(OTHER)
             for name, probability in found.probability.items()
             if name.startswith(OTHER) and probability > MAX_UNKNOWN_PROBABILITY
         ],
         implausible=() if accepted else [entry.effect for entry in found.chosen if not entry.plausible],
-        held_out=found.details.get("held_out"),
+        held_out=found.on_table.held_out if found.on_table else None,
         method=settings.method.of(sensor) or "",
         fit=last_fit(case.calibration),
         as_printed=settings.method.as_printed,
@@ -238,17 +238,17 @@ def _doubts_of_axes(leaning: Mapping[str, float], calibration: SensorCalibration
     ]
 
 
-def without_diagnosis(sensor: str, effects: Effects, failure: Mapping[str, Any]) -> SensorDiagnosis:
-    """Return the diagnosis of a sensor whose diagnosis failed; ``failure``: its ``code`` and ``message``.
+def without_diagnosis(sensor: str, effects: Effects, code: str, message: str) -> SensorDiagnosis:
+    """Return the diagnosis of a sensor whose diagnosis failed with an error of this code and message.
 
     The verdict is ``not_enough_data``, because nothing is known of what is missing.
     """
     listed = effects.of(sensor)
-    bug = failure["code"] == "internal_error"
+    bug = code == "internal_error"
     remedy = "report this fault with the traceback, which is in the log of the stage diagnose" if bug else ""
     found = _not_enough_data(sensor, [] if listed == AUTO else list(listed), "", remedy)
-    reason = f"The diagnosis failed: {failure['message']}. The calibration does not depend on it."
-    return replace(found, details={"failed": failure["message"]}, reason=reason, not_observable={})
+    reason = f"The diagnosis failed: {message}. The calibration does not depend on it."
+    return replace(found, details={"failed": message}, reason=reason, not_observable={})
 
 
 def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> SensorDiagnosis:

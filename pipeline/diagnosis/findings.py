@@ -14,25 +14,32 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.verdict import if_observable
-from pipeline.diagnosis.words import next_experiment, to_distinguish
+from pipeline.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
-from pipeline.model.effects import effect
-from pipeline.records import Answer, Candidate, SensorDiagnosis, standard_uncertainty
+from pipeline.model.effects import catalogue, effect
+from pipeline.records import Answer, Candidate, SensorDiagnosis, Wander, standard_uncertainty
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.ranking import Score
-    from pipeline.records import Noise, Recording, SensorCalibration, Values
+    from pipeline.records import (
+        Dependence,
+        MethodError,
+        Noise,
+        Recording,
+        SensorCalibration,
+        TableEvidence,
+        Values,
+    )
     from pipeline.settings import DataSheet, Settings
-    from pipeline.verdicts import Verdict
-
 
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
 
@@ -83,7 +90,7 @@ class Findings:
     excess: float  # of the first of these over the noise
     held_out: Sequence[float | None]  # held-out rms error, of the same fits as ``squares``
     hidden: Mapping[str, str]  # reason why an effect is not observable
-    unknown: list[dict[str, Any]]  # entries of ``unexplained``
+    unknown: Sequence[Dependence]
     over_noise: float | None  # rms residual of the base over the noise
     left_over_noise: float | None  # the same with the selected effects
     noises: Sequence[tuple[Setting, float]]  # noise settings and log L
@@ -95,8 +102,11 @@ class Findings:
     other: SensorCalibration | None = None  # of the other sensor
     on_table: bool = True
     departures: Sequence[str] = ()  # differences of faces and turns by hand from those that are stated
-    scatter: Mapping[str, float] = field(default_factory=dict)  # further entries of ``wander``
-    more: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
+    scatter_over_noise: float | None = None  # of the rests
+    method_errors: Sequence[MethodError] = ()
+    suggested_effect: Mapping[str, Any] | None = None  # content of an effect file
+    table_evidence: TableEvidence | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
     turns: Mapping[str, str] = field(default_factory=dict)  # recordings for which effects of turns have parameters
     search: Callable[[], Findings | None] | None = None  # for a formula outside the catalogue; returns None without one
     deeper: Callable[[], dict[str, Any]] | None = None  # further entries of the document if something is missing
@@ -110,42 +120,62 @@ def diagnosis_of(findings: Findings, case: DiagnosisInput) -> SensorDiagnosis:
     ranking = [_entry(findings, name) for name in (*findings.selected, *unselected)]
     verdict = if_observable(findings.verdict, ranking, findings.hidden)
     override = f"effects.{case.sensor}=[{','.join([*listed, *findings.selected])}]"
-    more = dict(findings.more)
+    answers = findings.answers
+    sets = [Answer(names, min(p, CERTAIN)) for names, p in answers.answer_set()]
     return SensorDiagnosis(
         verdict=verdict,
         configured=case.configured,
         residual_over_noise=findings.over_noise,
         selected=findings.selected,
         ranking=ranking,
-        **_probabilities(findings),
+        probability={name: min(answers.probability(name), CERTAIN) for name in answers.upper_limit},
+        answer_set=sets,
+        upper_limit=_upper_limits(findings),
+        to_distinguish=to_distinguish(sets, findings.sensor, on_table=findings.on_table),
         not_observable=findings.hidden,
         unexplained=findings.unknown,
-        suggested_effect=more.pop("suggested_effect", None),
+        suggested_effect=findings.suggested_effect,
         next_experiment=next_experiment(verdict, ranking, findings),
         override=override if findings.selected else "",
         wander=_wander(findings),
-        method_errors=more.pop("method_errors", ()),
-        details=more,
+        method_errors=findings.method_errors,
+        on_table=findings.table_evidence,
+        details=findings.details,
     )
 
 
-def _probabilities(findings: Findings) -> dict[str, Any]:
-    """Return probabilities, the answer set, how to reduce it, and upper limits of effects that were not selected."""
-    answers = findings.answers
-    sets = [Answer(names, min(p, CERTAIN)) for names, p in answers.answer_set()]
+def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Findings) -> str:
+    """Return the most informative next experiment as one sentence."""
+    on_table = findings.on_table
+    if verdict == Verdict.UNEXPLAINED:
+        return of_unknown(findings.unknown, on_table=on_table) if findings.unknown else findings.advice(verdict)
+    if not findings.selected:
+        if verdict == Verdict.NOTHING_MISSING and findings.answers.sets[0][0]:
+            pair = findings.answers.sets[0], ((), dict(findings.answers.sets).get((), 0.0))
+            sets = [Answer(names, min(p, CERTAIN)) for names, p in pair]
+            return f"to distinguish {to_distinguish(sets, findings.sensor, on_table=on_table)}"
+        return findings.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
+    entries = {entry.effect: entry for entry in ranking}
+
+    def alike(name: str) -> list[str]:
+        return [n for n in entries[name].look_alikes if name not in getattr(catalogue().get(n), "contains", ())]
+
+    name = next((n for n in findings.selected if alike(n)), findings.selected[0])
+    experiment = experiment_of(name, on_table=on_table)
+    others = listed([plain(other) for other in alike(name)[:2]], "or")
+    return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
+
+
+def _upper_limits(findings: Findings) -> dict[str, dict[str, tuple[float, str]]]:
+    """Return the upper limits of the parameters of effects that were not selected, with their units."""
     limits = {}
-    for name, values in answers.upper_limit.items():
+    for name, values in findings.answers.upper_limit.items():
         if name in findings.selected or name.startswith(OTHER):
             continue
         this = effect(name).of_recordings(findings.turns)
         linear = [p for p in this.parameters(findings.sensor) if p.name not in this.nonlinear or this.moves]
-        limits[name] = {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(linear, values, strict=True)}
-    return {
-        "probability": {name: min(answers.probability(name), CERTAIN) for name in answers.upper_limit},
-        "answer_set": sets,
-        "upper_limit": limits,
-        "to_distinguish": to_distinguish(sets, findings.sensor, on_table=findings.on_table),
-    }
+        limits[name] = {p.name: (float(v), p.unit) for p, v in zip(linear, values, strict=True)}
+    return limits
 
 
 def _entry(findings: Findings, name: str) -> Candidate:
@@ -169,7 +199,7 @@ def _entry(findings: Findings, name: str) -> Candidate:
         explained_share=float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
         held_out_error_before=before,
         held_out_error_after=after,
-        look_alikes=[{"effect": other, "share": share} for share, other in alike],
+        look_alikes={other: share for share, other in alike},
         plausible=plausible,
         meaning=effect(name).meaning if effect(name).definition else None,
     )
@@ -191,7 +221,7 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Any], bool]:
     }, plausible
 
 
-def _wander(findings: Findings) -> dict[str, Any]:
+def _wander(findings: Findings) -> Wander:
     """Return the most likely wander, given base, configured and selected effects, and whether it is inflated."""
     wander, best = max(findings.noises, key=lambda noise: noise[1])
     inflated = False
@@ -199,11 +229,11 @@ def _wander(findings: Findings) -> dict[str, Any]:
         limit = INFLATED * max(findings.expected_wander / findings.white, LEAST_RATIO)
         believed = [score for setting, score in findings.noises if setting.ratio <= limit]
         inflated = wander.ratio > limit and (not believed or best - max(believed) > EVIDENCE)
-    return {
-        "ratio": float(wander.ratio),
-        "time_s": float(wander.time) if wander.ratio else None,
-        "standard_deviation": float(wander.ratio * findings.white),
-        "expected": findings.expected_wander,
-        "inflated": bool(inflated),
-        **findings.scatter,
-    }
+    return Wander(
+        ratio=float(wander.ratio),
+        time_s=float(wander.time) if wander.ratio else None,
+        standard_deviation=float(wander.ratio * findings.white),
+        expected=findings.expected_wander,
+        inflated=bool(inflated),
+        scatter_over_noise=findings.scatter_over_noise,
+    )

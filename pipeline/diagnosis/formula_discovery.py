@@ -21,7 +21,7 @@ lists, by complexity, the forms that gain more than all simpler ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, count
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,7 @@ from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.model.effects import catalogue, effect_from, forget, register
 from pipeline.model.effects.base import unit_of
 from pipeline.model.formula import SIGNALS, parse
+from pipeline.records import Dependence, FittedForm, RankedFormula
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -227,23 +228,23 @@ class Discovery:
 
     context: Selection  # in whose residual the form was found
     reported: Selection  # with the form in its base, if there is one
-    unknown: list[dict[str, Any]]  # entries of ``unexplained``, the form first
+    unknown: Sequence[Dependence]  # that with the form first
     suggested: dict[str, Any] | None = None  # the effect's definition
-    front: list[dict[str, Any]] = field(default_factory=list)
+    front: Sequence[RankedFormula] = ()
 
 
 def why_not_suggested(discovery: Discovery, hidden: Mapping[str, str]) -> str | None:
     """Return why the form is not offered as an effect: unstable, or of a signal whose effects are not observable."""
-    covariate = discovery.unknown[0]["covariate"]
+    covariate = discovery.unknown[0].covariate
     if covariate in OBSERVABLE_BY and OBSERVABLE_BY[covariate] in hidden:
         return f"effects of the {covariate} are not observable: {hidden[OBSERVABLE_BY[covariate]]}"
-    stability = discovery.front[0]["stability"] if discovery.front else None
+    stability = discovery.front[0].stability if discovery.front else None
     if stability is not None and stability < LEAST_STABLE:
         return f"it is not stable: another formula is the best in {100 * (1 - stability):.0f} % of the resamples"
     return None
 
 
-def discover(selection: Selection, unknown: list[dict[str, Any]], case: DiagnosisInput) -> Discovery:
+def discover(selection: Selection, unknown: Sequence[Dependence], case: DiagnosisInput) -> Discovery:
     """Search for a formula in addition to base, configured and selected effects.
 
     ``unknown``: the ``dependences`` of the selection. No form is suggested if the residual with it is far above the
@@ -257,9 +258,9 @@ def discover(selection: Selection, unknown: list[dict[str, Any]], case: Diagnosi
         terms, ranked = search(context)
         if not terms:
             continue
-        entry = _entry(context, terms)
-        definition = suggested_effect([entry], case.sensor, catalogue())
-        assert definition is not None  # noqa: S101  (there is an entry)
+        found, first = _fitted_form(context, terms), terms[0]
+        entry = Dependence(first.form.covariate, first.gain.p_value, sum(term.gain.delta_bic for term in terms), found)
+        definition = suggested_effect(entry.covariate, found, case.sensor, catalogue())
         form = effect_from(definition, "a first guess")
         added = [*context.fit.terms, EffectColumns(form, np.zeros(len(form.parameters(case.sensor))))]
         residual_rms = fit_terms(context.observations, added, context.start, context.settings).residual_rms
@@ -275,7 +276,8 @@ def discover(selection: Selection, unknown: list[dict[str, Any]], case: Diagnosi
         if criterion > least:
             least, front = criterion, _front(context, terms, ranked)
             best = Discovery(context, reselected, [entry, *unknown], definition, front)
-    return replace(best, unknown=_explained(best)) if best.suggested else best
+    fitted = best.unknown[0].form if best.unknown else None
+    return replace(best, unknown=_explained(best, fitted)) if fitted else best
 
 
 def _criterion(selection: Selection, terms: Sequence[ScoredForm]) -> float:
@@ -285,8 +287,8 @@ def _criterion(selection: Selection, terms: Sequence[ScoredForm]) -> float:
     return 2.0 * selection.fit.log_likelihood - fitted * float(np.log(3.0 * selection.observations.samples)) - price
 
 
-def _entry(selection: Selection, terms: Sequence[ScoredForm]) -> dict[str, Any]:
-    """Return a form as an entry of ``unexplained``: phrase, formulas, and the coefficients on each of its axes."""
+def _fitted_form(selection: Selection, terms: Sequence[ScoredForm]) -> FittedForm:
+    """Return a form in words, with its formulas and their coefficients on each of its axes."""
     sensor, first = selection.observations.sensor, terms[0]
     texts = [text for term in terms for text in term.form.formulas]
     projected = ProjectedCurves(Scan(selection), forms.columns_of(texts, sensor))
@@ -296,32 +298,28 @@ def _entry(selection: Selection, terms: Sequence[ScoredForm]) -> dict[str, Any]:
     of_terms = np.split(coefficients, edges, axis=1)
     sizes = [forms.sizes_of(t.form, c, selection.observations) for t, c in zip(terms, of_terms, strict=True)]
     words = [forms.described(t.form, size, t.gain.axes, sensor) for t, size in zip(terms, sizes, strict=True)]
-    return {
-        "covariate": first.form.covariate,
-        "p_value": first.gain.p_value,
-        "shape": listed(words),
-        "kind": first.form.kind,
-        "axes": ["xyz"[c] for c in axes],
-        "formulas": texts,
-        "units": [term.form.unit(sensor) for term in terms for _ in term.form.formulas],
-        "coefficients": [coefficients[c].tolist() for c in axes],
-        "size": float(np.abs(sizes[0][list(first.gain.axes)]).max()),
-        "unit": "1" if first.form.kind == "ripple" else unit_of(sensor),
-        "delta_bic": sum(term.gain.delta_bic for term in terms),
-        "explained_by": None,
-    }
+    return FittedForm(
+        shape=listed(words),
+        kind=first.form.kind,
+        axes=["xyz"[c] for c in axes],
+        formulas=texts,
+        units=[term.form.unit(sensor) for term in terms for _ in term.form.formulas],
+        coefficients=[coefficients[c].tolist() for c in axes],
+        size=float(np.abs(sizes[0][list(first.gain.axes)]).max()),
+        unit="1" if first.form.kind == "ripple" else unit_of(sensor),
+    )
 
 
-def _explained(found: Discovery) -> list[dict[str, Any]]:
-    """Return the entries of ``unexplained`` with the form's covariate where the form explains the dependence too."""
-    form, *others = found.unknown
-    columns = forms.columns_of(form["formulas"], found.context.observations.sensor)
-    remaining = {entry["covariate"] for entry in dependences(found.context, columns)}
-    rest = [entry for entry in others if entry["covariate"] != form["covariate"]]
-    return [form, *({**e, "explained_by": None if e["covariate"] in remaining else form["covariate"]} for e in rest)]
+def _explained(found: Discovery, form: FittedForm) -> list[Dependence]:
+    """Return the dependences with the form's covariate where the form explains them too."""
+    first, *others = found.unknown
+    columns = forms.columns_of(form.formulas, found.context.observations.sensor)
+    remaining = {entry.covariate for entry in dependences(found.context, columns)}
+    others = [entry for entry in others if entry.covariate != first.covariate]
+    return [first, *(e if e.covariate in remaining else replace(e, explained_by=first.covariate) for e in others)]
 
 
-def _front(selection: Selection, terms: Sequence[ScoredForm], ranked: Sequence[ScoredForm]) -> list[dict[str, Any]]:
+def _front(selection: Selection, terms: Sequence[ScoredForm], ranked: Sequence[ScoredForm]) -> list[RankedFormula]:
     """Return the forms of one term that gain more than all simpler ones, and before them the suggested one."""
     finalists = list(ranked[:FINALISTS])
     stable = _stability(selection, finalists)
@@ -331,16 +329,16 @@ def _front(selection: Selection, terms: Sequence[ScoredForm], ranked: Sequence[S
             shown.append(each)
     shown = [terms[0], *(each for each in shown if each.form is not terms[0].form)][:LISTED_FORMULAS]
     return [
-        {
-            "formula": " + ".join(each.form.formulas),
-            "complexity": each.form.complexity,
-            "constants": each.form.scanned,
-            "delta_bic": each.gain.delta_bic,
-            "score": each.score,
-            "axes": ["xyz"[c] for c in each.gain.axes],
-            "stability": next((s for f, s in zip(finalists, stable, strict=True) if f.form is each.form), None),
-            "suggested": each.form is terms[0].form,
-        }
+        RankedFormula(
+            formula=" + ".join(each.form.formulas),
+            complexity=each.form.complexity,
+            constants=each.form.scanned,
+            delta_bic=each.gain.delta_bic,
+            score=each.score,
+            axes=["xyz"[c] for c in each.gain.axes],
+            stability=next((s for f, s in zip(finalists, stable, strict=True) if f.form is each.form), None),
+            suggested=each.form is terms[0].form,
+        )
         for each in shown
     ]
 
@@ -360,40 +358,19 @@ def _stability(selection: Selection, finalists: Sequence[ScoredForm]) -> list[fl
     return [float(share) for share in wins / max(counted, 1)]
 
 
-def suggested_effect(
-    unknown: Sequence[Mapping[str, Any]], sensor: str, taken: Collection[str] = ()
-) -> dict[str, Any] | None:
-    """Return the definition of an effect with the form of the first entry of ``unexplained``; None without a form.
-
-    Its name differs from those in ``taken``.
-    """
-    if not unknown or not unknown[0].get("formulas"):
-        return None
-    entry = unknown[0]
-    plain = f"unknown_{entry['covariate']}"
+def suggested_effect(covariate: str, form: FittedForm, sensor: str, taken: Collection[str]) -> dict[str, Any]:
+    """Return the definition of an effect with the form of a dependence; its name differs from those in ``taken``."""
+    plain = f"unknown_{covariate}"
     name = next(n for n in chain([plain], (f"{plain}_{k}" for k in count(2))) if n not in taken)
-    terms = zip("ABCDEFGHIJKL", entry["formulas"], entry["units"], strict=False)
-    signals = {signal for text in entry["formulas"] for signal in parse(text).signals}
-    of_table = entry["kind"] == "band" or any(not SIGNALS[signal].c for signal in signals)
+    terms = zip("ABCDEFGHIJKL", form.formulas, form.units, strict=False)
+    signals = {signal for text in form.formulas for signal in parse(text).signals}
+    of_table = form.kind == "band" or any(not SIGNALS[signal].c for signal in signals)
     return {
         "name": name,
         "owner": "table" if of_table else "recording" if "time" in signals else "sensor",
         "sensors": [sensor],
-        "meaning": f"First guess, to be confirmed: the {sensor} shows {entry['shape']}."[:500],
+        "meaning": f"First guess, to be confirmed: the {sensor} shows {form.shape}."[:500],
         "terms": {term: {"formula": formula, "unit": unit} for term, formula, unit in terms},
-        "axes": list(entry["axes"]),
+        "axes": list(form.axes),
         "source": "what a diagnosis found in the residual",
     }
-
-
-def effect_file(definition: Mapping[str, Any], unit: str) -> str:
-    """Return the text of an effect file for a campaign's ``effects/``, from the definition that a unit suggests."""
-    import yaml  # noqa: PLC0415  (only a unit with unknown physics pays for it)
-
-    name, sensor = definition["name"], definition["sensors"][0]
-    remarks = (
-        f"# What unit {unit} shows beyond the catalogue of effects: a first guess, to be named, tried and confirmed.\n"
-        f"# To try it, copy this file to effects/{name}.yaml in the campaign's directory and add {name} to\n"
-        f"# effects.{sensor}. To rename it, change the file's name and the one below together.\n"
-    )
-    return remarks + str(yaml.safe_dump(dict(definition), sort_keys=False, allow_unicode=True, width=110))

@@ -28,7 +28,7 @@ from pipeline.estimation.stages import declarations
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import table_motion
-from pipeline.records import BASE, BASE_COUNT, BIAS, matrix_of
+from pipeline.records import BASE, BASE_COUNT, BIAS, MethodError, matrix_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +44,7 @@ SIGNIFICANT_METHOD_ERROR = 5.0
 
 def method_errors(
     calibration: SensorCalibration, selection: Selection, recordings: Sequence[Recording], settings: Settings
-) -> list[dict[str, Any]]:
+) -> list[MethodError]:
     """Return the errors by the method's approximations, the largest share first; none if it is the free fit.
 
     ``selection``: the free fit. ``recordings``: all of the unit, filtered. Entries: ``name, meaning, size, unit, share,
@@ -79,7 +79,7 @@ def given_differences(
     free_fit: Callable[[], SensorCalibration],
     recordings: Sequence[Recording],
     settings: Settings,
-) -> list[dict[str, Any]]:
+) -> list[MethodError]:
     """Return the differences of a given calibration from a free fit of rests and moves by hand, as ``method_errors``.
 
     They are bias and the symmetric part of E, since by hand the sensor's axes have no relation to a body. Shares are
@@ -216,7 +216,7 @@ def _named(
     held_out: Mapping[str, Mapping[str, float]] | None = None,
     *,
     printed: bool = False,
-) -> list[dict[str, Any]]:
+) -> list[MethodError]:
     """Return the entries of significant errors, the largest share first; ``held_out``: shares by key and name."""
     held_out = held_out or {"held_out_share": {}, "held_out_magnitude_share": {}}
     certain, sensor = difference.certain(selected), difference.method.sensor
@@ -225,32 +225,32 @@ def _named(
     delay = max(float(each.get("delay_s", 0.0)) for each in filters)
     meaning = template("method_errors.txt").module.meaning  # type: ignore[attr-defined]
     found = [
-        {
-            "name": name,
-            "meaning": " ".join(meaning(name, sensor, stages, printed, filters[0]["name"], delay).split()),
-            **_size(name, difference, rms[name], recordings),
-            "share": share,
-            "rms": rms[name],
-            **{key: shares.get(name) for key, shares in held_out.items()},
-        }
+        MethodError(
+            name,
+            " ".join(meaning(name, sensor, stages, printed, filters[0]["name"], delay).split()),
+            *_size(name, difference, rms[name], recordings),
+            share,
+            rms[name],
+            *(shares.get(name) for shares in held_out.values()),
+        )
         for name, share in _shares(rms).items()
         if max(share, held_out["held_out_magnitude_share"].get(name, 0.0)) > MIN_MEAN_SQUARE_SHARE
         and certain.get(name, True)
     ]
-    return sorted(found, key=lambda entry: -float(entry["share"]))
+    return sorted(found, key=lambda error: -error.share)
 
 
-def _size(name: str, difference: _Difference, rms: float, recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return the size of an error in its usual unit."""
+def _size(name: str, difference: _Difference, rms: float, recordings: Sequence[Recording]) -> tuple[float, str]:
+    """Return the size of an error, and its usual unit."""
     sensor = difference.method.sensor
     if name == "bias":
-        return {"size": float(np.abs(difference.bias).max()), "unit": unit_of(sensor)}
+        return float(np.abs(difference.bias).max()), unit_of(sensor)
     if name == "scale_factor":
-        return {"size": float(np.abs(difference.matrices[name]).max()), "unit": "1"}
+        return float(np.abs(difference.matrices[name]).max()), "1"
     if name in difference.matrices:
-        return {"size": float(np.degrees(np.abs(difference.matrices[name]).max())), "unit": "deg"}
+        return float(np.degrees(np.abs(difference.matrices[name]).max())), "deg"
     if name == "filter_delay":
         turns = [(r, rate) for r in recordings if r.role == sensor and (rate := r.logged_rate) is not None]
         angles = [float(np.abs(rate).max() * r.filter.get("delay_s", 0.0)) for r, rate in turns]
-        return {"size": max(angles, default=0.0), "unit": "deg"}
-    return {"size": rms, "unit": unit_of(sensor)}
+        return max(angles, default=0.0), "deg"
+    return rms, unit_of(sensor)

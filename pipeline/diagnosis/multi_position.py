@@ -41,7 +41,7 @@ from pipeline.estimation.multi_position.selection import SelectionByHand, poster
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import is_given
 from pipeline.model.effects import catalogue, effect_from
-from pipeline.records import UnitRecordings
+from pipeline.records import Dependence, UnitRecordings
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
@@ -123,15 +123,15 @@ def findings(case: DiagnosisInput) -> Findings:
         other=case.accelerometer if case.sensor == "gyroscope" else None,
         on_table=False,
         departures=[text for stage in calibration.stages for text in stage.details.get("departures", ())],
-        scatter={"scatter_over_noise": float(best.scatter[0])},
-        more={
+        scatter_over_noise=float(best.scatter[0]),
+        method_errors=given_differences(
+            calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
+        ),
+        details={
             "pictures": {
                 "added_variable": added_variable_of_rests(selection) if selection.names else None,
                 "unexplained": [],
             },
-            "method_errors": given_differences(
-                calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
-            ),
             "cross_validation": _cross_validation(selection, lambda part: SelectionByHand(part, *given)),
         },
     )
@@ -267,8 +267,8 @@ def _squared(model: Model, state: State) -> float:
     return (model.held_out_error(state) or 0.0) ** 2
 
 
-def _dependences(selection: SelectionByHand) -> list[dict[str, Any]]:
-    """Return the covariates on which the residual depends, each with its p-value, the clearest first."""
+def _dependences(selection: SelectionByHand) -> list[Dependence]:
+    """Return the covariates on which the residual depends, the clearest first."""
     model, rests = selection.model, selection.model.rests
     tests: list[tuple[str, Sequence[str]]] = []  # covariate and formulas of its curves
     for covariate, values in (("time", rests.time), ("temperature", rests.temperature)):
@@ -294,7 +294,7 @@ def _dependences(selection: SelectionByHand) -> list[dict[str, Any]]:
         gain = factor * max(2.0 * (projected.with_candidate(j)[0] - before), 0.0)
         delta, p = gain - count * float(np.log(len(equations.residual))), scipy.special.chdtrc(max(count, 1), gain)
         results.append((covariate, delta, float(p)))
-    return [{"covariate": name, "p_value": p} for name, (_, p) in significant(results).items()]
+    return [Dependence(name, p) for name, (_, p) in significant(results).items()]
 
 
 def _suspects(selection: SelectionByHand, hidden: Mapping[str, str]) -> list[str]:

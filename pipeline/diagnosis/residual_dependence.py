@@ -34,6 +34,7 @@ from pipeline.estimation.free_curves import CURVE_DEGREE, MAX_CURVE_CYCLES
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import GaussMarkov, selection_grid
 from pipeline.model.effects import effect
+from pipeline.records import Dependence
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -55,8 +56,8 @@ SIGNALS = {"time": "time", "temperature": "temperature", "rate": "speed"}  # of 
 SIMULATIONS = 199  # standard error of the share: 3.5 % at most
 
 
-def dependences(selection: Selection, explained: Curves | None = None) -> list[dict[str, Any]]:
-    """Return the covariates on which the residual depends, the clearest first: ``covariate, p_value, delta_bic``.
+def dependences(selection: Selection, explained: Curves | None = None) -> list[Dependence]:
+    """Return the covariates on which the residual depends, the clearest first.
 
     ``explained``: curves that are projected out too.
     """
@@ -69,7 +70,7 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[d
         free = [setting._replace(prior=least) for setting in selection_grid(None)]
         unconstrained = _significant(replace(selection, settings=[*selection.settings, *free]), explained)
         found = {name: values for name, values in unconstrained.items() if name in found}
-    return [{"covariate": name, "p_value": p, "delta_bic": delta} for name, (delta, p) in found.items()]
+    return [Dependence(name, p, delta) for name, (delta, p) in found.items()]
 
 
 def significant(tests: Iterable[tuple[str, float, float]]) -> dict[str, tuple[float, float]]:

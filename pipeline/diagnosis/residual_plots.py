@@ -31,11 +31,11 @@ from pipeline.model.formula import parse
 from pipeline.records import BASE_COUNT
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Index, Noise, Values
+    from pipeline.records import Dependence, Index, Noise, Values
 
     JSON = dict[str, Any]
 
@@ -51,18 +51,16 @@ MAX_PLOTS = 3  # plots of dependences
 ABSCISSA_SIGNALS = {"rate": "speed", "specific_force": "u"}  # abscissa of a covariate without a form, if not itself
 
 
-def plots(
-    selection: Selection, unexplained: Sequence[Mapping[str, Any]], noise: Noise | None, reported: Selection
-) -> JSON:
+def plots(selection: Selection, unexplained: Sequence[Dependence], noise: Noise | None, reported: Selection) -> JSON:
     """Return the points of the plots of a diagnosis.
 
-    ``unexplained``: entries of the diagnosis for ``selection``, with ``covariate``, and ``axes, formulas,
-    coefficients`` of a form. ``reported``: the selection that the diagnosis reports, with a suggested form in its base.
+    ``unexplained``: the dependences for ``selection``. ``reported``: the selection that the diagnosis reports, with a
+    suggested form in its base.
     Returns ``added_variable`` (of the first selected effect, or None) and ``unexplained``, a list. Each has ``panels``,
     one for each axis, with the binned ``x, mean, standard_error``. Panels of an added variable also have the slope:
     ``parameter, unit, value, standard_uncertainty``. Panels of a suggested form also have ``curve_x, curve``.
     """
-    shown = [entry for entry in unexplained if not entry.get("explained_by")][:MAX_PLOTS]
+    shown = [entry for entry in unexplained if not entry.explained_by][:MAX_PLOTS]
     regression = _Columns(selection) if shown else None
     return {
         "added_variable": _added_variable(_Columns(reported), reported) if reported.names else None,
@@ -151,7 +149,7 @@ def _most_significant(term: EffectColumns, sensor: str, ratio: Values) -> list[i
     return [j if ratio[j] >= 0.0 else None for j in largest]
 
 
-def _unexplained(regression: _Columns, selection: Selection, entry: Mapping[str, Any], noise: Noise | None) -> JSON:
+def _unexplained(regression: _Columns, selection: Selection, entry: Dependence, noise: Noise | None) -> JSON:
     """Return the plot of the residual against a covariate, with the curve of the suggested form."""
     signal, forms = _signal_and_forms(selection, entry)
     setting, values = WHITE_SETTING, _values(selection, signal)
@@ -167,28 +165,28 @@ def _unexplained(regression: _Columns, selection: Selection, entry: Mapping[str,
             blocks = selection.observations.blocks
             variance += noise.wander[c] ** 2 * bins.bias_of_means(blocks, noise.correlation_time)
         panels.append({"axis": "xyz"[c]} | bins.document(residual, variance))
-        if coefficients is not None:
+        if entry.form and coefficients is not None:
             grid = np.linspace(float(np.nanmin(values[:, c])), float(np.nanmax(values[:, c])), CURVE)
-            columns = [np.broadcast_to(parse(text)({signal: grid}), grid.shape) for text in entry["formulas"]]
+            columns = [np.broadcast_to(parse(text)({signal: grid}), grid.shape) for text in entry.form.formulas]
             curve = np.stack(columns, axis=1) @ np.asarray(coefficients, float)
             panels[-1] |= {"curve_x": _rounded(grid), "curve": _rounded(curve)}
     unit = unit_of(selection.observations.sensor)
-    return {"covariate": entry["covariate"], "signal": signal, "unit": unit, "panels": panels}
+    return {"covariate": entry.covariate, "signal": signal, "unit": unit, "panels": panels}
 
 
 def _signal_and_forms(
-    selection: Selection, entry: Mapping[str, Any]
+    selection: Selection, entry: Dependence
 ) -> tuple[str, list[tuple[Values, Sequence[float] | None]]]:
     """Return the signal of a covariate, and the values and coefficients of the form on each axis."""
-    observations, formulas = selection.observations, entry.get("formulas") or []
+    observations, formulas = selection.observations, entry.form.formulas if entry.form else ()
     named = sorted({name for text in formulas for name in parse(text).signals})
-    signal = named[0] if named else ABSCISSA_SIGNALS.get(entry["covariate"], entry["covariate"])
+    signal = named[0] if named else ABSCISSA_SIGNALS.get(entry.covariate, entry.covariate)
     forms: list[tuple[Values, Sequence[float] | None]] = [(np.zeros(len(observations.weight)), None)] * 3
-    if len(named) != 1:
+    if entry.form is None or len(named) != 1:
         return signal, forms
     evaluate = columns_of(formulas, observations.sensor)
     columns = np.concatenate([evaluate(part.motion) for part in observations.parts])
-    for axis, coefficients in zip(entry["axes"], entry["coefficients"], strict=True):
+    for axis, coefficients in zip(entry.form.axes, entry.form.coefficients, strict=True):
         c = "xyz".index(axis)
         forms[c] = columns[:, c % columns.shape[1]] @ np.asarray(coefficients, float), coefficients
     return signal, forms

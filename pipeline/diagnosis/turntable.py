@@ -28,7 +28,7 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.posterior_turns import posterior
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.model.effects import catalogue, effect
-from pipeline.records import Noise, SensorCalibration
+from pipeline.records import HeldOutErrors, Noise, SensorCalibration, TableEvidence
 from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.heldout import noise_floors
 from pipeline.validation.samples import samples_of_motion
@@ -64,9 +64,10 @@ def findings(case: DiagnosisInput) -> Findings:
         reason = why_not_suggested(discovery, described.hidden)
         if reason is None:
             return described
-        formulas = [{**formula, "suggested": False} for formula in discovery.front]
-        more = {"suggested_effect": None, "not_suggested": reason, "formulas": formulas}
-        return replace(described, more={**described.more, **more})
+        formulas = [replace(formula, suggested=False) for formula in discovery.front]
+        held_out = described.table_evidence.held_out if described.table_evidence else None
+        evidence = TableEvidence(held_out, formulas, reason)
+        return replace(described, suggested_effect=None, table_evidence=evidence)
 
     catalogue_alone = Discovery(selection, selection, unknown)
     try:
@@ -85,7 +86,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     errors, floor = _held_out_errors(reported, fits, case)
     held_out = None
     if errors and noise is not None:
-        held_out = {"error_before": errors[0], "error_after": errors[-1], "floor": floor}
+        held_out = HeldOutErrors(errors[0], errors[-1], floor)
     hidden = not_observable(reported, case.modelled)
     squares = [fit.residual_rms**2 for fit in fits]
     reference = observations.less_stop_errors.expected_square
@@ -153,13 +154,10 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
         advice=advice,
         free=lambda: calibrated(selection.base),
         full=(lambda: calibrated(selection.fit)) if selection.names else None,
-        more={
-            "held_out": held_out,
-            "suggested_effect": discovery.suggested,
-            "formulas": discovery.front,
-            "pictures": plots(selection, unknown, noise, reported),
-            "method_errors": method_errors(case.calibration, reported, case.recordings, case.settings),
-        },
+        method_errors=method_errors(case.calibration, reported, case.recordings, case.settings),
+        suggested_effect=discovery.suggested,
+        table_evidence=TableEvidence(held_out, discovery.front),
+        details={"pictures": plots(selection, unknown, noise, reported)},
         turns=turns_of(observations),
         deeper=lambda: {
             "influence": influence(reported, [*suggested, *reported.names]),

@@ -7,7 +7,7 @@ error is compared with its 99 % interval (``pipeline.validation.expected_error``
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.diagnosis.words import of_unknown, template
 from pipeline.estimation.stages import FitStage
@@ -17,7 +17,7 @@ from pipeline.verdicts import Verdict
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.records import Agreement, SensorDiagnosis
+    from pipeline.records import Agreement, Dependence, HeldOutErrors, SensorDiagnosis
 
 EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
 # least share of the residual's excess that selected effects explain if the residual has another cause too
@@ -79,7 +79,7 @@ class VerdictInput:
     unknown: Sequence[str] = ()  # covariates on which the residual with the selected effects depends
     beyond: Sequence[str] = ()  # covariates of physics that is likely and outside the catalogue
     implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, unless the settings accept that
-    held_out: Mapping[str, float] | None = None  # ``error_before, error_after, floor`` of the selection's own fits
+    held_out: HeldOutErrors | None = None  # of the selection's own fits
     method: str = ""
     fit: FitStage = field(default_factory=FitStage)  # last stage of the method
     as_printed: bool = False  # whether the method uses the equations of the thesis as printed
@@ -115,7 +115,7 @@ class VerdictInput:
     def _unconfirmed(self) -> bool:
         if not self.implausible or self.held_out is None:
             return False
-        return self.held_out["error_after"] ** 2 > (1.0 - HELPFUL) * self.held_out["error_before"] ** 2
+        return self.held_out.error_after**2 > (1.0 - HELPFUL) * self.held_out.error_before**2
 
     @property
     def made_worse(self) -> bool:
@@ -165,12 +165,12 @@ class VerdictInput:
 
 def verdict_of_selection(
     names: Sequence[str],
-    unknown: Sequence[Mapping[str, Any]],
+    unknown: Sequence[Dependence],
     share: float,
     gain: float,
     *,
     above_noise: bool,
-    held_out: Mapping[str, float] | None,
+    held_out: HeldOutErrors | None,
     beyond: float = 0.0,
 ) -> Verdict:
     """Return the verdict by the selection on a table alone.
@@ -183,18 +183,18 @@ def verdict_of_selection(
     """
     if _made_worse(held_out) or len(names) > BELIEVED:
         return Verdict.UNEXPLAINED
-    at_floor = held_out is not None and held_out["error_after"] <= held_out["floor"]
+    at_floor = held_out is not None and held_out.error_after <= held_out.floor
     if names and beyond > (LIKELY_AT_FLOOR if at_floor else MAX_UNKNOWN_PROBABILITY):
         return Verdict.UNEXPLAINED
     if (unknown or above_noise) and (not names or share < MIN_EXPLAINED_EXCESS):
         return Verdict.UNEXPLAINED
-    if unknown and max(float(entry["delta_bic"]) for entry in unknown) > UNKNOWN_SHARE * gain:
+    if unknown and max(entry.delta_bic or 0.0 for entry in unknown) > UNKNOWN_SHARE * gain:
         return Verdict.UNEXPLAINED
     return Verdict.MISSING_EFFECT if names else Verdict.NOTHING_MISSING
 
 
 def verdict_of_selection_by_hand(
-    names: Sequence[str], unknown: Sequence[Mapping[str, Any]], left_over_noise: float | None
+    names: Sequence[str], unknown: Sequence[Dependence], left_over_noise: float | None
 ) -> Verdict:
     """Return the verdict by the selection in rests and moves alone; parameters as of ``verdict_of_selection``.
 
@@ -211,11 +211,11 @@ def if_observable(verdict: Verdict, ranking: Sequence[object], hidden: Mapping[s
     return Verdict.NOT_ENOUGH_DATA if shows_nothing else verdict
 
 
-def _made_worse(held_out: Mapping[str, float] | None) -> bool:
+def _made_worse(held_out: HeldOutErrors | None) -> bool:
     """Return whether the selected effects raise the held-out error: then they are not what is missing."""
     if held_out is None:
         return False
-    return held_out["error_after"] ** 2 - held_out["error_before"] ** 2 > MAX_HELD_OUT_INCREASE * held_out["floor"] ** 2
+    return held_out.error_after**2 - held_out.error_before**2 > MAX_HELD_OUT_INCREASE * held_out.floor**2
 
 
 # Verdict, its reason (a macro of ``templates/reasons.txt``), and the condition. ``e.above``: the held-out error of the
@@ -269,7 +269,7 @@ def may_be_unknown(verdict: Verdict, e: VerdictInput) -> bool:
     Also true if the held-out error with the selected effects is above the noise floor.
     """
     if verdict == Verdict.MISSING_EFFECT and e.held_out is not None:
-        return e.held_out["error_after"] > LEFT_OVER * e.held_out["floor"]
+        return e.held_out.error_after > LEFT_OVER * e.held_out.floor
     return verdict == Verdict.UNEXPLAINED or (verdict == Verdict.REFERENCE_IN_DOUBT and not e.doubts)
 
 

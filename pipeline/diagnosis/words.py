@@ -10,7 +10,6 @@ from jinja2 import Environment, FileSystemLoader, Template
 
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_held
 from pipeline.estimation.free_curves import OTHER
-from pipeline.estimation.posterior import CERTAIN
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, unit_of
 from pipeline.records import Answer
@@ -19,8 +18,7 @@ from pipeline.verdicts import Verdict
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.diagnosis.findings import Findings
-    from pipeline.records import Candidate
+    from pipeline.records import Dependence
 
 MOST_ANSWERS = 4  # answers of an answer set that a sentence lists
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
@@ -122,41 +120,18 @@ def to_distinguish(sets: Sequence[Answer], sensor: str, *, on_table: bool) -> st
     if different[0].startswith(OTHER):
         measured = "specific_force" if sensor == "accelerometer" else "rate"
         return f"{answers}: {UNKNOWN[different[0].removeprefix(OTHER).replace('input', measured)]}"
-    return f"{answers}: {_experiment(different[0], on_table=on_table)}"
+    return f"{answers}: {experiment_of(different[0], on_table=on_table)}"
 
 
-def _experiment(name: str, *, on_table: bool) -> str:
+def experiment_of(name: str, *, on_table: bool) -> str:
     """Return the experiment that separates an effect from its look-alikes."""
     this = catalogue()[name]
     return this.experiment if on_table else this.experiment_by_hand or this.experiment
 
 
-def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Findings) -> str:
-    """Return the most informative next experiment as one sentence."""
-    on_table = findings.on_table
-    if verdict == Verdict.UNEXPLAINED:
-        return of_unknown(findings.unknown, on_table=on_table) if findings.unknown else findings.advice(verdict)
-    if not findings.selected:
-        if verdict == Verdict.NOTHING_MISSING and findings.answers.sets[0][0]:
-            pair = findings.answers.sets[0], ((), dict(findings.answers.sets).get((), 0.0))
-            sets = [Answer(names, min(p, CERTAIN)) for names, p in pair]
-            return f"to distinguish {to_distinguish(sets, findings.sensor, on_table=on_table)}"
-        return findings.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
-    entries = {entry.effect: entry for entry in ranking}
-
-    def alike(name: str) -> list[str]:
-        others = [a["effect"] for a in entries[name].look_alikes]
-        return [n for n in others if name not in getattr(catalogue().get(n), "contains", ())]
-
-    name = next((n for n in findings.selected if alike(n)), findings.selected[0])
-    experiment = _experiment(name, on_table=on_table)
-    others = listed([plain(other) for other in alike(name)[:2]], "or")
-    return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
-
-
-def of_unknown(unknown: Sequence[Mapping[str, Any]], *, on_table: bool) -> str:
-    """Return the experiment that shows on which quantity the residual depends, from the entries ``unexplained``."""
+def of_unknown(unknown: Sequence[Dependence], *, on_table: bool) -> str:
+    """Return the experiment that shows on which quantity the residual depends."""
     if not unknown:
         return FAR_OFF if on_table else UNSTEADY
-    covariate = str(unknown[0]["covariate"])
+    covariate = unknown[0].covariate
     return f"to find other quantities than {plain(covariate)} on which the residual depends: {UNKNOWN[covariate]}"

@@ -22,13 +22,15 @@ class Candidate:
     explained_share: float  # of the residual above the noise
     held_out_error_before: float | None  # of a selected effect
     held_out_error_after: float | None
-    look_alikes: Sequence[Mapping[str, Any]]  # effects with a similar signal, and the share that they reproduce
+    look_alikes: Mapping[str, float]  # effects with a similar signal, and the share that they reproduce
     plausible: bool  # within the sensor file's limits
     meaning: str | None = None  # of a user's effect
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of the ranking."""
-        return {key: value for key, value in vars(self).items() if key != "meaning" or value is not None}
+        alike = [{"effect": name, "share": share} for name, share in self.look_alikes.items()]
+        document = {**vars(self), "look_alikes": alike}
+        return {key: value for key, value in document.items() if key != "meaning" or value is not None}
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,111 @@ class Answer:
 
 
 @dataclass(frozen=True)
+class FittedForm:
+    """A functional form of a dependence of the residual."""
+
+    shape: str  # in words
+    kind: str  # of ``pipeline.diagnosis.functional_forms.Factor``
+    axes: Sequence[str]
+    formulas: Sequence[str]
+    units: Sequence[str]  # of the coefficients of the formulas
+    coefficients: Sequence[Sequence[float]]  # of each axis
+    size: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """A covariate on which the residual depends."""
+
+    covariate: str
+    p_value: float
+    delta_bic: float | None = None  # None: of rests by hand
+    form: FittedForm | None = None
+    explained_by: str | None = None  # covariate whose form explains this dependence too
+
+    def to_json(self, *, searched: bool) -> dict[str, Any]:
+        """Return the entry of ``unexplained``; ``searched``: a form was found for a dependence of the sensor."""
+        return {
+            "covariate": self.covariate,
+            "p_value": self.p_value,
+            **(vars(self.form) if self.form else {}),
+            **({} if self.delta_bic is None else {"delta_bic": self.delta_bic}),
+            **({"explained_by": self.explained_by} if searched else {}),
+        }
+
+
+@dataclass(frozen=True)
+class RankedFormula:
+    """A formula outside the catalogue."""
+
+    formula: str
+    complexity: int
+    constants: int  # scanned
+    delta_bic: float
+    score: float
+    axes: Sequence[str]
+    stability: float | None  # share of the resamples in which it is the best; None: not among the finalists
+    suggested: bool
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """The held-out rms error without and with the selected effects, and the noise floor, g or deg/s."""
+
+    error_before: float
+    error_after: float
+    floor: float
+
+
+@dataclass(frozen=True)
+class TableEvidence:
+    """Evidence that turns on a table alone give."""
+
+    held_out: HeldOutErrors | None  # None: no effect was selected, or no motion is held out
+    formulas: Sequence[RankedFormula]
+    not_suggested: str | None = None  # why the first formula is not offered as an effect
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entries of the document."""
+        return {
+            "held_out": self.held_out and vars(self.held_out),
+            "formulas": [vars(each) for each in self.formulas],
+            **({"not_suggested": self.not_suggested} if self.not_suggested else {}),
+        }
+
+
+@dataclass(frozen=True)
+class MethodError:
+    """An error that the approximations of the method cause."""
+
+    name: str
+    meaning: str
+    size: float
+    unit: str
+    share: float  # of the mean square of all errors of the method
+    rms: float  # unit of the sensor
+    held_out_share: float | None  # the same on held-out motion
+    held_out_magnitude_share: float | None
+
+
+@dataclass(frozen=True)
+class Wander:
+    """The bias wander of a fit."""
+
+    ratio: float  # to the white noise
+    time_s: float | None
+    standard_deviation: float
+    expected: float | None
+    inflated: bool  # it may contain a missing effect
+    scatter_over_noise: float | None = None  # of rests by hand
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of the document."""
+        return {k: v for k, v in vars(self).items() if k != "scatter_over_noise" or v is not None}
+
+
+@dataclass(frozen=True)
 class SensorDiagnosis:
     """A sensor's part of ``diagnoses/<unit>.json``, which ``pipeline/schemas/diagnosis.json`` describes."""
 
@@ -54,16 +161,17 @@ class SensorDiagnosis:
     ranking: Sequence[Candidate] = ()
     probability: Mapping[str, float] = field(default_factory=dict)
     answer_set: Sequence[Answer] = ()
-    upper_limit: Mapping[str, Any] = field(default_factory=dict)
+    upper_limit: Mapping[str, Mapping[str, tuple[float, str]]] = field(default_factory=dict)  # values and units
     to_distinguish: str = ""
     not_observable: Mapping[str, str] = field(default_factory=dict)  # effect to the reason
-    unexplained: Sequence[Mapping[str, Any]] = ()
-    suggested_effect: Mapping[str, Any] | None = None
-    method_errors: Sequence[Mapping[str, Any]] = ()
+    unexplained: Sequence[Dependence] = ()
+    suggested_effect: Mapping[str, Any] | None = None  # content of an effect file
+    method_errors: Sequence[MethodError] = ()
     next_experiment: str = ""
     override: str = ""
-    wander: Mapping[str, Any] | None = None  # None: no fit
-    details: Mapping[str, Any] = field(default_factory=dict)  # of the selection: pictures, formulas, held-out errors
+    wander: Wander | None = None  # None: no fit
+    on_table: TableEvidence | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)  # entries of the document: pictures, cross-validation
     given: bool = False  # whether the calibration is given, not fitted
     reason: str = ""
     further: Mapping[str, Any] = field(default_factory=dict)  # influence, goodness of fit, effective noise
@@ -75,7 +183,7 @@ class SensorDiagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """Return the part of the document."""
-        of_method = {"method_errors": list(self.method_errors)}
+        searched = any(entry.form for entry in self.unexplained)
         return {
             "verdict": self.verdict,
             "residual_over_noise": self.residual_over_noise,
@@ -83,17 +191,20 @@ class SensorDiagnosis:
             "ranking": [entry.to_json() for entry in self.ranking],
             "probability": dict(self.probability),
             "answer_set": [answer.to_json() for answer in self.answer_set],
-            "upper_limit": dict(self.upper_limit),
+            "upper_limit": {
+                name: {parameter: {"value": value, "unit": unit} for parameter, (value, unit) in limits.items()}
+                for name, limits in self.upper_limit.items()
+            },
             "to_distinguish": self.to_distinguish,
             "not_observable": [{"effect": name, "reason": reason} for name, reason in self.not_observable.items()],
-            "unexplained": list(self.unexplained),
+            "unexplained": [entry.to_json(searched=searched) for entry in self.unexplained],
             "suggested_effect": self.suggested_effect,
-            **({} if self.wander else of_method),
             "next_experiment": self.next_experiment,
             "override": self.override,
             "configured": list(self.configured),
-            "wander": self.wander,
-            **of_method,
+            "wander": self.wander and self.wander.to_json(),
+            "method_errors": [vars(error) for error in self.method_errors],
+            **(self.on_table.to_json() if self.on_table else {}),
             **self.details,
             **({"given": True} if self.given else {}),
             "reason": self.reason,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.diagnose import diagnose, without_diagnosis
 from pipeline.diagnosis.effective_noise import effective_noise
-from pipeline.diagnosis.formula_discovery import effect_file
 from pipeline.errors import omission
 from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
@@ -62,7 +61,8 @@ def diagnose_unit(
             found = _diagnosed(calibration, known, recordings, noises[sensor], settings, validated, gravity)
         except Exception as error:  # noqa: BLE001  (the calibration does not depend on its diagnosis)
             made.omissions.append(omission(error, unit, f"diagnose/{sensor}"))
-            found = without_diagnosis(sensor, settings.effects, made.omissions[-1])
+            failure = made.omissions[-1]
+            found = without_diagnosis(sensor, settings.effects, failure["code"], failure["message"])
         if found.suggested_effect:
             file = f"{unit}_{sensor}_unknown.yaml"
             made.effect_files[file] = effect_file(found.suggested_effect, unit)
@@ -73,8 +73,8 @@ def diagnose_unit(
 
 def diagnose_without(job: Job, unit: str, settings: Settings, record: dict[str, Any]) -> Files:
     """Return the document of a unit without a diagnosis of either sensor."""
-    known = calibrated(StoredUnit(job, unit).fits)
-    parts = {s: None if c is None else without_diagnosis(s, settings.effects, record) for s, c in known.items()}
+    failed, fits = (settings.effects, record["code"], record["message"]), calibrated(StoredUnit(job, unit).fits)
+    parts = {s: None if fit is None else without_diagnosis(s, *failed) for s, fit in fits.items()}
     return {f"{unit}.json": Diagnosis(unit, parts).document}
 
 
@@ -102,3 +102,16 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
     other = next(c for s, c in known.items() if s != sensor)
     densities = effective_noise(calibration, filtered, noise, settings.table, found, other=other)
     return replace(found, further={**found.further, "effective_noise": densities})
+
+
+def effect_file(definition: Mapping[str, Any], unit: str) -> str:
+    """Return the text of an effect file for a campaign's ``effects/``, from the definition that a unit suggests."""
+    import yaml  # noqa: PLC0415  (only a unit with unknown physics pays for it)
+
+    name, sensor = definition["name"], definition["sensors"][0]
+    remarks = (
+        f"# What unit {unit} shows beyond the catalogue of effects: a first guess, to be named, tried and confirmed.\n"
+        f"# To try it, copy this file to effects/{name}.yaml in the campaign's directory and add {name} to\n"
+        f"# effects.{sensor}. To rename it, change the file's name and the one below together.\n"
+    )
+    return remarks + str(yaml.safe_dump(dict(definition), sort_keys=False, allow_unicode=True, width=110))

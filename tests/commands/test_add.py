@@ -9,9 +9,9 @@ import pytest
 from pipeline.commands import add
 from pipeline.config.campaign import load_campaign
 from pipeline.config.devices import set_override
-from pipeline.diagnosis.formula_discovery import effect_file
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.model.effects import read_effect_file
+from pipeline.stages.diagnose import effect_file
 
 SHEET = """unit,serial,overrides
 U1,S1,

@@ -17,7 +17,6 @@ from pipeline.diagnosis import turntable
 from pipeline.diagnosis.formula_discovery import (
     Discovery,
     discover,
-    effect_file,
     suggested_effect,
     why_not_suggested,
 )
@@ -33,9 +32,10 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
 from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.kinematics import reference_motion
-from pipeline.records import Recording, SensorCalibration
+from pipeline.records import Dependence, FittedForm, RankedFormula, Recording, SensorCalibration
 from pipeline.signal.filters import smooth_temperature
 from pipeline.simulation.description import shipped_settings
+from pipeline.stages.diagnose import effect_file
 from tests.published import diagnose
 
 SHEET = shipped_settings(sensor="mpu6050").sensor
@@ -298,12 +298,9 @@ def test_a_curve_that_rounding_hides_explains_nothing() -> None:
 
 
 def test_names_that_are_taken_are_not_given_again() -> None:
-    entry = {"covariate": "angle", "shape": "5 cycles", "kind": "harmonic", "formulas": ["cos(angle)"], "axes": ["x"]}
-    entry["units"] = ["g"]
-    made = suggested_effect([entry], "accelerometer", {"unknown_angle", "unknown_angle_2"})
-    assert made is not None
+    form = FittedForm("5 cycles", "harmonic", ["x"], ["cos(angle)"], ["g"], [[1.0]], 1.0, "g")
+    made = suggested_effect("angle", form, "accelerometer", {"unknown_angle", "unknown_angle_2"})
     assert made["name"] == "unknown_angle_3"
-    assert suggested_effect([], "accelerometer") is None
 
 
 @pytest.mark.study
@@ -336,5 +333,6 @@ def test_a_form_that_is_not_stable_or_of_a_signal_that_hardly_varies_is_not_offe
     covariate: str, stability: float | None, hidden: dict[str, str], reason: str | None
 ) -> None:
     selection: Any = None
-    found = Discovery(selection, selection, [{"covariate": covariate}], {"name": "f"}, [{"stability": stability}])
+    formula = RankedFormula("f", 1, 0, 20.0, 10.0, ["x"], stability, suggested=True)
+    found = Discovery(selection, selection, [Dependence(covariate, 0.0)], {"name": "f"}, [formula])
     assert why_not_suggested(found, hidden) == reason

@@ -38,18 +38,18 @@ def given(**changes: np.ndarray) -> SensorCalibration:
 
 def test_a_shift_of_the_bias_is_named_with_its_size() -> None:
     (found,) = given_differences(given(bias=FREE.bias + SHIFT), lambda: FREE, MOVES, SETTINGS)
-    assert (found["name"], found["unit"], found["share"]) == ("bias", "deg/s", 1.0)
-    assert found["size"] == pytest.approx(0.3 * 0.99)
+    assert (found.name, found.unit, found.share) == ("bias", "deg/s", 1.0)
+    assert found.size == pytest.approx(0.3 * 0.99)
 
 
 def test_a_scale_factor_is_named_and_a_rotation_of_the_mounting_is_not() -> None:
     (found,) = given_differences(given(matrix=FREE.matrix @ np.diag([1.02, 1.0, 1.0])), lambda: FREE, MOVES, SETTINGS)
-    assert found["name"] == "scale_factor"
-    assert found["size"] == pytest.approx(0.02)
-    assert found["rms"] == pytest.approx(30.0 * 0.02 / np.sqrt(3.0))
+    assert found.name == "scale_factor"
+    assert found.size == pytest.approx(0.02)
+    assert found.rms == pytest.approx(30.0 * 0.02 / np.sqrt(3.0))
     angle = np.radians(2.0)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    named = [e["name"] for e in given_differences(given(matrix=turn @ FREE.matrix), lambda: FREE, MOVES, SETTINGS)]
+    named = [e.name for e in given_differences(given(matrix=turn @ FREE.matrix), lambda: FREE, MOVES, SETTINGS)]
     assert "rotation" not in named
     assert "non_orthogonality" not in named
 

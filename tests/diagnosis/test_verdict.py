@@ -13,7 +13,7 @@ from pipeline.diagnosis.verdict import HeldOut, VerdictInput, decide, judged, ve
 from pipeline.estimation.stages import declared
 from pipeline.one_unit import unit_of_recordings
 from pipeline.outcome import commands_of
-from pipeline.records import Agreement, Note, Recording, SensorDiagnosis, StepErrors
+from pipeline.records import Agreement, Dependence, HeldOutErrors, Note, Recording, SensorDiagnosis, StepErrors
 from pipeline.report.parameters import summary_row
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
@@ -39,8 +39,8 @@ OFF = Agreement(p_value=1e-5, reads="x", of="y", error=3e-4, expanded_uncertaint
 BEYOND = replace(MISSING, implausible=("g_sensitivity",))
 
 
-def held_out(after: float) -> dict[str, float]:
-    return {"error_before": 1.0, "error_after": after, "floor": 0.3}
+def held_out(after: float) -> HeldOutErrors:
+    return HeldOutErrors(1.0, after, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -116,8 +116,8 @@ def test_the_first_that_applies_is_said_with_its_numbers(evidence: VerdictInput,
         assert "reference_least_squares" not in step + reason
 
 
-UNKNOWN = [{"covariate": "time", "delta_bic": 50.0}]
-BETTER, SAME, BAD = ({"error_before": 1.0, "error_after": a, "floor": 0.3} for a in (0.3, 0.5, 1.1))
+UNKNOWN = [Dependence("time", 1e-9, 50.0)]
+BETTER, SAME, BAD = map(held_out, (0.3, 0.5, 1.1))
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ BETTER, SAME, BAD = ({"error_before": 1.0, "error_after": a, "floor": 0.3} for a
     ],
 )
 def test_a_selection_that_leaves_a_residual_is_no_explanation(  # noqa: PLR0917  (what a selection found)
-    names: list[str], unknown: list[dict[str, Any]], share: float, gain: float, changes: dict[str, Any], verdict: str
+    names: list[str], unknown: list[Dependence], share: float, gain: float, changes: dict[str, Any], verdict: str
 ) -> None:
     given: dict[str, Any] = {"above_noise": False, "held_out": None} | changes
     assert verdict_of_selection(names, unknown, share, gain, **given) == verdict

@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.diagnosis.words import PLUS_MINUS, in_words, next_experiment
+from pipeline.diagnosis.findings import next_experiment
+from pipeline.diagnosis.words import PLUS_MINUS, in_words
 from pipeline.estimation.posterior import Answers
 from pipeline.model.effects import catalogue
 from tests.published import candidate
@@ -133,7 +134,7 @@ def test_an_effect_that_contains_another_needs_no_distinction() -> None:
         on_table = True
 
     (found,) = part("missing_effect", ["lever_arm"], [])["ranking"]
-    entries = [candidate("lever_arm", look_alikes=found["look_alikes"])]
+    entries = [candidate("lever_arm", look_alikes={a["effect"]: a["share"] for a in found["look_alikes"]})]
     said = next_experiment("missing_effect", entries, Found())  # type: ignore[arg-type]
     assert said == f"to confirm lever arm: {catalogue()['lever_arm'].experiment}"
     assert "moved by a known distance" in said
