@@ -220,9 +220,10 @@ def _mountings_by_gravity(recordings: Sequence[Recording], settings: Settings) -
 
 def _leaning(diagnosis: SensorDiagnosis | None, fit: SensorCalibration | None) -> dict[str, float]:
     """Return the largest tilt of a turn axis by each such effect that an accelerometer has or misses, deg."""
-    parameters = {e.effect: e.parameters for e in (diagnosis.chosen if diagnosis else ())}
-    parameters |= {e.name: e.parameters for e in (fit.effects if fit else ())}
-    return {name: max(abs(p["value"]) for p in parameters[name].values()) for name in LEANING if name in parameters}
+    chosen, effects = diagnosis.chosen if diagnosis else (), fit.effects if fit else ()
+    values = {entry.effect: [p.value for p in entry.parameters.values()] for entry in chosen}
+    values |= {each.name: each.values.tolist() for each in effects}
+    return {name: max(map(abs, values[name])) for name in LEANING if name in values}
 
 
 def _doubts_of_axes(leaning: Mapping[str, float], calibration: SensorCalibration) -> list[str]:

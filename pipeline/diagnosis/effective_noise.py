@@ -96,7 +96,7 @@ def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDi
     motion = samples.motion
     if entry is None or motion is None or not entry.parameters:
         return None
-    fitted = FittedEffect(name, entry.parameters)
+    fitted = FittedEffect(name, {n: {"value": p.value, "unit": p.unit} for n, p in entry.parameters.items()})
     this = effect_of(fitted)
     if any(getattr(motion, need) is None for need in this.needs):
         return None

@@ -22,7 +22,7 @@ from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
 from pipeline.model.effects import catalogue, effect
-from pipeline.records import Answer, Candidate, SensorDiagnosis, Wander, standard_uncertainty
+from pipeline.records import Answer, Candidate, Estimate, SensorDiagnosis, Wander, standard_uncertainty
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ def _entry(findings: Findings, name: str) -> Candidate:
     )
 
 
-def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Any], bool]:
+def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], bool]:
     """Return the parameters of an effect and whether they are plausible: if selected, by the fit of all selected."""
     values, uncertainty, plausible = score.values, score.uncertainty, score.plausible
     if score.name in findings.selected:
@@ -216,7 +216,7 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Any], bool]:
             plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= findings.limits[score.name]))
     described = effect(score.name).of_recordings(findings.turns).parameters(findings.sensor)
     return {
-        p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}
+        p.name: Estimate(float(v), p.unit, float(u) if u > 0 else None)
         for p, v, u in zip(described, values, uncertainty, strict=True)
     }, plausible
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FileSystemLoader, Template
 
-from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_held
+from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed
 from pipeline.estimation.free_curves import OTHER
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, unit_of
@@ -54,7 +54,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {"plain": plain, "listed": listed, "said": lambda answer: _said(Answer(**answer))}
-    environment.globals |= {"is_held": is_held, "largest_by_unit": largest_by_unit, "plus_minus": PLUS_MINUS}
+    environment.globals |= {"is_fixed": is_fixed, "largest_by_unit": largest_by_unit, "plus_minus": PLUS_MINUS}
     environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED, "Verdict": Verdict}
     return environment
 
@@ -85,7 +85,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
         catalogue=catalogue(),
         by_reason=by_reason.items(),
         answers=listed([*map(_said, sets[:MOST_ANSWERS]), *more], "or"),
-        held=FIXED_AT_ZERO,
+        fixed=FIXED_AT_ZERO,
         tilt=TILT,
     )
     return [line for line in text.splitlines() if line]

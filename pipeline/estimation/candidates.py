@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise, product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from pipeline.model.effects.base import parameter_limits
 from pipeline.model.effects.mounting import SETUP_EFFECTS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from pipeline.estimation.observations import Observations
     from pipeline.model.effects.base import Effect
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
 TILTS = ("d_x", "d_y")  # parameters of ``table_tilt``
-HELD_DEG = 1e-4  # standard deviation of a tilt that is fixed at 0: a hundredth of a good encoder's accuracy
+FIXED_DEG = 1e-4  # standard deviation of a tilt that is fixed at 0: a hundredth of a good encoder's accuracy
 FIXED_AT_ZERO = (
     "A tilt about the shaft has the same signal as a common zero of the turns: the recordings do not determine it "
     "together with mountings or zeros. table.levelling_deg does not state it, so that it is fixed at 0."
@@ -113,7 +113,7 @@ def prior_of(
     """
     if this.name == TILT:
         along = tilt_like_zeros([part.motion for part in observed.parts], fitted)
-        width = observed.levelling_deg or HELD_DEG
+        width = observed.levelling_deg or FIXED_DEG
         return None if along is None else NormalPrior(np.zeros(2), np.outer(along, along) / width**2)
     if this.name != MOUNTING:
         stated = observed.bench.get(this.name)
@@ -151,11 +151,10 @@ def tilt_like_zeros(motions: Sequence[Motion], fitted: Sequence[str]) -> Values 
     return np.asarray(shafts[0] / np.linalg.norm(shafts[0]), np.float64)
 
 
-def is_held(name: str, parameter: Mapping[str, Any]) -> bool:
-    """Return whether a parameter is a tilt that was fixed at 0, by its ``value, standard_uncertainty``."""
-    u = parameter.get("standard_uncertainty") or 0.0
-    is_tilt = name.rpartition(".")[2] in TILTS and parameter.get("unit") == "deg"
-    return is_tilt and u < 10.0 * HELD_DEG and abs(parameter["value"]) < 0.01 * HELD_DEG
+def is_fixed(name: str, value: float, unit: str | None, standard_uncertainty: float | None) -> bool:
+    """Return whether a parameter is a tilt that was fixed at 0."""
+    is_tilt = name.rpartition(".")[2] in TILTS and unit == "deg"
+    return is_tilt and (standard_uncertainty or 0.0) < 10.0 * FIXED_DEG and abs(value) < 0.01 * FIXED_DEG
 
 
 def limits_of(sensor: str, data_sheet: DataSheet) -> dict[str, Values]:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_held, parameter_names, require_available, starts_of
+from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed, parameter_names, require_available, starts_of
 from pipeline.estimation.design import (
     Design,
     EffectColumns,
@@ -364,11 +364,11 @@ def calibration_of(
     covariance = change @ fit.covariance @ change.T
     change = change @ turned
     effects, parameters = effect_parameters(sensor, fit.terms, covariance)
-    held = [is_held(name, parameter) for name, parameter in parameters.items()]
-    if any(held):  # no estimates: 0 without an uncertainty
-        rows = BASE_COUNT + np.flatnonzero(held)
+    is_fixed_at_zero = [is_fixed(name, p.value, p.unit, p.standard_uncertainty) for name, p in parameters.items()]
+    if any(is_fixed_at_zero):  # no estimates: 0 without an uncertainty
+        rows = BASE_COUNT + np.flatnonzero(is_fixed_at_zero)
         change[rows] = covariance[rows] = covariance[:, rows] = 0.0
-        of_terms = np.split(held, np.cumsum([len(term.values) for term in fit.terms])[:-1])
+        of_terms = np.split(is_fixed_at_zero, np.cumsum([len(term.values) for term in fit.terms])[:-1])
         terms = [
             replace(t, values=np.where(fixed, 0.0, t.values)) for t, fixed in zip(fit.terms, of_terms, strict=True)
         ]

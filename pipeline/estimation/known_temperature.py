@@ -23,7 +23,7 @@ from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.stages import FitStage
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE
-from pipeline.records import FittedEffect, SensorCalibration, StageResult
+from pipeline.records import Estimate, FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from pipeline.records import UnitRecordings
@@ -67,8 +67,6 @@ def fit(
     del recordings, previous  # it is the first stage
     effects = known_effects(sensor, settings.method)
     parameters = {
-        f"{e.name}.{name}": {"value": p["value"], "unit": p["unit"], "standard_uncertainty": None}
-        for e in effects
-        for name, p in e.parameters.items()
+        f"{e.name}.{name}": Estimate(p["value"], p["unit"]) for e in effects for name, p in e.parameters.items()
     }
     return SensorCalibration(sensor, effects=effects, stages=(StageResult(NAME, parameters),))

@@ -17,7 +17,8 @@ PNAS 17, 1931).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy
@@ -40,7 +41,6 @@ from pipeline.estimation.noise_terms import (
     allan_deviation,
     allan_variance,
     at_once,
-    each_term,
     evaluate,
     solved,
     spectrum_of,
@@ -78,6 +78,53 @@ NOT_FITTED = {
     "ramp": "only a static recording shows it",
     "temperature": "the temperature did not change, or only as a ramp",
 }
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """A value and its 95 % interval."""
+
+    value: float
+    interval: list[float]
+
+    @classmethod
+    def of(cls, value: float, spread: float) -> Self:
+        """Return a value with its interval by the standard uncertainty."""
+        return cls(value, [value - QUANTILE * spread, value + QUANTILE * spread])
+
+
+@dataclass(frozen=True)
+class SeenTerm:
+    """A noise term that the recording shows."""
+
+    name: str
+    coefficient: Bounded
+    unit: str
+    correlation_time_s: Bounded | None = None  # of a Gauss-Markov process
+    frequency_hz: Bounded | None = None  # of a sinusoid
+
+    def allan_variance(self, tau: Values, longer: float = 1.0) -> Values:
+        """Return the Allan variance at averaging times in s, with ``longer`` times the correlation time."""
+        constant = self.correlation_time_s or self.frequency_hz
+        return allan_variance(self.name, self.coefficient.value, tau, longer * constant.value if constant else np.nan)
+
+    def to_json(self) -> JSON:
+        """Return the published entry."""
+        constants = {"correlation_time_s": self.correlation_time_s, "frequency_hz": self.frequency_hz}
+        return {"unit": self.unit, **vars(self.coefficient), **{k: vars(v) for k, v in constants.items() if v}}
+
+
+@dataclass(frozen=True)
+class UnseenTerm:
+    """A noise term that the recording does not show."""
+
+    unit: str
+    reason: str
+    upper_limit: float | None = None
+
+    def to_json(self) -> JSON:
+        """Return the published entry."""
+        return {"value": None, "interval": None, **vars(self)}
 
 
 def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
@@ -214,51 +261,58 @@ def _axis(
     weight = np.exp(-0.5 * (np.array([c.bic for c in candidates]) - best.bic))
     probability = (weight / weight.sum()).tolist()
     present = _present(best, bounds[0], regression)
-    terms: JSON = {}
+    seen = {term.name: term for term in present}
+    terms: dict[str, SeenTerm | UnseenTerm] = {}
     for kind in SINGLE:
         name = STOCHASTIC[kind]
-        if kind in best.kinds:
-            terms[name] = present[best.kinds.index(kind)]
-        else:
-            limit = regression.scale * float(np.sqrt(bounds[1][kind]))
-            reason = _reason(kind, regression.names(best), spectrum)
-            terms[name] = {
-                "value": None, "unit": unit_of(name, unit), "interval": None, "reason": reason, "upper_limit": limit
-            }  # fmt: skip
-    processes = [term for term in present if "correlation_time_s" in term]
-    terms[STOCHASTIC[MARKOV]] = sorted(processes, key=lambda term: float(term["correlation_time_s"]["value"]))
-    deterministic = _deterministic(regression, best, spectrum)
+        limit = None if kind in best.kinds else regression.scale * float(np.sqrt(bounds[1][kind]))
+        reason = _reason(kind, regression.names(best), spectrum)
+        terms[name] = seen.get(name) or UnseenTerm(unit_of(name, unit), reason, limit)
+    processes = [(term.correlation_time_s.value, term) for term in present if term.correlation_time_s]
+    slopes = {
+        "ramp": _slope(regression, best, spectrum, "ramp", regression.span),
+        "temperature": _slope(regression, best, spectrum, "temperature", 1.0),
+    }
+    sinusoids = _sinusoids(regression, best)
+    others = [*(s for s in slopes.values() if isinstance(s, SeenTerm) and s.name == "ramp"), *sinusoids]
     return {
-        "terms": terms | deterministic,
+        "terms": {
+            **{name: term.to_json() for name, term in terms.items()},
+            STOCHASTIC[MARKOV]: [term.to_json() for _, term in sorted(processes, key=lambda pair: pair[0])],
+            **{name: slope.to_json() for name, slope in slopes.items()},
+            "sinusoid": [term.to_json() for term in sinusoids],
+        },
         "reason": None,
         "ranking": [
             {"terms": regression.names(c), "delta_bic": c.bic - best.bic, "probability": p}
             for c, p in list(zip(candidates, probability, strict=True))[:MOST_PUBLISHED]
         ],
         "p_value": p_value,
-        "allan": _allan(*measured, best, present, deterministic, spectrum),
+        "allan": _allan(*measured, best, present, others, spectrum),
         "doubts": doubts,
     }
 
 
-def _present(best: Candidate, within: Values, regression: Regression) -> list[JSON]:
-    """Return the stochastic terms of a composition as published; ``within``: intervals of the parameters."""
+def _present(best: Candidate, within: Values, regression: Regression) -> list[SeenTerm]:
+    """Return the stochastic terms of a composition; ``within``: intervals of the parameters."""
     n, terms = len(best.kinds), []
     for j, kind in enumerate(best.kinds):
-        term: JSON = {
-            "value": regression.scale * float(np.exp(0.5 * best.parameters[j])),
-            "unit": unit_of(STOCHASTIC[kind], regression.unit),
-            "interval": (regression.scale * np.exp(0.5 * within[:, j])).tolist(),
-        }
+        size = regression.scale * float(np.exp(0.5 * best.parameters[j]))
+        coefficient = Bounded(size, (regression.scale * np.exp(0.5 * within[:, j])).tolist())
+        time = None
         if kind == MARKOV:
-            time, interval = float(np.exp(best.parameters[n + j])), np.exp(within[:, n + j]).tolist()
-            term["correlation_time_s"] = {"value": time, "interval": interval}
-        terms.append(term)
+            time = Bounded(float(np.exp(best.parameters[n + j])), np.exp(within[:, n + j]).tolist())
+        terms.append(SeenTerm(STOCHASTIC[kind], coefficient, unit_of(STOCHASTIC[kind], regression.unit), time))
     return terms
 
 
 def _allan(  # noqa: PLR0917  (the curve and its terms)
-    tau: Values, measured: Values, best: Candidate, present: Sequence[JSON], deterministic: JSON, spectrum: Spectrum
+    tau: Values,
+    measured: Values,
+    best: Candidate,
+    present: Sequence[SeenTerm],
+    deterministic: Sequence[SeenTerm],
+    spectrum: Spectrum,
 ) -> JSON:
     """Return the Allan deviation of the readings, and that of the terms with its 95 % band.
 
@@ -267,18 +321,16 @@ def _allan(  # noqa: PLR0917  (the curve and its terms)
     """
     by_size, by_time = np.zeros((2, best.fit.kinds.shape[1], len(tau)))
     for j, (kind, term) in enumerate(zip(best.kinds, present, strict=True)):
-        by_size[j] = allan_variance(STOCHASTIC[kind], term, tau)
+        by_size[j] = term.allan_variance(tau)
         if kind == MARKOV:
-            longer = {"value": DERIVATIVE_STEP * term["correlation_time_s"]["value"]}
-            changed = allan_variance(STOCHASTIC[MARKOV], {**term, "correlation_time_s": longer}, tau)
-            by_time[j] = (changed - by_size[j]) / np.log(DERIVATIVE_STEP)
-    others = [(term, allan_variance(name, term, tau)) for name, term in each_term(deterministic)]
+            by_time[j] = (term.allan_variance(tau, DERIVATIVE_STEP) - by_size[j]) / np.log(DERIVATIVE_STEP)
+    others = [(term.coefficient, term.allan_variance(tau)) for term in deterministic]
     total = by_size.sum(axis=0) + np.sum([np.zeros(len(tau)), *(part for _, part in others)], axis=0)
     jacobian = np.concatenate([by_size, by_time]) / total
     covariance = best.fit.covariance(spectrum.count)[0]
     variance = np.maximum(np.einsum("it,ij,jt->t", jacobian, covariance, jacobian), 0.0)
     for coefficient, part in others:  # by the interval of the coefficient
-        variance += (part / total * np.diff(coefficient["interval"])[0] / coefficient["value"] / QUANTILE) ** 2
+        variance += (part / total * np.diff(coefficient.interval)[0] / coefficient.value / QUANTILE) ** 2
     half, deviation = QUANTILE * np.sqrt(variance), np.sqrt(total)
     curves = {
         "tau_s": tau,
@@ -302,41 +354,31 @@ def _reason(kind: int, names: Sequence[str], spectrum: Spectrum) -> str:
     )
 
 
-def _deterministic(regression: Regression, best: Candidate, spectrum: Spectrum) -> JSON:
-    """Return ramp, temperature and sinusoids, as published."""
-    ramp_unit, temperature_unit = unit_of("ramp", regression.unit), f"{regression.unit}/degC"
+def _sinusoids(regression: Regression, best: Candidate) -> list[SeenTerm]:
+    """Return the sinusoids of the most probable composition."""
     beta, covariance = best.fit.beta[0], best.fit.beta_covariance[0]
     sinusoids = []
     for j, line in zip(range(len(regression.optional), len(beta), 3), regression.lines, strict=False):
         size = float(np.hypot(line.a, line.b))
         direction = np.array([line.a, line.b]) / size
         spread = float(np.sqrt(direction @ covariance[j : j + 2, j : j + 2] @ direction))
-        amplitude = _with_interval(regression.scale * float(np.hypot(*beta[j : j + 2])), regression.scale * spread)
+        amplitude = Bounded.of(regression.scale * float(np.hypot(*beta[j : j + 2])), regression.scale * spread)
         of_frequency = float(np.sqrt(covariance[j + 2, j + 2])) / (regression.span * size)
-        frequency = _with_interval(line.frequency, of_frequency)
-        sinusoids.append(amplitude | {"unit": regression.unit, "frequency_hz": frequency})
-    return {
-        "ramp": {"unit": ramp_unit} | _slope(regression, best, spectrum, "ramp", regression.span),
-        "temperature": {"unit": temperature_unit} | _slope(regression, best, spectrum, "temperature", 1.0),
-        "sinusoid": sinusoids,
-    }
+        frequency = Bounded.of(line.frequency, of_frequency)
+        sinusoids.append(SeenTerm("sinusoid", amplitude, regression.unit, frequency_hz=frequency))
+    return sinusoids
 
 
-def _slope(regression: Regression, best: Candidate, spectrum: Spectrum, name: str, per: float) -> JSON:
-    """Return the coefficient of a column as published; the column is ``per`` times its unit."""
-    absent = {"value": None, "interval": None, "upper_limit": None}
+def _slope(regression: Regression, best: Candidate, spectrum: Spectrum, name: str, per: float) -> SeenTerm | UnseenTerm:
+    """Return the term of a deterministic column; the column is ``per`` times its unit."""
+    unit = f"{regression.unit}/degC" if name == "temperature" else unit_of(name, regression.unit)
     if name not in regression.optional:
-        return absent | {"reason": NOT_FITTED[name]}
+        return UnseenTerm(unit, NOT_FITTED[name])
     column = 1 + regression.optional.index(name)
     columns = tuple(sorted({*best.columns, column}))
     fit = evaluate(spectrum, [TermTrial(int(best.fit.axis[0]), best.kinds, columns, best.parameters)])
     value = regression.scale / per * float(fit.beta[0, column - 1])
     spread = regression.scale / per * float(np.sqrt(fit.beta_covariance[0, column - 1, column - 1]))
     if column in best.columns:
-        return _with_interval(value, spread)
-    return absent | {"reason": "not seen", "upper_limit": abs(value) + ONE_SIDED * spread}
-
-
-def _with_interval(value: float, spread: float) -> JSON:
-    """Return a value with its 95 % interval as published."""
-    return {"value": value, "interval": [value - QUANTILE * spread, value + QUANTILE * spread]}
+        return SeenTerm(name, Bounded.of(value, spread), unit)
+    return UnseenTerm(unit, "not seen", abs(value) + ONE_SIDED * spread)

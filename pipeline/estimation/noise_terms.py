@@ -42,13 +42,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 import scipy
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Mapping, Sequence
+    from collections.abc import Generator, Sequence
 
     from pipeline.records import Integers, Mask, Values
 
@@ -92,17 +92,19 @@ def markov_shape(omega: Values, interval: float, log_time: Values) -> tuple[Valu
     return shape, slope
 
 
-def allan_variance(name: str, term: Mapping[str, Any], tau: Values) -> Values:
-    """Return the Allan variance of a term as published (``value`` ...) at averaging times in s."""
-    value = float(term["value"])
+def allan_variance(name: str, value: float, tau: Values, constant: float = np.nan) -> Values:
+    """Return the Allan variance of a term with this coefficient at averaging times in s.
+
+    ``constant``: of a Gauss-Markov process the correlation time, s; of a sinusoid the frequency, Hz.
+    """
     if name == "gauss_markov":
-        x = tau / float(term["correlation_time_s"]["value"])
+        x = tau / constant
         series = x < 1e-3  # the closed form cancels there; its error is x^2, relative
         y = np.where(series, 1.0, x)
         bend = 1.0 - (3.0 - 4.0 * np.exp(-y) + np.exp(-2.0 * y)) / (2.0 * y)
         return np.asarray(value**2 * np.where(series, 2.0 * x / 3.0, 2.0 / y * bend))
     if name == "sinusoid":
-        x = np.pi * float(term["frequency_hz"]["value"]) * tau
+        x = np.pi * constant * tau
         return np.asarray(value**2 * np.sin(x) ** 4 / x**2)
     power = {
         "quantisation": 3.0 / tau**2,
@@ -112,12 +114,6 @@ def allan_variance(name: str, term: Mapping[str, Any], tau: Values) -> Values:
         "ramp": tau**2 / 2.0,
     }
     return np.asarray(value**2 * power[name])
-
-
-def each_term(terms: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return name and content of each published noise term of an axis that has a value."""
-    listed = [(name, part) for name, parts in terms.items() for part in (parts if isinstance(parts, list) else [parts])]
-    return [(name, part) for name, part in listed if part["value"] is not None and name in UNITS]
 
 
 def allan_deviation(values: Values, interval: float, points_per_decade: int = 10) -> tuple[Values, Values]:

@@ -17,7 +17,7 @@ The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effe
 for validation and diagnosis with the recordings. The uncertainty is that of the file. If the file states none, the
 covariance is zero, which the budget states; any held-out error beyond noise is then an error of the calibration.
 
-``pipeline.estimation.correction`` describes the correction of readings by the stages so far.
+``pipeline.records.correction`` describes the correction of readings by the stages so far.
 """
 
 from __future__ import annotations
@@ -31,14 +31,12 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
-from pipeline.estimation.correction import published
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
-from pipeline.records import BASE, NORMAL, SENSORS, Contribution, SensorCalibration, StageResult, Values
+from pipeline.records import BASE, NORMAL, SENSORS, Contribution, Estimate, SensorCalibration, StageResult, Step, Values
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.correction import Step
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.records import FittedEffect, UnitRecordings
     from pipeline.settings import DataSheet, Method, Settings
@@ -241,7 +239,7 @@ def _given(method: Method) -> dict[str, Any]:
 def staged_result(  # noqa: PLR0917  (the results of a stage)
     name: str,
     steps: Sequence[Step],
-    parameters: dict[str, dict[str, Any]],
+    parameters: Mapping[str, Estimate],
     error: Values,
     samples: tuple[int, int],
     noise: ResidualNoise,
@@ -255,4 +253,4 @@ def staged_result(  # noqa: PLR0917  (the results of a stage)
         "bias_wander": noise.wander.tolist(),
         "degrees_of_freedom": float(degrees_of_freedom.min()),
     }
-    return StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), published(steps), details)
+    return StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), tuple(steps), details)

@@ -17,7 +17,7 @@ Sources without a stated accuracy are listed as not included.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from pipeline.records import (
     SENSOR_UNITS,
     Budget,
     Contribution,
+    Estimate,
     FittedEffect,
     NotIncluded,
     SensorCalibration,
@@ -252,16 +253,13 @@ def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Val
     return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
 
 
-def stage_parameters(values: Mapping[str, tuple[float, str]], covariance: Values) -> dict[str, dict[str, Any]]:
-    """Return the parameters of a stage as published."""
+def stage_parameters(values: Mapping[str, tuple[float, str]], covariance: Values) -> dict[str, Estimate]:
+    """Return the parameters of a stage."""
     u = standard_uncertainty(covariance).tolist()
-    return {
-        name: {"value": value, "unit": unit, "standard_uncertainty": uncertainty}
-        for (name, (value, unit)), uncertainty in zip(values.items(), u, strict=True)
-    }
+    return {name: Estimate(*values[name], uncertainty) for name, uncertainty in zip(values, u, strict=True)}
 
 
-def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Values) -> dict[str, dict[str, Any]]:
+def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Values) -> dict[str, Estimate]:
     """Return bias and matrix as the parameters of a stage."""
     values = zip(base_values(bias, matrix).tolist(), base_units(sensor), strict=True)
     return stage_parameters(dict(zip(BASE_NAMES, values, strict=True)), covariance)
@@ -269,15 +267,15 @@ def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Value
 
 def effect_parameters(
     sensor: str, terms: Sequence[EffectColumns], covariance: Values
-) -> tuple[tuple[FittedEffect, ...], dict[str, dict[str, Any]]]:
-    """Return the fitted effects, and their parameters as published with a stage; they follow bias and matrix."""
+) -> tuple[tuple[FittedEffect, ...], dict[str, Estimate]]:
+    """Return the fitted effects, and their parameters as those of a stage; they follow bias and matrix."""
     u = iter(standard_uncertainty(covariance)[AFTER_BASE].tolist())
     effects, parameters = [], {}
     for term in terms:
         pairs = zip(term.effect.parameters(sensor), term.values.tolist(), strict=True)
-        described: dict[str, dict[str, Any]] = {p.name: {"value": value, "unit": p.unit} for p, value in pairs}
+        described = {p.name: {"value": value, "unit": p.unit} for p, value in pairs}
         for name, shared in described.items():
-            parameters[f"{term.effect.name}.{name}"] = {**shared, "standard_uncertainty": next(u) or None}
+            parameters[f"{term.effect.name}.{name}"] = Estimate(**shared, standard_uncertainty=next(u) or None)
         effects.append(FittedEffect(term.effect.name, described, term.effect.definition))
     return tuple(effects), parameters
 

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 import numpy as np
 
 from pipeline.records.budget import Budget, BudgetLine, finite, unlimited
+from pipeline.records.correction import Step, published, steps_of
 from pipeline.records.parameters import (
     BASE_NAMES,
     BIAS,
     SENSOR_UNITS,
+    Estimate,
     Parameters,
     base_units,
     base_values,
@@ -36,12 +38,22 @@ class StageResult:
     """One stage of a fit."""
 
     name: str
-    parameters: dict[str, Any]  # name to {"value", "unit", "standard_uncertainty"}; the uncertainty may be None
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)
     residual_rms: float | None = None  # of the error that the fit minimises, after this stage, unit of the sensor
-    # Correction of readings after this stage, if it is more than matrix and bias. The module of the method in
-    # pipeline.estimation defines the keys.
-    correction: dict[str, Any] | None = None
-    details: dict[str, Any] = field(default_factory=dict)  # for the report: condition number, samples used, iterations
+    correction: tuple[Step, ...] | None = None  # of readings after this stage, if it is more than matrix and bias
+    details: Mapping[str, Any] = field(default_factory=dict)  # for the report: condition number, samples, iterations
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of the document."""
+        parameters = {name: dict(vars(estimate)) for name, estimate in self.parameters.items()}
+        correction = None if self.correction is None else published(self.correction)
+        return {**vars(self), "parameters": parameters, "correction": correction}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the object from the value of ``to_json``."""
+        parameters = {name: Estimate(**estimate) for name, estimate in data["parameters"].items()}
+        return cls(**{**data, "parameters": parameters, "correction": steps_of(data.get("correction"))})
 
 
 @dataclass(frozen=True)
@@ -117,7 +129,7 @@ class SensorCalibration:
             "degrees_of_freedom": self.degrees_of_freedom if np.isfinite(self.degrees_of_freedom) else None,
             "effective_degrees_of_freedom": finite(parameters.degrees_of_freedom),
             "covariance": {"parameters": list(parameters.names), "values": parameters.covariance.tolist()},
-            "stages": [dict(vars(s)) for s in self.stages],
+            "stages": [stage.to_json() for stage in self.stages],
             "effects": [
                 {"name": e.name, "parameters": e.parameters} | ({"definition": e.definition} if e.definition else {})
                 for e in self.effects
@@ -136,7 +148,7 @@ class SensorCalibration:
             sensor=sensor,
             bias=np.array(data["bias"], float),
             matrix=np.array(data["matrix"], float),
-            stages=tuple(StageResult(**s) for s in data["stages"]),
+            stages=tuple(map(StageResult.from_json, data["stages"])),
             effects=tuple(FittedEffect(**e) for e in data["effects"]),
             covariance=None if np.isnan(covariance).all() else np.nan_to_num(covariance, copy=False),
             degrees_of_freedom=float("inf") if data["degrees_of_freedom"] is None else data["degrees_of_freedom"],

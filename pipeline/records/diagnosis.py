@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.records.parameters import Estimate
     from pipeline.verdicts import Verdict
 
 
@@ -18,7 +19,7 @@ class Candidate:
     effect: str
     delta_bic: float
     p_value: float
-    parameters: dict[str, dict[str, Any]]  # name to value, unit, standard uncertainty
+    parameters: Mapping[str, Estimate]
     explained_share: float  # of the residual above the noise
     held_out_error_before: float | None  # of a selected effect
     held_out_error_after: float | None
@@ -29,7 +30,8 @@ class Candidate:
     def to_json(self) -> dict[str, Any]:
         """Return the entry of the ranking."""
         alike = [{"effect": name, "share": share} for name, share in self.look_alikes.items()]
-        document = {**vars(self), "look_alikes": alike}
+        estimates = {name: vars(estimate) for name, estimate in self.parameters.items()}
+        document = {**vars(self), "parameters": estimates, "look_alikes": alike}
         return {key: value for key, value in document.items() if key != "meaning" or value is not None}
 
 

@@ -64,6 +64,15 @@ def standard_uncertainty(covariance: Values) -> Values:
 
 
 @dataclass(frozen=True)
+class Estimate:
+    """The value of a parameter."""
+
+    value: float
+    unit: str
+    standard_uncertainty: float | None = None
+
+
+@dataclass(frozen=True)
 class Parameters:
     """p parameters of a sensor, or some of them."""
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
-from pipeline.estimation.noise_terms import UNITS, allan_variance, each_term
+from pipeline.estimation.noise_terms import UNITS, allan_variance
 from pipeline.records import AXES, SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, LineMark, Panel, chart, sentences
 from pipeline.report.numbers import number, percent, plain
@@ -48,11 +48,10 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
     legend, tau = list(AXES_LEGEND), np.array(next(iter(axes.values()))["allan"]["tau_s"])
     if density:
         legend.append(("c3", "sensor file"))
-        white = {"value": density / np.sqrt(2.0)}
-        time = {"value": data_sheet.stated("wander_time_s") or DEFAULT_TIME_S}
-        stated = {"value": data_sheet.stated("bias_wander") or 0.0, "correlation_time_s": time}
-        variance = allan_variance("white", white, tau) + allan_variance("gauss_markov", stated, tau)
-        layers.append(LineMark(tau, np.sqrt(variance), 3, "dashed"))
+        size, time = data_sheet.stated("bias_wander") or 0.0, data_sheet.stated("wander_time_s") or DEFAULT_TIME_S
+        white = allan_variance("white", density / np.sqrt(2.0), tau)
+        deviation = np.sqrt(white + allan_variance("gauss_markov", size, tau, time))
+        layers.append(LineMark(tau, deviation, 3, "dashed"))
     mean = np.mean([part["allan"]["deviation"] for part in axes.values()], axis=0)
     finding, caption, description = sentences(
         "allan",
@@ -131,7 +130,13 @@ def _text(part: JSON | None) -> str:
 def _white(axes: JSON, density: float | None) -> JSON:
     """Return the white noise, its ratio to the sensor file's density with a likely cause, and the other terms."""
     terms = [part["terms"] for part in axes.values()]
-    names = {name for t in terms for name, _ in each_term(t)}
+    names = {
+        name
+        for term in terms
+        for name, parts in term.items()
+        for part in (parts if isinstance(parts, list) else [parts])
+        if part["value"] is not None
+    }
     densities = [t["white"]["value"] for t in terms if t["white"]["value"]]
     white = float(np.sqrt(np.mean(np.square(densities)))) if densities else None
     stated = (density or 0.0) / np.sqrt(2.0)

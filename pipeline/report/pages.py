@@ -13,7 +13,7 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
-from pipeline.estimation.candidates import is_held
+from pipeline.estimation.candidates import is_fixed
 from pipeline.report import numbers
 from pipeline.report.numbers import measured, number, plain, unit_text
 from pipeline.verdicts import Verdict
@@ -133,7 +133,7 @@ def parameter_texts(parameters: JSON | None, *, uncertain: bool = True) -> list[
     texts = []
     for name, given in (parameters or {}).items():
         p = given if isinstance(given, dict) else {"value": given}
-        if is_held(name, p):
+        if is_fixed(name, p["value"], p.get("unit"), p.get("standard_uncertainty")):
             texts.append(f"{name} fixed at 0")
             continue
         standard = p.get("standard_uncertainty")

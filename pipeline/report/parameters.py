@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.estimation.candidates import is_held
+from pipeline.estimation.candidates import is_fixed
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, limited_effects, without_rotation
 from pipeline.records import (
     AFTER_BASE,
@@ -162,8 +162,8 @@ def parameter_rows(sensor: str, part: JSON, data_sheet: DataSheet) -> list[JSON]
         else:
             found.append((p, f"Scale factor error {axes}", data_sheet.scale_factor))
     for p in fitted[AFTER_BASE]:
-        held = is_held(p.name, {"value": p.value, "unit": p.unit, "standard_uncertainty": p.standard_uncertainty})
-        name = f"{p.words} (not determined, fixed at 0)" if held else p.words
+        at_zero = is_fixed(p.name, p.value, p.unit, p.standard_uncertainty)
+        name = f"{p.words} (not determined, fixed at 0)" if at_zero else p.words
         found.append((p, name, limits.get(p.name)))
     return [
         {"p": p, "name": name, "limit": limit or None, "share": abs(p.value) / limit if limit else 0.0,

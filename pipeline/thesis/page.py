@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.estimation import correction
 from pipeline.io.yaml_file import read_yaml
 from pipeline.records import SENSOR_UNITS
+from pipeline.records.correction import corrected, steps_of
 from pipeline.report.chart import AXES_LEGEND, Figure, Panel, SampleMarks, chart
 from pipeline.report.group_charts import Point, curves, stems
 from pipeline.report.held_out_section import held_out_over_time
@@ -154,9 +154,9 @@ def _before_and_after(results: Results, name: str, sensor: str) -> Figure | None
     samples = samples_of_motion(sensor, held_out[0], SILENT, shipped_settings().table) if held_out else None
     if samples is None:
         return None
-    steps = correction.steps_of(results.correction(f"{name}-printed", sensor))
-    corrected = correction.corrected(steps, samples.reading)
-    before, after = (np.linalg.norm(v, axis=1) - samples.magnitude for v in (samples.reading, corrected))
+    steps = steps_of(results.correction(f"{name}-printed", sensor))
+    calibrated = corrected(steps or (), samples.reading)
+    before, after = (np.linalg.norm(v, axis=1) - samples.magnitude for v in (samples.reading, calibrated))
     drawn = held_out_over_time(f"held-out-{name}", sensor, held_out[0], before, after)
     means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
     finding = f"{_in_words(name)}: mean |e| goes from {means[0]} to {means[1]} {SENSOR_UNITS[sensor]}"

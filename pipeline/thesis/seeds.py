@@ -30,11 +30,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.accelerometer import staged as accelerometer
-from pipeline.estimation.correction import corrected
 from pipeline.estimation.gyroscope import cholesky_lu
 from pipeline.estimation.gyroscope import staged as gyroscope
 from pipeline.model.measurement import linear_truth
 from pipeline.records import SENSORS, Mask, NotCalibrated, Recording, Values
+from pipeline.records.correction import corrected
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import Description, UnitDescription, read_description, shipped_settings

@@ -241,9 +241,10 @@ def gravity_direction(
     if gyroscope.parameters.covariance[MATRIX, MATRIX].any():
         ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
         details = gyroscope.stages[-1].details if gyroscope.stages else {}
+        moves, directions = (float(details.get(f"scatter_of_{each}") or 0.0) for each in ("moves", "directions"))
         covariance, freedom = covariance_without_reference(gyroscope), gyroscope.parameters.degrees_of_freedom
         found["largest_expected_rms_deg"] = model.largest_direction_error(
-            states["after"], covariance, freedom, details, ratio
+            states["after"], covariance, freedom, (moves, directions), ratio
         )
     if turns:
         found["turns"] = [

@@ -18,13 +18,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.correction import corrected, steps_of
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.mounting import SEPARATOR, Mounting
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.measurement import SensorEffects, linear_truth, solve
-from pipeline.records import FittedEffect, Motion, SensorCalibration, StepErrors, Values
+from pipeline.records import FittedEffect, Motion, SensorCalibration, StepErrors, Values, corrected
 from pipeline.validation.samples import OTHER, Samples
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ def error_breakdown(calibration: SensorCalibration, samples: Sequence[Samples]) 
     """Return the errors after each step, and notes on effects that the samples cannot show."""
     stages = [(f"stage:{stage.name}", stage.correction) for stage in calibration.stages if stage.correction is not None]
     figures = [
-        _figures(name, [_uncorrected(s, corrected(steps_of(correction), s.reading)) for s in samples])
+        _figures(name, [_uncorrected(s, corrected(correction or (), s.reading)) for s in samples])
         for name, correction in [("raw", None), *stages]
     ]
     figures.append(_figures("calibrated", [_with_effects(calibration, (), s) for s in samples]))

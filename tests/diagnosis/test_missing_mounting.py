@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.one_unit import unit_of_recordings
-from pipeline.records import SENSORS, Recording, SensorCalibration, SensorDiagnosis
+from pipeline.records import SENSORS, Estimate, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 from pipeline.verdicts import Verdict
@@ -79,7 +79,7 @@ def test_a_lean_within_the_uncertainty_of_the_gyroscopes_matrix_is_no_doubt(
     assert fit.covariance is not None
     assert state.recordings is not None
     U = np.degrees(2.0 * np.sqrt(np.max(np.diag(fit.covariance)[3:12])))  # deg; 1e-3 of a matrix are 0.057 deg
-    lean = candidate("table_axis_nonorthogonality", parameters={"x_y": {"value": of_uncertainty * U}})
+    lean = candidate("table_axis_nonorthogonality", parameters={"x_y": Estimate(of_uncertainty * U, "deg")})
     gravity = SensorDiagnosis(Verdict.MISSING_EFFECT, [], selected=[lean.effect], ranking=[lean])
     noise = state.recordings.noises["gyroscope"]
     found = diagnose(fit, state.recordings.filtered, noise, unit.row.config, gravity=gravity)

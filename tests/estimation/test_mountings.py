@@ -124,7 +124,7 @@ def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(
         held_part, across = tilted.effects[-1].parameters.values()
         assert (held_part["value"], held_part["expanded_uncertainty"]) == (0.0, None)
         assert across["expanded_uncertainty"] > 1.9 * wider[-1] > 0.0 == wider[-2]
-        assert tilted.stages[-1].parameters["table_tilt.d_x"]["standard_uncertainty"] is None
+        assert tilted.stages[-1].parameters["table_tilt.d_x"].standard_uncertainty is None
         why = {line["source"]: line["reason"] for line in tilted.to_json()["uncertainty_budget"]["not_included"]}
         assert why["levelling"].startswith("table_tilt estimates the component across the shaft alone")
         assert abs(d[1]) < 4.0 * wider[-1]  # the part across the shaft is estimated; the truth is 0

@@ -8,9 +8,9 @@ from table_turns import Bench, run_stages, settings, specific_force, stepped_ang
 from unit_settings import filter_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.correction import corrected, steps_of
 from pipeline.estimation.stages import fit_stage
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
+from pipeline.records.correction import Subtract, TwoSided, corrected
 from pipeline.signal.filters import apply_filter
 
 STAGES = ["orthogonality", "misalignment", "bias", "scale_factor"]
@@ -26,7 +26,7 @@ def calibrate(recordings: list, **options: bool | float) -> SensorCalibration:
 
 def values(calibration: SensorCalibration, stage: str) -> dict[str, float]:
     result = next(s for s in calibration.stages if s.name == stage)
-    return {name: p["value"] for name, p in result.parameters.items()}
+    return {name: p.value for name, p in result.parameters.items()}
 
 
 def rotation(degrees: tuple[float, float, float]) -> np.ndarray:
@@ -67,9 +67,9 @@ def test_each_stage_keeps_those_before_it_and_corrects_readings_up_to_itself() -
     rms = [stage.residual_rms for stage in found.stages]
     assert rms[1] > 5 * rms[2] > 1000 * rms[3]
     truth = specific_force("x", recordings[0].table_angle)
-    output = corrected(steps_of(found.stages[-1].correction), recordings[0].accelerometer)
+    output = corrected(found.stages[-1].correction, recordings[0].accelerometer)
     assert np.allclose(output, truth, rtol=0, atol=1e-9)
-    after_bias = corrected(steps_of(found.stages[2].correction), recordings[0].accelerometer)
+    after_bias = corrected(found.stages[2].correction, recordings[0].accelerometer)
     assert np.allclose(after_bias.mean(axis=0), recordings[0].accelerometer.mean(axis=0) - BIAS, atol=1e-9)
 
 
@@ -146,20 +146,15 @@ def test_as_printed_the_bias_passes_for_misalignment() -> None:
 def test_as_printed_the_side_is_chosen_by_the_sign_of_the_biased_reading() -> None:
     recordings = Bench("accelerometer", BIAS, np.eye(3)).stop_and_go()
     for as_printed, switch_at in ((False, BIAS), (True, [0.0, 0.0, 0.0])):
-        step = calibrate(recordings, as_printed=as_printed).stages[0].correction["steps"][0]
-        assert np.allclose(step["two_sided"]["switch_at"], switch_at, atol=1e-9)
+        step = calibrate(recordings, as_printed=as_printed).stages[0].correction[0]
+        assert np.allclose(step.switch_at, switch_at, atol=1e-9)
 
 
 def test_as_printed_still_corrects_noise_free_readings_but_subtracts_the_level_reading_twice() -> None:
     recordings = Bench("accelerometer", BIAS, np.diag(1.0 / SCALE), c=ASYMMETRY).stop_and_go()
     found = calibrate(recordings, as_printed=True)
-    assert [list(step) for step in found.stages[-1].correction["steps"]] == [
-        ["two_sided"],
-        ["two_sided"],
-        ["subtract"],
-        ["subtract"],
-        ["two_sided"],
-    ]
+    kinds = [TwoSided, TwoSided, Subtract, Subtract, TwoSided]
+    assert [type(step) for step in found.stages[-1].correction] == kinds
     assert found.stages[-1].residual_rms < 1e-4
 
 
@@ -234,7 +229,7 @@ def test_held_out_error_of_mpu6050_falls_by_more_than_85_percent() -> None:
     found = calibrate(bench.stop_and_go(5.0, 1.2))
     attitudes = np.random.default_rng(5).standard_normal((10_250, 3))
     raw = bench.reading(attitudes / np.linalg.norm(attitudes, axis=1, keepdims=True))
-    output = corrected(steps_of(found.stages[-1].correction), raw)
+    output = corrected(found.stages[-1].correction, raw)
     before, after = (np.mean(np.abs(np.linalg.norm(a, axis=1) - 1.0)) for a in (raw, output))
     assert before == pytest.approx(0.071, abs=0.003)
     assert 1.0 - after / before > 0.85

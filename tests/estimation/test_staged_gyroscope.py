@@ -8,10 +8,10 @@ from table_turns import INTERVAL, Bench, ramped_rate, run_stages, settings
 from unit_settings import filter_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.correction import corrected, steps_of
 from pipeline.estimation.stages import fit_stage
 from pipeline.model.kinematics import earth_rate
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
+from pipeline.records.correction import Subtract, corrected
 from pipeline.signal.filters import apply_filter
 
 STAGES = ["bias", "orthogonality_and_misalignment", "scale_factor"]
@@ -26,7 +26,7 @@ def calibrate(recordings: list, **options: bool | float) -> SensorCalibration:
 
 def values(calibration: SensorCalibration, stage: str) -> dict[str, float]:
     result = next(s for s in calibration.stages if s.name == stage)
-    return {name: p["value"] for name, p in result.parameters.items()}
+    return {name: p.value for name, p in result.parameters.items()}
 
 
 def printed_matrix(calibration: SensorCalibration) -> np.ndarray:
@@ -74,7 +74,7 @@ def test_the_correction_of_each_stage_is_that_of_row_vectors() -> None:
     recordings = Bench("gyroscope", BIAS, K).turns_at([60.0])
     found = calibrate(recordings)
     raw = recordings[1].gyroscope
-    after_bias, after_matrix = (corrected(steps_of(stage.correction), raw) for stage in found.stages[:2])
+    after_bias, after_matrix = (corrected(stage.correction, raw) for stage in found.stages[:2])
     assert np.allclose(after_bias, raw - BIAS, atol=1e-10)
     assert np.allclose(after_matrix, (raw - BIAS) @ M, atol=1e-9)
 
@@ -192,8 +192,8 @@ def test_ramps_are_no_part_of_a_steady_turn() -> None:
 def test_a_stage_works_on_the_output_of_the_stage_before() -> None:
     recordings = Bench("gyroscope", BIAS, K).turns_at([60.0])
     before = run_stages("gyroscope", STAGES[:1], recordings, settings())
-    shifted = [{"subtract": (np.array(BIAS) + 0.5).tolist()}]
-    given = replace(before, bias=before.bias + 0.5, stages=(replace(before.stages[0], correction={"steps": shifted}),))
+    shifted = Subtract(np.array(BIAS) + 0.5)
+    given = replace(before, bias=before.bias + 0.5, stages=(replace(before.stages[0], correction=(shifted,)),))
     found = fit_stage("gyroscope", STAGES[1], with_noise(recordings, settings()), given, settings())
     assert found.bias == pytest.approx(np.array(BIAS) + 0.5, abs=1e-9)
-    assert found.stages[-1].correction["steps"][:1] == shifted
+    assert found.stages[-1].correction[0] is shifted

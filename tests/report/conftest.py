@@ -10,7 +10,7 @@ import pytest
 from unit_settings import settings_of
 
 from pipeline.model.kinematics import reference_motion
-from pipeline.records import Note, Recording, SensorCalibration, StageResult
+from pipeline.records import Estimate, Note, Recording, SensorCalibration, StageResult
 from pipeline.settings import Settings, Stated
 
 SIGMA = {"accelerometer": 0.003, "gyroscope": 0.05}
@@ -36,7 +36,7 @@ def sensor_truth(sensor: str) -> SensorCalibration:
             sensor,
             np.array([0.031, -0.022, 0.067]),
             np.array([[0.994, 0.004, -0.002], [0.001, 1.007, 0.003], [-0.005, 0.002, 0.951]]),
-            stages=(StageResult("least_squares", {"bias_x": {"value": 0.031, "unit": "g"}}, SIGMA[sensor]),),
+            stages=(StageResult("least_squares", {"bias_x": Estimate(0.031, "g")}, SIGMA[sensor]),),
             covariance=np.eye(12) * 1e-8,
             degrees_of_freedom=900.0,
         )
@@ -44,7 +44,7 @@ def sensor_truth(sensor: str) -> SensorCalibration:
         sensor,
         np.array([1.7, -0.9, 0.4]),
         np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0.005, 0.998]]),
-        stages=(StageResult("least_squares", {"bias_x": {"value": 1.7, "unit": "deg/s"}}, SIGMA[sensor]),),
+        stages=(StageResult("least_squares", {"bias_x": Estimate(1.7, "deg/s")}, SIGMA[sensor]),),
         covariance=np.eye(12) * 1e-6,
         degrees_of_freedom=400.0,
     )

@@ -12,7 +12,7 @@ from unit_settings import filter_of, settings_of
 from pipeline.model.effects import effect
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import compensate, predicted_reading
-from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, StageResult
+from pipeline.records import FittedEffect, Multiply, Noise, Recording, SensorCalibration, StageResult, Subtract
 from pipeline.signal.filters import apply_filter
 from tests.published import validate
 
@@ -273,8 +273,8 @@ def test_timing_moves_the_rate_where_no_attitude_is_logged(name: str, size: floa
 
 def test_stages_of_a_staged_fit_are_steps() -> None:
     c = calibration("accelerometer")
-    half = {"steps": [{"subtract": c.bias.tolist()}]}
-    full = {"steps": [*half["steps"], {"matrix": c.matrix.tolist()}]}
+    half = (Subtract(c.bias),)
+    full = (*half, Multiply(c.matrix))
     stages = (StageResult("bias", {}, None, half), StageResult("scale_factor", {}, None, full), StageResult("x", {}))
     recording = read(held_out(300), 1.0, accelerometer=c)
     part = validate(replace(c, stages=stages), [recording], noise_of("accelerometer"), SETTINGS)

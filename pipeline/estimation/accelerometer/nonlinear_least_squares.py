@@ -18,12 +18,11 @@ is linear in p; its centre is ``b = -Q^-1 h``, and ``L^T L = Q G^2 / (1 + b^T Q 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.correction import Multiply, Step, Subtract
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
 from pipeline.estimation.least_squares import ScaledColumns
@@ -58,10 +57,14 @@ from pipeline.records import (
     BIAS,
     BIAS_NAMES,
     MATRIX,
+    Estimate,
     Mask,
+    Multiply,
     Noise,
     NoMonteCarlo,
     SensorCalibration,
+    StageResult,
+    Subtract,
     Values,
     base_units,
     base_values,
@@ -69,7 +72,7 @@ from pipeline.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from pipeline.records import UnitRecordings
     from pipeline.settings import Settings
@@ -179,22 +182,17 @@ def _fit_triangular(
         rows = _without(rows, refused)
         solved = _fit_determined(rows, gravity_g, prior, limit)
     fitted, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
-    steps: list[Step] = [Subtract(fitted.state.bias), Multiply(fitted.state.matrix)]
     if not rows.by_hand and solved.spare > 1:
-        return _on_table(rows, solved, before, steps, prior, settings)
+        return _on_table(rows, solved, before, prior, settings)
     covariance = PLACED @ fitted.covariance @ PLACED.T
     freedom = float(fitted.degrees_of_freedom.min())
-    details, parameters = _details(rows, solved, freedom), _parameters(solved, covariance)
     gain = (ScaledColumns.of(solved.columns).weights() * solved.share)[:, solved.rows]
     return after_stage(
         before,
-        NAME,
-        details,
+        _stage(rows, solved, covariance, freedom),
         solved.model,
         fitted,
         settings,
-        steps,
-        parameters=parameters,
         white=PLACED @ np.sum(gain**2, axis=1),
         not_included=OF_LENGTH,
     )
@@ -312,11 +310,10 @@ def _outlier(rows: Orientations, solved: _Solved) -> dict[int, str]:
     return {worst: f"length of the specific force is {error}"}
 
 
-def _on_table(  # noqa: PLR0917  (what a fit on a table is)
+def _on_table(
     rows: Orientations,
     solved: _Solved,
     before: SensorCalibration,
-    steps: Sequence[Step],
     prior: WanderPrior,
     settings: Settings,
 ) -> SensorCalibration:
@@ -344,9 +341,9 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     weights, share, white = ScaledColumns.of(solved.columns).weights(), solved.share, solved.fit.error
     scatter = noise_contribution(noise, map_of((weights * share / white)[:, solved.rows], PLACED), prior)
     lines = [scatter, *limits_contribution(solved.model, solved.fit)[0]]
-    details = _details(rows, solved, float(scatter.degrees_of_freedom.min()))
-    parameters = _parameters(solved, np.sum([line.covariance for line in lines], axis=0))
-    calibration = with_stage(before, NAME, details, solved.model, solved.fit, steps, parameters)
+    covariance = np.sum([line.covariance for line in lines], axis=0)
+    stage = _stage(rows, solved, covariance, float(scatter.degrees_of_freedom.min()))
+    calibration = with_stage(before, stage, solved.model, solved.fit)
     gravity, missing = gravity_line(calibration, settings.table)
     lines += gravity
     complete, trials = combined(calibration, lines, missing | OF_LENGTH), settings.uncertainty.monte_carlo
@@ -365,7 +362,7 @@ def _on_table(  # noqa: PLR0917  (what a fit on a table is)
     return with_trials(complete, through(noise.posterior(map_of(every, every)), [], results), trials, lines[1:])
 
 
-def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]]:
+def _parameters(solved: _Solved, covariance: Values) -> dict[str, Estimate]:
     """Return b, S and T with their uncertainties; ``L_ij = T_ij S_j``."""
     values = base_values(solved.fit.state.bias, solved.fit.state.matrix)[PLACE]
     S, J = np.diag(solved.fit.state.matrix)[COLUMNS], np.eye(9)
@@ -379,8 +376,9 @@ def _parameters(solved: _Solved, covariance: Values) -> dict[str, dict[str, Any]
     return stage_parameters(dict(named), J @ covariance[np.ix_(PLACE, PLACE)] @ J.T)
 
 
-def _details(rows: Orientations, solved: _Solved, freedom: float) -> dict[str, Any]:
-    return {
+def _stage(rows: Orientations, solved: _Solved, covariance: Values, freedom: float) -> StageResult:
+    """Return the result of the stage; ``covariance``: (12, 12), of bias and matrix."""
+    details = {
         "orientations_used": len(rows.rests.time),
         "samples_used": int(rows.rests.count.sum()),
         "rests_used": describe_rests(rows.used) if rows.by_hand else [],
@@ -394,3 +392,5 @@ def _details(rows: Orientations, solved: _Solved, freedom: float) -> dict[str, A
         "cosine": solved.fit.cosine,
         "degrees_of_freedom": freedom,
     }
+    correction = Subtract(solved.fit.state.bias), Multiply(solved.fit.state.matrix)
+    return StageResult(NAME, _parameters(solved, covariance), correction=correction, details=details)

@@ -39,7 +39,6 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     sinusoids_of,
     turns_of,
 )
-from pipeline.estimation.correction import Step, Subtract, TwoSided, corrected, steps_of
 from pipeline.estimation.engine import LinearMap, ResidualNoise
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage, staged_result
@@ -61,8 +60,12 @@ from pipeline.records import (
     FittedEffect,
     Recording,
     SensorCalibration,
+    Step,
+    Subtract,
+    TwoSided,
     Values,
     base_values,
+    corrected,
 )
 
 if TYPE_CHECKING:
@@ -207,7 +210,7 @@ class CorrectedForces:
             return cls()
         k = 1.0 / np.diag(previous.matrix)
         c = sum((e.values for e in previous.effects if e.name == ASYMMETRY), np.zeros(3))
-        return cls(steps_of(previous.stages[-1].correction), previous.bias, 1.0 / (k + c), 1.0 / (k - c))
+        return cls([*(previous.stages[-1].correction or ())], previous.bias, 1.0 / (k + c), 1.0 / (k - c))
 
     @property
     def k(self) -> Values:

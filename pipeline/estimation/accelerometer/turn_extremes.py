@@ -37,10 +37,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.correction import Step, TwoSided
 from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
 from pipeline.estimation.turns import TurnPart, filtered_alike
-from pipeline.records import AXES, Mask, Values
+from pipeline.records import AXES, Mask, Step, TwoSided, Values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -37,7 +37,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.correction import Multiply, Subtract, published
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.monte_carlo import with_matrix
@@ -55,9 +54,11 @@ from pipeline.records import (
     BIAS,
     Index,
     Mask,
+    Multiply,
     Recording,
     SensorCalibration,
     StageResult,
+    Subtract,
     Values,
 )
 from pipeline.signal.rests import runs
@@ -137,7 +138,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         name=NAME,
         parameters=stage_parameters(_values(factors), (scatter.covariance + of_bias)[AFTER_BASE, AFTER_BASE]),
         residual_rms=float(np.sqrt(np.mean(error**2))),
-        correction=published([Subtract(previous.bias), Multiply(matrix)]),
+        correction=(Subtract(previous.bias), Multiply(matrix)),
         details={
             "turns": len(U),
             "turns_left_out": turns.left_out,

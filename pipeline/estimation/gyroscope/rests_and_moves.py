@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError
-from pipeline.estimation.correction import Multiply, Step, Subtract
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
@@ -25,7 +24,7 @@ from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
 from pipeline.estimation.stages import FitStage
-from pipeline.records import BASE_COUNT, MATRIX, MATRIX_NAMES, SensorCalibration
+from pipeline.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Multiply, SensorCalibration, StageResult, Subtract
 
 if TYPE_CHECKING:
     from pipeline.records import UnitRecordings
@@ -105,6 +104,6 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     if model.turns is not None:
         details["turns"] = model.turns.described(fitted.state)
         details["departures"] = model.turns.departures(fitted.state)
-    steps: list[Step] = [Subtract(fitted.state.bias), Multiply(fitted.state.matrix)]
+    stage = StageResult(NAME, correction=(Subtract(fitted.state.bias), Multiply(fitted.state.matrix)), details=details)
     before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
-    return after_stage(before, NAME, details, model, fitted, settings, steps)
+    return after_stage(before, stage, model, fitted, settings)

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.correction import Multiply, Step, Subtract, corrected, steps_of
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import wander_prior
@@ -35,7 +34,20 @@ from pipeline.estimation.stages import FitStage, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
-from pipeline.records import AFTER_BASE, AXES, BASE, Mask, Recording, SensorCalibration, Values, motion_at_rest
+from pipeline.records import (
+    AFTER_BASE,
+    AXES,
+    BASE,
+    Mask,
+    Multiply,
+    Recording,
+    SensorCalibration,
+    Step,
+    Subtract,
+    Values,
+    corrected,
+    motion_at_rest,
+)
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
@@ -179,7 +191,7 @@ def fit(
 
     here = theta.T.ravel()
     so_far = previous.stages[-1].correction if previous and previous.stages else None
-    found = follow(response, [name], steps_of(so_far))
+    found = follow(response, [name], so_far or ())
     x, y, z = np.split(derivative(chain, here, np.full(here.size, DIFFERENCE_STEP_DPS)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
     reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings.table)

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -159,20 +159,20 @@ class GyroscopeModel:
         return error, np.sqrt(0.25 * np.pi * np.sum(noise**2, axis=1))
 
     def largest_direction_error(
-        self, state: State, covariance: Values, freedom: Values, scatter: Mapping[str, Any], ratio: float
+        self, state: State, covariance: Values, freedom: Values, scatter: tuple[float, float], ratio: float
     ) -> float:
         """Return the bound that the rms of ``direction_errors`` exceeds with a probability of 0.5 %, deg; simulated.
 
         Errors of the accelerometer's calibration are drawn both for the directions and in the covariance, as if these
         were independent; so the bound is too large rather than too small.
 
-        ``covariance``: (p, p), of bias and matrix first. ``freedom``: (p,), degrees of freedom. ``scatter``: details of
-        the fit, with the scatter of moves and of directions over the noise. ``ratio``: of bias wander to white noise.
+        ``covariance``: (p, p), of bias and matrix first. ``freedom``: (p,), degrees of freedom. ``scatter``: of moves
+        and of directions, over the noise. ``ratio``: of bias wander to white noise.
         """
         block = self._of_moves(state)
         n, H = len(block.residual), np.asarray(block.bias)
-        S = (1.0 + float(scatter.get("scatter_of_moves") or 0.0) ** 2) * np.eye(n) + np.asarray(block.common)
-        S = S + float(scatter.get("scatter_of_directions") or 0.0) ** 2 * np.asarray(block.direction)
+        S = (1.0 + scatter[0] ** 2) * np.eye(n) + np.asarray(block.common)
+        S = S + scatter[1] ** 2 * np.asarray(block.direction)
         S = S + ratio**2 * np.einsum("cnk,cmk->nm", H, H)
         rng = np.random.default_rng(0)
         drawn = rng.standard_normal((INTERVAL_DRAWS, n)) @ cholesky(S).T  # continuous in S, as eigenvectors are not

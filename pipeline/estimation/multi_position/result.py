@@ -11,14 +11,13 @@ gravity's length, with the equations of ``accelerometer`` and ``faces_and_turns`
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import AUTO, limits_of
-from pipeline.estimation.correction import published
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
@@ -47,7 +46,6 @@ from pipeline.records import Contribution, Recording, SensorCalibration, StageRe
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.correction import Step
     from pipeline.records import Noise, UnitRecordings
     from pipeline.settings import Procedure, Settings
 
@@ -134,19 +132,11 @@ def calibration_of(model: Model, fitted: FitByHand, before: SensorCalibration, s
         "wander_time_s": float(fitted.noise.bias.time),
         "scatter_over_noise": list(fitted.noise.scatter),
     }
-    return after_stage(before, "effects", details, model, fitted, settings)
+    return after_stage(before, StageResult("effects", details=details), model, fitted, settings)
 
 
-def with_stage(  # noqa: PLR0917  (what a fit by hand is)
-    before: SensorCalibration,
-    name: str,
-    details: dict[str, Any],
-    model: Model,
-    fitted: FitByHand,
-    steps: Sequence[Step],
-    parameters: dict[str, dict[str, Any]],
-) -> SensorCalibration:
-    """Return a calibration after an additional stage, without its uncertainty."""
+def with_stage(before: SensorCalibration, stage: StageResult, model: Model, fitted: FitByHand) -> SensorCalibration:
+    """Return a calibration after an additional stage, without its uncertainty; it adds the residual to the stage."""
     at_rest = slice(0, model.rests_equations)
     rms = float(np.sqrt(np.mean((fitted.residual[at_rest] * fitted.error[at_rest]) ** 2)))
     rank = fitted.rank - len(model.known_by_limit)
@@ -154,37 +144,34 @@ def with_stage(  # noqa: PLR0917  (what a fit by hand is)
         before,
         bias=fitted.state.bias,
         matrix=fitted.state.matrix,
-        stages=(*before.stages, StageResult(name, parameters, rms, published(steps) if steps else None, details)),
+        stages=(*before.stages, replace(stage, residual_rms=rms)),
         converged=fitted.converged,
         convergence=certified(fitted.cosine, fitted.condition, rank, len(fitted.covariance)),
     )
 
 
-def after_stage(  # noqa: PLR0917  (what a fit by hand is)
+def after_stage(
     before: SensorCalibration,
-    name: str,
-    details: dict[str, Any],
+    stage: StageResult,
     model: Model,
     fitted: FitByHand,
     settings: Settings,
-    steps: Sequence[Step] = (),
     *,
-    parameters: dict[str, dict[str, Any]] | None = None,
     white: Values | None = None,
     not_included: Mapping[str, str] = NOT_INCLUDED,
 ) -> SensorCalibration:
     """Convert a fit to a calibration after an additional stage, with its uncertainty budget by the residuals.
 
-    ``parameters``: of the stage, where they are not bias and matrix. ``white``: (12,), variance by white noise, where
-    the budget states it separately.
+    ``stage``: without parameters, they are bias, matrix and those of the effects. ``white``: (12,), variance by white
+    noise, where the budget states it separately.
     """
     sensor, table, place = model.sensor, settings.table, _places(model, fitted)
     covariance = place @ fitted.covariance @ place.T
     freedom = np.min(np.where(place != 0.0, fitted.degrees_of_freedom, np.inf), axis=1)
     effects, of_effects = effect_parameters(sensor, fitted.state.terms, covariance)
-    parameters = parameters or of_effects
+    parameters = stage.parameters or of_effects
     parameters = parameters or base_parameters(sensor, fitted.state.bias, fitted.state.matrix, covariance)
-    calibration = replace(with_stage(before, name, details, model, fitted, steps, parameters), effects=effects)
+    calibration = replace(with_stage(before, replace(stage, parameters=parameters), model, fitted), effects=effects)
     limit, of_limit = limits_contribution(model, fitted)
     variance, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
     if white is not None:
@@ -305,4 +292,4 @@ def fit_faces(before: SensorCalibration, recordings: UnitRecordings, settings: S
         "condition": fitted.condition,
         "degrees_of_freedom": float(fitted.degrees_of_freedom.min()),
     }
-    return after_stage(before, NAME, details, model, fitted, settings)
+    return after_stage(before, StageResult(NAME, details=details), model, fitted, settings)

@@ -14,7 +14,6 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit, triangle
-from pipeline.estimation.correction import corrected, steps_of
 from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.fit import fit as fit_model
@@ -23,6 +22,7 @@ from pipeline.estimation.rest_means import gathered, held_out_rests, rest_means
 from pipeline.model.calibration_file import not_determined
 from pipeline.planning.guide import derivative_of
 from pipeline.records import Recording, SensorCalibration, StageResult, coverage_factor
+from pipeline.records.correction import corrected
 from pipeline.signal.rests import Rest
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def test_the_matrix_is_lower_triangular_and_its_upper_triangle_has_no_uncertaint
 
 def test_scale_factors_and_misalignment_make_up_the_matrix() -> None:
     calibration = fit(with_noise([_by_hand(_spread(24), np.random.default_rng(5))], _settings()), None, _settings())
-    found = {name: p["value"] for name, p in calibration.stages[-1].parameters.items()}
+    found = {name: p.value for name, p in calibration.stages[-1].parameters.items()}
     S = np.diag([found[f"scale_factor_{axis}"] for axis in "xyz"])
     T = np.eye(3)
     T[1, 0], T[2, 0], T[2, 1] = (found[f"misalignment_{pair}"] for pair in ("yx", "zx", "zy"))
@@ -215,7 +215,7 @@ def test_the_correction_is_the_calibration() -> None:
     calibration = fit(with_noise([recording], _settings()), None, _settings())
     assert recording.accelerometer is not None
     expected = (recording.accelerometer - calibration.bias) @ calibration.matrix.T
-    assert corrected(steps_of(calibration.stages[-1].correction), recording.accelerometer) == pytest.approx(expected)
+    assert corrected(calibration.stages[-1].correction, recording.accelerometer) == pytest.approx(expected)
 
 
 def test_earlier_stages_are_kept_and_the_result_survives_its_file() -> None:

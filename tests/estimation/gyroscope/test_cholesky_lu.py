@@ -9,10 +9,10 @@ import pytest
 from unit_settings import settings_of, with_noise
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.correction import corrected, steps_of
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
 from pipeline.estimation.stages import fit_stage
 from pipeline.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
+from pipeline.records.correction import corrected
 
 if TYPE_CHECKING:
     from pipeline.settings import Settings
@@ -84,7 +84,7 @@ def _fit(recordings: list[Recording], settings: Settings = SETTINGS) -> SensorCa
 
 
 def _values(calibration: SensorCalibration) -> dict[str, float]:
-    return {name: p["value"] for name, p in calibration.stages[-1].parameters.items()}
+    return {name: p.value for name, p in calibration.stages[-1].parameters.items()}
 
 
 def _matrices(values: dict[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -175,8 +175,8 @@ def test_the_uncertainty_of_the_factors_is_the_scatter_of_their_repeats() -> Non
     scatter, claimed = [], []
     for seed in range(25):
         parameters = _fit(_campaign(np.random.default_rng(100 + seed))).stages[-1].parameters
-        scatter.append([p["value"] for p in parameters.values()])
-        claimed.append([p["standard_uncertainty"] for p in parameters.values()])
+        scatter.append([p.value for p in parameters.values()])
+        claimed.append([p.standard_uncertainty for p in parameters.values()])
     truth = np.concatenate([S, T[np.tril_indices(3, -1)], M.ravel()])
     ratio = np.sqrt(np.mean(np.square(np.array(scatter) - truth), axis=0) / np.mean(np.square(claimed), axis=0))
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.25)
@@ -269,7 +269,7 @@ def test_the_correction_is_the_calibration_and_survives_its_file() -> None:
     assert [stage.name for stage in calibration.stages] == ["bias", "cholesky_lu"]
     reading = np.asarray(recordings[0].gyroscope)
     expected = (reading - calibration.bias) @ calibration.matrix.T
-    assert corrected(steps_of(calibration.stages[-1].correction), reading) == pytest.approx(expected, abs=1e-12)
+    assert corrected(calibration.stages[-1].correction, reading) == pytest.approx(expected, abs=1e-12)
     again = SensorCalibration.from_json("gyroscope", json.loads(json.dumps(calibration.to_json())))
     assert again.stages == calibration.stages
 

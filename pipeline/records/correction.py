@@ -1,6 +1,6 @@
 """Correct readings by the steps of a method, each of which acts on the output of the step before.
 
-The steps act on row vectors v; ``StageResult.correction`` is ``{"steps": [...]}`` with one entry for each:
+The steps act on row vectors v. Published is ``{"steps": [...]}`` with one entry for each:
 
     {"subtract": b}                                          v - b
     {"matrix": M}                                            v M^T, that is M v as a column
@@ -21,7 +21,7 @@ from pipeline.errors import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Values
+    from pipeline.records.recording import Values
 
 KINDS = "subtract, matrix, two_sided"
 
@@ -77,9 +77,9 @@ class TwoSided:
 Step: TypeAlias = Subtract | Multiply | TwoSided
 
 
-def steps_of(correction: Mapping[str, Any] | None) -> list[Step]:
+def steps_of(correction: Mapping[str, Any] | None) -> tuple[Step, ...] | None:
     """Return the steps of a published correction; raise ``ConfigurationError`` if one is of an unknown kind."""
-    return [] if correction is None else [_step(entry) for entry in correction["steps"]]
+    return None if correction is None else tuple(_step(entry) for entry in correction["steps"])
 
 
 def _step(entry: Mapping[str, Any]) -> Step:
@@ -94,7 +94,7 @@ def _step(entry: Mapping[str, Any]) -> Step:
 
 
 def published(steps: Sequence[Step]) -> dict[str, Any]:
-    """Return ``StageResult.correction``."""
+    """Return the published correction."""
     return {"steps": [step.to_json() for step in steps]}
 
 
