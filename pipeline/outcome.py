@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.errors import first
 from pipeline.files import INSTALLED, read_json, text_of_cell
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
-from pipeline.verdicts import Verdict
+from pipeline.verdicts import WITH_THEM, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -240,13 +240,19 @@ def _reasons(results: Path, units: Sequence[str]) -> list[str]:
 
 
 def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
-    """Group the units by source of error that can exceed the expanded uncertainty U and is not part of it."""
-    groups: dict[str, list[str]] = {}
+    """Group the units by source of error that can exceed the expanded uncertainty U and is not part of it.
+
+    The size of U with open effects is that of the first unit.
+    """
+    groups: dict[tuple[str, str], list[str]] = {}
+    said: dict[tuple[str, str], str] = {}
     for row in rows:
         for sensor in SENSORS:
             if source := row.get(f"{sensor}_not_in_uncertainty"):
-                groups.setdefault(f"{sensor}, U does not include {source}", []).append(row["unit"])
-    return groups
+                key = sensor, source.partition(WITH_THEM)[0]
+                groups.setdefault(key, []).append(row["unit"])
+                said.setdefault(key, f"{sensor}, U does not include {source}")
+    return {said[key]: units for key, units in groups.items()}
 
 
 def _changes(entries: Sequence[JSON]) -> list[str]:

@@ -45,7 +45,7 @@ STEPS = {  # in the order of a run
     ),
     "calibration": Step(
         "calibration.calibration_document",
-        ("unit", "checked", "fits", "validated"),
+        ("unit", "checked", "fits", "validated", "diagnosis"),
         (*BENCH, "method", "ingest", "stated"),
         "calibration",
     ),

@@ -25,3 +25,6 @@ class Verdict(StrEnum):
 def css_class(verdict: str | None) -> str:
     """Return the class of a verdict of a document; empty for a sensor without one."""
     return Verdict(verdict).css_class if verdict in set(Verdict) else ""
+
+
+WITH_THEM = ", with which the largest U is "  # between open effects and the uncertainty, in summary.csv and sentences

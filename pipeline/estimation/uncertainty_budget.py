@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.at_limits import changes_on_table
 from pipeline.estimation.candidates import TILT, tilt_like_zeros
 from pipeline.estimation.monte_carlo import through, with_trials
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
@@ -213,7 +214,9 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
         missing[QUANTISATION] = rounded
     else:
         lines.append(rounded)
-    complete = combined(calibration, [*lines, *found], {**absent, **missing})
+    modelled = [*estimated, *(e.name for e in calibration.effects)]
+    at_limits = changes_on_table(reference, fit, modelled, settings.sensor.of(sensor))
+    complete = combined(replace(calibration, at_limits=at_limits), [*lines, *found], {**absent, **missing})
     trials = settings.uncertainty.monte_carlo
     if not trials:
         return complete

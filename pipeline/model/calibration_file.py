@@ -38,6 +38,7 @@ from pipeline.io.files import not_regular
 from pipeline.model.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import parameter_limits
+from pipeline.model.open_effects import OF_BUDGET, open_words
 from pipeline.pack import read_published
 from pipeline.records import (
     AXES,
@@ -404,15 +405,18 @@ def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     Each entry is the source with its size, and the reason why U does not include it. A relative error of the matrix
     changes the scale factors most, so that it is compared with their U. ``part``: of ``calibrations/<unit>.json``.
     """
-    found = []
+    found, left_open = [], open_words(part)
     part = part or {}
+    listed = {entry["effect"] for entry in part.get("open") or []} if left_open else set()
     for entry in (part.get("uncertainty_budget") or {}).get("not_included", []):
+        if OF_BUDGET.get(entry["source"]) in listed:
+            continue
         for key, size in entry.get("up_to", {}).items():
             U = part["expanded_uncertainty"][key]
             if size > max(u or 0.0 for u in (U if key == "bias" else np.diag(U))):
                 of = f"{size:.2g} {part['unit']} of bias" if key == "bias" else f"{100.0 * size:.2g} % of the matrix"
                 found.append((f"{entry['source']}, up to {of}", entry["reason"].partition("; up to ")[0]))
-    return found
+    return found + left_open
 
 
 def not_determined(part: Mapping[str, Any]) -> str:

@@ -94,6 +94,8 @@ class SensorCalibration:
     freedom: Values | None = None  # (p,), effective degrees of freedom; None: ``degrees_of_freedom`` for all
     budget: Budget | None = None
     convergence: dict[str, Any] | None = None
+    # each (12, p), signed; change of bias and matrix by each parameter of an effect, absent in the model, at its limit
+    at_limits: Mapping[str, Values] = field(default_factory=dict)
 
     @property
     def parameters(self) -> Parameters:
@@ -137,6 +139,7 @@ class SensorCalibration:
             "converged": self.converged,
             "convergence": self.convergence,
             "uncertainty_budget": self.budget and self.budget.to_json(parameters),
+            "at_limits": {name: change.tolist() for name, change in self.at_limits.items()},
         }
 
     @classmethod
@@ -156,6 +159,7 @@ class SensorCalibration:
             freedom=None if freedom is None else unlimited(freedom),
             budget=budget and Budget.from_json(budget),
             convergence=data.get("convergence"),
+            at_limits={name: np.array(change, float) for name, change in data.get("at_limits", {}).items()},
         )
 
 

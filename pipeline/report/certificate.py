@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from pipeline.model.calibration_file import beyond_uncertainty
 from pipeline.outcome import run_command
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import first_and_last_step
@@ -166,6 +167,7 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, 
             "laboratory": stated.environment,
         },
         "results": _quantities(part),
+        "notInUncertainty": [f"{source}: {reason}" for source, reason in beyond_uncertainty(part)],
         "beyondLimits": part.get("beyond_limits") or [],
         "uncertaintyBudget": part.get("uncertainty_budget"),
         "beforeAdjustment": {k: first.get(k) for k in ERRORS} if first else None,
@@ -189,7 +191,10 @@ def _quantities(part: JSON) -> list[JSON]:
     for p, (U, u, k, freedom) in zip(fitted_parameters(part), known, strict=False):
         expanded = {"uncertainty": U, "standardUncertainty": u, "coverageFactor": k}
         expanded |= {"effectiveDegreesOfFreedom": freedom, "coverageProbability": 0.95, "distribution": "t"}
-        rows.append({"name": p.name, "value": p.value, "unit": p.unit, "expandedUnc": expanded if u > 0.0 else None})
+        rows.append({
+            "name": p.name, "value": p.value, "unit": p.unit, "expandedUnc": expanded if u > 0.0 else None,
+            "uncertaintyWithOpenEffects": p.with_open,
+        })  # fmt: skip
     return rows
 
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from pipeline.estimation.candidates import is_fixed
 from pipeline.model.calibration_file import beyond_uncertainty, left_out, limited_effects, without_rotation
+from pipeline.model.open_effects import both_figures
 from pipeline.records import (
     AFTER_BASE,
     AXES,
@@ -65,6 +66,7 @@ class Parameter(NamedTuple):
     unit: str
     expanded_uncertainty: float | None = None
     coverage_factor: float | None = None
+    with_open: float | None = None  # expanded uncertainty with the open effects, where it differs
 
     @property
     def standard_uncertainty(self) -> float | None:
@@ -92,7 +94,9 @@ def fitted_parameters(part: JSON) -> list[Parameter]:
     k_of_effects = dict(zip(budget["parameters"], budget["coverage_factor"], strict=True))
     values, expanded, factors = ([*each["bias"], *chain(*each["matrix"])] for each in (part, U, k))
     units = (part["unit"],) * len(BIAS_NAMES) + ("1",) * len(MATRIX_NAMES)
-    found = list(map(Parameter, BASE_NAMES, values, units, expanded, factors))
+    wide = both_figures(part)
+    with_open = [wide[name][1] if name in wide else None for name in BASE_NAMES]
+    found = list(map(Parameter, BASE_NAMES, values, units, expanded, factors, with_open))
     for effect in part.get("effects") or []:
         for symbol, p in effect["parameters"].items():
             name, expanded = f"{effect['name']}.{symbol}", p.get("expanded_uncertainty")

@@ -40,7 +40,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "fit": ("ingest", "filter"),
     "validate": ("ingest", "filter", *FITS),
     "diagnose": ("ingest", "filter", *FITS, "validate"),
-    "calibration": ("ingest", *FITS, "validate"),
+    "calibration": ("ingest", *FITS, "validate", "diagnose"),
     "export": ("calibration", "validate", "diagnose"),
     "report": ("ingest", "filter", "calibration", "validate", "diagnose", "export"),
     "summary": ("calibration", "validate", "diagnose", "report"),

@@ -20,8 +20,17 @@ from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.channel_table import axis_maps
 from pipeline.io.quality_flags import GAP
 from pipeline.model.calibration_file import beyond_limits, implausible, not_determined
+from pipeline.model.open_effects import with_open
 from pipeline.pack import FAILED
-from pipeline.records import SCHEMA_VERSION, SENSORS, NotCalibrated, Recording, Validation, calibrated
+from pipeline.records import (
+    SCHEMA_VERSION,
+    SENSORS,
+    NotCalibrated,
+    Recording,
+    SensorCalibration,
+    Validation,
+    calibrated,
+)
 from pipeline.stages.unit_files import StoredUnit
 from pipeline.version import VERSION
 
@@ -36,14 +45,17 @@ MOVE = "record turns of 100 deg/s and more about all axes"
 LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
-def calibration_document(
+def calibration_document(  # noqa: PLR0917  (what a calibration is composed of)
     unit: str,
     checked: list[Recording],
     fits: Mapping[str, Fit],
     validated: Validation,
+    diagnosis: Mapping[str, Any],
     settings: Settings,
 ) -> dict[str, Any]:
     """Return ``calibrations/<unit>.json``: the fits, noise at rest, inputs and software.
+
+    ``diagnosis``: ``diagnoses/<unit>.json``, for the effects that are not observable.
 
     Raises ``CannotCalibrateError`` if no sensor is calibrated.
     """
@@ -61,10 +73,20 @@ def calibration_document(
         "not_calibrated": reasons,
         "noise": identify_noise(checked),
     }
+    hidden = {sensor: _hidden(diagnosis.get(sensor)) for sensor in SENSORS}
     for sensor, fit in fits.items():
-        found = None if sensor in reasons else judged(sensor, fit.to_json(), settings.sensor.of(sensor))
-        document[sensor] = found
+        document[sensor] = None
+        if sensor not in reasons and isinstance(fit, SensorCalibration):
+            part = {k: v for k, v in fit.to_json().items() if k != "at_limits"} | with_open(sensor, fit, hidden)
+            document[sensor] = judged(sensor, part, settings.sensor.of(sensor))
     return document
+
+
+def _hidden(part: Mapping[str, Any] | None) -> dict[str, str] | None:
+    """Return the effects that are not observable with their reasons; None where the diagnosis failed."""
+    if part is None or part.get("failed"):
+        return None
+    return {entry["effect"]: entry["reason"] for entry in part["not_observable"]}
 
 
 def not_calibrated(fits: Mapping[str, Fit], validated: Validation, settings: Settings) -> dict[str, str]:

@@ -24,8 +24,8 @@ TAKE_JSON = {
     "documents of a run: written, read, and shown on pages, by commands and in formats of other programs": (
         "commands/explain.py", "commands/noise.py", "diagnosis/words.py", "exports/", "field_logs/compensate.py",
         "history.py", "io/arrow.py", "io/channel_table.py", "io/digests.py", "model/calibration_file.py",
-        "model/compensation.py", "outcome.py", "planning/plan.py", "records/", "report/", "result.py",
-        "results_folder.py", "stages/", "study/result.py", "thesis/page.py",
+        "model/compensation.py", "model/open_effects.py", "outcome.py", "planning/plan.py", "records/", "report/",
+        "result.py", "results_folder.py", "stages/", "study/result.py", "thesis/page.py",
     ),
 }  # fmt: skip
 

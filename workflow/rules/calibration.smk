@@ -6,6 +6,7 @@ rule calibration:
         accelerometer=last_fit("accelerometer"),
         gyroscope=last_fit("gyroscope"),
         validate=f"{BATCH}/validate.zip",
+        diagnose=f"{BATCH}/diagnose.zip",
     output:
         f"{BATCH}/calibration.zip",
     log:
@@ -18,4 +19,4 @@ rule calibration:
         code=code_digest("pipeline.stages.calibration"),
     shell:
         "{RUN} calibration --config {input.settings:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
-        " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --output {output:q} > {log:q} 2>&1"
+        " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.at_limits import changes_on_table
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
 from pipeline.estimation.least_squares import ScaledColumns
@@ -43,7 +44,8 @@ from pipeline.estimation.multi_position.result import (
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
 from pipeline.estimation.stages import FitStage
-from pipeline.estimation.turns import TurnPart, noise_of_turns
+from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.turns import TurnPart, noise_of_turns, used_motions
 from pipeline.estimation.uncertainty_budget import (
     combined,
     gravity_line,
@@ -339,11 +341,14 @@ def _on_table(
         return LinearMap((x, y, z), (derivative, derivative, derivative))
 
     weights, share, white = ScaledColumns.of(solved.columns).weights(), solved.share, solved.fit.error
-    scatter = noise_contribution(noise, map_of((weights * share / white)[:, solved.rows], PLACED), prior)
+    linear = map_of((weights * share / white)[:, solved.rows], PLACED)
+    scatter = noise_contribution(noise, linear, prior)
     lines = [scatter, *limits_contribution(solved.model, solved.fit)[0]]
     covariance = np.sum([line.covariance for line in lines], axis=0)
     stage = _stage(rows, solved, covariance, float(scatter.degrees_of_freedom.min()))
-    calibration = with_stage(before, stage, solved.model, solved.fit)
+    reference = Reference("accelerometer", used_motions(parts), solved.fit.state.K, settings.table)
+    at_limits = changes_on_table(reference, linear, (), settings.sensor.accelerometer)
+    calibration = replace(with_stage(before, stage, solved.model, solved.fit), at_limits=at_limits)
     gravity, missing = gravity_line(calibration, settings.table)
     lines += gravity
     complete, trials = combined(calibration, lines, missing | OF_LENGTH), settings.uncertainty.monte_carlo

@@ -106,4 +106,4 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         details["departures"] = model.turns.departures(fitted.state)
     stage = StageResult(NAME, correction=(Subtract(fitted.state.bias), Multiply(fitted.state.matrix)), details=details)
     before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
-    return after_stage(before, stage, model, fitted, settings)
+    return after_stage(before, stage, model, fitted, settings, other=accelerometer)

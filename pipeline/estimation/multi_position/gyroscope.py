@@ -272,7 +272,12 @@ class GyroscopeModel:
             common=np.where(other_move, means @ means.T, 0.0) + shared @ shared.T,
             direction=directions @ directions.T,
             shared=shared,
+            force=WD,
         )
+
+    def by_force(self, state: State) -> Values:
+        """Return the change of the moves' residuals by the specific force at each rest, per g: (n, m, 3) array."""
+        return np.asarray(self._of_moves(state).force)
 
     def accelerometer_errors(self, fitted: FitByHand) -> Values:
         """Return the estimate of the accelerometer's errors of bias and matrix from the moves: (12,) array."""

@@ -188,6 +188,7 @@ class EquationBlock:
     common: Values | None = None
     direction: Values | None = None
     shared: Values | None = None  # (n, 12); change of moves by errors of the accelerometer's calibration
+    force: Values | None = None  # (n, m, 3); change of moves by the specific force at each rest, per g
 
 
 def stacked(

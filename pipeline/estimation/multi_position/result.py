@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.at_limits import changes_by_hand, changes_through_gravity, gain_of
 from pipeline.estimation.candidates import AUTO, limits_of
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import certified
@@ -117,11 +118,17 @@ def fit_effects_by_rests(
             f"matrix: record at least {fitted.rank + 10} rests in as many orientations"
         )
     require_observable(model, fitted, limits)
-    return calibration_of(model, fitted, before, settings)
+    return calibration_of(model, fitted, before, settings, other)
 
 
-def calibration_of(model: Model, fitted: FitByHand, before: SensorCalibration, settings: Settings) -> SensorCalibration:
-    """Convert a fit to a calibration with the stage ``effects``."""
+def calibration_of(
+    model: Model,
+    fitted: FitByHand,
+    before: SensorCalibration,
+    settings: Settings,
+    other: SensorCalibration | None = None,
+) -> SensorCalibration:
+    """Convert a fit to a calibration with the stage ``effects``; ``other``: as of ``after_stage``."""
     details = {
         "samples": round(model.samples()),
         "rests": len(model.rests.time),
@@ -132,7 +139,7 @@ def calibration_of(model: Model, fitted: FitByHand, before: SensorCalibration, s
         "wander_time_s": float(fitted.noise.bias.time),
         "scatter_over_noise": list(fitted.noise.scatter),
     }
-    return after_stage(before, StageResult("effects", details=details), model, fitted, settings)
+    return after_stage(before, StageResult("effects", details=details), model, fitted, settings, other=other)
 
 
 def with_stage(before: SensorCalibration, stage: StageResult, model: Model, fitted: FitByHand) -> SensorCalibration:
@@ -159,11 +166,12 @@ def after_stage(
     *,
     white: Values | None = None,
     not_included: Mapping[str, str] = NOT_INCLUDED,
+    other: SensorCalibration | None = None,
 ) -> SensorCalibration:
     """Convert a fit to a calibration after an additional stage, with its uncertainty budget by the residuals.
 
     ``stage``: without parameters, they are bias, matrix and those of the effects. ``white``: (12,), variance by white
-    noise, where the budget states it separately.
+    noise, where the budget states it separately. ``other``: for the gyroscope, the calibration of the accelerometer.
     """
     sensor, table, place = model.sensor, settings.table, _places(model, fitted)
     covariance = place @ fitted.covariance @ place.T
@@ -171,7 +179,9 @@ def after_stage(
     effects, of_effects = effect_parameters(sensor, fitted.state.terms, covariance)
     parameters = stage.parameters or of_effects
     parameters = parameters or base_parameters(sensor, fitted.state.bias, fitted.state.matrix, covariance)
-    calibration = replace(with_stage(before, replace(stage, parameters=parameters), model, fitted), effects=effects)
+    calibration = with_stage(before, replace(stage, parameters=parameters), model, fitted)
+    at_limits = _at_limits(model, fitted, place, other, settings)
+    calibration = replace(calibration, effects=effects, at_limits=at_limits)
     limit, of_limit = limits_contribution(model, fitted)
     variance, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
     if white is not None:
@@ -192,6 +202,17 @@ def after_stage(
         missing["Earth's rotation"] = "not in the model: by hand the heading is unknown; up to 0.0042 deg/s of bias"
     complete, trials = combined(calibration, [*lines, *limit], missing), settings.uncertainty.monte_carlo
     return _with_monte_carlo(complete, model, fitted, trials, lines[1:]) if trials else complete
+
+
+def _at_limits(
+    model: Model, fitted: FitByHand, place: Values, other: SensorCalibration | None, settings: Settings
+) -> dict[str, Values]:
+    """Return the change of bias and matrix by each effect at its limits; ``other``: of the accelerometer."""
+    gain, modelled = gain_of(model, fitted, place), [term.effect.name for term in fitted.state.terms]
+    found = changes_by_hand(model, fitted, gain, modelled, settings.sensor.of(model.sensor))
+    if isinstance(model, gyroscope.GyroscopeModel) and other is not None:
+        found |= changes_through_gravity(model, fitted, gain, other, settings.sensor.accelerometer)
+    return found
 
 
 def _places(model: Model, fitted: FitByHand) -> Values:

@@ -1,0 +1,111 @@
+"""Errors of bias and matrix with one effect at its limit, against U and U with the open effects, in-process.
+
+    nice python benchmarks/open_effects.py [--units 2] [--procedure ferraris six_positions ...] [--none]
+
+Every unit has one effect of its sensor file at the limit, with random signs; ``--none``: no effect. Prints for each
+procedure the share of the parameters within U, within ``uncertainty_with_open``, and the largest error over the latter,
+with the verdict, of units that are said to lack nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+from pipeline.estimation.at_limits import limited_effects
+from pipeline.one_unit import unit_of_recordings, unit_row
+from pipeline.records import SENSORS
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription
+
+PROCEDURES = {
+    "ferraris": {"interval_s": 0.02},
+    "six_positions": {"interval_s": 0.02},
+    "orientations_24": {"interval_s": 0.02},
+    "multi_position": {"interval_s": 0.02},
+    "three_axis_turns": {"table": "acutronic"},
+}
+
+
+def errors_of(procedure: str, effect: str, limit: np.ndarray | None, seed: int) -> list[dict]:
+    """Return for each sensor the errors of bias and matrix, both uncertainties and the verdict of one unit."""
+    rng = np.random.default_rng([seed, 38])
+    hidden = {} if limit is None else {effect: (limit * rng.choice([-1.0, 1.0], len(limit))).tolist()}
+    described = {"table": "hand", **PROCEDURES[procedure]}
+    unit = UnitDescription("U", procedure=procedure, effects=hidden, **described)
+    recordings, truth = simulate_unit(unit, seed, 0)
+    layers = [f"table={unit.table}", f"procedure={procedure}", "sensor=mpu6050"]
+    began = time.process_time()
+    state = unit_of_recordings(recordings, layers).run_to("calibration")
+    spent = time.process_time() - began
+    found = []
+    for sensor in SENSORS:
+        part, true = state.calibration[sensor], truth[sensor]
+        if part is None:
+            continue
+        flat = [np.append(p["bias"], np.ravel(p["matrix"])) for p in (part, true, part["expanded_uncertainty"])]
+        wide = part["uncertainty_with_open"]
+        wide = np.append(wide["bias"], np.ravel(wide["matrix"]))
+        own = {entry["effect"]: entry["up_to"] for entry in part["open"]}
+        name = effect.partition(".")[2] if effect.startswith(sensor) else effect
+        line = own.get(name)
+        up_to = np.zeros(12) if line is None else np.append(line["bias"], np.ravel(line["matrix"]))
+        verdict = state.diagnosis[sensor]["verdict"]
+        found.append({
+            "sensor": sensor, "effect": effect, "error": np.abs(flat[0] - flat[1]), "U": flat[2], "wide": wide,
+            "line": up_to, "verdict": str(verdict), "open": sorted(own), "cpu_s": spent,
+            "selected": list(state.diagnosis[sensor]["selected"]),
+        })  # fmt: skip
+    return found
+
+
+def main() -> None:
+    """Measure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--units", type=int, default=1, help="of each effect")
+    parser.add_argument("--procedure", nargs="+", default=list(PROCEDURES), choices=list(PROCEDURES))
+    parser.add_argument("--none", action="store_true")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--told", action="store_true", help="list the units that are not said to lack nothing")
+    options = parser.parse_args()
+    settings = unit_row(["sensor=mpu6050"]).config.sensor
+    effects = {
+        f"{s}.{this.name}": np.where(limits > 0.0, limits, start)
+        for s in SENSORS
+        for this, start, limits in limited_effects(s, (), settings.of(s))
+    }
+    for procedure in options.procedure:
+        rows = []
+        for number, (name, limit) in enumerate(effects.items()):
+            for k in range(options.units):
+                seed = 1000 * options.seed + 50 * number + k
+                try:
+                    rows += errors_of(procedure, name, None if options.none else limit, seed)
+                except Exception as error:  # noqa: BLE001
+                    print(procedure, name, type(error).__name__, str(error)[:150])
+        silent = [r for r in rows if r["verdict"] in {"nothing_missing", "not_enough_data"}]
+        told = [r for r in rows if r["verdict"] not in {"nothing_missing", "not_enough_data"}]
+        within = [np.mean([r["error"] <= r["U"] + share * r["line"] for r in silent]) for share in (0.0, 1.0)]
+        wide = np.mean([r["error"] <= r["wide"] for r in silent])
+        cpu, ratio = np.mean([r["cpu_s"] for r in rows]), np.median([r["wide"] / r["U"] for r in rows])
+        print(f"{procedure}: {len(silent)} of {len(rows)} silent; CPU {cpu:.2f} s a unit; U with open {ratio:.2f} U")
+        print(f"   within U {within[0]:.3f}, U + line {within[1]:.3f}, U with open {wide:.3f}")
+        for r in sorted(silent, key=lambda r: -np.max(r["error"] / r["wide"]))[:6]:
+            over = [np.max(r["error"] / r[key]) for key in ("U", "wide")]
+            said = f"{over[0]:.1f} U, {over[1]:.2f} of U with open, {r['verdict']}"
+            print(f"   {r['sensor']} with {r['effect']}: {said}, line {'yes' if r['line'].any() else 'no'}")
+        print(
+            "   told:",
+            sorted({(r["sensor"][:4], r["effect"], r["verdict"], ",".join(r["selected"])) for r in told})
+            if options.told
+            else len(told),
+        )
+
+
+if __name__ == "__main__":
+    main()
