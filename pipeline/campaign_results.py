@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 JSON = dict[str, Any]
-PARAMETERS = ("parameter", "value", "value_unit", "expanded_uncertainty", "coverage_factor")
+PARAMETERS = ("parameter", "value", "value_unit", "expanded_uncertainty", "coverage_factor", "uncertainty_with_open")
 ERRORS = (
     "step", "rms_error", "mean_abs_error", "max_error", "min_error", "sum_abs_error", "change_percent",
     "vector_rms_error", "noise_floor", "vector_noise_floor",
@@ -106,7 +106,8 @@ class CampaignResults:
         """One row for each unit, sensor and parameter.
 
         Columns: ``unit, sensor, parameter, value, value_unit, expanded_uncertainty`` (95 %, in the unit of the value)
-        and ``coverage_factor`` (k; the standard uncertainty is expanded_uncertainty / k).
+        and ``coverage_factor`` (k; the standard uncertainty is expanded_uncertainty / k), ``uncertainty_with_open``
+        (the expanded uncertainty with the open effects of bias and matrix, where it is larger by more than 10 %).
 
         Parameters of ``truth = matrix (reading - bias - effects)``: ``bias_x``, ``matrix_xy``, ``<effect>.<symbol>``.
         Elements of ``K = matrix^-1``: ``scale_factor_error_x`` (``K_xx - 1``) and
