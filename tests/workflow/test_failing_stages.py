@@ -110,7 +110,10 @@ def test_a_fault_after_the_fit_leaves_the_calibration_and_is_stated_everywhere(
     for stage in AFTER_FIT:
         unit = f"at_{stage}"
         document = json.loads((results / "calibrations" / f"{unit}.json").read_text())
-        assert (document["status"], document["gyroscope"]) == ("ok", good["gyroscope"])
+        of_diagnosis = {"open", "uncertainty_with_open"} if stage == "diagnose" else set()
+        parts = [{k: v for k, v in d["gyroscope"].items() if k not in of_diagnosis} for d in (document, good)]
+        assert document["status"] == "ok"
+        assert parts[0] == parts[1]
         cause = f"no room for {unit}" if stage == "export" else f"fault at {unit}"
         assert (rows[unit]["status"], rows[unit]["error"]) == ("ok", "")
         assert rows[unit]["incomplete"].startswith(f"{stage}: ")
